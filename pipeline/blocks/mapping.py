@@ -22,15 +22,25 @@ _NEIGHBOURS = 12
 
 
 @dataclass(frozen=True)
+class Sight:
+    """A point in an image: column and row of its feature, the first pixel's centre being (0, 0); size_px: that of the
+    feature, the standard deviation of the Gaussian that found it; off_px: how far the point's own projection lies."""
+
+    image: str
+    col: float
+    row: float
+    size_px: float
+    off_px: float
+
+
+@dataclass(frozen=True)
 class Mapped:
     """What COLMAP found, in coordinates of its own: by image the rotation (3, 3) and translation (3,) to axes x right,
-    y down, z forward; by point its coordinates (3,) and its tracks (image, column, row), the first pixel's centre being
-    (0, 0), with their reprojection errors in px."""
+    y down, z forward; by point its coordinates (3,) and its sights."""
 
     poses: dict[str, tuple[Array, Array]]
     points: dict[int, Array]
-    tracks: dict[int, list[tuple[str, float, float]]]
-    errors_px: dict[int, float]
+    tracks: dict[int, list[Sight]]
 
 
 def mapped(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], folder: Path) -> Mapped:
@@ -67,26 +77,36 @@ def _run_mapping(pictures: Sequence[BlockPicture], folder: Path) -> Mapped:
     models = pycolmap.incremental_mapping(str(folder / "colmap.db"), str(folder / "pictures"), str(sparse), options)
     if not models:
         raise InputError("COLMAP orients no two of these frames: they may not overlap, or show too little in common.")
-    return read_model(max(models.values(), key=lambda model: model.num_reg_images()), pictures)
+    model = max(models.values(), key=lambda model: model.num_reg_images())
+    return read_model(model, pycolmap.Database.open(str(folder / "colmap.db")), pictures)
 
 
-def read_model(model: Any, pictures: Sequence[BlockPicture]) -> Mapped:
-    """What a reconstruction says, by the images' names here."""
+def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> Mapped:
+    """What a reconstruction says, by the images' names here; the features' sizes stand in its database."""
     names = {picture.name: picture.image for picture in pictures}
     images = {number: model.images[number] for number in model.reg_image_ids()}
     poses = {}
     for image in images.values():
         pose = image.cam_from_world()
         poses[names[image.name]] = (np.array(pose.rotation.matrix()), np.array(pose.translation))
-    tracks, points, errors = {}, {}, {}
+    sizes_px = {number: _sizes_px(np.array(database.read_keypoints(number))) for number in images}
+    tracks, points = {}, {}
     for number, point in model.points3D.items():
-        places = []
+        sights = []
         for element in point.track.elements:
-            image = images[element.image_id]
-            col, row = image.points2D[element.point2D_idx].xy - CONVENTION.first_pixel_px
-            places.append((names[image.name], float(col), float(row)))
-        tracks[int(number)], points[int(number)], errors[int(number)] = places, np.array(point.xyz), float(point.error)
-    return Mapped(poses, points, tracks, errors)
+            image, row = images[element.image_id], element.point2D_idx
+            seen = image.points2D[row].xy
+            off_px = float(np.linalg.norm(seen - image.project_point(point.xyz)))
+            place = seen - CONVENTION.first_pixel_px
+            size_px = float(sizes_px[element.image_id][row])
+            sights.append(Sight(names[image.name], float(place[0]), float(place[1]), size_px, off_px))
+        tracks[int(number)], points[int(number)] = sights, np.array(point.xyz)
+    return Mapped(poses, points, tracks)
+
+
+def _sizes_px(keypoints: Array) -> Array:
+    """(n,) of COLMAP's features (n, 6): x, y and the (2, 2) shape of each."""
+    return np.asarray(np.sqrt(np.abs(np.linalg.det(keypoints[:, 2:6].reshape(-1, 2, 2)))))
 
 
 def _extract(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[BlockPicture], camera: CameraFile) -> None:

@@ -2,13 +2,15 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from adjust.problem.network import ObjectPoint
 from measure.status import Status
-from pipeline.blocks.mapping import Mapped
+from pipeline.blocks.mapping import Mapped, Sight
 from pipeline.blocks.pictures import BlockPicture, BlockScan
 from pipeline.errors import InputError
 from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
@@ -19,59 +21,98 @@ Array = NDArray[np.float64]
 CELLS = 8  # a side of an image: ties are spread over these
 A_CELL = 3  # ties that are taken of one, the longest tracks first
 FEWEST_CONTROL = 3
-_MAD = 1.4826  # of a normal distribution's standard deviation in median absolute deviations
-_CONSISTENT = 3.0  # standard deviations of a reprojection error that a track may have
+_CONSISTENT = 3.0  # standard deviations that the sights of a track may lie off, rms
+_FEWEST_SIGHTS = 3
+_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class FeaturePrecision:
+    """The variance of a feature's coordinate is grain^2 + (share * size)^2: a large one is found less exactly."""
+
+    grain_px: float
+    share: float
+
+    def sigma_px(self, size_px: float) -> float:
+        return float(np.hypot(self.grain_px, self.share * size_px))
+
+    @property
+    def variances_px2(self) -> Array:
+        return np.array([self.grain_px**2, self.share**2])
 
 
 def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[ComparatorPoint, ...]:
-    """The tracks that are taken, back in the scans that they were seen in, with one standard deviation for all."""
+    """The tracks that are taken, back in the scans that they were seen in, with the standard deviations that features
+    of their sizes show among themselves."""
     by_image = {picture.image: picture for picture in pictures}
-    sigma_px = feature_sigma_px(mapped)
+    precision = feature_precision(mapped)
     marks = []
-    for number in chosen_tracks(mapped, by_image, sigma_px):
-        for image, col, row in mapped.tracks[number]:
-            picture = by_image[image]
-            seen = picture.scan_place(picture.lattice.camera_mm(np.array([col, row])))
+    for number in chosen_tracks(mapped, by_image, precision):
+        for sight in mapped.tracks[number]:
+            picture = by_image[sight.image]
+            seen = picture.scan_place(picture.lattice.camera_mm(np.array([sight.col, sight.row])))
             if seen is None:
                 continue
             scan, place_px = seen
             place = comparator_from_pixel(place_px, scan.chain.pitch_um)
-            sigma = np.full(2, sigma_px * picture.lattice.pitch_mm)
+            sigma = np.full(2, precision.sigma_px(sight.size_px) * picture.lattice.pitch_mm)
             marks.append(ComparatorPoint(scan.image, f"tie-{number}", "tie", place, sigma, 0.0, Status.MEASURED, ""))
     return tuple(marks)
 
 
-def feature_sigma_px(mapped: Mapped) -> float:
-    """The standard deviation of a feature's coordinate, from the reprojection errors of tracks that are seen thrice or
-    more: of 2 n coordinates three degrees of freedom went into the point.
+def feature_precision(mapped: Mapped) -> FeaturePrecision:
+    """How exactly features are found, from how far the sights of tracks that are seen thrice or more lie off: of 2 n
+    coordinates three degrees of freedom went into the point.
 
-    COLMAP's error is the mean length of a point's residuals, whose square is pi / 4 of the mean square of the lengths
-    of normally distributed ones. Of many points the median counts, and the median of chi-square over its degrees of
-    freedom f is about (1 - 2 / (9 f))^3 (Wilson and Hilferty 1931).
+    It begins with the median of all, which of chi-square with two degrees of freedom is 2 ln 2; then the squares of
+    consistent tracks are fitted, each weighted by its expectation. Raises InputError where no track is seen thrice.
     """
-    squares = []
-    for number, track in mapped.tracks.items():
-        if len(track) >= 3:
-            free = 2 * len(track) - 3
-            of_lengths = mapped.errors_px[number] ** 2 * 4.0 / np.pi
-            squares.append(of_lengths / 2.0 * 2 * len(track) / free / (1.0 - 2.0 / (9.0 * free)) ** 3)
-    if not squares:
+    tracks = [track for track in mapped.tracks.values() if len(track) >= _FEWEST_SIGHTS]
+    if not tracks:
         raise InputError("COLMAP found no point in three frames: a block needs more overlap.")
-    return float(np.sqrt(np.median(squares)))
+    squares = np.concatenate([_squares_px2(track) for track in tracks])
+    design = np.concatenate([_design(track) for track in tracks])
+    ends = np.cumsum([len(track) for track in tracks])
+    precision = FeaturePrecision(float(np.sqrt(np.median(squares / design[:, 0]) / np.log(2.0))), 0.0)
+    for _ in range(_ROUNDS):
+        expected = design @ precision.variances_px2
+        agree = [part.mean() < _CONSISTENT**2 for part in np.split(squares / expected, ends[:-1])]
+        used = np.repeat(agree, np.diff(ends, prepend=0))
+        weight = 1.0 / expected[used]
+        grain2, share2 = nnls(weight[:, None] * design[used], weight * squares[used])[0]
+        precision = FeaturePrecision(float(np.sqrt(grain2)), float(np.sqrt(share2)))
+    return precision
 
 
-def chosen_tracks(mapped: Mapped, pictures: Mapping[str, BlockPicture], sigma_px: float) -> list[int]:
-    """Of every part of every image the longest tracks, as far as they agree with themselves."""
+def _squares_px2(track: Sequence[Sight]) -> Array:
+    """(n,) by how far its sights lie off, the mean square of a coordinate."""
+    return np.array([sight.off_px**2 / 2.0 for sight in track])
+
+
+def _design(track: Sequence[Sight]) -> Array:
+    """(n, 2) what these are expected to be, as parts of grain^2 and share^2.
+
+    With a share f of the coordinates' freedom left, a residual's variance is f^2 of the sight's own and f (1 - f) of
+    the mean of all, as of a projection in any direction: which one it is the sights' geometry alone would say.
+    """
+    free = (2 * len(track) - 3) / (2 * len(track))
+    squares = np.array([sight.size_px**2 for sight in track])
+    return np.stack([np.full(len(track), free), free * (free * squares + (1.0 - free) * squares.mean())], axis=1)
+
+
+def chosen_tracks(mapped: Mapped, pictures: Mapping[str, BlockPicture], precision: FeaturePrecision) -> list[int]:
+    """Of every part of every image the longest tracks, the most precise first, as far as they agree with themselves."""
     usable = [
         number
         for number, track in mapped.tracks.items()
-        if len({image for image, _, _ in track}) == len(track) and mapped.errors_px[number] < _CONSISTENT * sigma_px
+        if len({sight.image for sight in track}) == len(track)
+        and (_squares_px2(track) / (_design(track) @ precision.variances_px2)).mean() < _CONSISTENT**2
     ]
-    usable.sort(key=lambda number: (-len(mapped.tracks[number]), mapped.errors_px[number]))
+    usable.sort(key=lambda number: (-len(mapped.tracks[number]), max(s.size_px for s in mapped.tracks[number])))
     taken: dict[tuple[str, int, int], int] = defaultdict(int)
     chosen = []
     for number in usable:
-        cells = [_cell(pictures[image], col, row) for image, col, row in mapped.tracks[number]]
+        cells = [_cell(pictures[sight.image], sight.col, sight.row) for sight in mapped.tracks[number]]
         if any(taken[cell] < A_CELL for cell in cells):
             chosen.append(number)
             for cell in cells:

@@ -15,9 +15,9 @@ from adjust.functional_model.transformation import Film
 from adjust.problem.network import Distortion, ObjectPoint, Prior
 from measure.status import Status
 from pipeline.blocks.block_stage import written_block
-from pipeline.blocks.mapping import Mapped, camera_params
+from pipeline.blocks.mapping import Mapped, Sight, camera_params
 from pipeline.blocks.pictures import BlockPicture, BlockScan, lattice_of, write_pictures
-from pipeline.blocks.ties import A_CELL, CELLS, feature_sigma_px, oriented_by_control, similarity, tie_marks
+from pipeline.blocks.ties import A_CELL, CELLS, feature_precision, oriented_by_control, similarity, tie_marks
 from pipeline.errors import InputError
 from pipeline.exchange.foreign_camera import fiducial_camera
 from pipeline.files.camera_file import CameraFile
@@ -66,10 +66,17 @@ def mapped(noise_px: float = 0.0) -> Mapped:
         station = SCALE * TURN @ np.array(TRUTH.stations[i]) + SHIFT
         poses[f"f{i}"] = (turn, -turn @ station)
     seen = [lattice_px(camera_mm(i)) + rng.normal(0.0, noise_px, (100, 2)) for i in IMAGES]
-    tracks = {j: [(f"f{i}", *seen[i][j].tolist()) for i in IMAGES] for j in range(100)}
-    free = np.sqrt((8 - 3) / 8)  # of eight coordinates three went into the point
-    off = noise_px * np.sqrt(2.0) * free
-    return Mapped(poses, dict(enumerate(theirs)), tracks, dict.fromkeys(range(100), off))
+    off = float(noise_px * np.sqrt(2.0 * (8 - 3) / 8))  # of eight coordinates three went into the point
+    tracks = {
+        j: [Sight(f"f{i}", float(seen[i][j, 0]), float(seen[i][j, 1]), 4.0, off) for i in IMAGES] for j in range(100)
+    }
+    return Mapped(poses, dict(enumerate(theirs)), tracks)
+
+
+def at_odds(block: Mapped, off_px: float) -> Mapped:
+    """The same places, but points that do not quite agree with them."""
+    tracks = {j: [replace(sight, off_px=off_px) for sight in track] for j, track in block.tracks.items()}
+    return replace(block, tracks=tracks)
 
 
 def test_a_similarity_is_found() -> None:
@@ -82,7 +89,7 @@ def test_a_similarity_is_found() -> None:
 
 
 def test_tracks_come_back_into_turned_and_mirrored_scans() -> None:
-    marks = tie_marks(replace(mapped(), errors_px=dict.fromkeys(range(100), 0.4)), PICTURES)
+    marks = tie_marks(at_odds(mapped(), 0.4), PICTURES)
     assert {mark.image for mark in marks} == {"f0", "f1", "f2", "f3"}
     for mark in marks:
         col, row = scan_px(int(mark.image[1:]), camera_mm(int(mark.image[1:])))[int(mark.point.removeprefix("tie-"))]
@@ -104,7 +111,7 @@ def in_halves(i: int) -> BlockPicture:
 
 
 def test_tracks_of_a_frame_that_was_scanned_in_parts_come_back_into_the_scan_that_shows_them() -> None:
-    block = replace(mapped(), errors_px=dict.fromkeys(range(100), 0.4))
+    block = at_odds(mapped(), 0.4)
     marks = tie_marks(block, [in_halves(i) for i in IMAGES])
     whole = {(mark.image, mark.point): mark for mark in tie_marks(block, PICTURES)}
     assert len(marks) == len(whole)
@@ -117,30 +124,34 @@ def test_tracks_of_a_frame_that_was_scanned_in_parts_come_back_into_the_scan_tha
         assert col < LEFT_PX if mark.image.endswith("l") else col > RIGHT_PX
 
 
-def test_their_standard_deviation_is_that_of_the_features() -> None:
-    """Simulated as COLMAP tells it: residuals of a fit with three unknowns, their mean length; 3, 4 and 7 sights."""
+def test_their_standard_deviation_is_that_of_features_of_their_size() -> None:
+    """Simulated: residuals of a fit with three unknowns to 3, 4 and 7 sights, one track in thirty false."""
     rng = np.random.default_rng(8)
-    tracks, errors = {}, {}
+    tracks = {}
     for number in range(4000):
         sights = int(rng.choice([3, 4, 7]))
+        sizes = rng.uniform(3.0, 12.0, sights)
+        sigmas = np.repeat(np.hypot(0.5, 0.12 * sizes), 2)
         design = np.linalg.qr(rng.normal(size=(2 * sights, 3)))[0]
-        noise = rng.normal(0.0, 0.5, 2 * sights)
+        noise = sigmas * rng.normal(size=2 * sights) * (30.0 if number % 30 == 0 else 1.0)
         left = noise - design @ (design.T @ noise)
-        tracks[number] = [(f"f{i}", 1.0, 1.0) for i in range(sights)]
-        errors[number] = float(np.hypot(*left.reshape(-1, 2).T).mean())
-    assert feature_sigma_px(replace(mapped(), tracks=tracks, errors_px=errors)) == pytest.approx(0.5, rel=0.03)
+        offs = np.hypot(*left.reshape(-1, 2).T)
+        tracks[number] = [Sight(f"f{i}", 1.0, 1.0, float(sizes[i]), float(offs[i])) for i in range(sights)]
+    precision = feature_precision(replace(mapped(), tracks=tracks))
+    for size_px in (4.0, 7.0, 11.0):
+        assert precision.sigma_px(size_px) == pytest.approx(np.hypot(0.5, 0.12 * size_px), rel=0.04)
     with pytest.raises(InputError, match="more overlap"):
-        feature_sigma_px(replace(mapped(), tracks={1: [("f0", 1.0, 1.0), ("f1", 1.0, 1.0)]}))
+        feature_precision(replace(mapped(), tracks={1: tracks[1][:2]}))
 
 
 def test_ties_are_spread_and_wrong_ones_left_out() -> None:
     block = mapped(0.5)
-    crowded = {j: [(f"f{i}", 1000.0 + j, 1000.0) for i in IMAGES] for j in range(100)}
+    crowded = {j: [replace(sight, col=1000.0 + j, row=1000.0) for sight in track] for j, track in block.tracks.items()}
     assert len(tie_marks(replace(block, tracks=crowded), PICTURES)) == 4 * A_CELL
     assert LATTICE.width_px / CELLS > 100
-    wrong = {**block.errors_px, 7: 4.0}
-    assert "tie-7" not in {mark.point for mark in tie_marks(replace(block, errors_px=wrong), PICTURES)}
-    twice = {**block.tracks, 8: [*block.tracks[8], ("f0", 5.0, 5.0)]}
+    wrong = {**block.tracks, 7: [replace(sight, off_px=4.0) for sight in block.tracks[7]]}
+    assert "tie-7" not in {mark.point for mark in tie_marks(replace(block, tracks=wrong), PICTURES)}
+    twice = {**block.tracks, 8: [*block.tracks[8], Sight("f0", 5.0, 5.0, 4.0, 0.5)]}
     assert "tie-8" not in {mark.point for mark in tie_marks(replace(block, tracks=twice), PICTURES)}
 
 
