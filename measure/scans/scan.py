@@ -226,8 +226,7 @@ class Scan:
     ) -> Array:
         """(height, width) pixels of the reduced scan from its column col0 and row row0 on, read from the file by
         themselves; parts outside of the scan repeat its edge."""
-        fine = self.samples(col0 * factor, row0 * factor, width * factor, height * factor)
-        return weighted(means(fine, factor), self._weights(weights))
+        return weighted(self._reduced_part(factor, col0, row0, width, height), self._weights(weights))
 
     def close(self) -> None:
         self._segments.close()
@@ -289,18 +288,30 @@ class Scan:
         fine = [one for one in self._overviews if one.width_px * factor >= self.width_px]
         return min(fine, key=lambda one: one.width_px, default=None)
 
+    def _reduced_part(self, factor: int, col0: int, row0: int, width: int, height: int) -> Array:
+        """(height, width, channels) pixels of the reduced scan, from the file."""
+        if overview := self._overview(factor):
+            whole, scale, shift = overview._steps_to(self, factor)
+            first = np.array([col0, row0])
+            low = np.floor(scale * first + shift).astype(int)
+            high = np.ceil(scale * (first + (width - 1, height - 1)) + shift).astype(int) + 1
+            means_ = overview._reduced_part(whole, *low.tolist(), *(high - low).tolist())
+            return _interpolated(means_, scale, scale * first + shift - low, width, height)
+        return means(self.samples(col0 * factor, row0 * factor, width * factor, height * factor), factor)
+
     def _enlarged_to(self, scan: "Scan", factor: int, width: int, height: int) -> Array:
-        """This overview of a scan as the scan is reduced by a factor: averaged as far as whole pixels go, and then
-        interpolated."""
+        """This overview of a scan as the scan is reduced by a factor."""
+        whole, scale, shift = self._steps_to(scan, factor)
+        means_ = self._reduced_channels(whole, self.width_px // whole, self.height_px // whole)
+        return _interpolated(means_, scale, shift, width, height)
+
+    def _steps_to(self, scan: "Scan", factor: int) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
+        """From this overview to its scan reduced by a factor: by how many whole pixels to average, and then how many of
+        these (x, y) a step is, and where the first pixel lies among them, to interpolate."""
         px = np.array([scan.width_px / self.width_px, scan.height_px / self.height_px])  # of the scan to one of these
         whole = max(int(factor / px.max() + _OF_A_PX), 1)
-        means_ = self._reduced_channels(whole, self.width_px // whole, self.height_px // whole)
         scale = factor / (whole * px)
-        matrix = np.column_stack([np.diag(scale), scale / 2 - 0.5])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return np.asarray(
-            cv2.warpAffine(means_, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE), np.float32
-        ).reshape(height, width, self.channels)
+        return whole, scale, scale / 2 - 0.5
 
     def _weights(self, weights: Sequence[float] | None) -> Sequence[float]:
         if weights is None:
@@ -308,6 +319,16 @@ class Scan:
         if len(weights) != self.channels:
             raise ValueError(f"{self.name}: {len(weights)} weights for {self.channels} channels")
         return weights
+
+
+def _interpolated(
+    picture: Array, scale: NDArray[np.float64], shift: NDArray[np.float64], width: int, height: int
+) -> Array:
+    """(height, width, channels) in steps of scale (x, y) of a picture (rows, columns, channels), from shift (x, y) on."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    matrix = np.column_stack([np.diag(scale), shift])
+    warped = cv2.warpAffine(picture, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(warped, np.float32).reshape(height, width, -1)
 
 
 def _reduced_side(fine_px: int, factor: int, most_px: int) -> int:

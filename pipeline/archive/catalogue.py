@@ -129,11 +129,13 @@ def _is_like(one: ScanHead, other: ScanHead) -> bool:
 
 
 def _copies(of_one_size: Iterable[list[Path]], max_pixels: int | None) -> Iterator[tuple[Path, Path]]:
-    """Files with the same bytes as an earlier one, and that one. What tells most files apart is read first."""
+    """Files with the same bytes as another one, and that one: of the shortest name, for copies are called `Copy of
+    0001` or `0001 (1)`, and the first of these. What tells most files apart is read first."""
     for paths in of_one_size:
         for alike in _by(lambda path: parts_hash(path, max_pixels), paths):
             for same in _by(content_hash, alike):
-                yield from ((path, same[0]) for path in same[1:])
+                original, *others = sorted(same, key=lambda path: len(path.name))
+                yield from ((path, original) for path in others)
 
 
 def _by(told: Callable[[Path], str], paths: Sequence[Path]) -> list[list[Path]]:

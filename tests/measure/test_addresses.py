@@ -107,6 +107,11 @@ def test_a_scan_is_looked_at_small_by_its_overviews(
     assert np.abs(seen - exact)[2:-2, 2:-2].max() < 6 + 0.3 * factor  # what is interpolated
     most = {3: 0.25, 4: 0.07, 5: 0.07, 8: 0.02, 20: 0.02}[factor]  # of the area, and so of what is stored
     assert fetched < 1.3 * most * SIDE_PX**2 + (1 << 17)
+    with open_scan(f"{server.url}/s.tif") as remote:
+        before = server.sent_bytes
+        window = remote.reduced_window(factor, 5, 7, 12, 9)
+        assert server.sent_bytes - before < 5 * TILE_PX**2  # of an overview
+    np.testing.assert_allclose(window, seen[7:16, 5:17], atol=2e-3)
     col, row = np.meshgrid(np.arange(seen.shape[1]), np.arange(seen.shape[0]))
     for place in (places - (factor - 1) / 2) / factor:
         near = np.hypot(col - place[0], row - place[1]) < 60 / factor
