@@ -20,6 +20,7 @@ from measure.marks.shapes import FiducialLayout
 from measure.pose.pose_decision import decide_pose
 from measure.probabilities import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE
 from measure.results import Pose
+from measure.scans.addresses import Address
 from measure.scans.scan import Scan
 from measure.search.centred_frame import is_worth_a_look, outermost
 from measure.search.constellation import Placement
@@ -97,16 +98,18 @@ def find_frame(
 
 
 def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: bool) -> list[Attempt]:
-    """In the middle of the scan where the pitch is given, then anywhere; where what is found may be chance, under other
-    pitches; where nothing is, at a closer look: less of what lies beside a mark counts there, for the frame's edge may
-    drown it else."""
+    """In the middle of the scan where the pitch is given, of one that is fetched also beside it, then anywhere; where
+    what is found may be chance, under other pitches; where nothing is, at a closer look: less of what lies beside a
+    mark counts there, for the frame's edge may drown it else."""
     given, *others = hypotheses
     close = FrameSearch(wide.scan, wide.layout, wide.options, CLOSE)
     closer = slightly_longer(given[0], _STRETCH) if is_given else given
     is_whole = not wide.options.part
+    is_fetched = isinstance(wide.scan.path, Address)
     is_centred = is_whole and is_given and is_worth_a_look(wide.scan, wide.layout, given[0].mm)
     return [
         *([Attempt(wide, given, _in_the_middle, lambda _: False, True)] if is_centred else []),
+        *([Attempt(wide, given, _beside_it, lambda found: found.is_taken, True)] if is_centred and is_fetched else []),
         Attempt(wide, given, _anywhere, lambda found: found.is_complete, True),
         *(Attempt(wide, group, _in_spite_of_pitch, lambda found: found.is_undoubted) for group in others),
         Attempt(close, closer, _at_a_closer_look, lambda found: found.is_taken),
@@ -115,8 +118,20 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
 
 def _in_the_middle(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Seen:
     """The frame in the middle of a large scan, in the best of the placements there."""
+    return _best_measured(search, _of_few(search).in_the_middle(hypotheses[0]))
+
+
+def _beside_it(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Seen:
+    """The same of a frame that lies off the middle, where that takes less of the file than all of it."""
+    return _best_measured(search, _of_few(search).beside_the_middle(hypotheses[0]))
+
+
+def _of_few(search: FrameSearch) -> FrameSearch:
     few = replace(search.layout, marks=outermost(search.layout.marks))
-    found = FrameSearch(search.scan, few, search.options).in_the_middle(hypotheses[0])
+    return FrameSearch(search.scan, few, search.options)
+
+
+def _best_measured(search: FrameSearch, found: list[Placement]) -> Seen:
     return found, _believed(measure_frame(search.scan, search.layout, found[0], search.options) if found else None)
 
 

@@ -292,9 +292,9 @@ class Scan:
         """(height, width, channels) pixels of the reduced scan, from the file."""
         if overview := self._overview(factor):
             whole, scale, shift = overview._steps_to(self, factor)
-            first = np.array([col0, row0])
+            first, last = np.array([col0, row0]), np.array([col0 + width, row0 + height]) - 1
             low = np.floor(scale * first + shift).astype(int)
-            high = np.ceil(scale * (first + (width - 1, height - 1)) + shift).astype(int) + 1
+            high = np.ceil(scale * last + shift).astype(int) + 1
             means_ = overview._reduced_part(whole, *low.tolist(), *(high - low).tolist())
             return _interpolated(means_, scale, scale * first + shift - low, width, height)
         return means(self.samples(col0 * factor, row0 * factor, width * factor, height * factor), factor)
@@ -324,7 +324,7 @@ class Scan:
 def _interpolated(
     picture: Array, scale: NDArray[np.float64], shift: NDArray[np.float64], width: int, height: int
 ) -> Array:
-    """(height, width, channels) in steps of scale (x, y) of a picture (rows, columns, channels), from shift (x, y) on."""
+    """(height, width, channels) a picture (rows, columns, channels) in steps of scale (x, y) from shift (x, y) on."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     matrix = np.column_stack([np.diag(scale), shift])
     warped = cv2.warpAffine(picture, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)

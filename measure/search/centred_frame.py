@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 _LARGE_PX = 1 << 24  # a smaller scan is read whole in no time
 _REACH = 0.025  # of the frame's side: laid by hand it is off by some millimetres and a degree
+_BESIDE = 0.05  # of the frame's side: farther off a search of the whole scan finds it
+_TURNED_DEG = 1.0
 _LARGEST_SHARE = 0.25  # of the scan: where windows hold more, the whole of it tells more
 _BEYOND_MM = 3.0  # the scan's edge: a frame may be cut off there by less than its rim
 _CORNERS = 4  # a mark toward each of them
@@ -25,6 +27,16 @@ _ALIKE = 0.5  # of the marks: a lattice of which more fall on others one step as
 def reach_mm(layout: FiducialLayout) -> float:
     """How far from its place in a centred frame a mark is looked for."""
     return _REACH * max(layout.frame_mm)
+
+
+def beside_mm(layout: FiducialLayout) -> float:
+    """How far from its place in a centred frame a single mark is looked for, in scans that are dear to read."""
+    return _BESIDE * max(layout.frame_mm)
+
+
+def turned_mm(layout: FiducialLayout) -> float:
+    """How far a turn moves a mark from where another one of the frame puts it."""
+    return float(np.deg2rad(_TURNED_DEG)) * max(layout.frame_mm)
 
 
 def room_mm(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> float:

@@ -13,7 +13,7 @@ from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from measure.search.candidates import FULL, Effort, Look, Responses, respond, respond_about
-from measure.search.centred_frame import centred_places_px, reach_mm, room_mm
+from measure.search.centred_frame import beside_mm, centred_places_px, reach_mm, room_mm, turned_mm
 from measure.search.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
 from measure.search.correlation import WIDE, Map, Surroundings
 from measure.search.pitches import PitchHypothesis
@@ -25,6 +25,7 @@ Pair = tuple[float, float]
 
 _TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
 _WINDOWS_SHARE = 0.6  # of the scan: where windows hold more, the whole of it takes no longer
+_ANSWERS = 3  # of the mark that is looked for first, that are followed
 _WAYS = 3  # of being as good: by heights, by the misfit, or by that under a stretch
 _STRETCHES = np.linspace(-0.03, 0.03, 13)  # of pixels longer one way, in steps that move no mark by more than is narrow
 
@@ -104,6 +105,31 @@ class FrameSearch:
         """The placements of a frame that lies about in the middle of the scan, best first. Only the windows are read
         in which its marks lie then."""
         return _best_first(self._placements([hypothesis], self._about_middle(hypothesis.mm, reach_mm(self.layout))))
+
+    def beside_the_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
+        """The placements of a frame that lies off the middle of the scan, best first: the mark toward the first corner
+        is looked for farther about, and the others where one of its strongest answers puts them all."""
+        linear, mm = _flip(hypothesis.mm), hypothesis.mm
+        places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
+        first = [int(each.sum(axis=1).argmin()) for each in places]
+        looks = [
+            Look(self.layout.marks[mark].mark, linear @ up_from_camera(pose))
+            for pose, mark in zip(self.poses, first, strict=True)
+        ]
+        expected_px = np.array([each[mark] for each, mark in zip(places, first, strict=True)])
+        reach_px = beside_mm(self.layout) / max(mm)
+        responses, kind_of = respond_about(self.scan, looks, expected_px, reach_px, self._signs, self._most_px)
+        answers = [
+            (height, responses.scan_px(top) - expected_px[kind_of.index(kind)])
+            for (kind, _), layer in layers_of(responses, self._reaches).items()
+            for top, height in zip(*layer.highest(layer.candidates[:_ANSWERS], 0.0), strict=True)
+        ]
+        for _, shift_px in sorted(answers, key=lambda answer: -answer[0])[:_ANSWERS]:
+            about = self._about_middle(mm, turned_mm(self.layout), shift_px)
+            found = _best_first(self._placements([hypothesis], about))
+            if found and found[0].supported == len(self.layout.marks):
+                return found
+        return []
 
     def within(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements of a frame that the scan holds all of, best first: its marks are then looked for only where
@@ -214,12 +240,14 @@ class FrameSearch:
         turn = float(np.deg2rad(self.options.rotation_deg))
         return (scale + turn) * farthest_mm + self.options.search_mm(self.layout)
 
-    def _about_middle(self, drawn_mm: Pair, reach_mm: float) -> _Answers:
-        """What the windows answer that reach so far about the marks of a frame in the middle of the scan."""
+    def _about_middle(self, drawn_mm: Pair, reach_mm: float, shift_px: Array | float = 0.0) -> _Answers:
+        """What the windows answer that reach so far about the marks of a frame in the middle of the scan, or beside it
+        by shift_px (2,)."""
         linear, looks = _flip(drawn_mm), self._looks(drawn_mm)
         places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
         reach_px = reach_mm / max(drawn_mm)
-        about = respond_about(self.scan, looks, np.concatenate(places), reach_px, self._signs, self._most_px)
+        places_px = np.concatenate(places) + shift_px
+        about = respond_about(self.scan, looks, places_px, reach_px, self._signs, self._most_px)
         return self._answers(*about)
 
     @property

@@ -98,9 +98,11 @@ class NewProject:
             scans = sum(len(group.paths) for group, _ in mute)
             pixels = [um for _, kind in mute if (um := _pixel_um(kind))]
             told = f", {np.median(pixels):.1f} um in the samples" if pixels else ""
+            are_all = len(mute) == len(self.named)
+            sets = "sets it" if are_all else "is that of all scans: to set it, give these a project of their own"
             yield (
                 f"{scans} scans do not say their resolution ({mute[0][0].head.pitch.note}): the marks' separations "
-                f"tell it{told}; pitch_um in the project sets it."
+                f"tell it{told}; pitch_um in the project {sets}."
             )
         plates = sorted({number for _, kind in self.named for number in kind.numbers})
         if plates:

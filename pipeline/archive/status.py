@@ -100,6 +100,9 @@ select uri, bytes, mtime_ns, etag, is_current, verdict,
         (select detail ->> '$.problems[0]' from judged_frame f where f.judging = seen.judging and f.scan = seen.scan
          and f.result = seen.result),
         (select detail ->> '$.problems[0]' from result where id = seen.result),
+        (select 'pose ' || coalesce(f.detail ->> '$.pose.name', r.pose) || ' is assumed' from result r
+         left join judged_frame f on f.judging = seen.judging and f.scan = seen.scan and f.result = r.id
+         where r.id = seen.result and not coalesce(f.detail ->> '$.pose.decided', r.pose_decided)),
         'its file is a copy of that of ' || (select name from scan where id = seen.original),
         (select point || ': ' || reason from judged where judged.judging = seen.judging and judged.result = seen.result
          and reason <> '' and reason_code not like 'decided%' order by number limit 1),

@@ -302,6 +302,17 @@ def test_status_tells_what_changed_outside(folder: Path, capsys: SAID) -> None:
     assert run(["status", project, "--verdict", "dreadful"]) == 2
 
 
+def test_status_says_why_a_scan_needs_a_look(folder: Path) -> None:
+    with sqlite3.connect(folder / "out" / "measurement.db") as db:
+        db.execute("update result set pose_decided = 0")
+        db.execute("update judged_frame set verdict = 'look'")
+        db.execute("""update judged_frame set detail = '{"pose": {"name": "90", "decided": false}}' where name = 'b'""")
+        db.execute("""update judged_frame set detail = '{"pose": {"name": "90", "decided": true}}' where name = 'c'""")
+    status = archive_status(read_project(folder / "project.toml"))
+    whys = {scan.image: scan.why for scan in status.scans}
+    assert whys == {"a": "pose 0 is assumed", "b": "pose 90 is assumed", "c": ""}
+
+
 def test_the_page_of_archives_has_the_table_of_verdicts() -> None:
     text = (Path(__file__).parents[2] / "docs" / "archives.md").read_text(encoding="utf-8")
     assert all(f"| `{verdict}` | {MEANING[verdict]} | {NEXT_STEP[verdict]} |" in text for verdict in Verdict)

@@ -46,7 +46,7 @@ def box(tmp_path: Path) -> Path:
         scan(folder / "1952" / name)
     scan(folder / "1952" / "0003.tif", 61, 89)  # cut by hand
     scan(folder / "1952" / "0004.tif", 120, 90)
-    shutil.copy(folder / "1952" / "0002.tif", folder / "1952" / "0009.tif")
+    shutil.copy(folder / "1952" / "0002.tif", folder / "1952" / "0002 Kopie.tif")
     (folder / "1952" / "broken.tif").write_bytes(b"II*\0")
     (folder / "1952" / "notes.txt").write_text("by hand")
     (folder / "1952" / ".hidden.tif").write_bytes(b"")
@@ -65,7 +65,7 @@ def test_files_are_sorted_into_kinds_copies_and_broken_ones(box: Path) -> None:
         ("1958", 60): ["0001.TIF"],
         ("1958", 30): ["0001.tiff"],
     }
-    assert found.copies == {box / "1952/0009.tif": box / "1952/0002.tif"}
+    assert found.copies == {box / "1952/0002 Kopie.tif": box / "1952/0002.tif"}
     assert [path.name for path in found.broken] == ["broken.tif"]
     assert found.endings == {".txt": 1}
     assert found.files == 9
@@ -148,7 +148,7 @@ def test_the_project_that_is_written_is_read_and_has_each_scans_camera(box: Path
     assert any("Nr 120, 60" in case for cases in looks.values() for case in cases)
     text = (out / "project.toml").read_text(encoding="utf-8")
     assert "# the same bytes as another scan\n" in text
-    assert "0009.tif" in text
+    assert "0002 Kopie.tif" in text
     assert run(["init", str(box), "--out", str(out)]) == 2
     assert "init writes over nothing" in capsys.readouterr().err
     assert (out / "project.toml").read_text(encoding="utf-8") == text
