@@ -1,15 +1,16 @@
-"""What measuring a whole scan takes of a tiled TIFF file with overviews on a server: requests, bytes and their share.
+"""What measuring a whole scan takes of a tiled TIFF file on a server, with overviews or without.
 
     python benchmarks/object_measuring.py [--side 11500] [--seed 1]
 
-The frame has the eight ring-crosses of an aerial camera on grainy film, in the scan's middle or so far off it that they
-are sought in the whole; the server counts what is asked for.
+The frame has the eight ring-crosses of an aerial camera on grainy film, in the scan's middle or so far off it that one
+is sought first; the server counts requests and bytes.
 """
 
 import argparse
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -59,7 +60,7 @@ def main() -> None:
         layout = read_camera(folder / "camera.toml").layout()
         print("| tiles, px | overviews | off, px | marks | requests | bytes | share of the file | CPU, s |")
         print("|---" * 8 + "|")
-        for tile_px, overviews, off_px in ((256, True, 0), (512, True, 0), (256, True, 350), (256, False, 350)):
+        for overviews, off_px, tile_px in product((True, False), (0, 350), (256, 512)):
             name = f"{tile_px}-{off_px}{'-with' if overviews else ''}.tif"
             _write(
                 folder / name,

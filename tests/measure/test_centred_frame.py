@@ -9,6 +9,7 @@ import pytest
 import tifffile
 from brute_marks import Array, written_scan
 from drawn_frames import CORNERS, NUMBERED, RING_CROSS, assert_right, frame_picture, layout_of, pixel_from_camera
+from range_server import range_server
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
@@ -99,6 +100,25 @@ def test_of_a_large_scan_with_all_marks_clear_only_windows_are_read(bent_mm: flo
         result = measure_fiducials(scan, layout, PITCH_UM)
     assert all(mark.status.is_observation for mark in result.marks)
     assert len(read) * 64**2 < 0.4 * grey.size
+
+
+def test_of_a_scan_that_is_fetched_windows_are_read_beside_the_middle_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = [(4.5 * x, 4.5 * y) for x, y in (*CORNERS, (7.0, 0.0), (-7.0, 0.0), (0.0, 7.0), (0.0, -7.0))]
+    layout = layout_of([MarkShape(RING_CROSS)] * 8, places, (66.0, 66.0))
+    matrix = pixel_from_camera("0", center=(749.3, 650.6))
+    stored = np.clip(np.rint(frame_picture(layout, matrix, size=1400)), 0, 65535).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "s.tif", stored, tile=(64, 64), compression="zlib")
+    with open_scan(tmp_path / "s.tif") as scan:
+        here = measure_fiducials(scan, layout, PITCH_UM)
+    monkeypatch.setattr(FrameSearch, "anywhere", None)
+    with range_server(tmp_path) as server, open_scan(f"{server.url}/s.tif") as scan:
+        result = measure_fiducials(scan, layout, PITCH_UM)
+        assert server.sent_bytes < 0.5 * (tmp_path / "s.tif").stat().st_size
+    for mark, other in zip(result.marks, here.marks, strict=True):
+        assert mark.status is other.status is Status.MEASURED
+        np.testing.assert_allclose(mark.center_px, other.center_px, atol=1e-3)
 
 
 def test_a_lattice_is_told_from_a_frame() -> None:
