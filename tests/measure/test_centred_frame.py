@@ -118,6 +118,8 @@ def test_of_a_scan_that_is_fetched_windows_are_read_beside_the_middle_too(
         assert server.sent_bytes < 0.5 * (tmp_path / "s.tif").stat().st_size
     for mark, other in zip(result.marks, here.marks, strict=True):
         assert mark.status is other.status is Status.MEASURED
+        assert mark.center_px is not None
+        assert other.center_px is not None
         np.testing.assert_allclose(mark.center_px, other.center_px, atol=1e-3)
 
 
