@@ -61,18 +61,20 @@ def convert_lens(
     corners_mm: Array,
     estimated: Sequence[str] | None = None,
     uncertain: Sequence[str] = (),
+    held: Sequence[str] = (),
 ) -> ConvertedLens:
     """A lens in another family, over the rectangle between two corners (2, 2) in the camera frame.
 
     interior (3,): c, x0', y0' in mm; parameters (m,) in the order of `families.parameter_names`. into: the family and
-    its settings, such as r0. estimated: which of its parameters; by default the usual ones, with affinity and shear
-    where they bring something, less those that are 0 and stay it whatever those parameters of the lens are that are
-    uncertain. Raises AdjustmentError where the lens has no
-    image there or no fit stands still, ValueError for a parameter that there is not.
+    its settings, such as r0, and its parameters where they are not to begin at 0: those that are not estimated stay
+    there. estimated: which of its parameters; by default the usual ones, with affinity and shear where they bring
+    something, less those that are 0 and stay it whatever those parameters of the lens are that are uncertain. held:
+    which of c, x0 and y0 are not estimated. Raises AdjustmentError where the lens has no image there or no fit stands
+    still, ValueError for a parameter that there is not.
     """
     lens = _Rays.of(distortion, interior, parameters, corners_mm)
     if estimated is not None:
-        return lens.fitted(into, tuple(estimated))
+        return lens.fitted(into, tuple(estimated), held)
     usual, with_affinity = _usual(into.family)
     found = lens.fitted(into, usual)
     if not found.is_same and with_affinity != usual:
@@ -81,6 +83,13 @@ def convert_lens(
     names = parameter_names(distortion.family)
     needed = lens.needed(found, [_INTERIOR + names.index(each) for each in uncertain])
     return found if needed == found.estimated else lens.fitted(into, needed)
+
+
+def frame_grid_mm(corners_mm: Array) -> Array:
+    """Camera points (n, 2) over the rectangle between two opposite corners (2, 2)."""
+    along = np.linspace(0.0, 1.0, _GRID)
+    fractions = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+    return np.asarray(corners_mm[0] + fractions * (corners_mm[1] - corners_mm[0]))
 
 
 def _usual(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -102,9 +111,7 @@ class _Rays:
 
     @classmethod
     def of(cls, distortion: Distortion, interior: Array, parameters: Array, corners_mm: Array) -> "_Rays":
-        along = np.linspace(0.0, 1.0, _GRID)
-        fractions = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
-        grid_mm = corners_mm[0] + fractions * (corners_mm[1] - corners_mm[0])
+        grid_mm = frame_grid_mm(corners_mm)
         ideal_mm, found = ideal_from_observed(distortion, interior, parameters, grid_mm)
         if found.sum() < found.size / 4:
             raise AdjustmentError(
@@ -116,15 +123,16 @@ class _Rays:
         by_lens = np.concatenate([at.by_interior, at.by_parameters], axis=2)
         return cls(rays, observed_mm, -np.linalg.solve(at.by_xy, by_lens), interior)
 
-    def fitted(self, into: Distortion, estimated: tuple[str, ...]) -> ConvertedLens:
+    def fitted(self, into: Distortion, estimated: tuple[str, ...], held: Sequence[str] = ()) -> ConvertedLens:
         names = parameter_names(into.family)
         unknown = sorted(set(estimated) - set(names))
         if unknown:
             raise ValueError(
                 f"{into.family} has no parameter {', '.join(unknown)}; it has {', '.join(names) or 'none'}"
             )
-        columns = [*range(_INTERIOR), *(_INTERIOR + names.index(each) for each in names if each in estimated)]
-        values = np.concatenate([self.interior, np.zeros(len(names))])
+        interior = [k for k, each in enumerate(("c", "x0", "y0")) if each not in held]
+        columns = [*interior, *(_INTERIOR + names.index(each) for each in names if each in estimated)]
+        values = np.concatenate([self.interior, into.values])
         for _ in range(_STEPS):
             misfit, design = self._linearised(into, values, columns)
             step = _least_squares(design, misfit.reshape(-1, 1))[:, 0]

@@ -104,7 +104,7 @@ def _interior(camera: Camera, frames: Frames) -> Array:
     if family(camera.distortion.family).is_pinhole_at_zero:
         found = find_principal_distance(fields)
     else:
-        found = find_wide_distance(fields, camera.distortion, _given_parameters(camera))
+        found = find_wide_distance(fields, camera.distortion, camera.distortion.values)
     if found is None:
         raise AdjustmentError(
             f"the principal distance of camera {camera.name} cannot be found from its images: they see too few known "
@@ -126,12 +126,6 @@ def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> 
     return fields
 
 
-def _given_parameters(camera: Camera) -> Array:
-    """(k,) of its distortion, 0 where nothing is given."""
-    known, names = camera.distortion.parameters, parameter_names(camera.distortion.family)
-    return np.array([known[name].value if name in known else 0.0 for name in names])
-
-
 def _known_place(network: Network, name: str) -> tuple[float, float, float]:
     point = network.point_by_id.get(name)
     if point is None or point.X is None or point.Y is None or point.Z is None:
@@ -143,7 +137,7 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
     """Freed of the distortion as it is known beforehand. Raises AdjustmentError where that folds an image over."""
     known = camera.distortion.parameters
     names = parameter_names(camera.distortion.family)
-    parameters = _given_parameters(camera)
+    parameters = camera.distortion.values
     images = frames.of_camera(camera.name)
     folds = folded_over(camera.distortion, interior, parameters, frames.xy_mm[frames.places(images)])
     first = np.cumsum([0, *np.diff(frames.starts)[images]])

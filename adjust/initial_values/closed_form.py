@@ -1,26 +1,29 @@
 """Orientations of many images of known points at once: in closed form, then refined, then judged.
 
 Fields that are about flat by homographies, others by the direct linear transformation (Hartley and Zisserman 2004,
-sections 4.1 and 7.1), all images in one eigenvalue problem. This knows nothing of gross errors: what does not agree
-is not given, and is left to `resection`.
+sections 4.1 and 7.1), all images in one eigenvalue problem. Images whose points do not agree are oriented once more by
+those of their points that do. What does not agree then is not given, and is left to `resection`.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import rotation_from_vector
 from adjust.initial_values.pose_refinement import refined_distance, refined_poses, squared_residuals
-from adjust.initial_values.resection import Pose, robust_sigmas
+from adjust.initial_values.resection import REJECTION, Pose, half_of, robust_sigmas
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 FEWEST = 6  # points of an image: fewer do not show whether they agree
+FEWEST_TRIMMED = 16  # points of an image, half of which still show whether they agree
+TRIMMINGS = 20  # at most: mostly the same half is the nearest after five
 POINTS_AT_ONCE = 100_000
+PLANE = 1e-3  # relief over width up to which a plane's homography tells which points disagree
 SHALLOW = 0.25  # relief over width, standard deviations, up to which a homography is nearer than a transformation
 LINE = 1e-4  # width over length of points about on a line
 WORSE = 3.0  # times the usual standard deviation that an image's residuals may have
@@ -41,57 +44,49 @@ class KnownField:
     sigma_mm: float
 
 
-def orient_together(fields: Sequence[KnownField], principal_distances_mm: Sequence[float]) -> list[Pose | None]:
+def orient_together(seen: Sequence[KnownField], principal_distances_mm: Sequence[float]) -> list[Pose | None]:
     """The poses of the images whose points agree on one; None for the others.
 
     They agree where no residual is gross and all are as large as the standard deviations say, or as those of most
     images are: a lens that is not known yet leaves some everywhere.
     """
-    poses: list[Pose | None] = [None] * len(fields)
-    c = np.array(principal_distances_mm)
-    several = [(some, _Fields.of([fields[i] for i in some])) for some in _batches(fields)]
-    oriented = [batch.oriented(*batch.approximate(c[some]), c[some]) for some, batch in several]
-    if not oriented:
-        return poses
-    typical = _typical(np.concatenate([each.sigma for each in oriented]))
-    for (some, batch), found in zip(several, oriented, strict=True):
-        for k in np.flatnonzero(found.agree(batch.sigma_mm / c[some], typical)):
-            poses[some[k]] = batch.pose(int(k), found)
+    poses: list[Pose | None] = [None] * len(seen)
+    c, sigmas = np.array(principal_distances_mm), np.full(len(seen), np.nan)
+    for fewest, trimmed in ((FEWEST, False), (FEWEST_TRIMMED, True)):
+        left = [i for i, pose in enumerate(poses) if pose is None and len(seen[i].xyz) >= fewest]
+        several = [(some, _Fields.of([seen[i] for i in some])) for some in _batches(seen, left)]
+        several = [(some, batch.trimmed()[0] if trimmed else batch) for some, batch in several]
+        oriented = [batch.oriented(*batch.approximate(c[some]), c[some]) for some, batch in several]
+        for (some, _), found in zip(several, oriented, strict=True):
+            sigmas[some] = found.sigma
+        typical = _typical(sigmas[~np.isnan(sigmas)])
+        for (some, batch), found in zip(several, oriented, strict=True):
+            for k in np.flatnonzero(found.agree(batch.sigma_mm / c[some], typical)):
+                poses[some[k]] = batch.pose(int(k), found)
     return poses
 
 
-def principal_distance_together(fields: Sequence[KnownField]) -> tuple[float, float] | None:
+def principal_distance_together(seen: Sequence[KnownField]) -> tuple[float, float] | None:
     """The principal distance in mm of all images together, and the standard deviation of its logarithm; None where not
     all images agree on it.
 
     Of flat fields from the orthogonality of their homographies' axes (Zhang 2000), with a principal point that is
     known and pixels that are square; then by least squares with all poses.
     """
-    some = [field for field in fields if len(field.xyz) >= FEWEST]
+    some = [field for field in seen if len(field.xyz) >= FEWEST]
     batch = _Fields.of(some) if some else None
-    start = batch.principal_distance() if batch is not None else None
-    if batch is None or start is None:
-        return None
-    poses = batch.approximate(np.full(len(some), start))
-    if not np.isfinite(poses[1]).all():
-        return None
-    sigma_mm = float(batch.sigma_mm.max())
-    fields_mm = batch.points, batch.xy_mm, batch.weights
-    try:
-        rotations, shifts, c, sigma = refined_distance(*poses, *fields_mm, start, sigma_mm)
-    except np.linalg.LinAlgError:  # points behind the camera, for gross errors
-        return None
-    if not np.isfinite(sigma):
-        return None
-    found = batch.oriented(rotations, shifts, np.full(len(some), c))
-    return (c, sigma) if found.agree(batch.sigma_mm / c, _typical(found.sigma)).all() else None
+    together = None if batch is None else batch.distance_together()
+    if batch is None or together is not None or 2 * (batch.counts >= FEWEST_TRIMMED).sum() <= len(some):
+        return together
+    batch, sigma_mm = batch.some(batch.counts >= FEWEST_TRIMMED).trimmed()
+    agreeing = sigma_mm <= WORSE * np.maximum(batch.sigma_mm, np.median(sigma_mm))
+    return batch.some(agreeing).distance_together() if 2 * agreeing.sum() > len(some) else None
 
 
-def _batches(fields: Sequence[KnownField]) -> Iterator[Indices]:
-    """Images of about as many points, some at a time."""
-    counts = np.array([len(field.xyz) for field in fields], dtype=np.intp)
-    order = np.argsort(-counts, kind="stable")
-    order = order[counts[order] >= FEWEST]
+def _batches(seen: Sequence[KnownField], images: Sequence[int]) -> Iterator[Indices]:
+    """Of some images those of about as many points, some at a time."""
+    counts = np.array([len(field.xyz) for field in seen], dtype=np.intp)
+    order = np.array(sorted(images, key=lambda i: -counts[i]), dtype=np.intp)
     while len(order):
         largest = int(counts[order[0]])
         alike = counts[order[: max(1, POINTS_AT_ONCE // largest)]] > largest // 2
@@ -126,9 +121,10 @@ class _Oriented:
 @dataclass(frozen=True, eq=False)
 class _Fields:
     """Fields of k images: points (k, n, 3) in units of their extent about their mean, along the axes of their extent,
-    the longest first; places xy_mm (k, n, 2) with weights (k, n), 0 behind the counts (k,) of those that have less.
+    the longest first; places xy_mm (k, n, 2) with weights (k, n), 0 behind the counts (k,) of those that have less, and
+    for points that disagree.
 
-    origin (k, 3), size (k,), axes (k, 3, 3): the way back; flat (k,); sigma_mm (k,).
+    origin (k, 3), size (k,), axes (k, 3, 3): the way back; relief (k,): over the width; sigma_mm (k,).
     """
 
     points: Array
@@ -138,7 +134,7 @@ class _Fields:
     origin: Array
     size: Array
     axes: Array
-    flat: Mask
+    relief: Array
     on_a_line: Mask
     sigma_mm: Array
 
@@ -158,13 +154,74 @@ class _Fields:
         size = np.maximum(long, np.finfo(float).tiny)
         points = about @ axes / size[:, None, None]
         sigma_mm = np.array([field.sigma_mm for field in fields])
-        shape = np.asarray(thick <= SHALLOW * wide), np.asarray(wide <= LINE * size)
-        return cls(points, xy_mm, weights, counts, origin, size, axes, *shape, sigma_mm)
+        relief, on_a_line = thick / np.maximum(wide, np.finfo(float).tiny), np.asarray(wide <= LINE * size)
+        return cls(points, xy_mm, weights, counts, origin, size, axes, relief, on_a_line, sigma_mm)
+
+    @property
+    def flat(self) -> Mask:
+        """(k,)"""
+        return np.asarray(self.relief <= SHALLOW)
+
+    def some(self, images: Mask) -> "_Fields":
+        return _Fields(*(getattr(self, each.name)[images] for each in fields(self)))
 
     def pose(self, k: int, found: _Oriented) -> Pose:
         """Of one image, in the axes and units of the object."""
         rotation = found.rotations[k] @ self.axes[k].T
         return Pose(rotation, self.origin[k] - self.size[k] * rotation.T @ found.shifts[k])
+
+    def trimmed(self) -> tuple["_Fields", Array]:
+        """Without points that disagree with a homography, or linear transformation, of most of their image's points,
+        and the robust standard deviations (k,) of these, in mm.
+
+        Least trimmed squares by concentration (Rousseeuw and Van Driessen 2006): of half of the points, those nearest
+        to what the last half gave.
+        """
+        here, rank = self, np.zeros_like(self.weights)
+        for _ in range(TRIMMINGS):
+            squared = np.where(self._present, here._squared_misfits(), np.inf)
+            np.put_along_axis(
+                rank, np.argsort(squared, axis=1, kind="stable"), np.arange(squared.shape[1])[None], axis=1
+            )
+            weights = (rank < half_of(self.counts)[:, None]).astype(np.float64)
+            if np.array_equal(weights, here.weights):
+                break
+            here = replace(self, weights=weights)
+        sigma_mm = np.maximum(robust_sigmas(squared, self.counts) * self._unit_mm, self.sigma_mm)
+        agreeing = squared < REJECTION * (sigma_mm[:, None] / self._unit_mm) ** 2
+        return replace(self, weights=agreeing.astype(np.float64)), sigma_mm
+
+    def _squared_misfits(self) -> Array:
+        """Squared distances (k, n), in the unit, of the places from what homographies and transformations give."""
+        squared = np.full(self.weights.shape, np.inf)
+        is_plane = self.relief <= PLANE
+        for members, columns in ((is_plane, 3), (~is_plane, 4)):
+            some = members & ~self.on_a_line
+            if some.any():
+                uvw = self._homogeneous(some, columns) @ self._images(some, columns).swapaxes(1, 2)
+                depth = uvw[..., 2] * np.sign((uvw[..., 2] * self.weights[some]).sum(axis=1))[:, None]
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    off = uvw[..., :2] / uvw[..., 2:] + self.xy_mm[some] / self._unit_mm
+                squared[some] = np.where(depth > 0.0, (off**2).sum(axis=2), np.inf)
+        return squared
+
+    def distance_together(self) -> tuple[float, float] | None:
+        """See `principal_distance_together`."""
+        start = self.principal_distance()
+        if start is None:
+            return None
+        poses = self.approximate(np.full(len(self.counts), start))
+        if not np.isfinite(poses[1]).all():
+            return None
+        fields_mm, sigma_mm = (self.points, self.xy_mm, self.weights), float(self.sigma_mm.max())
+        try:
+            rotations, shifts, c, sigma = refined_distance(*poses, *fields_mm, start, sigma_mm)
+        except np.linalg.LinAlgError:  # points behind the camera, for gross errors
+            return None
+        if not np.isfinite(sigma):
+            return None
+        found = self.oriented(rotations, shifts, np.full(len(self.counts), c))
+        return (c, sigma) if found.agree(self.sigma_mm / c, _typical(found.sigma)).all() else None
 
     def principal_distance(self) -> float | None:
         """In closed form, the median or mean of what all images say."""
@@ -201,7 +258,7 @@ class _Fields:
         rotations, shifts = refined_poses(rotations, shifts, self.points, tangents, self.weights)
         squared = squared_residuals(rotations, shifts, self.points, tangents)
         squares = (self.weights * squared).sum(axis=1)
-        sigma = robust_sigmas(np.where(self.weights > 0.0, squared, np.inf), self.counts)
+        sigma = robust_sigmas(np.where(self._present, squared, np.inf), self.counts)
         rivals = self._has_rival(rotations, shifts, tangents, squares)
         largest = (self.weights * squared).max(axis=1)
         return _Oriented(rotations, shifts, np.where(known, sigma, np.inf), largest, rivals)
@@ -225,24 +282,30 @@ class _Fields:
         return rivals
 
     @property
+    def _present(self) -> Mask:
+        """(k, n) the points that there are."""
+        return np.asarray(np.arange(self.weights.shape[1]) < self.counts[:, None])
+
+    @property
     def _unit_mm(self) -> float:
         """In which image coordinates are about 1."""
-        return float(np.sqrt((self.xy_mm**2).sum() / self.weights.sum())) or 1.0
+        return float(np.sqrt((self.xy_mm**2).sum() / self.counts.sum())) or 1.0
 
     def _homogeneous(self, some: Mask, columns: int) -> Array:
         """Points (k, n, columns) with a 1 behind: in the plane of the field, or in space."""
-        return np.concatenate([self.points[some][..., : columns - 1], self.weights[some][..., None]], axis=2)
+        points = self.points[some][..., : columns - 1]
+        return np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=2)
 
     def _images(self, some: Mask, columns: int) -> Array:
         """The matrices (k, 3, columns) that take homogeneous points to U, V, W: image = -U/W, -V/W, in the unit.
 
         Of least algebraic error under the norm 1, with image coordinates about their mean and of the size 1.
         """
-        weights, counts = self.weights[some], self.counts[some, None]
-        xy = self.xy_mm[some] / self._unit_mm
-        middle = xy.sum(axis=1) / counts
-        about = (xy - middle[:, None]) * weights[..., None]
-        size = np.sqrt((about**2).sum(axis=(1, 2)) / counts[:, 0])
+        weights, counts = self.weights[some], self.weights[some].sum(axis=1)
+        xy = self.xy_mm[some] * (weights[..., None] / self._unit_mm)
+        middle = xy.sum(axis=1) / counts[:, None]
+        about = xy - middle[:, None] * weights[..., None]
+        size = np.sqrt((about**2).sum(axis=(1, 2)) / counts)
         x, y = np.moveaxis(about / size[:, None, None], -1, 0)
         points = self._homogeneous(some, columns)
         products = (points[..., :, None] * points[..., None, :]).reshape(*weights.shape, columns**2)

@@ -138,27 +138,27 @@ def _best_of(rotations: Array, shifts: Array, points: Array, tangents: Array) ->
     order = np.argsort(_trimmed_cost(rotations, shifts, points, tangents), kind="stable")[:REFINED_CANDIDATES]
     rotations, shifts = rotations[order], shifts[order]
     for _ in range(2):
-        kept = _smallest_half(squared_residuals(rotations, shifts, points, tangents))
+        kept = _smallesthalf_of(squared_residuals(rotations, shifts, points, tangents))
         rotations, shifts = refined_poses(rotations, shifts, points, tangents, kept)
     best = int(np.argmin(_trimmed_cost(rotations, shifts, points, tangents)))
     return rotations[[best]], shifts[[best]]
 
 
-def _half(n: Count) -> Count:
+def half_of(n: Count) -> Count:
     """The number of residuals that least trimmed squares keeps, for poses of three points."""
     return (n + 4) // 2
 
 
-def _smallest_half(squared: Array) -> Array:
+def _smallesthalf_of(squared: Array) -> Array:
     """Weights (k, n): 1 for the smallest residuals of each pose."""
     weights = np.zeros_like(squared)
-    h = _half(squared.shape[1])
+    h = half_of(squared.shape[1])
     np.put_along_axis(weights, np.argsort(squared, axis=1, kind="stable")[:, :h], 1.0, axis=1)
     return weights
 
 
 def _trimmed_cost(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
-    half = _half(len(points))
+    half = half_of(len(points))
     squared = squared_residuals(rotations, shifts, points, tangents)
     return np.asarray(np.partition(squared, half - 1, axis=1)[:, :half].sum(axis=1))
 
@@ -168,7 +168,7 @@ def robust_sigmas(squared: Array, counts: NDArray[np.intp]) -> Array:
 
     Of these, counts (k,) are there, the others are infinite.
     """
-    half = _half(counts)
+    half = half_of(counts)
     left_out = 1 - half / counts
     with np.errstate(divide="ignore", invalid="ignore"):
         truncation = 1 + np.where(left_out > 0, left_out * np.log(left_out) / (1 - left_out), 0.0)

@@ -66,6 +66,12 @@ class Distortion:
         if not all(0.0 <= half < np.inf for half in self.half_mm):
             raise ValueError(f"half the frame must be two lengths in mm, not {self.half_mm}")
 
+    @property
+    def values(self) -> Array:
+        """(k,) what is given of the family's parameters, 0 where nothing is."""
+        given = self.parameters
+        return np.array([given[name].value if name in given else 0.0 for name in parameter_names(self.family)])
+
 
 @dataclass(frozen=True)
 class Fiducial:

@@ -51,11 +51,12 @@ def adjust(
     keep_freed_memory()
     validate(network)
     options = options or Options()
-    weighs_anew = options.plain != options
+    weighs_anew, own = options.plain != options, None
     if weighs_anew:  # what is wrong with all would be weighed away here and there
-        _check_whole(network, _plainly(network, options), options)
+        own = _own_start(network, options)
+        _check_whole(network, _plainly(network, own, options), options)
     try:
-        start = approximations or approximate(with_held(network, options.datum_coordinates))
+        start = approximations or own or approximate(with_held(network, options.datum_coordinates))
         result = _adjusted(network, start, options)
     except AdjustmentError:
         if not weighs_anew:
@@ -71,17 +72,30 @@ def adjust(
 
 def _check_whole(network: Network, given: Adjustment | None, options: Options) -> None:
     """Raise AdjustmentError where a slip of the whole network explains what the network as it is given does not."""
-    slip = network_slip(network, given, lambda other: _plainly(other, options), options.probabilities.family)
+
+    def tried(other: Network) -> Adjustment | None:
+        return _plainly(other, _own_start(other, options), options)
+
+    slip = network_slip(network, given, tried, options.probabilities.family)
     if slip:
         raise AdjustmentError(slip)
 
 
-def _plainly(network: Network, options: Options) -> Adjustment | None:
-    """A network adjusted from its own approximations with the weights as they are given; None where it cannot begin."""
+def _own_start(network: Network, options: Options) -> Approximations | None:
+    """A network's own approximations; None where it has none."""
+    try:
+        return approximate(with_held(network, options.datum_coordinates))
+    except AdjustmentError:
+        return None
+
+
+def _plainly(network: Network, start: Approximations | None, options: Options) -> Adjustment | None:
+    """A network adjusted with the weights as they are given; None where it cannot begin."""
+    if start is None:
+        return None
     plain = replace(options.plain, iteration_limit=min(options.iteration_limit, TRIAL_STEPS))
     try:
-        own = approximate(with_held(network, options.datum_coordinates))
-        return adjust_problem(_numbered(network, own, plain), plain)
+        return adjust_problem(_numbered(network, start, plain), plain)
     except AdjustmentError:
         return None
 

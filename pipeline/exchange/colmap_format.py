@@ -11,10 +11,11 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
-from pipeline.exchange.fitted_lens import BROWN, INTERIOR, RATIONAL
+from pipeline.exchange.fitted_lens import BROWN, RATIONAL
 from pipeline.exchange.foreign_camera import foreign_pose, opencv_camera
 from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
+from pipeline.opencv_check.opencv_model import INTERIOR
 from pipeline.text.image_names import image_name
 
 CONVENTION = Convention(

@@ -6,22 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.choices.lens_conversion import convert_lens, frame_grid_mm
+from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.projection import ideal_from_observed
+from adjust.functional_model.projection import camera_from_ray, ideal_from_observed
+from adjust.problem.network import Distortion
 from pipeline.exchange.block import Block, Frame
 from pipeline.exchange.convention import ExportOptions
-from pipeline.opencv_check.opencv_model import NAMES, Freedom, image_grid, project, refit
+from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, fixed, opencv_values
 from pipeline.resampling.frame_chain import Lens
 
 Array = NDArray[np.float64]
 
-INTERIOR = ("fx", "fy", "cx", "cy")
 BROWN = ("k1", "k2", "p1", "p2", "k3")
 RATIONAL = (*BROWN, "k4", "k5", "k6")
 PRISMS = (*BROWN, "s1", "s2", "s3", "s4")
 _AFFINE = ("b1", "b2")
 _ONE_SCALE = ("none", "torlegard")  # families that stretch x and y alike, and have no shear
-_ROUNDS = 8  # of a fit whose affinity is of the distorted point: each leaves some thousandths of the step
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def fisheye_lens(block: Block, frame: Frame, options: ExportOptions) -> FittedLe
     """The lens of an image's camera where it is OpenCV's fisheye; a skew, which programs leave out, is its misfit."""
     lens = frame.lens
     assert lens is not None
-    if lens.distortion.family != "opencv_fisheye" or options.with_lens:
+    if lens.distortion.family != FISHEYE or options.with_lens:
         return None
     *k, b1, b2 = lens.parameters.tolist()
     c, x0, y0 = lens.interior
@@ -81,15 +82,11 @@ def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
         return FittedLens(_pinhole(lens), 0.0)
     if _is_of(lens, BROWN if at_ideal else (*BROWN, *_AFFINE)):
         return _opencv(lens)
-    if family in _ONE_SCALE:
-        return _fitted(block, frame, BROWN)
+    if family in _ONE_SCALE or not at_ideal:
+        return _fitted(block, frame, (*BROWN, *_AFFINE))
     rays, observed_mm = _over_frame(block, frame)
-    fitted = _pinhole(lens)
-    shear = 0.0
-    for _ in range(1 if at_ideal else _ROUNDS):
-        fitted, shear = _sheared_step(rays, observed_mm, rays if at_ideal else _bent(fitted, rays))
-    imaged_mm = _sheared(fitted, shear, rays, at_ideal)
-    return FittedLens(fitted, _largest(imaged_mm - observed_mm), shear=shear)
+    fitted, shear = _sheared_step(rays, observed_mm)
+    return FittedLens(fitted, _largest(_sheared(fitted, shear, rays) - observed_mm), shear=shear)
 
 
 def frame_corners_mm(block: Block, frame: Frame) -> Array:
@@ -133,7 +130,7 @@ def _over_frame(block: Block, frame: Frame) -> tuple[Array, Array]:
     """Rays (n, 2) over the frame, y up, and where the lens images them (n, 2), mm."""
     lens = frame.lens
     assert lens is not None
-    grid_mm = image_grid(frame_corners_mm(block, frame))
+    grid_mm = frame_grid_mm(frame_corners_mm(block, frame))
     ideal_mm, found = ideal_from_observed(lens.distortion, lens.interior, lens.parameters, grid_mm)
     return (ideal_mm[found] - lens.interior[1:]) / lens.interior[0], grid_mm[found]
 
@@ -143,25 +140,23 @@ def _fitted(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
     lens = frame.lens
     assert lens is not None
     family = lens.distortion.family
-    start = _pinhole(lens)
-    if family == "opencv":
-        own = _opencv(lens).values
-        held = [index for index, name in enumerate(NAMES) if name in (*INTERIOR, *names)]
-        start[held] = own[held]
-    grid_mm = image_grid(frame_corners_mm(block, frame))
-    free = tuple(name for name in INTERIOR if name != "fy" or family not in _ONE_SCALE)
-    fitted = refit(lens.distortion, lens.interior, lens.parameters, grid_mm, Freedom((*free, *names)), start).parameters
-    rays, observed_mm = _over_frame(block, frame)
-    return FittedLens(fitted, _largest(project(fitted, rays)[0] - observed_mm))
+    estimated = [name for name in names if name not in _AFFINE] if family in _ONE_SCALE else [*names, "b1"]
+    own = zip(parameter_names(family), lens.parameters.tolist(), strict=True)
+    into = fixed("opencv", {name: value for name, value in own if name in estimated} if family == "opencv" else {})
+    corners_mm = frame_corners_mm(block, frame)
+    try:
+        found = convert_lens(lens.distortion, lens.interior, lens.parameters, into, corners_mm, estimated)
+    except AdjustmentError:  # as bad as a model that is nowhere near
+        return FittedLens(_pinhole(lens), np.inf)
+    return FittedLens(opencv_values(found)[0], found.largest_mm, shear=float(found.parameters[-1]))
 
 
-def _sheared_step(rays: Array, observed_mm: Array, affine: Array) -> tuple[Array, float]:
-    """Parameters (18,) and shear by one linear fit: what is observed is linear in c, in c times each of the others, and
-    in the principal point. affine (n, 2): the points that affinity and shear belong to, for the distorted ones about
-    right."""
+def _sheared_step(rays: Array, observed_mm: Array) -> tuple[Array, float]:
+    """Parameters (18,) and shear, with affinity of the ideal point, by one linear fit: what is observed is linear in c,
+    in c times each of the others, and in the principal point."""
     a, b = (rays * (1.0, -1.0)).T  # OpenCV's axes
     r2, none, one = a * a + b * b, np.zeros_like(a), np.ones_like(a)
-    across = [a, a * r2, a * r2**2, 2 * a * b, r2 + 2 * a * a, a * r2**3, affine[:, 0], -affine[:, 1], one, none]
+    across = [a, a * r2, a * r2**2, 2 * a * b, r2 + 2 * a * a, a * r2**3, a, b, one, none]
     down = [b, b * r2, b * r2**2, r2 + 2 * b * b, 2 * a * b, b * r2**3, none, none, none, -one]
     design = np.concatenate([np.stack(across, axis=1), np.stack(down, axis=1)])
     scale = np.linalg.norm(design, axis=0)
@@ -172,19 +167,11 @@ def _sheared_step(rays: Array, observed_mm: Array, affine: Array) -> tuple[Array
     return values, b2 / c
 
 
-def _bent(values: Array, rays: Array) -> Array:
-    """The rays as the distortion alone shows them, y up."""
-    alone = values.copy()
-    alone[:4] = 1.0, 1.0, 0.0, 0.0
-    return project(alone, rays)[0]
-
-
-def _sheared(values: Array, shear: float, rays: Array, at_ideal: bool) -> Array:
+def _sheared(values: Array, shear: float, rays: Array) -> Array:
     """Camera coordinates (n, 2) in mm of rays."""
     fx, fy = values[:2]
-    bent = _bent(values, rays)
-    of = rays if at_ideal else bent
-    across = fy * bent[:, 0] + (fx - fy) * of[:, 0] - fy * shear * of[:, 1]
+    bent, _ = camera_from_ray(Distortion("opencv"), np.array([1.0, 0.0, 0.0]), np.array([*values[4:], 0.0, 0.0]), rays)
+    across = fy * bent[:, 0] + (fx - fy) * rays[:, 0] - fy * shear * rays[:, 1]
     return np.asarray(np.column_stack([across, fy * bent[:, 1]]) + values[2:4])
 
 

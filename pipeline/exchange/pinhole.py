@@ -11,7 +11,8 @@ from measure.errors import MeasurementError
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, Frame, WholeFrame
 from pipeline.exchange.convention import ExportOptions
-from pipeline.exchange.fitted_lens import INTERIOR, FittedLens, fisheye_lens, nearest_lens
+from pipeline.exchange.fitted_lens import FittedLens, fisheye_lens, nearest_lens
+from pipeline.opencv_check.opencv_model import INTERIOR
 from pipeline.resampling.canvas import Canvas, canvas_of
 from pipeline.results.comparator_file import ComparatorPoint
 

@@ -22,7 +22,7 @@ from adjust.problem.network import (
 )
 from adjust.problem.result import Adjustment
 from pipeline.opencv_check.opencv_calibration import ImagePoints, can_begin
-from pipeline.opencv_check.opencv_model import NAMES, Freedom
+from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, Freedom
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,8 @@ COUNTERPARTS: Mapping[str, Mapping[str, str]] = {
     "australis": {"k1": "k1", "k2": "k2", "k3": "k3", "p1": "p1", "p2": "p2", "b1": "fy"},
     "aicon": {"a1": "k1", "a2": "k2", "a3": "k3", "b1": "p2", "b2": "p1", "c1": "fy"},
     "opencv": {name: name for name in parameter_names("opencv") if name not in ("b1", "b2")} | {"b1": "fy"},
+    FISHEYE: {name: name for name in parameter_names(FISHEYE) if name not in ("b1", "b2")}
+    | {"b1": "fy", "b2": "alpha"},
 }
 # Its own parameters that OpenCV estimates together or not at all.
 FREE_TOGETHER = (frozenset({"p1", "p2"}), frozenset({"s1", "s2", "s3", "s4"}), frozenset({"tau_x", "tau_y"}))
@@ -136,7 +138,8 @@ def free_parameters(camera: Camera) -> set[str]:
         if free & own:
             free |= own
     interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
-    return free | {name for name, prior in interior.items() if prior is None or prior.sigma > 0}
+    free |= {name for name, prior in interior.items() if prior is None or prior.sigma > 0}
+    return free | ({"b1"} if camera.distortion.family == FISHEYE and "c" in free else set())
 
 
 def _freedom(camera: Camera, free: set[str]) -> Freedom:

@@ -1,4 +1,4 @@
-"""The adjustment against OpenCV: the same observations through cv2.calibrateCameraExtended, compared in sigmas.
+"""The adjustment against OpenCV: the same observations through its calibration of cameras or fisheyes, in sigmas.
 
 OpenCV knows neither film, nor priors, nor weights, nor uncertain object points. So the comparison is of one problem
 that both programs can solve: the observations in the camera frame by the adjusted transformations, the object points
@@ -18,9 +18,9 @@ from adjust.problem.network import Camera
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model
-from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate
+from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate, calibrate_fisheye
 from pipeline.opencv_check.opencv_conversion import Converted, converted
-from pipeline.opencv_check.opencv_model import NAMES, Freedom
+from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, Freedom, model_names
 from pipeline.results.check_file import CameraCheck, Check, Row, Verdict
 
 LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, for the two models are not quite the same
@@ -76,8 +76,6 @@ def _check_camera(adjustment: Adjustment, name: str) -> CameraCheck:
 
 def _hindrance(camera: Camera) -> str:
     """Why OpenCV has no model for this camera; empty where it has."""
-    if camera.distortion.family == "opencv_fisheye":
-        return "OpenCV's own calibration of a fisheye gives no standard deviations: it is not compared."
     if camera.distortion.family not in COUNTERPARTS:
         return f"OpenCV has no counterpart of the distortion family {camera.distortion.family}."
     free = free_parameters(camera)
@@ -113,14 +111,14 @@ def _without_stop(adjustment: Adjustment) -> str:
 
 
 def _compared(adjustment: Adjustment, problem: BareProblem, solved: Adjustment, counts: tuple[int, int]) -> CameraCheck:
-    conversion = converted(problem, solved)
-    rms_um, refit_um, sigma_um = _rms_um(solved), 1e3 * conversion.refit.residual_mm, 1e3 * problem.sigma_mm
-    known: dict[str, Any] = {
-        "images": counts[0],
-        "points": counts[1],
-        "rms_reseau_um": rms_um,
-        "refit_residual_um": refit_um,
-    }
+    rms_um, sigma_um = _rms_um(solved), 1e3 * problem.sigma_mm
+    known: dict[str, Any] = {"images": counts[0], "points": counts[1], "rms_reseau_um": rms_um}
+    try:
+        conversion = converted(problem, solved)
+    except AdjustmentError as error:
+        return CameraCheck("not possible", f"OpenCV's model cannot take this lens: {error}", **known)
+    refit_um = 1e3 * conversion.residual_mm
+    known["refit_residual_um"] = refit_um
     if refit_um > LARGEST_REFIT * sigma_um:
         reason = (
             f"OpenCV's model cannot take this lens: the nearest one is off by {refit_um:.2f} um, rms over the image, "
@@ -128,11 +126,15 @@ def _compared(adjustment: Adjustment, problem: BareProblem, solved: Adjustment, 
         )
         return CameraCheck("not possible", reason, **known)
     try:
-        opencv = calibrate(problem.images, problem.freedom, conversion.refit.parameters)
+        is_fisheye = problem.network.cameras[0].distortion.family == FISHEYE
+        opencv = (calibrate_fisheye if is_fisheye else calibrate)(
+            problem.images, problem.freedom, conversion.parameters
+        )
     except cv2.error as error:
         return CameraCheck("not possible", f"OpenCV refuses these observations: {error.err}.", **known)
     sigmas_tell = rms_um > ROUNDINGS * opencv.rounding_um
-    rows = _rows(problem.freedom, conversion, solved.sigma0 if sigmas_tell else 1.0, opencv)
+    names = model_names(problem.network.cameras[0].distortion.family)
+    rows = _rows(names, problem.freedom, conversion, solved.sigma0 if sigmas_tell else 1.0, opencv)
     known |= {"rms_opencv_um": opencv.rms_um, "rows": rows}
     if opencv.rms_um > WORSE_RMS * rms_um + ROUNDINGS * opencv.rounding_um:
         reason = (
@@ -160,15 +162,17 @@ def _rms_um(solved: Adjustment) -> float:
     return 1e3 * float(np.sqrt((solved.residuals.v_mm**2).sum(axis=1).mean()))
 
 
-def _rows(freedom: Freedom, conversion: Converted, sigma0: float, opencv: OpenCvCalibration) -> tuple[Row, ...]:
+def _rows(
+    names: Sequence[str], freedom: Freedom, conversion: Converted, sigma0: float, opencv: OpenCvCalibration
+) -> tuple[Row, ...]:
     return tuple(
         Row(
             name,
-            "mm" if name in NAMES[:4] else "rad" if name in NAMES[-2:] else "1",
-            *(float(each[NAMES.index(name)]) for each in (conversion.refit.parameters, sigma0 * conversion.sigmas)),
-            *(float(each[NAMES.index(name)]) for each in (opencv.parameters, opencv.sigmas)),
+            "mm" if name in INTERIOR else "rad" if name in ("tau_x", "tau_y") else "1",
+            *(float(each[k]) for each in (conversion.parameters, sigma0 * conversion.sigmas)),
+            *(float(each[k]) for each in (opencv.parameters, opencv.sigmas)),
         )
-        for name in NAMES
+        for k, name in enumerate(names)
         if name in freedom.names
     )
 
@@ -193,13 +197,13 @@ def _sigma_ratio(row: Row) -> float:
 
 def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: OpenCvCalibration) -> bool:
     """Whether the adjustment with OpenCV's own model comes to OpenCV's solution."""
-    if problem.network.cameras[0].distortion.family == "opencv":
+    if problem.network.cameras[0].distortion.family in ("opencv", FISHEYE):
         return False
-    same = in_opencv_model(problem, conversion.refit.parameters)
+    same = in_opencv_model(problem, conversion.parameters)
     solved = adjust(same.network, same.approximations)
     if not solved.converged:
         return False
-    rows = _rows(same.freedom, converted(same, solved), solved.sigma0, opencv)
+    rows = _rows(NAMES, same.freedom, converted(same, solved), solved.sigma0, opencv)
     return all(
         row.difference_sigmas < SAME_MODEL_DIFFERENCE and _sigma_ratio(row) < SAME_MODEL_SIGMA_RATIO for row in rows
     )

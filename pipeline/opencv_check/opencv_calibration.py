@@ -1,4 +1,4 @@
-"""cv2.calibrateCameraExtended on observations in the camera frame."""
+"""cv2.calibrateCameraExtended, and cv2.fisheye.calibrate, on observations in the camera frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.scans.parallel import one_opencv_thread
-from pipeline.opencv_check.opencv_model import NAMES, Y_UP, Freedom, camera_matrix
+from pipeline.opencv_check.opencv_model import FISHEYE_NAMES, NAMES, Y_UP, Freedom, camera_matrix
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class ImagePoints:
 
 @dataclass(frozen=True)
 class OpenCvCalibration:
-    """Parameters (18,) and standard deviations (18,) in the order of `opencv_model.NAMES`; rms a point in um.
+    """Parameters (n,) and standard deviations (n,) in the order of `opencv_model.model_names`; rms a point in um.
 
     rounding_um: rms of what the rounding to single precision, which OpenCV demands, changes an image coordinate by.
     """
@@ -64,32 +64,123 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
     Its points are single precision: object points are taken about their mean, and the frame about its middle.
     Raises cv2.error where OpenCV refuses.
     """
-    observed = np.concatenate([image.xy_mm for image in images])
-    corners = np.array([np.minimum(observed.min(axis=0), start[2:4]), np.maximum(observed.max(axis=0), start[2:4])])
-    pixel_mm = float((corners[1] - corners[0]).max()) / (PICTURE_PX - 1)
-    offset = np.array([corners[0, 0], -corners[1, 1]]) / pixel_mm - 0.5  # of the top left corner, y down
-    middle = np.concatenate([image.xyz for image in images]).mean(axis=0)
-
-    exact = [image.xy_mm * Y_UP / pixel_mm - offset for image in images]
-    pixels = [each.astype(np.float32) for each in exact]
-    objects = [(image.xyz - middle).astype(np.float32) for image in images]
-    matrix = camera_matrix(start) / pixel_mm
-    matrix[2, 2] = 1.0
-    matrix[:2, 2] -= offset
-    size = tuple(int(extent) + 2 for extent in np.ceil((corners[1] - corners[0]) / pixel_mm))
+    pixels = _Pixels.of(images, start)
+    rounded = [each.astype(np.float32) for each in pixels.places]
+    objects = [each.astype(np.float32) for each in pixels.objects]
     tilted = "tau_x" in freedom.names or bool(start[-2:].any())
     lens = start[4:] if tilted else start[4:-2]
     with one_opencv_thread():  # several add up the images in the order in which they end, which differs by the run
         rms_px, adjusted_matrix, distortion, _, _, sigmas, _, _ = cv2.calibrateCameraExtended(
-            objects, pixels, (size[0], size[1]), matrix, lens.copy(), flags=_flags(freedom, tilted), criteria=CRITERIA
+            objects,
+            rounded,
+            pixels.size,
+            pixels.matrix(start),
+            lens.copy(),
+            flags=_flags(freedom, tilted),
+            criteria=CRITERIA,
         )
-    rounding_px = np.concatenate([a - b for a, b in zip(exact, pixels, strict=True)])
+    values = np.zeros(len(NAMES) - 4)
+    values[: np.size(distortion)] = np.ravel(distortion)[: len(values)]  # without a tilt OpenCV gives none
+    rounding_px = np.concatenate([a - b for a, b in zip(pixels.places, rounded, strict=True)])
     return OpenCvCalibration(
-        parameters=_parameters(np.asarray(adjusted_matrix, dtype=np.float64), np.ravel(distortion), offset, pixel_mm),
-        sigmas=_sigmas(np.ravel(sigmas), freedom, start, pixel_mm),
-        rms_um=1e3 * pixel_mm * float(rms_px),
-        rounding_um=1e3 * pixel_mm * float(np.sqrt((rounding_px**2).mean())),
+        parameters=np.concatenate([pixels.interior_mm(np.asarray(adjusted_matrix, dtype=np.float64)), values]),
+        sigmas=_sigmas(np.ravel(sigmas), freedom, start, pixels.mm),
+        rms_um=1e3 * pixels.mm * float(rms_px),
+        rounding_um=1e3 * pixels.mm * float(np.sqrt((rounding_px**2).mean())),
     )
+
+
+def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> OpenCvCalibration:
+    """OpenCV's least squares of a fisheye from `start` (9,); what `freedom` does not name is held at its start.
+
+    It gives no standard deviations: these are from the derivatives that it gives, at where it ends. It takes double
+    precision; what may be told from its solution is what is left of a gradient that is not quite 0.
+    Raises cv2.error where OpenCV refuses.
+    """
+    pixels = _Pixels.of(images, start)
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_RECOMPUTE_EXTRINSIC
+    flags |= 0 if "alpha" in freedom.names else cv2.CALIB_FIX_SKEW
+    flags |= 0 if "fx" in freedom.names else cv2.CALIB_FIX_FOCAL_LENGTH
+    flags |= 0 if "cx" in freedom.names else cv2.CALIB_FIX_PRINCIPAL_POINT
+    for name in FISHEYE_NAMES[4:-1]:
+        flags |= 0 if name in freedom.names else RADIAL_FLAGS[name]
+    begun = pixels.matrix(start)
+    begun[0, 1] = start[-1] * begun[0, 0]
+    with one_opencv_thread():
+        rms_px, ended, distortion, rotations, shifts = cv2.fisheye.calibrate(
+            [each[None] for each in pixels.objects],
+            [each[None] for each in pixels.places],
+            pixels.size,
+            begun,
+            start[4:-1].copy(),
+            flags=flags,
+            criteria=CRITERIA,
+        )
+    matrix = np.asarray(ended, dtype=np.float64)
+    alpha = float(matrix[0, 1] / matrix[0, 0])
+    by_camera = [
+        _fisheye_derivatives(xyz, np.ravel(turn), np.ravel(shift), matrix, np.ravel(distortion), alpha)
+        for xyz, turn, shift in zip(pixels.objects, rotations, shifts, strict=True)
+    ]
+    own = [FISHEYE_NAMES.index(name) for name in freedom.names]
+    normal = sum((each[:, own].T @ each[:, own] for each in by_camera), start=np.zeros((len(own), len(own))))
+    squares = len(pixels.places_px) * float(rms_px) ** 2
+    redundancy = 2 * len(pixels.places_px) - 6 * len(images) - len(own)
+    sigmas = np.zeros(len(FISHEYE_NAMES))
+    sigmas[own] = np.sqrt(squares / redundancy * np.diag(np.linalg.inv(normal)))
+    sigmas[:4] *= pixels.mm
+    return OpenCvCalibration(
+        parameters=np.concatenate([pixels.interior_mm(matrix), np.ravel(distortion), [alpha]]),
+        sigmas=sigmas,
+        rms_um=1e3 * pixels.mm * float(rms_px),
+        rounding_um=1e3 * pixels.mm * PICTURE_PX * float(np.finfo(np.float64).eps),
+    )
+
+
+def _fisheye_derivatives(xyz: Array, turn: Array, shift: Array, matrix: Array, lens: Array, alpha: float) -> Array:
+    """By the camera's parameters (2 n, 9), in their order, less what a change of the pose does as well."""
+    _, jacobian = cv2.fisheye.projectPoints(xyz[None], turn, shift, matrix, lens, alpha=alpha)
+    pose = np.linalg.qr(jacobian[:, 8:14])[0]
+    by_camera = jacobian[:, [*range(8), 14]]
+    return np.asarray(by_camera - pose @ (pose.T @ by_camera))
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """The images as OpenCV is given them: places (n, 2) in pixels of mm, y down, object points about their mean; offset
+    (2,) of the top left corner, size of the frame."""
+
+    objects: list[Array]
+    places: list[Array]
+    mm: float
+    offset: Array
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, images: Sequence[ImagePoints], start: Array) -> "_Pixels":
+        observed = np.concatenate([image.xy_mm for image in images])
+        corners = np.array([np.minimum(observed.min(axis=0), start[2:4]), np.maximum(observed.max(axis=0), start[2:4])])
+        mm = float((corners[1] - corners[0]).max()) / (PICTURE_PX - 1)
+        offset = np.array([corners[0, 0], -corners[1, 1]]) / mm - 0.5
+        middle = np.concatenate([image.xyz for image in images]).mean(axis=0)
+        width, height = (int(extent) + 2 for extent in np.ceil((corners[1] - corners[0]) / mm))
+        objects = [image.xyz - middle for image in images]
+        return cls(objects, [image.xy_mm * Y_UP / mm - offset for image in images], mm, offset, (width, height))
+
+    @property
+    def places_px(self) -> Array:
+        return np.concatenate(self.places)
+
+    def matrix(self, values: Array) -> Array:
+        """OpenCV's camera matrix (3, 3) in pixels."""
+        matrix = camera_matrix(values) / self.mm
+        matrix[2, 2] = 1.0
+        matrix[:2, 2] -= self.offset
+        return matrix
+
+    def interior_mm(self, matrix: Array) -> Array:
+        """fx, fy, cx, cy (4,), y up, of such a matrix."""
+        return np.concatenate([np.diag(matrix)[:2], (matrix[:2, 2] + self.offset) * Y_UP]) * self.mm
 
 
 def _flags(freedom: Freedom, tilted: bool) -> int:
@@ -105,13 +196,6 @@ def _flags(freedom: Freedom, tilted: bool) -> int:
     for name, flag in RADIAL_FLAGS.items():
         flags |= 0 if name in free else flag
     return flags
-
-
-def _parameters(matrix: Array, distortion: Array, offset: Array, pixel_mm: float) -> Array:
-    principal_point = (matrix[:2, 2] + offset) * pixel_mm * Y_UP
-    lens = np.zeros(len(NAMES) - 4)
-    lens[: len(distortion)] = distortion[: len(lens)]  # without a tilt OpenCV gives none
-    return np.concatenate([np.diag(matrix)[:2] * pixel_mm, principal_point, lens])
 
 
 def _sigmas(sigmas: Array, freedom: Freedom, start: Array, pixel_mm: float) -> Array:

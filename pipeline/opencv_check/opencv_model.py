@@ -1,118 +1,87 @@
-"""OpenCV's camera model beside the adjustment's: conversion by a refit over the image, with propagated sigmas.
+"""OpenCV's camera models beside the adjustment's: their parameters, and lenses brought to them.
 
-Parameters are those of cv2.calibrateCamera in the camera frame's unit: fx, fy, cx, cy in mm, cx and cy being the
-principal point x0', y0' (y up); k1 to s4 without unit and the sensor's tilt tau_x, tau_y in rad, in
-OpenCV's own signs.
+Parameters are those of cv2.calibrateCamera, or of cv2.fisheye.calibrate, in the camera frame's unit: fx, fy, cx, cy in
+mm, cx and cy being the principal point x0', y0' (y up); k1 to s4 and the fisheye's alpha without unit and the sensor's
+tilt tau_x, tau_y in rad, in OpenCV's own signs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.projection import ideal_from_observed
-from adjust.problem.network import Distortion
+from adjust.choices.lens_conversion import ConvertedLens, convert_lens
+from adjust.functional_model.families import parameter_names
+from adjust.problem.network import Distortion, Prior
 
 Array = NDArray[np.float64]
 
+INTERIOR = ("fx", "fy", "cx", "cy")
 NAMES = (
-    "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
+    *INTERIOR, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
 )  # fmt: skip
-GRID = 25  # points a side of the grid over the image on which the refit is made
-ITERATIONS = 30
+FISHEYE = "opencv_fisheye"  # the adjustment's family of this model
+FISHEYE_NAMES = (*INTERIOR, "k1", "k2", "k3", "k4", "alpha")
 Y_UP = np.array([1.0, -1.0])
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """Which of OpenCV's parameters are estimated. "fx" alone of the two: one focal length, the ratio fx/fy is kept."""
+    """Which of a model's parameters are estimated. "fx" alone of the two: one focal length, the ratio fx/fy is kept."""
 
     names: tuple[str, ...]
 
-    def basis(self, start: Array) -> Array:
-        """(18, k): what a change of each estimated parameter changes."""
-        basis = np.eye(len(NAMES))[:, [NAMES.index(name) for name in self.names]]
-        if "fx" in self.names and "fy" not in self.names:
-            basis[NAMES.index("fy"), self.names.index("fx")] = start[1] / start[0]
-        return basis
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Which of c, x0 and y0 are not."""
+        return tuple(own for own, name in (("c", "fx"), ("x0", "cx"), ("y0", "cy")) if name not in self.names)
+
+    @property
+    def distortion(self) -> tuple[str, ...]:
+        """Which parameters of the adjustment's family of this model are."""
+        affinity = [own for own, name in (("b1", "fy"), ("b2", "alpha")) if name in self.names]
+        return (*(name for name in self.names if name not in (*INTERIOR, "alpha")), *affinity)
 
 
-@dataclass(frozen=True)
-class Refit:
-    """OpenCV's parameters (18,) that image the same rays to the same places; what is left, rms a point, in mm."""
-
-    parameters: Array
-    residual_mm: float
+def model_names(family: str) -> tuple[str, ...]:
+    """The parameters of OpenCV's model of a distortion family."""
+    return FISHEYE_NAMES if family == FISHEYE else NAMES
 
 
-def image_grid(corners_mm: Array) -> Array:
-    """Camera points (n, 2) over the rectangle between two opposite corners (2, 2)."""
-    along = np.linspace(0.0, 1.0, GRID)
-    x, y = np.meshgrid(along, along)
-    fractions = np.stack([x, y], axis=-1).reshape(-1, 2)
-    return np.asarray(corners_mm[0] + fractions * (corners_mm[1] - corners_mm[0]))
+def to_opencv_model(
+    distortion: Distortion, interior: Array, parameters: Array, corners_mm: Array, estimated: Sequence[str]
+) -> ConvertedLens:
+    """A lens in the adjustment's family of OpenCV's model, over the rectangle between two corners (2, 2).
 
-
-def refit(
-    distortion: Distortion, interior: Array, parameters: Array, grid_mm: Array, freedom: Freedom, fixed: Array
-) -> Refit:
-    """The OpenCV model nearest to the adjustment's over a grid of observed camera points.
-
-    interior (3,): c, x0', y0' in mm; parameters in the order of `families.parameter_names`. fixed (18,): the values of
-    the parameters that are not estimated, and the start for the others. Both models are given the same rays: the
-    adjustment's corrects the observed point, OpenCV's distorts the ideal one, and no finite conversion is exact.
+    interior (3,): c, x0', y0' in mm; estimated: the parameters that are fitted. Of a lens of such a family the others
+    keep their values, but for the skew b2, which cv2.calibrateCamera does not know.
+    Raises AdjustmentError where no fit stands still.
     """
-    ideal_mm, found = ideal_from_observed(distortion, interior, parameters, grid_mm)
-    rays, observed_mm = (ideal_mm[found] - interior[1:]) / interior[0], grid_mm[found]
-    values, basis = fixed.copy(), freedom.basis(fixed)
-    for _ in range(ITERATIONS):
-        imaged_mm, by_parameters = project(values, rays)
-        design = (by_parameters @ basis).reshape(-1, basis.shape[1])
-        scale = np.linalg.norm(design, axis=0)
-        step = np.linalg.lstsq(design / scale, (observed_mm - imaged_mm).ravel())[0] / scale
-        values = values + basis @ step
-        if np.abs(step * scale).max(initial=0.0) < 1e-12 * interior[0]:
-            break
-    left = observed_mm - project(values, rays)[0]
-    return Refit(values, float(np.sqrt((left**2).sum(axis=1).mean())))
+    own = dict(zip(parameter_names(distortion.family), parameters.tolist(), strict=True))
+    begun = own if distortion.family in ("opencv", FISHEYE) else {}
+    if distortion.family == "opencv":
+        begun = own | {"b2": 0.0}
+    model = FISHEYE if distortion.family == FISHEYE else "opencv"
+    return convert_lens(distortion, interior, parameters, fixed(model, begun), corners_mm, estimated)
 
 
-def refit_jacobian(
-    distortion: Distortion,
-    interior: Array,
-    parameters: Array,
-    steps: Sequence[float],
-    grid_mm: Array,
-    freedom: Freedom,
-    fixed: Array,
-) -> Array:
-    """Derivative (18, 3 + k) of the refit by c, x0', y0' and the distortion parameters, by central differences.
-
-    steps (3 + k): how far each is moved, a part of its standard deviation; 0 where it is fixed.
-    """
-    middle = np.concatenate([interior, parameters])
-    jacobian = np.zeros((len(NAMES), len(middle)))
-    for column, step in enumerate(steps):
-        if step == 0.0:
-            continue
-        sides = []
-        for sign in (1.0, -1.0):
-            moved = middle.copy()
-            moved[column] += sign * step
-            sides.append(refit(distortion, moved[:3], moved[3:], grid_mm, freedom, fixed).parameters)
-        jacobian[:, column] = (sides[0] - sides[1]) / (2 * step)
-    return jacobian
+def fixed(family: str, values: Mapping[str, float]) -> Distortion:
+    return Distortion(family, {name: Prior(value, 0.0) for name, value in values.items()})
 
 
-def project(values: Array, rays: Array) -> tuple[Array, Array]:
-    """Camera coordinates (n, 2) in mm, y up, of rays (n, 2), and their derivatives (n, 2, 18), by cv2.projectPoints."""
-    points = np.column_stack([rays * Y_UP, np.ones(len(rays))])
-    projected, jacobian = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera_matrix(values), values[4:])
-    by_values = jacobian[:, 6 : 6 + len(NAMES)].reshape(-1, 2, len(NAMES)) * Y_UP[:, None]
-    by_values[..., NAMES.index("cy")] *= -1.0
-    return projected.reshape(-1, 2) * Y_UP, by_values
+def opencv_values(lens: ConvertedLens) -> tuple[Array, Array]:
+    """OpenCV's parameters (n,) of a lens in the family of its model, and their derivatives (n, 3 + k) by c, x0', y0'
+    and the family's parameters."""
+    (c, x0, y0), (*others, b1, b2) = lens.interior, lens.parameters
+    values = [c * (1.0 + b1), c, x0, y0, *others]
+    by_lens = np.zeros((len(values) + 1, 3 + len(lens.parameters)))
+    by_lens[0, [0, -2]], by_lens[1, 0] = (1.0 + b1, c), 1.0
+    by_lens[2 : len(values), 1:-2] = np.eye(len(values) - 2)
+    by_lens[-1, -2:] = -b2 / (1.0 + b1) ** 2, 1.0 / (1.0 + b1)
+    if lens.distortion.family == FISHEYE:
+        return np.array([*values, b2 / (1.0 + b1)]), by_lens
+    return np.array(values), by_lens[:-1]
 
 
 def camera_matrix(values: Array) -> Array:

@@ -30,10 +30,11 @@ def test_what_is_wrong_with_all_is_named(name: str) -> None:
     assert outcome(kind, sentences) == "named", sentences
 
 
-def test_targets_of_exchanged_frames_are_named() -> None:
+@pytest.mark.parametrize("options", [Options(), Options(robust="igg3")])
+def test_targets_of_exchanged_frames_are_named(options: Options) -> None:
     few = network(1)
     with pytest.raises(AdjustmentError, match=r"targets of the frames f1 and f3 are exchanged\. Without this all"):
-        adjust(exchanged(few))
+        adjust(exchanged(few), options=options)
 
 
 @pytest.mark.parametrize("options", [Options(robust=True), Options(snooping=True)])

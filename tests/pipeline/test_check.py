@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from lens_networks import LENSES, network_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -247,6 +248,29 @@ def test_a_strong_lens_agrees_by_way_of_the_same_model(family: str) -> None:
     assert check.verdict == "agrees", check.reason
     assert check.reason.startswith("Given the very same model both programs agree.")
     assert max(row.difference_sigmas for row in check.rows) > 1.0
+
+
+@pytest.mark.parametrize("skew", [True, False], ids=["skew", "no skew"])
+def test_a_fisheye_agrees_with_opencvs_fisheye(skew: bool) -> None:
+    """Which estimates both focal lengths or none: one of them free here is two for the comparison."""
+    network = network_of("opencv_fisheye", np.random.default_rng(2))
+    if not skew:
+        camera = network.cameras[0]
+        lens = {"k1": Prior(0.0, FREE), "k2": Prior(0.0, FREE), "b2": Prior(LENSES["opencv_fisheye"][1]["b2"], 0.0)}
+        network = replace(network, cameras=(replace(camera, distortion=Distortion("opencv_fisheye", lens)),))
+    check = check_against_opencv(adjust(network)).cameras["L"]
+    names = ["fx", "fy", "cx", "cy", "k1", "k2", *(["alpha"] if skew else [])]
+    assert [row.name for row in check.rows] == names
+    if skew:
+        assert check.verdict == "agrees", check.reason
+        assert max(row.difference_sigmas for row in check.rows) < 1e-4
+        assert max(abs(row.sigma / row.opencv_sigma - 1.0) for row in check.rows) < 1e-4
+        values = adjust(network).values.copy()
+        values[adjust(network).index("IO.L.c")] += 0.05
+        assert check_against_opencv(replace(adjust(network), values=values)).verdict == "differs"
+    else:  # b1 was held at 0 and is 4e-4
+        assert check.verdict == "differs"
+        assert "Priors or weights move b1" in check.reason
 
 
 @pytest.mark.parametrize("what", ["parameters", "sigmas"])

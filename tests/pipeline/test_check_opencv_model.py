@@ -1,13 +1,24 @@
-"""The refit of the adjustment's distortion in OpenCV's model, against independent figures and OpenCV itself."""
+"""Lenses brought to OpenCV's models, against independent figures and OpenCV itself."""
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from adjust.choices.lens_conversion import ConvertedLens, convert_lens
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.projection import camera_from_ray
 from adjust.problem.network import Distortion
-from pipeline.opencv_check.opencv_model import NAMES, Freedom, image_grid, project, refit, refit_jacobian
+from pipeline.opencv_check.opencv_model import (
+    FISHEYE,
+    NAMES,
+    Freedom,
+    camera_matrix,
+    fixed,
+    model_names,
+    opencv_values,
+    to_opencv_model,
+)
 
 Array = NDArray[np.float64]
 
@@ -15,31 +26,38 @@ FRAME_MM = np.array([[-10.0, -7.5], [10.0, 7.5]])
 C_MM = 24.0
 INTERIOR = np.array([C_MM, 0.05, -0.03])
 MODERATE = {"k3": 1.2e-4, "k5": -2e-7, "p1": 3e-6, "p2": -2e-6}  # 170 um at the corner
-RADIAL_TANGENTIAL = Freedom(("fx", "cx", "cy", "k1", "k2", "p1", "p2", "k3"))
+RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3")
+VALUES = {
+    "opencv": {"k1": -0.26, "k2": 0.13, "p1": -2e-4, "p2": 4e-5, "k3": 0.01, "b1": 6e-4},
+    FISHEYE: {"k1": 0.03, "k2": -0.01, "b1": 4e-4, "b2": -3e-4},
+}
+RAYS = np.array([[0.3, 0.2], [-0.1, 0.25], [0.0, -0.4]])
 
 
-def torlegard(**values: float) -> Array:
-    return np.array([values.get(name, 0.0) for name in parameter_names("torlegard")])
+def lens_of(family: str, **values: float) -> Array:
+    return np.array([values.get(name, 0.0) for name in parameter_names(family)])
 
 
-def started(c_mm: float = C_MM) -> Array:
-    return np.array([c_mm, c_mm, *np.zeros(len(NAMES) - 2)])
+def of_torlegard(
+    values: dict[str, float], interior: Array = INTERIOR, r0_mm: float = 0.0
+) -> tuple[dict[str, float], float]:
+    """OpenCV's values, and what is left, rms in mm."""
+    lens = Distortion("torlegard", r0_mm=r0_mm), interior, lens_of("torlegard", **values)
+    found = to_opencv_model(*lens, FRAME_MM, RADIAL_TANGENTIAL)
+    return dict(zip(NAMES, opencv_values(found)[0].tolist(), strict=True)), found.rms_mm
 
 
 @pytest.mark.parametrize(("strength", "at_most_um"), [(1.0, 0.06), (4.0, 0.4)])
-def test_refit_leaves_what_an_independent_calculation_found(strength: float, at_most_um: float) -> None:
+def test_what_is_left_is_what_an_independent_calculation_found(strength: float, at_most_um: float) -> None:
     """0.06 um at the corner for 170 um of distortion, 0.4 um for 670 um."""
-    lens = torlegard(**{name: strength * value for name, value in MODERATE.items()})
-    found = refit(Distortion("torlegard"), INTERIOR, lens, image_grid(FRAME_MM), RADIAL_TANGENTIAL, started())
-    assert 1e3 * found.residual_mm < at_most_um
+    _, rms_mm = of_torlegard({name: strength * value for name, value in MODERATE.items()})
+    assert 1e3 * rms_mm < at_most_um
 
 
 def test_series_holds_for_a_weak_lens() -> None:
     """k1 = k3 c², k2 = (3 k3² + k5) c⁴, p1cv = -p2 c, p2cv = p1 c: exact in the limit of a weak lens."""
     k3, k5, p1, p2 = 1e-6, -2e-10, 3e-7, -2e-7
-    lens = torlegard(k3=k3, k5=k5, p1=p1, p2=p2)
-    found = refit(Distortion("torlegard"), INTERIOR, lens, image_grid(FRAME_MM), RADIAL_TANGENTIAL, started())
-    values = dict(zip(NAMES, found.parameters, strict=True))
+    values, _ = of_torlegard({"k3": k3, "k5": k5, "p1": p1, "p2": p2})
     assert values["fx"] == pytest.approx(C_MM, rel=1e-7)
     assert values["k1"] == pytest.approx(k3 * C_MM**2, rel=1e-2)
     assert values["k2"] == pytest.approx((3 * k3**2 + k5) * C_MM**4, rel=5e-2)
@@ -47,70 +65,68 @@ def test_series_holds_for_a_weak_lens() -> None:
     assert values["p2"] == pytest.approx(p1 * C_MM, rel=1e-2)
 
 
-def test_opencv_family_is_given_back_as_it_is() -> None:
-    names = parameter_names("opencv")
-    values = {"k1": -0.26, "k2": 0.13, "p1": -2e-4, "p2": 4e-5, "k3": 0.01, "b1": 6e-4}
-    free = Freedom(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"))
-    lens = np.array([values.get(name, 0.0) for name in names])
-    found = refit(Distortion("opencv"), INTERIOR, lens, image_grid(FRAME_MM), free, started())
-    expected = {**values, "fx": C_MM * (1 + values["b1"]), "fy": C_MM, "cx": INTERIOR[1], "cy": INTERIOR[2]}
-    assert found.residual_mm < 1e-10
-    for name in free.names:
-        assert found.parameters[NAMES.index(name)] == pytest.approx(expected[name], rel=1e-7, abs=1e-10)
-
-
 def test_r0_is_no_parameter_of_its_own() -> None:
     """r0 is r0 = 0 with c, k and p divided by 1 + k3 r0² + k5 r0⁴ (+ k7 r0⁶)."""
     r0 = 8.0
-    with_r0 = refit(
-        Distortion("torlegard", r0_mm=r0),
-        INTERIOR,
-        torlegard(**MODERATE),
-        image_grid(FRAME_MM),
-        RADIAL_TANGENTIAL,
-        started(),
-    )
+    with_r0, _ = of_torlegard(MODERATE, r0_mm=r0)
     ratio = 1 + MODERATE["k3"] * r0**2 + MODERATE["k5"] * r0**4
-    scaled = torlegard(**{name: value / ratio for name, value in MODERATE.items()})
-    interior = np.array([C_MM / ratio, *INTERIOR[1:]])
-    without = refit(Distortion("torlegard"), interior, scaled, image_grid(FRAME_MM), RADIAL_TANGENTIAL, started())
-    np.testing.assert_allclose(with_r0.parameters, without.parameters, rtol=1e-9, atol=1e-12)
+    scaled = {name: value / ratio for name, value in MODERATE.items()}
+    without, _ = of_torlegard(scaled, np.array([C_MM / ratio, *INTERIOR[1:]]))
+    assert list(with_r0.values()) == pytest.approx(list(without.values()), rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("family", list(VALUES))
+def test_opencvs_own_families_keep_their_values_and_project_as_opencv_does(family: str) -> None:
+    lens = lens_of(family, **VALUES[family])
+    found = to_opencv_model(Distortion(family), INTERIOR, lens, FRAME_MM, ())
+    values, _ = opencv_values(found)
+    assert found.is_same
+    named = dict(zip(model_names(family), values, strict=True))
+    b1 = VALUES[family]["b1"]
+    of_interior = {"fx": C_MM * (1.0 + b1), "fy": C_MM, "cx": 0.05, "cy": -0.03}
+    own = {name: value for name, value in VALUES[family].items() if name not in ("b1", "b2")}
+    for name, value in {**of_interior, **own}.items():
+        assert named[name] == pytest.approx(value, rel=1e-12)
+    points, matrix = np.column_stack([RAYS * (1.0, -1.0), np.ones(len(RAYS))]), camera_matrix(values)
+    if family == FISHEYE:
+        seen, _ = cv2.fisheye.projectPoints(
+            points[:, None], np.zeros(3), np.zeros(3), matrix, values[4:8], alpha=named["alpha"]
+        )
+    else:
+        seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, values[4:])
+    ours, _ = camera_from_ray(Distortion(family), INTERIOR, lens, RAYS)
+    np.testing.assert_allclose(ours, np.reshape(seen, (-1, 2)) * (1.0, -1.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("family", list(VALUES))
+def test_derivatives_of_opencvs_values(family: str) -> None:
+    start = np.concatenate([INTERIOR, lens_of(family, **VALUES[family])])
+
+    def values(at: Array) -> Array:
+        lens = ConvertedLens(Distortion(family), at[:3], at[3:], (), np.zeros((0, 0)), 0.0, 0.0)
+        return opencv_values(lens)[0]
+
+    _, by_lens = opencv_values(ConvertedLens(Distortion(family), start[:3], start[3:], (), start[None], 0.0, 0.0))
+    for k, step in enumerate(1e-6 * np.eye(len(start))):
+        numeric = (values(start + step) - values(start - step)) / 2e-6
+        np.testing.assert_allclose(by_lens[:, k], numeric, atol=1e-7)
+
+
+def test_what_is_held_stays_and_its_share_is_not_taken_by_others() -> None:
+    """By k3 alone, c and the principal point held: OpenCV's k1 changes as the series says, and nothing else does."""
+    freedom = Freedom(("k1",))
+    lens = Distortion("torlegard"), INTERIOR, lens_of("torlegard", k3=1e-6)
+    whole = to_opencv_model(*lens, FRAME_MM, RADIAL_TANGENTIAL)
+    held = fixed("opencv", dict(zip(parameter_names("opencv"), whole.parameters.tolist(), strict=True)))
+    found = convert_lens(*lens, held, FRAME_MM, freedom.distortion, held=freedom.held)
+    np.testing.assert_allclose(found.parameters[1:], whole.parameters[1:], atol=1e-15)
+    assert (found.interior == INTERIOR).all()
+    changed = found.by_source[:, 3]
+    assert changed[3] == pytest.approx(C_MM**2, rel=1e-2)
+    assert np.flatnonzero(changed).tolist() == [3]
 
 
 def test_one_focal_length_keeps_the_ratio() -> None:
-    start = started()
-    start[0] *= 1.01
-    found = refit(Distortion("none"), INTERIOR, np.zeros(0), image_grid(FRAME_MM), Freedom(("fx", "cx", "cy")), start)
-    assert found.parameters[0] / found.parameters[1] == pytest.approx(1.01, rel=1e-12)
-
-
-def test_projection_and_derivatives_are_opencvs_with_y_up() -> None:
-    values = np.array([24.0, 24.1, 0.05, -0.03, -0.2, 0.05, 1e-3, -5e-4, 0.01, *np.zeros(9)])
-    rays = np.array([[0.3, 0.2], [-0.1, 0.25]])
-    xy, by_values = project(values, rays)
-    x, y = rays[0, 0], -rays[0, 1]
-    down, _ = cv2.projectPoints(
-        np.array([[x, y, 1.0]]),
-        np.zeros(3),
-        np.zeros(3),
-        np.array([[24.0, 0, 0.05], [0, 24.1, 0.03], [0, 0, 1]]),
-        values[4:9],
-    )
-    np.testing.assert_allclose(xy[0], down.ravel() * [1.0, -1.0], atol=1e-12)
-    for column in range(9):
-        step = np.zeros(len(NAMES))
-        step[column] = 1e-6
-        numeric = (project(values + step, rays)[0] - project(values - step, rays)[0]) / 2e-6
-        np.testing.assert_allclose(by_values[..., column], numeric, atol=1e-6)
-
-
-def test_jacobian_of_the_refit_is_the_series_derivative_for_a_weak_lens() -> None:
-    lens = torlegard(k3=1e-6)
-    steps = [0.0, 0.0, 0.0, 1e-8, 0, 0, 0, 1e-8, 0, 0]
-    jacobian = refit_jacobian(
-        Distortion("torlegard"), INTERIOR, lens, steps[:10], image_grid(FRAME_MM), RADIAL_TANGENTIAL, started()
-    )
-    assert jacobian[NAMES.index("k1"), 3] == pytest.approx(C_MM**2, rel=1e-2)
-    assert jacobian[NAMES.index("p2"), 6] == 0.0
-    assert jacobian[NAMES.index("p1"), 7] == pytest.approx(-C_MM, rel=1e-2)
-    assert (jacobian[:, :3] == 0.0).all()
+    assert Freedom(("fx", "cx", "cy")).distortion == ()
+    assert Freedom(("fx", "fy", "cx", "cy", "alpha")).distortion == ("b1", "b2")
+    assert Freedom(("fx", "fy")).held == ("x0", "y0")
