@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause, Covariance
+from measure.fitting.alike_marks import taken_out_of
 from measure.fitting.border_search import is_overwhelming, likely_border
 from measure.fitting.bordered_model import BorderedModel
 from measure.fitting.clipping import Sides, clear_of_ends
@@ -305,7 +306,8 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
     if not fit.reason:
         patches = blank_patches(about.grey, about.free, noise.variance_dn2)
         if not noise.is_white or is_coloured(patches):
-            noise = grain_model(model.residuals, used, model.design, noise.neighbour_correlation, patches)
+            taken = taken_out_of(fit, used)
+            noise = grain_model(model.residuals, used, taken, noise.neighbour_correlation, patches)
         precision = _weighed(fit, used, noise, about)
     state, covariance = model.state, precision.covariance
     return Match(

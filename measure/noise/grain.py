@@ -11,7 +11,7 @@ alone, and more of it than the window holds.
 """
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -79,21 +79,21 @@ def _squares(image: Array | Mask) -> Array:
 
 
 def grain_model(
-    residuals: Array, used: Mask, design: Array, neighbour_correlation: float, blank: Array | None = None
+    residuals: Array, used: Mask, taken: Array, neighbour_correlation: float, blank: Array | None = None
 ) -> NoiseModel:
     """The noise model, a sum of white noise and grains, whose residuals after the fit are most like the ones there are.
 
-    residuals (height, width), where used; design (unknowns, height, width): derivatives by the unknowns of the fit.
+    residuals (height, width), where used; taken: what the fit takes out of the noise, as `taken_out` gives it.
     blank (n, PATCH_PX, PATCH_PX): patches of blank film less a plane.
     """
-    window = _Window(used, design, _FARTHEST_PX)
+    window = _Pixels(used, _FARTHEST_PX)
     left = window.products(np.where(used, residuals, 0.0)[None]) * window.weights
-    expected = window.expected * window.weights
+    expected = window.expected(taken) * window.weights
     if blank is not None and len(blank) > 0:
-        patch, count = _patch(), len(blank)
+        (patch, of_patch), count = _patch(), len(blank)
         weights = patch.weights / np.sqrt(count)
         left = np.concatenate([left, patch.products(blank) * weights])
-        expected = np.concatenate([expected, patch.expected * weights * count], axis=1)
+        expected = np.concatenate([expected, of_patch * weights * count], axis=1)
     shares, _ = nnls(expected.T, left)
     lags = np.tensordot(shares, _KERNELS, axes=1)
     variance = float(lags[_HERE, _HERE])
@@ -111,19 +111,38 @@ def _kernel(grain_px: float | None) -> Array:
     return np.asarray(squared == 0, float) if grain_px is None else np.exp(-squared / (4.0 * grain_px**2))
 
 
-class _Window:
-    """The pixels of a fit and what it takes out of the noise there; sums over all pairs of pixels so far apart."""
+def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> Array:
+    """(1 + grains, distances) what a fit takes out of the sums of products of pixels so far apart, up to farthest_px,
+    that white noise and noise of each grain make at unit variance. used (height, width); design (unknowns, height,
+    width): derivatives by its unknowns.
 
-    def __init__(self, used: Mask, design: Array, farthest_px: float) -> None:
-        """used (height, width); design (unknowns, height, width): derivatives."""
+    The fit leaves M C M of a covariance matrix C, with M = I - Q Q'. Summed over pixels so far apart, by D, that
+    is tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q): the last two are sums of products of Q's columns, lag by lag,
+    times the autocorrelation at that lag, whatever it is.
+    """
+    rings, border, seen = _rings(farthest_px), int(farthest_px), design[:, used]
+    within = np.pad(used, border)
+    base = np.zeros((len(design), *within.shape), np.float32)
+    orthonormal = to_orthonormal(seen @ seen.T)
+    base[: len(orthonormal), within] = orthonormal @ seen
+    shape, index = padded(within.shape, REACH_PX), np.arange(-REACH_PX, REACH_PX + 1)
+    spectra = np.conj(fft.rfft2(base, s=shape))
+    flat, counted = base.reshape(len(base), -1), within.ravel().astype(np.float32)
+    taken = []
+    for ring in rings:
+        beside = ring.sums(flat, within.shape[1]) * counted
+        beside = (flat @ beside.T) @ flat - 2 * beside
+        lags = fft.irfft2((spectra * fft.rfft2(beside.reshape(base.shape), s=shape)).sum(axis=0), s=shape)
+        taken.append(_KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel())
+    return np.stack(taken, axis=1)
+
+
+class _Pixels:
+    """The pixels of a fit (height, width), and sums over all pairs of them so far apart."""
+
+    def __init__(self, used: Mask, farthest_px: float) -> None:
         self.rings = _rings(farthest_px)
-        border = int(farthest_px)
-        self.used = np.pad(used, border)
-        seen = design[:, used]
-        base = to_orthonormal(seen @ seen.T) @ seen
-        self.taken = np.zeros((len(base), *self.used.shape), np.float32)
-        self.taken[:, self.used] = base
-        self.pairs = self.products(self.used[None])
+        self.pairs = self.products(used[None])
         self.weights = 1.0 / np.sqrt(np.maximum(self.pairs, 1.0))
 
     def products(self, images: Array | Mask) -> Array:
@@ -132,26 +151,11 @@ class _Window:
         lags = fft.irfft2((np.abs(fft.rfft2(images.astype(np.float32), s=shape)) ** 2).sum(axis=0), s=shape)
         return np.array([lags[ring.index].sum() for ring in self.rings])
 
-    @cached_property
-    def expected(self) -> Array:
-        """(1 + grains, distances) what white noise and noise of each grain leave of these sums, at unit variance.
-
-        The fit leaves M C M of a covariance matrix C, with M = I - Q Q'. Summed over pixels so far apart, by D, that
-        is tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q): the last two are sums of products of Q's columns, lag by lag,
-        times the autocorrelation at that lag, whatever it is.
-        """
-        shape = padded(self.used.shape, REACH_PX)
-        spectra = np.conj(fft.rfft2(self.taken, s=shape))
-        index = np.arange(-REACH_PX, REACH_PX + 1)
-        taken, used = self.taken.reshape(len(self.taken), -1), self.used.ravel().astype(np.float32)
-        left = []
-        for ring, pairs in zip(self.rings, self.pairs, strict=True):
-            beside = ring.sums(taken, self.used.shape[1]) * used
-            beside = (taken @ beside.T) @ taken - 2 * beside
-            lags = fft.irfft2((spectra * fft.rfft2(beside.reshape(self.taken.shape), s=shape)).sum(axis=0), s=shape)
-            less = _KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel()
-            left.append(pairs * _KERNELS[:, _HERE + ring.lags[0][0], _HERE + ring.lags[0][1]] + less)
-        return np.stack(left, axis=1)
+    def expected(self, taken: Array) -> Array:
+        """(1 + grains, distances) what white noise and noise of each grain make of these sums, at unit variance, less
+        what a fit takes out."""
+        lags = np.array([ring.lags[0] for ring in self.rings]).T + _HERE
+        return np.asarray(self.pairs * _KERNELS[:, *lags] + taken)
 
 
 @dataclass(frozen=True)
@@ -186,9 +190,11 @@ def _rings(farthest_px: float) -> list[_Ring]:
 
 
 @cache
-def _patch() -> _Window:
+def _patch() -> tuple[_Pixels, Array]:
+    """A patch of blank film, and what noise leaves there less a plane."""
     whole = np.ones((PATCH_PX, PATCH_PX), dtype=bool)
-    return _Window(whole, PLANE.T.reshape(-1, PATCH_PX, PATCH_PX), _FARTHEST_BLANK_PX)
+    pixels = _Pixels(whole, _FARTHEST_BLANK_PX)
+    return pixels, pixels.expected(taken_out(whole, PLANE.T.reshape(-1, PATCH_PX, PATCH_PX), _FARTHEST_BLANK_PX))
 
 
 _KERNELS = np.stack([_kernel(grain_px) for grain_px in (None, *GRAIN_PX)])
