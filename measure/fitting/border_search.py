@@ -80,16 +80,16 @@ class _Search:
         self.blur_px = model.seen_blur_px
         self.soft_px = np.sqrt(2 * np.pi) * self.blur_px
         side_px = max(round(self.soft_px), 1)
-        self._squares(rows // side_px * used.shape[1] + cols // side_px)
+        self._squares(rows // side_px * (used.shape[1] // side_px + 1) + cols // side_px)
 
     def _squares(self, square: NDArray[np.intp]) -> None:
         """Sum up the pixels, of which each lies in a square of that number: an orthonormal base of the design and what
         this leaves, both times the picture, and the picture's powers."""
-        _, square = np.unique(square, return_inverse=True)
         of_pixels = csr_array((np.ones(len(square)), square, np.arange(len(square) + 1))).T
         both = np.concatenate([self.design, self.left[None]])
         powers = np.stack([np.ones_like(self.shown), self.shown, self.shown**2])
         sums = of_pixels @ np.concatenate([both, both * self.shown, powers, self.place]).T
+        sums = sums[sums[:, -_POWERS - 2] > 0]
         by_unknown, by_change = (sums[:, at : at + len(self.design)] @ self.orthonormal.T for at in (0, len(both)))
         left, left_by_change = (sums[:, [at]] for at in (len(self.design), 2 * len(both) - 1))
         powers, place = sums[:, -_POWERS - 2 : -2], sums[:, -2:]
