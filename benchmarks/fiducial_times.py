@@ -1,0 +1,101 @@
+"""What measuring the fiducials of one scan takes of the processor.
+
+    python benchmarks/fiducial_times.py [--size 11500] [--rounds 5]
+
+A large scan with eight marks, 16 bit in LZW tiles, as `large_scans` renders it; one of an archive, 2400 px, as
+`archive_real` draws it, in light and with its tone curve not known; and a small frame of four marks in a pose that is
+not known. Each is measured in a process of its own with one thread, which has imported everything: for the first time,
+and then again, the least of the rounds. Beside them one decode of the large scan, and `reseau measure` on it.
+"""
+
+import argparse
+import multiprocessing
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import cv2
+import tifffile
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "measure"))
+
+import numpy as np
+from archive_real import draw
+from drawn_frames import NUMBERED, PITCH_UM, frame_picture, pixel_from_camera
+from large_scans import FRAME_MM, Storage, rendered
+
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.marks.shapes import FiducialLayout
+from measure.scans.scan import open_scan
+from measure.scans.tone import LINEAR, Tone
+from pipeline.files.camera_file import read_camera
+
+_COMMAND = "from pipeline.main import main; main()"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", type=int, default=11500, help="of the large scan, px")
+    parser.add_argument("--rounds", type=int, default=5)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        large = rendered(folder, options.size)
+        path = folder / "frame" / "scans" / "frame.tif"
+        Storage(16, "lzw", "tiles").write(large.grey, path)
+        draw(folder / "archive", 1, 2400)
+        archive, small = folder / "archive" / "scans" / "box00" / "0000.tif", folder / "small.tif"
+        grey = frame_picture(NUMBERED, pixel_from_camera("90m"))
+        tifffile.imwrite(small, np.clip(np.rint(grey), 0, 65535).astype(np.uint16))
+        layout, pitch_um = read_camera(folder / "archive" / "camera.toml").layout(), 1000 * FRAME_MM / options.size
+        print("scan | measured for the first time, s | again, s")
+        for name, given in {
+            f"{options.size} px, eight marks": (path, large.layout, pitch_um, "auto", LINEAR),
+            "2400 px, eight marks": (archive, layout, 20.0, "0", LINEAR),
+            "the same, its curve not known": (archive, layout, 20.0, "0", Tone.unknown()),
+            "400 px, four marks": (small, NUMBERED, PITCH_UM, "auto", LINEAR),
+        }.items():
+            with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
+                first, *again = process.submit(_spent_s, options.rounds, *given).result()
+            print(f"{name} | {first:.3f} | {min(again):.3f}", flush=True)
+        decode_s = min(_processor_s(lambda: tifffile.imread(path)) for _ in range(options.rounds))
+        print(f"decoded whole | | {decode_s:.2f}", flush=True)
+        print(f"reseau measure | {_command_s(folder / 'frame' / 'project.toml'):.2f} |")
+
+
+def _spent_s(
+    rounds: int, path: Path, layout: FiducialLayout, pitch_um: float, pose: str, tone: Tone
+) -> tuple[float, ...]:
+    cv2.setNumThreads(1)
+
+    def measured() -> None:
+        with open_scan(path) as scan:
+            measure_fiducials(scan.seen_through(tone), layout, (pitch_um, pitch_um), FiducialOptions(pose=pose))
+
+    return tuple(_processor_s(measured) for _ in range(1 + rounds))
+
+
+def _processor_s(function: Callable[[], object]) -> float:
+    start_s = time.process_time()
+    function()
+    return time.process_time() - start_s
+
+
+def _command_s(project: Path) -> float:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-c", _COMMAND, "measure", str(project), "--workers", "1"]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+if __name__ == "__main__":
+    main()
