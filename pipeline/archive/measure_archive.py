@@ -47,12 +47,12 @@ def measure_archive(
     if options.retry:
         store.forget_failed()
     with executor_of(project, options) as executor, ThumbnailStore.beside(store.path) as thumbnails:
+        if options.moved:
+            thumbnails.rekey(find_moved(store, project, reporter))
         work = Work(project, store, executor, options, thumbnails)
         learned = learn_marks(project, reporter, work.measure, executor, learned_folder, store)
         tasks = scan_tasks(learned, names, said_of_tones(learned, reporter, work.measure, store))
         tasks, _ = with_known_lines(tasks, work.measure, reporter)
-        if options.moved:
-            thumbnails.rekey(find_moved(store, tasks, work, reporter))
         store.set_project({work.state(task).uri: task.name for task in tasks})
         if options.shard is not None:
             part, parts = options.shard

@@ -4,39 +4,38 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 from measure.scans.addresses import scan_path
-from pipeline.archive.file_state import Identity
+from pipeline.archive.file_state import FileStates, Identity
 from pipeline.archive.identity import content_hash, parts_hash
 from pipeline.archive.store import Store
 from pipeline.archive.work import Work
+from pipeline.files.project_file import Project
+from pipeline.files.scan_files import as_named
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 
 
-def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> dict[str, str]:
+def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, str]:
     """Give files that the store does not know as they are the results of those whose whole content they have, and say
     what fingerprints these have now, by the earlier ones. Only results count whose content was hashed: an earlier call
     with `--moved` did that."""
-    known = store.identities()
+    known, files = store.identities(), FileStates(project.path.resolve().parent)
     by_size = defaultdict[int, dict[str, str]](dict)
     for uri, content in store.content_hashes().items():
         by_size[known[uri].state.bytes][content] = uri
-    unknown = [
-        task
-        for task in tasks
-        if task.scan and work.state(task) != getattr(known.get(work.state(task).uri), "state", None)
-    ]
-    taken = {work.state(task).uri for task in tasks} - {work.state(task).uri for task in unknown}
+    states = {name: files.of(file) for name, file in as_named(project.scans).items()}
+    unknown = {name: state for name, state in states.items() if state != getattr(known.get(state.uri), "state", None)}
+    taken = {state.uri for name, state in states.items() if name not in unknown}
     found, keys = 0, dict[str, str]()
     with reporter.stage("looked for in the store") as count:
-        for done, task in enumerate(unknown, 1):
-            count(task.name, done, len(unknown))
-            state = work.state(task)
+        for done, (name, state) in enumerate(unknown.items(), 1):
+            count(name, done, len(unknown))
             if not by_size.get(state.bytes):
                 continue
-            content = content_hash(scan_path(task.scan))
+            path = project.scans[name]
+            content = content_hash(path)
             uri = by_size[state.bytes].get(content, "")
             if content and uri and uri not in taken:
-                keys |= store.move(uri, Identity(state, parts_hash(scan_path(task.scan), task.max_pixels)))
+                keys |= store.move(uri, Identity(state, parts_hash(path, project.max_pixels)))
                 taken.add(state.uri)
                 del by_size[state.bytes][content]
                 found += 1
@@ -44,7 +43,6 @@ def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Re
         reporter.say(
             f"{found} of {len(unknown)} files that are new or changed have the content of ones that are measured"
         )
-    work.refresh()
     return keys
 
 

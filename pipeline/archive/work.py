@@ -108,10 +108,6 @@ class Work:
         of_row = {row: key for key, row in self._rows.items()}
         return {name: of_row[row] for name, row in self.results.items()}
 
-    def refresh(self) -> None:
-        """Know what the store holds now."""
-        self._identities, self._rows = self._store.identities(), self._store.fingerprints()
-
     def state(self, task: ScanTask) -> FileState:
         """Of the task's file, as it was when it was first asked for."""
         if task.scan not in self._states or not task.scan:

@@ -23,7 +23,7 @@ from pipeline.cli import run
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import read_project
 from pipeline.measuring.checked import CheckedScan, checked
-from pipeline.measuring.scan_task import ScanTask
+from pipeline.measuring.scan_task import Measure, ScanTask
 from pipeline.results.measured_scan import MeasuredScan
 
 SAID = pytest.CaptureFixture[str]
@@ -154,7 +154,14 @@ def test_a_project_that_is_moved_as_a_whole_keeps_its_results(folder: Path, tmp_
     assert marks(tmp_path / "elsewhere") == before
 
 
-def test_moved_and_touched_files_are_known_by_their_content_where_that_is_asked(folder: Path) -> None:
+def test_moved_and_touched_files_are_known_by_their_content_where_that_is_asked(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asks_first(tasks: Sequence[ScanTask], measure: Measure, _: Any) -> Any:
+        """A step that has scans measured before all others, as that which reads a roll's first frames."""
+        return tasks, {scan.frame.image: scan for scan in measure(tasks)}
+
+    monkeypatch.setattr("pipeline.archive.measure_archive.with_known_lines", asks_first)
     measure(folder, "--moved")  # hashes whole files
     assert not measured
     os.utime(folder / "a.tif", ns=(1, 1))
