@@ -30,6 +30,7 @@ _MOST_CONTRAST = (
 _SURE = 3.0  # standard deviations
 _SOLID_MARGIN_PX = 7.0  # of ground: with 6 a sharp dot loses a hundredth and a notch two, and they cost little
 _SOLID_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
+_DRAWN_SIGMA = 0.04  # of a drawing that is true in part only: its angles (rad) and sizes are as good as film shows them
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +162,8 @@ def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) ->
         return options
     if frame_sigma is None:
         return replace(options, freedom="shift")
-    return replace(options, freedom="affine", linear_sigma=frame_sigma)
+    in_part = isinstance(mark, MarkShape) and mark.true_mm is not None
+    return replace(options, freedom="affine", linear_sigma=np.hypot(frame_sigma, _DRAWN_SIGMA if in_part else 0.0))
 
 
 def _is_solid(mark: Mark) -> bool:

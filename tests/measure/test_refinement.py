@@ -9,7 +9,7 @@ from drawn import scan_of
 
 from measure.fitting.matching import MatchOptions, match
 from measure.fitting.scan_window import ScanWindow
-from measure.frames.refinement import sight, strained_px
+from measure.frames.refinement import options_for, sight, strained_px
 from measure.marks.shapes import MarkShape, cross, polygon
 from measure.search.prediction import MarkPrediction
 
@@ -48,3 +48,19 @@ def test_a_slim_wedge_that_looks_like_itself_along_its_edges_is_followed_to_its_
         expected, pixel_from_mark=np.column_stack([true[:, :2], true[:, 2] - (14.0 * np.sign(along_px), 0.0)])
     )
     assert sight(scan, far, MatchOptions()).fit is None
+
+
+def test_the_flanks_of_a_drawing_that_is_true_in_part_lie_as_the_film_shows_them() -> None:
+    """Real notches of one camera are turned by two degrees against one another, however well the frame lies."""
+    turn = np.array([[np.cos(0.04), -np.sin(0.04)], [np.sin(0.04), np.cos(0.04)]])
+    true = np.column_stack([turn @ START[:, :2], START[:, 2]])
+    grey = 100.0 + 100.0 * brute_picture(WING, true, 81, 81, 1.0)
+    grey += np.random.default_rng(1).normal(0.0, 2.0, grey.shape)
+    in_part = replace(WING, true_mm=((-1.0, -1.0), (0.75, 1.0)))
+    off = {}
+    for mark in (WING, in_part):
+        fit = match(ScanWindow(grey), mark, START, options_for(mark, MatchOptions(), 1e-4))
+        error = fit.center_px - true[:, 2]
+        off[mark] = float(np.sqrt(error @ np.linalg.solve(fit.covariance_px2, error)))
+    assert off[WING] > 10.0
+    assert off[in_part] < 3.0
