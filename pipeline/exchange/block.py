@@ -192,7 +192,7 @@ class Block:
         if not any(self.oriented()):
             raise InputError(
                 f"{format} is for oriented images, and {self.project.adjustment_path} has none. Run `reseau adjust` "
-                "first."
+                "first, with object points that the images show, or `reseau block`."
             )
 
 

@@ -77,7 +77,9 @@ def _camera_files(block: Block, camera: str, frames: Sequence[OutFrame], options
         files[f"Ori-InterneScan/MeasuresIm-{frame.file_name}.xml"] = xml_text(lines)
     oriented = [frame for frame in (usable if fiducials else frames) if frame.is_oriented]
     if not oriented:
-        return Written(files, notes=_no_orientation(camera), left_out=tuple(left_out))
+        has_frame = bool(usable) and block.camera_file(camera).frame_mm is not None
+        command = (_resampling(camera, box_of(block, usable[0], options)),) if has_frame else ()
+        return Written(files, notes=(*command, *_no_orientation(camera)), left_out=tuple(left_out))
     lens = sheared_lens(block, oriented[0], at_ideal=True)
     box = box_of(block, oriented[0], options) if fiducials else picture_box(block, oriented[0])
     reech = _REECH if fiducials else ""
@@ -214,16 +216,20 @@ def _notes(
     fitted = f"{camera}: the lens was fitted over the frame: it is off by {misfit_px:.2g} px at most."
     if not fiducials:
         return (fitted,)
-    right, bottom = box.x_mm + box.width_px * box.pitch_mm, box.y_mm - box.height_px * box.pitch_mm
-    corners = ",".join(f"{value:.{_DIGITS}g}" for value in (box.x_mm, -box.y_mm, right, -bottom))
     beside = {frame.image: affine_misfit_px(frame, fiducials, box) for frame in frames}
     worst = max(beside, key=lambda image: beside[image])
     own = (
         f"MicMac fits its affine transformation without weights: in image {worst} it lies up to {beside[worst]:.2g} px "
         "beside the adjusted one."
     )
+    return (_resampling(camera, box), fitted, own)
+
+
+def _resampling(camera: str, box: Canvas) -> str:
+    right, bottom = box.x_mm + box.width_px * box.pitch_mm, box.y_mm - box.height_px * box.pitch_mm
+    corners = ",".join(f"{value:.{_DIGITS}g}" for value in (box.x_mm, -box.y_mm, right, -bottom))
     command = f'mm3d ReSampFid ".*tif" {box.pitch_mm:.{_DIGITS}g} BoxCh=[{corners}]'
-    return (f"{camera}: {command} makes the frames of Ori-Reseau.", fitted, own)
+    return f"{camera}: {command} makes the frames; name your scans in the place of .*tif."
 
 
 def affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canvas) -> float:
@@ -240,7 +246,7 @@ def affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canva
 
 
 def _no_orientation(camera: str) -> tuple[str, ...]:
-    return (f"{camera}: no image is oriented, so there are marks only: run `reseau adjust` for camera and poses.",)
+    return (f"{camera}: no image is oriented, so there are marks only: camera and poses come by object points.",)
 
 
 def _file_word(name: str) -> str:

@@ -410,6 +410,7 @@ def test_without_an_adjustment_the_marks_go_out(tmp_path: Path, capsys: pytest.C
     folder = exported(project, "micmac", tmp_path)
     assert not (folder / "Ori-Reseau").exists()
     assert len(list((folder / "Ori-InterneScan").iterdir())) == 5
+    assert "0.1 BoxCh=[-114,-114,114,114]" in (folder / "README.txt").read_text(encoding="utf-8")
     assert sorted(path.name for path in exported(project, "csv", tmp_path).iterdir()) == ["README.txt", "marks.csv"]
     capsys.readouterr()
     assert run(["export", str(project), "colmap", str(tmp_path / "c")]) == WRONG_INPUT
