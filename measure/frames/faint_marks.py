@@ -18,7 +18,7 @@ from measure.fitting.matching import Match
 from measure.fitting.scan_window import Coding
 from measure.marks.rendering import extent_px, picture
 from measure.reason import NO_REASON
-from measure.scans.scan import Scan
+from measure.scans.scan import Scan, means
 from measure.search.candidates import FAINT, detail_px
 from measure.search.prediction import MarkPrediction
 
@@ -37,6 +37,7 @@ _AGAIN_PX = 1.5  # about the place where it was found, for that
 _VERTEX_PX = 0.7  # of a paraboloid's top from the highest pixel, along either axis
 _LEAST_DISTANCE_PX = 1.0  # predictions are no better
 _LEAST_PLACES = 200  # of the texture that a covariance can be taken from
+_FINEST_PX = 16.0  # of a mark's lines: what is wider is sought in a picture that is reduced so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +80,9 @@ def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px:
 def _found(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
     """By the scan's one curve."""
     field = _Field(scan, expected, extreme_dn)
-    center, reach_px = expected.center_px - field.origin, expected.search_px
+    center, reach_px = field.predicted, expected.search_px / field.step
     for _ in range(_ROUNDS):
-        response = field.response(center, blur_px)
+        response = field.response(center, blur_px / field.step)
         place = response.highest(center, reach_px)
         if place is None:
             return None
@@ -114,19 +115,21 @@ class _Response:
 
 
 class _Field:
-    """The window about a predicted place, freed of everything coarser than the mark's lines."""
+    """The window about a predicted place, freed of everything coarser than the mark's lines, step pixels of the scan to
+    one of its own, in which all its places are."""
 
     def __init__(self, scan: Scan, expected: MarkPrediction, extreme_dn: float) -> None:
-        self.mark, self.linear, self.polarity = expected.mark, expected.linear, expected.polarity
-        self.predicted = expected.center_px
+        self.step = step = max(1, int(detail_px(expected.mark, expected.linear) / _FINEST_PX))
+        self.mark, self.linear, self.polarity = expected.mark, expected.linear / step, expected.polarity
         self.coarse_px = _BACKGROUND * detail_px(self.mark, self.linear)
         least, greatest = extent_px(self.mark, np.column_stack([self.linear, np.zeros(2)]))
         self.half = int(np.ceil(max(-least.min(), greatest.max()) + 2 * self.coarse_px)) + 1
-        side = self.half + int(np.ceil(max(expected.search_px, _RING)))
-        first = np.floor(self.predicted).astype(int) - side
-        self.origin = first.astype(float)
-        window = (int(first[0]), int(first[1]), 2 * side + 1, 2 * side + 1)
-        light = scan.light(*window, expected.weights)
+        side = self.half + int(np.ceil(max(expected.search_px / step, _RING)))
+        first = np.floor(expected.center_px).astype(int) - side * step - step // 2
+        self.origin = first + (step - 1) / 2
+        self.predicted = (expected.center_px - self.origin) / step
+        window = (int(first[0]), int(first[1]), *((2 * side + 1) * step,) * 2)
+        light = _reduced(scan.light(*window, expected.weights), step)
         self.coding = Coding(None, scan.tone, scan.full_scale_dn)
         self.ground_dn = ground = np.asarray(cv2.GaussianBlur(light, (0, 0), self.coarse_px), np.float32)
         detail = light - ground
@@ -135,7 +138,8 @@ class _Field:
         self.texture_dn: Array = np.sqrt(spread + least_dn**2)
         extreme = float(scan.tone.light(np.array(extreme_dn), scan.full_scale_dn))
         room_dn = np.maximum(self.polarity * (extreme - ground), 0.0)
-        self.room_dn = np.where(scan.inside(*window), room_dn, 0.0).astype(np.float32)
+        inside = _reduced(scan.inside(*window).astype(np.float32), step) == 1.0
+        self.room_dn = np.where(inside, room_dn, 0.0).astype(np.float32)
         self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
         self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
 
@@ -164,8 +168,8 @@ class _Field:
         by_row, by_col = (np.gradient(response.value, axis=axis) for axis in (0, 1))
         slopes = np.asarray(np.cov(np.stack([by_col[texture], by_row[texture]])), dtype=float)
         scatter = float(np.sqrt(np.mean(response.value[texture] ** 2)))
-        inverse, place = np.linalg.inv(bend), center + self.origin
-        distance_px = float(np.hypot(*(place - self.predicted)))
+        inverse, place = np.linalg.inv(bend) * self.step, center * self.step + self.origin
+        distance_px = float(np.hypot(*(center - self.predicted)))
         lines = np.abs(response.template)
         lit = lines * self.room[patch]
         contrast_dn = self.polarity * amplitude * float(np.average(self.room_dn[patch], weights=lit))
@@ -174,7 +178,7 @@ class _Field:
             reason=NO_REASON,
             center_px=place,
             place_covariance=Covariance.of_noise(inverse @ slopes @ inverse),
-            pixel_from_mark=np.column_stack([self.linear, place]),
+            pixel_from_mark=np.column_stack([self.linear * self.step, place]),
             contrast_dn=contrast_dn,
             stored_contrast_dn=self.coding.stored_contrast_dn(
                 float(np.average(self.ground_dn[patch], weights=lit)), contrast_dn
@@ -199,6 +203,10 @@ class _Field:
         whole[self.half : -self.half, self.half : -self.half] = True
         alone = np.abs(signal) < _SELF * signal[place]
         return np.asarray(near & whole & alone & (response.norm > _SHOWN * response.norm[place]))
+
+
+def _reduced(picture: NDArray[np.floating], step: int) -> NDArray[np.floating]:
+    return picture if step == 1 else np.asarray(means(picture[..., None], step)[..., 0])
 
 
 def _chance(strength: float, slopes: Array, radius_px: float) -> float:

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from measure.covariance import Cause
 from measure.frames.faint_marks import FaintMark, find_faint
-from measure.marks.shapes import MarkShape, cross
+from measure.marks.shapes import MarkShape, cross, dot
 from measure.scans.tone import Tone, power
 from measure.search.prediction import MarkPrediction
 
@@ -52,6 +52,24 @@ def test_a_cross_of_the_grounds_own_contrast_is_measured_with_an_honest_sigma(tm
             error = found.fit.center_px - place
             squares.append(float(error @ np.linalg.solve(found.fit.covariance_px2, error)) / 2)
     assert 0.7 < float(np.sqrt(np.mean(squares))) < 1.4
+
+
+def test_a_mark_many_pixels_wide_is_sought_in_a_reduced_picture_with_an_honest_sigma(tmp_path: Path) -> None:
+    """A disk of 116 pixels, of half of the texture's contrast; at full size too little texture lies about it."""
+    wide, side_px, errors, squares = MarkShape(dot(1.6), "dark"), 801, [], []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        place, texture = 400 + rng.uniform(-3.0, 3.0, 2), gaussian_filter(rng.normal(0.0, 1.0, (side_px,) * 2), 1.0)
+        grey = 20000 + 2000 * texture / texture.std()
+        grey -= 1000 * brute_picture(wide, np.column_stack([LINEAR, place]), side_px, side_px, 0.7)
+        expected = MarkPrediction(wide, np.column_stack([LINEAR, [400.0, 400.0]]), 8.0, -1)
+        with written_scan(grey, tmp_path) as scan:
+            found = find_faint(scan, expected, 0.0, 0.7)
+        assert found is not None
+        errors.append(found.fit.center_px - place)
+        squares.append(float(errors[-1] @ np.linalg.solve(found.fit.covariance_px2, errors[-1])) / 2)
+    assert 0.5 < float(np.sqrt(np.mean(squares))) < 1.5
+    assert np.abs(np.mean(errors, axis=0)).max() < 3.0 * np.std(errors) / np.sqrt(len(errors))
 
 
 def test_bare_texture_answers_as_often_as_chance_says(tmp_path: Path) -> None:
