@@ -33,7 +33,7 @@ FRAME_BY_CHANCE = _limit(
 CAMERA_BY_CHANCE = _limit(
     0.01,
     "constellations that chance is expected to make as good",
-    "other pitches are tried before a camera is named",
+    "a camera is not named unless its marks in wrong places look half as much like themselves",
 )
 NOISE_LIKE_A_MARK = _limit(
     0.05, "noise as coarse as the window's answering as strongly as the best place", "nothing is matched there"

@@ -5,22 +5,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import comb
 
 from measure.fiducial_options import FiducialOptions
 from measure.fitting.matching import Match
+from measure.frames.first_look import seen as sight_of_mark
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import look_at_frame
+from measure.frames.frame_sighter import FrameSighter
 from measure.marks.shapes import FiducialLayout
 from measure.match_options import MatchOptions
-from measure.probabilities import CAMERA_BY_CHANCE
 from measure.scans.scan import Scan
 from measure.search.candidates import Effort
 from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis
 
-_COMPARED = 5  # best placements: the one that chance makes least is among them
-_QUICK = Effort(held_bytes=48 << 20, half_px=16)
+_COMPARED = 3  # best placements: the one that chance makes least is among them
+_FITTED, _BY_NOISE = 3, 1e-8  # marks, and how many constellations of so many noise is expected to make as good
+_QUICK = Effort(held_bytes=48 << 20, half_px=16, twins=False)
 _LOOKS = 3  # at the best of these
 _PLACES = 2  # that are looked at, each in the poses that answer there
 _LOOK = FiducialOptions(match=MatchOptions(damage_rounds=1))  # how a mark looks takes less than where it lies
@@ -29,26 +32,18 @@ _LOOK = FiducialOptions(match=MatchOptions(damage_rounds=1))  # how a mark looks
 @dataclass(frozen=True, eq=False)
 class Answer:
     """expected: how many constellations that answer as well as the scan's best one chance would find in a scan like it
-    without any frame of this camera, infinite where none answers. placements: those that chance makes least first."""
+    without any frame of this camera, infinite where none answers. placements: best first."""
 
     expected: float
     placements: tuple[Placement, ...]
 
 
-def answer(
-    scan: Scan, layout: FiducialLayout, hypotheses: Sequence[Sequence[PitchHypothesis]], tried: int = 0
-) -> Answer:
-    """How the scan answers to the constellation under groups of hypotheses about its pitch, a later one being tried
-    where chance may have made what answers to the earlier ones. tried: hypotheses that were tried before."""
-    search, ranked = FrameSearch(scan, layout, FiducialOptions(), effort=_QUICK), list[tuple[float, Placement]]()
-    for group in hypotheses:
-        tried += len(group)
-        found = search.within(group)[:_COMPARED]
-        ranked += [(tried * search.expected_alike(placement), placement) for placement in found]
-        ranked.sort(key=lambda each: each[0])
-        if ranked and ranked[0][0] <= CAMERA_BY_CHANCE:
-            break
-    return Answer(ranked[0][0] if ranked else np.inf, tuple(placement for _, placement in ranked))
+def answer(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int = 0) -> Answer:
+    """How the scan answers to the constellation under hypotheses about its pitch. tried: how many were before."""
+    search, tried = FrameSearch(scan, layout, FiducialOptions(), effort=_QUICK), tried + len(hypotheses)
+    found = search.within(hypotheses)[:_COMPARED]
+    expected = [tried * search.expected_alike(placement) for placement in found]
+    return Answer(min(expected, default=np.inf), tuple(found))
 
 
 def seen(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.0) -> Frame | None:
@@ -61,10 +56,23 @@ def seen(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.
             places.append(placement)
         if len(places) > _PLACES:
             break
-        frame = look_at_frame(scan, layout, _enlarged(placement, times), _LOOK)
-        if frame.accepted:
-            return frame
+        enlarged = _enlarged(placement, times)
+        if _may_be_there(scan, layout, enlarged):
+            frame = look_at_frame(scan, layout, enlarged, _LOOK)
+            if frame.accepted:
+                return frame
     return None
+
+
+def _may_be_there(scan: Scan, layout: FiducialLayout, placement: Placement) -> bool:
+    """Whether noise hardly makes three of the marks look like themselves as much as they do. A fit takes ten times as
+    long as to see that."""
+    sighter = FrameSighter(scan, layout, placement, _LOOK)
+    looks = [
+        sight_of_mark(scan, sighter.expected(index, sighter.first_search_px)) for index in range(len(layout.marks))
+    ]
+    chances = np.sort([1.0 if look is None else look[1] for look in looks])[:_FITTED]
+    return bool(comb(len(looks), len(chances)) * chances.prod() <= _BY_NOISE)
 
 
 def _enlarged(placement: Placement, times: float) -> Placement:

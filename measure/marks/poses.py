@@ -1,5 +1,7 @@
 """The eight ways a frame can lie in its scan: four quarter turns, with and without mirror."""
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,13 +10,16 @@ Array = NDArray[np.float64]
 POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
 
 
+@cache
 def up_from_camera(pose: str) -> Array:
     """(2, 2) turn, after a mirror if there is one, from the camera's (x', y') to the scan's (right, up)."""
     quarter = int(pose.removesuffix("m")) // 90
     c, s = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[quarter]
     turn = np.array([[c, -s], [s, c]])
     mirror = np.diag([-1.0 if pose.endswith("m") else 1.0, 1.0])
-    return np.asarray(turn @ mirror)
+    up = np.asarray(turn @ mirror)
+    up.flags.writeable = False  # it is everybody's
+    return up
 
 
 def pose_in_camera(seen: str, frame: str) -> str:

@@ -67,13 +67,16 @@ class Responses:
 @dataclass(frozen=True)
 class Effort:
     """How much a search takes. held_bytes: of correlations, at a time. half_px: how far about its point a cross is
-    drawn at most, in the reduced scan: where one arm is far longer the middle tells enough."""
+    drawn at most, in the reduced scan: where one arm is far longer the middle tells enough. twins: whether a pose that
+    shows the same marks in the same places as another has placements of its own."""
 
     held_bytes: int
     half_px: int
+    twins: bool
 
 
-FULL = Effort(held_bytes=768 << 20, half_px=1000)  # sixteen looks, of four marks that differ, in a large scan
+_SIXTEEN_LOOKS = 768 << 20  # bytes: of four marks that differ, in a large scan
+FULL = Effort(held_bytes=_SIXTEEN_LOOKS, half_px=1000, twins=True)
 
 
 @dataclass(frozen=True, eq=False)

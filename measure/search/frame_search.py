@@ -43,9 +43,11 @@ class _Answers:
 @dataclass(eq=False)
 class _Searched:
     """One hypothesis searched, in one pose after another. looks: by pose, the kind of response of every mark; found: by
-    pose, the placements; unlike: poses whose marks do not lie within the tolerance of another pose's before."""
+    pose, the placements, of twins of other poses only if twins says so; unlike: poses whose marks do not lie within the
+    tolerance of another pose's before."""
 
     search: PlacementSearch
+    twins: bool = True
     looks: dict[str, tuple[int, ...]] = field(default_factory=dict)
     found: dict[str, list[Placement]] = field(default_factory=dict)
     unlike: list[str] = field(default_factory=list)
@@ -57,7 +59,10 @@ class _Searched:
             next((name for name in self.found if self._same_picture(name, pose, own, within_mm)), "")
             for within_mm in (_TWIN * misfit_mm, misfit_mm)
         )
-        found = [place.posed(pose) for place in self.found[twin]] if twin else search.of_pose(pose, own)
+        if twin:
+            found = [place.posed(pose) for place in self.found[twin]] if self.twins else []
+        else:
+            found = search.of_pose(pose, own)
         self.looks[pose], self.found[pose] = own, found
         self.unlike += [] if like else [pose]
 
@@ -88,7 +93,7 @@ class FrameSearch:
         self._searched: dict[Pair, _Searched] = {}
         # Of reaches there are two for each of the looks of one pose.
         self._maps, self._reaches = Held[Map](2 * effort.held_bytes // 3), Held[Reach](effort.held_bytes // 3)
-        self._most_px = effort.half_px
+        self._effort = effort
 
     def anywhere(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements in the whole scan, of all poses asked for, best first."""
@@ -96,7 +101,7 @@ class FrameSearch:
         for drawn_mm, alike in groupby(hypotheses, _drawn_mm):
             if self._drawn is None or self._drawn[0] != drawn_mm:
                 looks = self._looks(drawn_mm)
-                answers = respond(self.scan, looks, self._signs, self.surroundings, self._maps, self._most_px)
+                answers = respond(self.scan, looks, self._signs, self.surroundings, self._maps, self._effort.half_px)
                 self._drawn = drawn_mm, self._answers(*answers)
             found += self._placements(list(alike), self._drawn[1])
         return _best_first(found)
@@ -118,7 +123,7 @@ class FrameSearch:
         ]
         expected_px = np.array([each[mark] for each, mark in zip(places, first, strict=True)])
         reach_px = beside_mm(self.layout) / max(mm)
-        responses, kind_of = respond_about(self.scan, looks, expected_px, reach_px, self._signs, self._most_px)
+        responses, kind_of = respond_about(self.scan, looks, expected_px, reach_px, self._signs, self._effort.half_px)
         answers = [
             (height, responses.scan_px(top) - expected_px[kind_of.index(kind)])
             for (kind, _), layer in layers_of(responses, self._reaches).items()
@@ -215,7 +220,7 @@ class FrameSearch:
             reduced = searched.search.responses.reduced_px(place)
             shares.append(searched.share(placement.pose, index, sign, reduced, tolerance_px))
             same_px = searched.search.layers[searched.looks[placement.pose][index], sign].within(tolerance_px).area_px
-        counts = np.arange(min(3, inside), len(shares) + 1)
+        counts = np.arange(max(min(3, inside), 1), len(shares) + 1)
         if len(counts) == 0:
             return np.inf
         likely = comb(inside, counts) * np.sort(shares)[counts - 1] ** counts
@@ -247,7 +252,7 @@ class FrameSearch:
         places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
         reach_px = reach_mm / max(drawn_mm)
         places_px = np.concatenate(places) + shift_px
-        about = respond_about(self.scan, looks, places_px, reach_px, self._signs, self._most_px)
+        about = respond_about(self.scan, looks, places_px, reach_px, self._signs, self._effort.half_px)
         return self._answers(*about)
 
     @property
@@ -267,7 +272,7 @@ class FrameSearch:
         marks, responses, look_of = self.layout.marks, answers.responses, answers.look_of
         rotation_rad, misfit_mm = float(np.deg2rad(self.options.rotation_deg)), self.options.search_mm(self.layout)
         tried = {
-            each.mm: _Searched(PlacementSearch(marks, responses, each.mm, bounds, answers.layers))
+            each.mm: _Searched(PlacementSearch(marks, responses, each.mm, bounds, answers.layers), self._effort.twins)
             for each in hypotheses
             for bounds in [Bounds(each.tolerance, rotation_rad, misfit_mm)]
         }

@@ -1,8 +1,9 @@
 """Which camera a scan is of: every camera whose marks are drawn is tried on it, at reduced size."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from measure.frames.camera_recognition import likeness
 from measure.frames.frame import Frame
 from measure.marks.frame_border import at_border
 from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.probabilities import CAMERA_BY_CHANCE
 from measure.scans.scan import Scan, open_scan
 from measure.scans.thumbnail import thumbnail
 from measure.writing.networks import networks
@@ -31,7 +33,6 @@ Names = tuple[str, ...]
 
 _PICTURE_PX = 2400  # of the scan as it is looked at: a tenth of a millimetre of aerial film, in which plates are read
 _FEW = 3  # of the answers while the pitch is sought: those that are tried at the pitch that each comes to
-_CERTAIN = 0.01  # constellations expected by chance: no mark need be matched in wrong places to know better
 _BY_CHANCE = 1.0  # constellation expected: chance may have made it
 _HOPELESS = 100.0  # likewise: so many answer as well that its marks need not be looked at
 _ODDS = 1000.0  # times what chance makes of another camera's marks: that one is seen, and not this
@@ -52,12 +53,9 @@ def identify(
     picture, times, its_pitch_um = _picture(path, max_pixels)
     given, search = its_pitch_um if pitch_um is None else (pitch_um, pitch_um), LayoutSearch(picture)
     layouts = {names: _as_seen(cameras[names[0]].layout()) for names in _alike(cameras)}
-    trials = list[Trial]()
+    pitch = None if given is None else (times * given[0], times * given[1])
     with reporter.stage("trying") as count:
-        if given is not None:
-            trials = _as_given(search, layouts, (times * given[0], times * given[1]), count)
-        if not any(trial.stands_out for trial in trials):
-            trials = _at_any_pitch(search, layouts, count)
+        trials = _first_that_stand_out(search, layouts, pitch, count)
     del search  # and the correlations that it holds
     sources = {name: camera.source for name, camera in cameras.items()}
     unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
@@ -92,24 +90,33 @@ def _plate(picture: Scan) -> dict[str, str]:
     return {} if reader is None else plate_of(read_writing(picture, reader))
 
 
-def _as_given(
-    search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float], count: Count
+def _first_that_stand_out(
+    search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float] | None, count: Count
 ) -> list[Trial]:
-    """The trials at the given pitch, or with pixels that are longer one way."""
+    """The trials at the given pitch; where none stands out, with pixels that are longer one way; where still none does,
+    at any pitch."""
+    if pitch_um is not None:
+        for at_pitch in (search.at_pitch, search.longer_one_way):
+            trials = _trials(search, _each(layouts, partial(at_pitch, pitch_um=pitch_um), count), count)
+            if any(trial.stands_out for trial in trials):
+                return trials
+    return _at_any_pitch(search, layouts, count)
+
+
+def _each(
+    layouts: Mapping[Names, FiducialLayout], tried: Callable[[FiducialLayout], Tried], count: Count
+) -> dict[Names, Tried]:
     tries = dict[Names, Tried]()
     for done, (names, layout) in enumerate(layouts.items()):
         count(f"the marks of {', '.join(names)}", done, 2 * len(layouts))
-        tries[names] = search.at_pitch(layout, pitch_um)
-    return _trials(search, tries, count)
+        tries[names] = tried(layout)
+    return tries
 
 
 def _at_any_pitch(search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count) -> list[Trial]:
     """The trials of a scan that the frame may fill: what its pixels then measure each layout says for itself, and those
     that answer best are tried at that pitch."""
-    tries = dict[Names, Tried]()
-    for done, (names, layout) in enumerate(layouts.items()):
-        count(f"at any pitch the marks of {', '.join(names)}", done, 2 * len(layouts))
-        tries[names] = search.at_any_pitch(layout)
+    tries = _each(layouts, search.at_any_pitch, count)
     least = sorted({each.answer.expected for each in tries.values()})[:_FEW]
     best = {names: search.refined(each) for names, each in tries.items() if each.answer.expected in least}
     return _trials(search, tries | best, count)
@@ -141,7 +148,7 @@ def _expected_at_most(seen: Trial, marks: int) -> float:
     """How many constellations chance may make of a layout of so many marks for it to be measured after a trial that
     stands out: where that is certain, the other has to be so, too. Where it has more marks, nine crosses of a lattice,
     say, answer to a lattice of nine; but chance makes nine so much more easily than twenty-five."""
-    most = _CERTAIN if seen.expected <= _CERTAIN else _BY_CHANCE
+    most = CAMERA_BY_CHANCE if seen.expected <= CAMERA_BY_CHANCE else _BY_CHANCE
     return min(most, _ODDS * seen.expected) if seen.found > marks else most
 
 
@@ -180,7 +187,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         likeness=float(np.mean([fit.likeness for fit in fits])) if fits else 0.0,
         snr=float(np.median([fit.snr for fit in fits])) if fits else 0.0,
         score=score,
-        chance=_score_by_chance(search, each) if score > close and expected > _CERTAIN else None,
+        chance=_score_by_chance(search, each) if score > close and expected > CAMERA_BY_CHANCE else None,
         residual_sigmas=None if residual is None else residual[0],
         residual_mm=None if residual is None else residual[1],
         reason="" if frame else "no three of its marks are seen where its constellation answers best",

@@ -14,7 +14,7 @@ from measure.scans.scan import Scan
 from measure.scans.thumbnail import thumbnail
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 
-Hypotheses = Sequence[Sequence[PitchHypothesis]]
+Hypotheses = Sequence[PitchHypothesis]
 
 _LARGEST_PX = 1600  # of what is searched: of aerial film a seventh of a millimetre, about as wide as fine lines
 _COARSE_PX = 1024  # the same while the pitch is sought: fine lines are half a pixel wide then
@@ -52,19 +52,27 @@ class LayoutSearch:
         self._known: list[Tried] = []
 
     def at_pitch(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
-        """At the scan's pitch, or with pixels that are longer one way."""
+        """At the scan's pitch."""
+        return self._as_given(layout, pitch_um, 0)
+
+    def longer_one_way(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
+        """With pixels that are longer one way than the other."""
+        return self._as_given(layout, pitch_um, 1)
+
+    def _as_given(self, layout: FiducialLayout, pitch_um: tuple[float, float], number: int) -> Tried:
+        """By one of the groups of hypotheses about a given pitch."""
         bold = _boldest(layout)
         picture = self._solid if all(_is_solid(mark) for mark in bold.marks) else self._fine
         times = self._scan.width_px / picture.width_px
         options = FiducialOptions(pitch_is_right=True)
-        hypotheses = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
-        return self._tried(_some(layout), bold, picture, hypotheses)
+        groups = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
+        return self._tried(_some(layout), bold, picture, groups[number], sum(map(len, groups[:number])))
 
     def at_any_pitch(self, layout: FiducialLayout) -> Tried:
         """Where the frame may fill the scan, its pixels being square."""
         bold = _boldest(layout)
         picture = self._coarse_solid if all(_is_solid(mark) for mark in bold.marks) else self._coarse
-        return self._tried(_some(layout), bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions())[:1])
+        return self._tried(_some(layout), bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions())[0])
 
     def refined(self, coarse: Tried) -> Tried:
         """At the pitch that the best answer came to, in a larger picture."""
@@ -74,7 +82,7 @@ class LayoutSearch:
         picture = self._solid if coarse.picture is self._coarse_solid else self._fine
         pitch_mm = coarse.picture.width_px / picture.width_px / float(np.sqrt(abs(np.linalg.det(linear))))
         hypothesis = PitchHypothesis((pitch_mm, pitch_mm), _PITCH_TOLERANCE, (pitch_mm, pitch_mm))
-        return self._tried(coarse.layout, coarse.bold, picture, [[hypothesis]], sum(map(len, coarse.hypotheses)))
+        return self._tried(coarse.layout, coarse.bold, picture, [hypothesis], len(coarse.hypotheses))
 
     def stretched(self, tried: Tried) -> Tried:
         """The same with marks in wrong places."""
