@@ -35,6 +35,11 @@ CAMERA_BY_CHANCE = _limit(
     "constellations that chance is expected to make as good",
     "a camera is not named unless its marks in wrong places look half as much like themselves",
 )
+CAMERA_BY_NOISE = _limit(
+    1e-8,
+    "triples of marks that noise is expected to make look as much like themselves",
+    "the marks of a camera are not matched there to tell whether it is the scan's",
+)
 NOISE_LIKE_A_MARK = _limit(
     0.05, "noise as coarse as the window's answering as strongly as the best place", "nothing is matched there"
 )

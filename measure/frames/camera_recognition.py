@@ -15,6 +15,7 @@ from measure.frames.frame_measurement import look_at_frame
 from measure.frames.frame_sighter import FrameSighter
 from measure.marks.shapes import FiducialLayout
 from measure.match_options import MatchOptions
+from measure.probabilities import CAMERA_BY_NOISE
 from measure.scans.scan import Scan
 from measure.search.candidates import Effort
 from measure.search.constellation import Placement
@@ -22,8 +23,8 @@ from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis
 
 _COMPARED = 3  # best placements: the one that chance makes least is among them
-_FITTED, _BY_NOISE = 3, 1e-8  # marks, and how many constellations of so many noise is expected to make as good
 _QUICK = Effort(held_bytes=48 << 20, half_px=16, twins=False)
+_AT_LEAST = 3  # marks that are seen of a frame
 _LOOKS = 3  # at the best of these
 _PLACES = 2  # that are looked at, each in the poses that answer there
 _LOOK = FiducialOptions(match=MatchOptions(damage_rounds=1))  # how a mark looks takes less than where it lies
@@ -71,8 +72,8 @@ def _may_be_there(scan: Scan, layout: FiducialLayout, placement: Placement) -> b
     looks = [
         sight_of_mark(scan, sighter.expected(index, sighter.first_search_px)) for index in range(len(layout.marks))
     ]
-    chances = np.sort([1.0 if look is None else look[1] for look in looks])[:_FITTED]
-    return bool(comb(len(looks), len(chances)) * chances.prod() <= _BY_NOISE)
+    chances = np.sort([1.0 if look is None else look[1] for look in looks])[:_AT_LEAST]
+    return bool(comb(len(looks), len(chances)) * chances.prod() <= CAMERA_BY_NOISE)
 
 
 def _enlarged(placement: Placement, times: float) -> Placement:

@@ -5,7 +5,7 @@ at two scales and cut out of a finer picture; each is read in the four ways in w
 it tells itself which way is right. Light letters on dark film are read as well as dark ones on light.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import get_args
 
@@ -34,17 +34,26 @@ _READ_WELL = 0.6  # the mean confidence of what need not be looked at again at a
 
 
 def read_writing(
-    scan: Scan, networks: Networks, frame_px: Array | None = None, about: tuple[Side, Array] | None = None
+    scan: Scan,
+    networks: Networks,
+    frame_px: Array | None = None,
+    about: tuple[Side, Array] | None = None,
+    enough: Callable[[Sequence[Line]], bool] = lambda _: False,
 ) -> tuple[Line, ...]:
     """The lines written on a scan, as they read from the face of the film from which most can be read, those first
     that say most.
 
     frame_px: (n, 2) column and row of the corners of the exposed frame; None where it is not known: then what stands
     along the edges of the scan is read. about: the side and the outline (n, 2) of a line, in px, where only what stands
-    about it is to be read."""
+    about it is to be read. enough: whether the lines of some sides say all that is asked: then no other is read."""
     places = [(side, None) for side in get_args(Side)] if about is None else [about]
-    strips = [_strip(scan, side, frame_px, outline_px) for side, outline_px in places]
-    return of_one_face([line for strip in strips if strip is not None for line in strip.lines(networks)])
+    lines = list[Line]()
+    for side, outline_px in places:
+        strip = _strip(scan, side, frame_px, outline_px)
+        lines += [] if strip is None else strip.lines(networks)
+        if enough(of_one_face(lines)):
+            break
+    return of_one_face(lines)
 
 
 @dataclass(frozen=True, eq=False)

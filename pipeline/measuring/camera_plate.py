@@ -19,6 +19,11 @@ def plate_of(lines: Sequence[Line]) -> dict[str, str]:
     return {name: next(iter(values)) for name, values in found.items() if len(values) == 1}
 
 
+def is_whole_plate(lines: Sequence[Line]) -> bool:
+    """Whether they say all that a plate says."""
+    return len(plate_of(lines)) == len(CAMERA)
+
+
 def contradictions(camera: CameraFile, plate: dict[str, str]) -> list[str]:
     """How a plate says that it is of another camera, a clause each."""
     told = []

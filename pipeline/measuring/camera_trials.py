@@ -23,7 +23,7 @@ from measure.writing.networks import networks
 from measure.writing.reading import read_writing
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_answer import CLOSE, Identification, Trial
-from pipeline.measuring.camera_plate import contradictions, plate_of
+from pipeline.measuring.camera_plate import contradictions, is_whole_plate, plate_of
 from pipeline.measuring.drawn_alike import drawn_alike
 from pipeline.measuring.layout_search import LayoutSearch, Tried, same_marks
 from pipeline.progress import Count, Reporter
@@ -87,7 +87,7 @@ def _as_seen(layout: FiducialLayout) -> FiducialLayout:
 def _plate(picture: Scan) -> dict[str, str]:
     """What the camera's own plate says in the scan, as far as anything is there that reads."""
     reader = networks()
-    return {} if reader is None else plate_of(read_writing(picture, reader))
+    return {} if reader is None else plate_of(read_writing(picture, reader, enough=is_whole_plate))
 
 
 def _first_that_stand_out(

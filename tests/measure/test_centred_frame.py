@@ -146,6 +146,8 @@ def test_a_frame_that_the_scan_holds_is_found_by_windows_as_by_the_whole(
         search = FrameSearch(scan, NUMBERED, FiducialOptions())
         found = search.within(hypothesis)[0]
         assert search.expected_alike(found) < 0.01
+        beside = np.add(found.pixel_from_camera, [[0.0, 0.0, 9999.0], [0.0, 0.0, 0.0]])
+        assert np.isinf(search.expected_alike(replace(found, pixel_from_camera=beside)))
     assert found.pose == whole.pose
     assert found.same_place(whole)
     assert np.hypot(*(found.pixel_from_camera - matrix)[:, 2]) < 3.0

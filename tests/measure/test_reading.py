@@ -67,6 +67,12 @@ def test_dark_letters_on_light_film_are_read_as_well(tmp_path: Path) -> None:
     assert (title.text.replace(" ", ""), title.pose) == (TITLE.replace(" ", ""), "0")
 
 
+def test_no_other_side_is_read_where_the_lines_of_some_are_enough(tmp_path: Path) -> None:
+    with written_scan(written_film(), tmp_path) as scan:
+        lines = read_writing(scan, required(), enough=lambda lines: len(lines) == 1)
+    assert len(lines) == 1
+
+
 def test_the_outline_lies_about_the_letters(tmp_path: Path) -> None:
     film = written_film()
     title, plate = read(film, tmp_path)

@@ -25,6 +25,7 @@ from pipeline.measuring import camera_trials
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.measuring.camera_trials import _alike, identify
 from pipeline.measuring.drawn_alike import drawn_alike
+from pipeline.measuring.layout_search import LayoutSearch
 from pipeline.progress import Reporter
 from pipeline.rendered.against_truth import compare_with_truth
 from pipeline.rendered.scene_file import render_project
@@ -172,8 +173,11 @@ def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(
 
 
 @one_frame
-def test_the_frame_is_told_from_another_camera(frame: Path) -> None:
-    """A ring with a cross holds the plain cross of older cameras too: the ring then counts as damage."""
+def test_the_frame_is_told_from_another_camera(frame: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ring with a cross holds the plain cross of older cameras too: the ring then counts as damage. No other pitch
+    than the file's is tried."""
+    monkeypatch.setattr(LayoutSearch, "longer_one_way", None)
+    monkeypatch.setattr(LayoutSearch, "at_any_pitch", None)
     (scan,) = (frame.parent / "scans").glob("*.tif")
     few = {name: LIBRARY[name] for name in ("jena-lmk-153", "wild-rc5-153", "wild-rc8-153", RENDERED)}
     found = identify(scan, few, None, Reporter())
@@ -261,6 +265,17 @@ def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     assert trials[0]["expected"] < 1e-4
     assert trials[1]["expected"] is None
     assert trials[1]["reason"] == "not measured: nowhere in the scan do its marks answer together"
+
+
+def test_what_noise_answers_as_well_is_not_matched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor are marks reckoned with that a constellation puts outside of the scan."""
+    grey = np.random.default_rng(3).normal(120.0, 25.0, (600, 600)).clip(0, 255).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "noise.tif", grey, resolution=(25, 25), resolutionunit=3)
+    monkeypatch.setattr("measure.frames.camera_recognition.look_at_frame", pytest.fail)
+    few = {name: LIBRARY[name] for name in (RENDERED, "fairchild-t5-153", "wild-18x18-115")}
+    found = identify(tmp_path / "noise.tif", few, None, Reporter())
+    assert found.best == ()
+    assert {trial.score for trial in found.trials} == {0.0}
 
 
 def test_what_chance_finds_as_well_does_not_stand_out() -> None:
