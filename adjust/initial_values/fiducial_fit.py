@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.film_kinds import Congruent, FilmKind, Identity, Projective, marks_of
 from adjust.functional_model.transformation import film_kind, marks_needed, simpler
+from adjust.linear_algebra.small_matrices import applied
 from adjust.problem.network import Transformation
 
 Array = NDArray[np.float64]
@@ -82,14 +83,14 @@ def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple
     best_cost = float(np.sort(squared)[:half].sum())
     if half == n or _agree(squared):
         return best, best_cost
-    for subset in _subsets(n, fewest):
-        candidate = _fit(kind, comparator_mm[subset], camera_mm[subset])
-        for _ in range(2):
-            kept = np.argsort(_squared(kind, candidate, comparator_mm, camera_mm), kind="stable")[:half]
-            candidate = _fit(kind, comparator_mm[kept], camera_mm[kept])
-        cost = float(np.sort(_squared(kind, candidate, comparator_mm, camera_mm))[:half].sum())
-        if cost < best_cost:
-            best, best_cost = candidate, cost
+    kept = _subsets(n, fewest)
+    for _ in range(3):
+        candidates = _fit(kind, comparator_mm[kept], camera_mm[kept])
+        squared = _squared(kind, candidates[:, None], comparator_mm, camera_mm)
+        kept = np.argsort(squared, axis=1, kind="stable")[:, :half]
+    costs = np.take_along_axis(squared, kept, axis=1).sum(axis=1)
+    if costs.min() < best_cost:
+        best, best_cost = candidates[costs.argmin()], float(costs.min())
     variance = best_cost / (2 * half - len(kind.names))
     agree = _squared(kind, best, comparator_mm, camera_mm) < GROSS * max(variance, LEAST_VARIANCE_MM2)
     return _fit(kind, comparator_mm[agree], camera_mm[agree]), best_cost
@@ -100,62 +101,80 @@ def _agree(squared: Array) -> bool:
     return bool((squared < GROSS * LEAST_VARIANCE_MM2).all())
 
 
-def _subsets(n: int, size: int) -> list[Indices]:
-    """All subsets of some of n marks, or as many at random as are enough."""
+def _subsets(n: int, size: int) -> Indices:
+    """(subsets, size): all of some of n marks, or as many at random as are enough."""
     if comb(n, size) <= MOST_SUBSETS:
-        return [np.array(subset) for subset in combinations(range(n), size)]
+        return np.array(list(combinations(range(n), size)))
     generator = np.random.default_rng(0)
-    return [generator.permutation(n)[:size] for _ in range(MOST_SUBSETS)]
+    return np.array([generator.permutation(n)[:size] for _ in range(MOST_SUBSETS)])
 
 
 def _squared(kind: FilmKind, parameters: Array, comparator_mm: Array, camera_mm: Array) -> Array:
     with np.errstate(all="ignore"):  # a subset of bad geometry may send other marks to infinity
-        squared = ((kind.apply(parameters, comparator_mm) - camera_mm) ** 2).sum(axis=1)
+        squared = ((kind.apply(parameters, comparator_mm) - camera_mm) ** 2).sum(axis=-1)
     return np.where(np.isfinite(squared), squared, np.inf)
 
 
 def _fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> Array:
-    """Least squares about the marks' means; what they do not determine, on a line say, has the least norm."""
-    center, half, target = comparator_mm.mean(axis=0), _half(comparator_mm), camera_mm.mean(axis=0)
-    xy, moved = (comparator_mm - center) / half, camera_mm - target
+    """(..., u) of marks (..., n, 2): least squares about their means; what they do not determine has the least norm."""
+    center, half = comparator_mm.mean(axis=-2, keepdims=True), _half(comparator_mm)
+    target = camera_mm.mean(axis=-2, keepdims=True)
+    moved, count = camera_mm - target, len(kind.names)
     match kind:
         case Identity():
-            return np.zeros(0)
+            return np.zeros((*half.shape, 0))
         case Congruent():
-            return _congruent(kind, xy, moved, center, target)
+            return _congruent(kind, comparator_mm - center, moved, center[..., 0, :], target[..., 0, :])
         case Projective():
-            return _projective(xy, moved, center, half, target)
-    nothing = np.zeros(len(kind.names))
-    design = kind.design(nothing, comparator_mm, center, np.asarray(half))
-    centred = np.linalg.lstsq(design.reshape(-1, len(nothing)), moved.reshape(-1))[0]
-    parameters = kind.by_centred(nothing, center, np.asarray(half)) @ centred
-    parameters[[kind.names.index("a1"), kind.names.index("b1")]] += target
-    return np.asarray(parameters)
+            return _projective((comparator_mm - center) / half[..., None, None], moved, center, half, target)
+    nothing = np.zeros(count)
+    design = kind.design(nothing, comparator_mm, center, half[..., None])
+    centred = _solved(design, moved)
+    parameters = applied(kind.by_centred(nothing, center[..., 0, :], half), centred)
+    parameters[..., [kind.names.index("a1"), kind.names.index("b1")]] += target[..., 0, :]
+    return parameters
 
 
-def _half(xy_mm: Array) -> float:
-    """Half the larger side of what the marks enclose."""
-    return float(np.ptp(xy_mm, axis=0).max()) / 2.0 or 1.0
+def _solved(design: Array, values: Array) -> Array:
+    """(..., u) by least squares, of the least norm: design (..., n, 2, u), values (..., n, 2)."""
+    rows = design.reshape(*design.shape[:-3], -1, design.shape[-1])
+    inverse = np.linalg.pinv(rows, rcond=max(rows.shape[-2:]) * np.finfo(np.float64).eps)
+    return applied(inverse, values.reshape(*values.shape[:-2], -1))
+
+
+def _half(xy_mm: Array) -> Array:
+    """(...): half the larger side of what marks (..., n, 2) enclose."""
+    half = np.ptp(xy_mm, axis=-2).max(axis=-1) / 2.0
+    return np.where(half > 0.0, half, 1.0)
 
 
 def _congruent(kind: Congruent, xy: Array, moved: Array, center: Array, target: Array) -> Array:
     m = -1.0 if kind.mirrored else 1.0
-    (x, y), (u, v) = xy.T, moved.T
-    turn = np.array([0.0, 0.0, np.arctan2((x * v - m * y * u).sum(), (x * u + m * y * v).sum())])
-    shift = target - kind.apply(turn, center)
-    return np.array([*shift, turn[2]])
+    (x, y), (u, v) = np.moveaxis(xy, -1, 0), np.moveaxis(moved, -1, 0)
+    turn = np.zeros((*center.shape[:-1], 3))
+    turn[..., 2] = np.arctan2((x * v - m * y * u).sum(axis=-1), (x * u + m * y * v).sum(axis=-1))
+    turn[..., :2] = target - kind.apply(turn, center)
+    return turn
 
 
-def _projective(xy: Array, moved: Array, center: Array, half: float, target: Array) -> Array:
+def _projective(xy: Array, moved: Array, center: Array, half: Array, target: Array) -> Array:
     """From x' (1 + c1 x + c2 y) = a1 + a2 x + a3 y and the like for y', about the means (Hartley's normalisation)."""
-    size = _half(moved)
-    rows = np.zeros((len(xy), 2, 8))
+    size = _half(moved)[..., None, None]
+    rows = np.zeros((*xy.shape, 8))
     for row in (0, 1):
-        rows[:, row, 3 * row : 3 * row + 3] = np.column_stack([np.ones(len(xy)), xy])
-        rows[:, row, 6:] = -xy * moved[:, row, None] / size
-    a1, a2, a3, b1, b2, b3, c1, c2 = np.linalg.lstsq(rows.reshape(-1, 8), moved.reshape(-1) / size)[0]
-    to_unit = np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, half]])
-    from_unit = np.array([[size, 0.0, target[0]], [0.0, size, target[1]], [0.0, 0.0, 1.0]])
-    matrix = from_unit @ np.array([[a2, a3, a1], [b2, b3, b1], [c1, c2, 1.0]]) @ to_unit
-    (a2, a3, a1), (b2, b3, b1), (c1, c2, _) = matrix / matrix[2, 2]
-    return np.array([a1, a2, a3, b1, b2, b3, c1, c2])
+        rows[..., row, 3 * row] = 1.0
+        rows[..., row, 3 * row + 1 : 3 * row + 3] = xy
+        rows[..., row, 6:] = -xy * moved[..., row, None] / size
+    solved = _solved(rows, moved / size)
+    unit = np.concatenate([solved, np.ones_like(solved[..., :1])], axis=-1)[..., [1, 2, 0, 4, 5, 3, 6, 7, 8]]
+    matrix = _scaled(size[..., 0, 0], target[..., 0, :]) @ unit.reshape(*half.shape, 3, 3)
+    matrix = matrix @ np.linalg.inv(_scaled(half, center[..., 0, :]))
+    flat = (matrix / matrix[..., 2:, 2:]).reshape(*half.shape, 9)
+    return np.asarray(flat[..., [2, 0, 1, 5, 3, 4, 6, 7]])
+
+
+def _scaled(size: Array, origin: Array) -> Array:
+    """(..., 3, 3): to places about an origin (..., 2) from those in units of a size (...) of it."""
+    matrix = np.zeros((*size.shape, 3, 3))
+    matrix[..., [0, 1], [0, 1]], matrix[..., :2, 2], matrix[..., 2, 2] = size[..., None], origin, 1.0
+    return matrix
