@@ -11,3 +11,7 @@ class AdjustmentError(Exception):
 
 class NoImageError(AdjustmentError):
     """An adjustment that cannot start, for with the approximations some point has no image."""
+
+
+class DatumError(AdjustmentError):
+    """A choice of the datum that holds the object too much or too little, or names what there is not."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from adjust.errors import AdjustmentError, NoImageError
+from adjust.errors import AdjustmentError, DatumError, NoImageError
 from adjust.initial_values.approximations import approximate
 from adjust.initial_values.far_points import far_points
 from adjust.least_squares.kept_memory import keep_freed_memory
@@ -58,6 +58,8 @@ def adjust(
     try:
         start = approximations or own or approximate(with_held(network, options.datum_coordinates))
         result = _adjusted(network, start, options)
+    except DatumError:  # whatever the observations say
+        raise
     except AdjustmentError:
         if not weighs_anew:
             _check_whole(network, None, options)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.errors import AdjustmentError
+from adjust.errors import DatumError
 from adjust.problem.network import Network, ObjectPoint, Prior
 from adjust.problem.problem import Problem
 from adjust.undetermined.datum import FLAT, ObjectDatum, free_coordinates, object_datum
@@ -35,7 +35,7 @@ def _with_held(point: ObjectPoint, held: set[str]) -> ObjectPoint:
 def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
     """Positions of the coordinates, "point.X" and so on, that a minimal datum is to hold.
 
-    Raises AdjustmentError where one is unknown or given already, where they hold less than is free of the datum, or
+    Raises DatumError where one is unknown or given already, where they hold less than is free of the datum, or
     more: that would strain the network.
     """
     positions = [_position(problem, text) for text in coordinates]
@@ -51,7 +51,7 @@ def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
             strained.append(text)
     if strained:
         others = "the other datum coordinates and" if len(motions) else ""
-        raise AdjustmentError(
+        raise DatumError(
             f"The datum is over-constrained: {others} what is given hold {', '.join(strained)} already, and "
             f"a minimal datum takes {datum.free.shape[1]} values here. To hold more would strain the network. "
             f"Leave {'it' if len(strained) == 1 else 'them'} out of the datum coordinates, or say by a standard "
@@ -64,13 +64,13 @@ def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
 def _position(problem: Problem, coordinate: str) -> int:
     point, _, axis = coordinate.rpartition(".")
     if axis not in ("X", "Y", "Z"):
-        raise AdjustmentError(
+        raise DatumError(
             f"The datum coordinate {coordinate} is none: write the point, a dot and X, Y or Z, such as 12.X."
         )
     _check_points(problem, [point])
     position = int(problem.unknowns.point[point]["XYZ".index(axis)])
     if np.isfinite(problem.unknowns.sigma[position]):
-        raise AdjustmentError(
+        raise DatumError(
             f"The datum coordinate {coordinate} is given with the standard deviation "
             f"{problem.unknowns.sigma[position]:g}: it holds the network as it is. Leave it out of the datum "
             f"coordinates, or leave its standard deviation blank."
@@ -81,7 +81,7 @@ def _position(problem: Problem, coordinate: str) -> int:
 def chosen_points(problem: Problem, points: Sequence[str]) -> Indices:
     """Positions of the free coordinates of the points (all points if none is named) that carry the inner constraints.
 
-    Raises AdjustmentError where one is unknown, or where they do not carry all that is free of the datum.
+    Raises DatumError where one is unknown, or where they do not carry all that is free of the datum.
     """
     _check_points(problem, points)
     members = free_coordinates(problem, points)
@@ -98,7 +98,7 @@ def _check_points(problem: Problem, points: Sequence[str]) -> None:
         if point not in problem.unknowns.point:
             given = point in problem.network.point_by_id
             why = "is shown by no image" if given else "is not among the object points"
-            raise AdjustmentError(f"Point {point}, which the datum names, {why}. Name another point, or correct it.")
+            raise DatumError(f"Point {point}, which the datum names, {why}. Name another point, or correct it.")
 
 
 def _check_complete(datum: ObjectDatum, motions: Array, what: str) -> None:
@@ -108,7 +108,7 @@ def _check_complete(datum: ObjectDatum, motions: Array, what: str) -> None:
     if open_directions.shape[1] == 0:
         return
     numbers = _telling_rows(open_directions)
-    raise AdjustmentError(
+    raise DatumError(
         f"{what} do not hold the object space: it {'; it '.join(DATUM_LEADS[number][0] for number in numbers)}. "
         f"Name {'; '.join(dict.fromkeys(DATUM_LEADS[number][1] for number in numbers))}, or leave the choice to "
         f"the program."

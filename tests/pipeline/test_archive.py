@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from drawn_frames import layout_of
 from drawn_project import CAMERA, write_project
 
+from measure.marks.shapes import MarkShape, polygon
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.archive.witness import Witnessed, witnessed_scan
@@ -393,14 +395,14 @@ def test_learned_marks_stay_when_a_scan_comes(three: Path, tmp_path: Path) -> No
     assert measured == ["d"]
 
 
-TIPS = 'kind = "polygon"\nvertices_mm = [[0, 0], [0.8, -1.0], [0.8, 1.0]]\n'  # leans on the tone curve
+TIP_MM = ((0.0, 0.0), (0.8, -1.0), (0.8, 1.0))  # of a wedge, whose sides lean on the tone curve
 
 
-def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(three: Path, tmp_path: Path, capsys: SAID) -> None:
+def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, capsys: SAID) -> None:
     folder = tmp_path / "p"
-    shutil.copytree(three, folder)
-    camera = CAMERA.split("[mark.m]")[0] + f"[mark.m]\n{TIPS}"
-    (folder / "camera.toml").write_text(camera, encoding="utf-8")
+    write_project(folder, ["a", "b", "c"], layout=layout_of([MarkShape(polygon(TIP_MM))] * 4))
+    mark = f'[mark.m]\nkind = "polygon"\nvertices_mm = {[*map(list, TIP_MM)]}\n'
+    (folder / "camera.toml").write_text(CAMERA.split("[mark.m]")[0] + mark, encoding="utf-8")
     measure(folder)
     assert "0 of 3 scans are measured already" in capsys.readouterr().err  # this call asked them for the curve itself
     measured.clear()

@@ -324,7 +324,8 @@ def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_p
     px = true["f1"] + rng.uniform(-2.5, 2.5, (4, 2))
     lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, px.tolist(), strict=True))
     project = project_of(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="auto")
-    frames = measured(project, *(f"f{k}" for k in range(4)))
+    known = learned(project)
+    frames = [measure_scan(known, f"f{k}").frame for k in range(4)]
     outward, across = [], []
     for frame in frames:
         assert frame.pose is not None
@@ -340,7 +341,7 @@ def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_p
     # Every pose takes origins that lie outward of their marks to one another: nothing tells them from the middles.
     np.testing.assert_allclose(outward, np.mean(outward), atol=0.02)
     np.testing.assert_allclose(across, 0.0, atol=0.02)
-    template = learned(project).default_camera.fiducials[0].mark
+    template = known.default_camera.fiducials[0].mark
     assert isinstance(template, MarkTemplate)
     assert len(template.shares) == 4
     assert_measured_alike(project, frames[0])

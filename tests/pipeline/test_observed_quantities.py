@@ -259,7 +259,11 @@ def test_a_calibration_of_another_lens_is_refused(
         ('datum = "minimal"\ndatum_coordinates = ["1X"]', ["1X", "a dot and X, Y or Z"]),
     ],
 )
-def test_a_mistake_in_the_datum_gets_a_message(lines: str, words: list[str], tmp_path: Path) -> None:
+def test_a_mistake_in_the_datum_gets_a_message(
+    lines: str, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once: it is sought in no observation."""
+    monkeypatch.setattr("adjust.solution.adjustment.network_slip", lambda *_: pytest.fail("sought a slip"))
     free_project(tmp_path, lines)
     with pytest.raises((InputError, AdjustmentError)) as error:
         adjusted(tmp_path)
