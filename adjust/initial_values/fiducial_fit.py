@@ -138,7 +138,8 @@ def _fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> Array:
 def _solved(design: Array, values: Array) -> Array:
     """(..., u) by least squares, of the least norm: design (..., n, 2, u), values (..., n, 2)."""
     rows = design.reshape(*design.shape[:-3], -1, design.shape[-1])
-    inverse = np.linalg.pinv(rows, rcond=max(rows.shape[-2:]) * np.finfo(np.float64).eps)
+    smallest = max(rows.shape[-2:]) * float(np.finfo(np.float64).eps)  # of the largest singular value, as lstsq has it
+    inverse: Array = np.linalg.pinv(rows, rcond=smallest).astype(np.float64)
     return applied(inverse, values.reshape(*values.shape[:-2], -1))
 
 
