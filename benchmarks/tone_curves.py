@@ -1,6 +1,6 @@
 """Marks measured through unknown tone curves, against their truth.
 
-    python benchmarks/tone_curves.py [--frames 60] [--first 0] [--seed 1] [--keep FILE] [--every 50]
+    python benchmarks/tone_curves.py [--frames 60] [--first 0] [--seed 1] [--keep FILE] [--every 50] [--scans 1]
 
 Frames as `tone_frames` draws them: seven kinds of marks; gamma 1, 1.8, 2.2, sRGB and an S-curve; 16 and 8 bit and JPEG
 of quality 60 to 95; signal-to-noise 8 to 100; turned by up to 3 degrees; uneven focus, vignetting, a stamp over a mark,
@@ -10,36 +10,40 @@ frame, so that a run can be stopped and go on, or be printed again; the table so
 Told are, for each kind, curve, way to store, difficulty and noise: marks that can be seen, of these the per cent found
 and the per cent `measured`; of the marks `measured` the rms error, the rms of error over claim, the largest one, and
 how many are off by more than 5 standard deviations. Of tips: the mean error along their axes, outwards.
+
+--scans 8: eight frames in a row, of tips alone, are scans of one camera by one scanner, as in a folder. What four of
+them say of the curve is believed of the others, as `reseau measure` does; --frames counts scans.
 """
 
 import argparse
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import cache
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tone_frames import PITCH_UM, TIPS, Case, draw_case
+from tone_frames import KINDS, PITCH_UM, TIPS, Case, draw_case
 
 from measure.covariance import Cause
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.scans.tone import Tone
+from measure.results import FrameMeasurement
+from measure.scans.tone import SaidOfTone, Tone
 from measure.status import Status
 
 Row = dict[str, Any]
 
-_GROSS = 5.0
+_GROSS, _SAMPLES = 5.0, 4
 _NOISES = (8.0, 15.0, 30.0, 60.0, 101.0)
 
 
-def rows_of(case: Case, index: int) -> list[Row]:
-    """One for each mark of a frame."""
+def rows_of(case: Case, index: int, said: Sequence[SaidOfTone] = ()) -> list[Row]:
+    """One for each mark of a frame; said: by other scans of its scanner."""
     start = time.process_time()
-    scan = case.scan.seen_through(Tone.unknown())
-    frame = measure_fiducials(scan, case.layout, (PITCH_UM, PITCH_UM), FiducialOptions(pose=case.pose))
+    frame = measured(case, Tone.unknown().told(said).tone)
     seconds = time.process_time() - start
     rows = []
     for mark in frame.marks:
@@ -63,6 +67,19 @@ def rows_of(case: Case, index: int) -> list[Row]:
             row["tone_px"] = mark.covariance.sigmas_px.get(Cause.TONE, 0.0)
         rows.append(row)
     return rows
+
+
+def measured(case: Case, tone: Tone) -> FrameMeasurement:
+    scan = case.scan.seen_through(tone)
+    return measure_fiducials(scan, case.layout, (PITCH_UM, PITCH_UM), FiducialOptions(pose=case.pose))
+
+
+@cache
+def said_in_folder(seed: int, folder: int, scans: int) -> dict[int, SaidOfTone]:
+    """By frame, what some of a folder's scans say of its curve."""
+    some = range(folder * scans, folder * scans + min(scans, _SAMPLES))
+    tones = {index: measured(draw_case(seed, index, scans, TIPS), Tone.unknown()).tone for index in some}
+    return {index: tone.said for index, tone in tones.items() if tone is not None and tone.said is not None}
 
 
 def told(name: str, rows: Iterable[Row]) -> str:
@@ -116,11 +133,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--every", type=int, default=50)
+    parser.add_argument("--scans", type=int, default=1)
     options = parser.parse_args()
     kept = kept_frames(options.keep) if options.keep else {}
     wanted = range(options.first, options.first + options.frames)
     for done, index in enumerate((index for index in wanted if index not in kept), 1):
-        kept[index] = rows_of(draw_case(options.seed, index), index)
+        scans = options.scans
+        said = {} if scans == 1 else said_in_folder(options.seed, index // scans, scans)
+        case = draw_case(options.seed, index, scans, KINDS if scans == 1 else TIPS)
+        kept[index] = rows_of(case, index, [each for other, each in said.items() if other != index])
         if options.keep:
             with options.keep.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(kept[index]) + "\n")

@@ -1,6 +1,7 @@
 """Frames whose light was stored by a tone curve: every kind of mark under every difficulty, each drawn by chance from a
 seed of its own, with its truth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -70,14 +71,16 @@ class Case:
     hidden: frozenset[str]
 
 
-def draw_case(seed: int, index: int) -> Case:
-    """The index-th frame of the study of that seed: kinds, curves and ways to store take turns."""
-    rng = np.random.default_rng([seed, index])
-    kind = KINDS[index % len(KINDS)]
-    curve = CURVES[index // len(KINDS) % len(CURVES)]
-    stored, difficulty = str(rng.choice(STORED)), str(rng.choice(DIFFICULTIES))
+def draw_case(seed: int, index: int, scans: int = 1, kinds: Sequence[str] = KINDS) -> Case:
+    """The index-th frame of the study of that seed: kinds, curves and ways to store take turns. scans: so many frames
+    in a row are scans of one camera by one scanner, with the same marks, curve and way to store."""
+    rng, group = np.random.default_rng([seed, index]), index // scans
+    of_scanner = rng if scans == 1 else np.random.default_rng([seed, scans, group])
+    kind = kinds[group % len(kinds)]
+    curve = CURVES[group // len(kinds) % len(CURVES)]
+    stored, difficulty = str(of_scanner.choice(STORED)), str(rng.choice(DIFFICULTIES))
     snr = float(np.exp(rng.uniform(np.log(8), np.log(100))))
-    layout, tones = _layout(rng, kind), _tones(rng, kind)
+    layout, tones = _layout(of_scanner, kind), _tones(rng, kind)
     scene, missing = _scene(rng, layout, tones, difficulty)
     light: Picture = painted(scene).astype(np.float32) / np.float32(_FULL)
     whole = replace(scene, camera=replace(scene.camera, fiducials=fiducials_of(layout.marks)))
