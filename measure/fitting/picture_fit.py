@@ -8,15 +8,7 @@ from numpy.typing import NDArray
 
 from measure.fitting.clipping import noise_scale
 from measure.fitting.linear_fit import sandwich_covariance
-from measure.fitting.picture_model import (
-    BENT,
-    GREY,
-    LINEAR,
-    ROUGHLY_BENT,
-    ROUGHLY_LINEAR,
-    ROUNDING_DN,
-    PictureModel,
-)
+from measure.fitting.picture_model import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.fitting.rounding import (
     COARSEST_VARIANCE,
     ROUNDING_VARIANCE,
@@ -72,7 +64,7 @@ class PictureFit:
         if not self.reason and np.ptp(self.model.grey[self.area]) == 0.0:
             self.reason = Reason("the picture is even there: nothing stands out", Code.CONTRAST)
         if not self.reason:
-            self.model.bent, self.model.linear_within = ROUGHLY_BENT, ROUGHLY_LINEAR
+            self.model.bent = ROUGHLY_BENT
             self._adjust(robust=False, tolerance_px=0.1)
         if self.reason == _UNSETTLED:  # dust may keep squares from settling, and not what holds against it
             self.reason = NO_REASON
@@ -92,7 +84,7 @@ class PictureFit:
 
     def refine(self) -> None:
         """Robust from there, then on what is undamaged."""
-        self.model.bent, self.model.linear_within = BENT, LINEAR
+        self.model.bent = BENT
         if not self.reason:
             self._steady()
             self._adjust(robust=True, tolerance_px=0.005)

@@ -27,8 +27,7 @@ _MOST_DISTORTION = 0.3  # of scale, rotation (rad) and shear: more is another ma
 PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little more blur
 _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
 _MOST_BLURRED = 2.0  # times the blur, likewise
-# Times the blur: within it a linearisation is as good as a new one, to 1e-4 of the blur, or to a two hundredth.
-LINEAR, ROUGHLY_LINEAR = 0.015, 0.1
+_LINEAR = 0.015  # times the blur: within it a linearisation is as good as a new one, to 1e-4 of the blur
 _CHIP_SMOOTHED_PX = 0.7  # and of what it is compared with: as sharp as pixels, edges are sampled falsely in both
 
 
@@ -59,8 +58,7 @@ class PictureModel:
     if there is one, and the greys.
 
     border_unknowns: how many a border in the ground has; border: where they stand in the design.
-    bent: how far, in units of the blur, a series may bend the drawing before it is drawn anew; linear_within: how far,
-    likewise, a state may be from that of the design.
+    bent: how far, in units of the blur, a series may bend the drawing before it is drawn anew.
     start: where the mark is expected, where the state begins too.
     light (height, width): grey values with their surroundings, grey: what is fitted of them.
     ground (3, height, width): offset and slopes of the background.
@@ -102,7 +100,7 @@ class PictureModel:
         self.state = State(start.copy(), added_px2 + self.smoothed_px2, np.zeros(GREY))
         # The state that the design is of, and its residuals.
         self._linearised: tuple[State, Array] | None = None
-        self.bent, self.linear_within = BENT, LINEAR
+        self.bent = BENT
         self._draw(start[:, :2])
         self.reach_px = reach_px(mark, start[:, :2])
         self.mark_from_start: Array = np.linalg.inv(start[:, :2]).astype(float)
@@ -119,7 +117,7 @@ class PictureModel:
         if self._linearised is not None:
             at, residuals = self._linearised
             change = self._change(at)
-            if self._length_px(change) < self.linear_within * self.seen_blur_px and not self._is_bent():
+            if self._length_px(change) < _LINEAR * self.seen_blur_px and not self._is_bent():
                 self.residuals = residuals - combined(change, self.design)
                 return
         height, width = self.grey.shape
@@ -174,13 +172,7 @@ class PictureModel:
 
     def take_steadiness(self, steadiness: Array) -> None:
         """Another noise of each pixel (height, width) over that of an ordinary one."""
-        ratio, self.steadiness = steadiness / self.steadiness, steadiness
-        if self.is_clipped or self._linearised is None:
-            self._linearised = None
-            return
-        at, residuals = self._linearised
-        self._linearised, self.residuals = (at, residuals * ratio), self.residuals * ratio
-        self.design *= ratio
+        self.steadiness, self._linearised = steadiness, None
 
     def _change(self, before: State) -> Array:
         """(unknowns,) from a state before to the present one, both alike."""

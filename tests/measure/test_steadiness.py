@@ -6,7 +6,6 @@ from drawn import scan_of
 from true_marks import KIND, some_mark, whitened_rms
 
 from measure.fitting.matching import match
-from measure.fitting.picture_model import PictureModel
 from measure.fitting.scan_window import read_window
 from measure.match_options import MatchOptions
 from measure.noise.weighting import steadiness
@@ -57,22 +56,3 @@ def test_a_light_mark_is_not_damaged_for_its_noise(alike_in: str) -> None:
         covariances.append(fit.covariance_px2)
     assert np.mean(damaged) < 0.05
     assert 0.75 < whitened_rms(errors, covariances) < 1.3
-
-
-def test_derivatives_and_residuals_of_a_match_follow_a_new_steadiness() -> None:
-    rng = np.random.default_rng(6)
-    mark = some_mark(KIND["cross"], 1.0, rng)
-    grey = 100.0 + 50.0 * mark.picture + rng.standard_normal(mark.picture.shape)
-    steady, everywhere = rng.uniform(0.5, 2.0, grey.shape), np.ones(grey.shape, dtype=bool)
-    model, fresh = (
-        PictureModel(grey, np.zeros(grey.shape, np.int8), mark.kind.shape, mark.place, MatchOptions()) for _ in range(2)
-    )
-    model.linearise(everywhere)
-    fresh.state = model.state
-    for one in (np.full(grey.shape, 0.7), steady):
-        model.take_steadiness(one)
-    model.linearise(everywhere)
-    fresh.take_steadiness(steady)
-    fresh.linearise(everywhere)
-    assert np.allclose(model.design, fresh.design)
-    assert np.allclose(model.residuals, fresh.residuals)
