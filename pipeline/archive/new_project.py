@@ -79,6 +79,11 @@ class NewProject:
                 if kind.cameras[1:]
             ],
         )
+        yield (
+            "are told by the form of their marks alone, and others have marks much like them: look at the marks of one "
+            "scan of each (`reseau cameras --scan`) before you measure",
+            [*self._told_by_form()],
+        )
         numbers = defaultdict[str, set[str]](set)
         for _, kind in self.named:
             numbers[chosen(kind)].update(kind.numbers)
@@ -126,6 +131,14 @@ class NewProject:
             "needs_a_look": {what: cases for what, cases in self.remarks() if cases},
             "notes": list(self.notes()),
         }
+
+    def _told_by_form(self) -> Iterator[str]:
+        for group, kind in self.named:
+            others = dict.fromkeys(name for sample in kind.samples for name in sample.much_alike())
+            marks = [trial for sample in kind.samples for trial in sample.best[:1]]
+            found = f"{sum(trial.found for trial in marks)} of {sum(trial.drawn for trial in marks)} marks seen"
+            if others:
+                yield f"{group.folder}: {chosen(kind)}, {found}; beside {', '.join(others)}"
 
     def _contradicted_pitches(self) -> Iterator[str]:
         for group, kind in self.named:

@@ -94,14 +94,20 @@ class Identification:
         against = self.against_pitch()
         return told + self._of_forms() + self._of_plate() + (f" {against}" if against else "")
 
-    def _of_forms(self) -> str:
-        """That a name rests on the form of wings, notches or arrows alone, of which others have much the same."""
+    def much_alike(self) -> tuple[str, ...]:
+        """Other cameras whose marks are drawn much like those that stand out: wings, notches or arrows."""
         best = [name for trial in self.best for name in trial.cameras]
-        others = [other for name in best for other in self.alike.get(name, ()) if other not in best]
+        others = (other for name in best for other in self.alike.get(name, ()) if other not in best)
+        return tuple(dict.fromkeys(others))
+
+    def _of_forms(self) -> str:
+        """That a name rests on the form of marks alone, of which others have much the same."""
+        others = " or ".join(self.much_alike())
         if not others:
             return ""
-        told = " or ".join(dict.fromkeys(others))
-        return f" That rests on the form of its marks alone, and {told} has marks much like them: compare the drawings."
+        return (
+            f" That rests on the form of its marks alone, and {others} has marks much like them: compare the drawings."
+        )
 
     def _of_plate(self) -> str:
         """What the plate says of the cameras that stand out."""

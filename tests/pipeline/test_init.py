@@ -81,11 +81,12 @@ def test_scans_of_one_size_and_head_are_no_copies_unless_all_their_bytes_are_the
 
 
 def of_camera(
-    path: Path, *names: str, plate: Mapping[str, str] | None = None, against: Sequence[str] = ()
+    path: Path, *names: str, plate: Mapping[str, str] | None = None, against: Sequence[str] = (), beside: str = ""
 ) -> Identification:
     trial = Trial(names, 4, 4, 0.9, 9.0, 0.9, None, None, None, "", 1.0, 1e-9, 20.0)
     contradicted = {name: ["another"] for name in against}
-    return Identification(path, (trial,) if names else (), {}, (20.0, 20.0), plate or {}, contradicted)
+    alike = {name: [beside] for name in names if beside}
+    return Identification(path, (trial,) if names else (), {}, (20.0, 20.0), plate or {}, contradicted, alike)
 
 
 def kind(group: Group, *samples: Identification) -> ScanKind:
@@ -123,7 +124,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> None:
         names = [("wild-rc10-153",) if group.folder.name in ("1952", "sub") else () for group in groups]
         plates = [{"camera_number": str(group.head.height_px)} for group in groups]
         return [
-            kind(group, of_camera(group.paths[0], *own, plate=plate))
+            kind(group, of_camera(group.paths[0], *own, plate=plate, beside="arrow-153" * (group.folder.name == "sub")))
             for group, own, plate in zip(groups, names, plates, strict=True)
         ], {}
 
@@ -142,7 +143,9 @@ def test_the_project_that_is_written_is_read_and_has_each_scans_camera(box: Path
     assert lines[:2] == ["image,camera", "0001,library:wild-rc10-153"]
     assert told["scans"] == len(lines) - 1 == 5
     looks = told["needs_a_look"]
-    assert len(looks) == 3
+    assert len(looks) == 4
+    forms = [case for what, cases in looks.items() if "form of their marks" in what for case in cases]
+    assert forms == [f"{box / '1952' / 'sub'}: wild-rc10-153, 4 of 4 marks seen; beside arrow-153"]
     assert any("broken.tif" in case for cases in looks.values() for case in cases)
     assert any("1958" in case and "no camera stands out" in case for cases in looks.values() for case in cases)
     assert any("Nr 120, 60" in case for cases in looks.values() for case in cases)
