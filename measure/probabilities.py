@@ -38,7 +38,7 @@ CAMERA_BY_CHANCE = _limit(
 CAMERA_BY_NOISE = _limit(
     1e-8,
     "triples of marks that noise is expected to make look as much like themselves",
-    "the marks of a camera are not matched there to tell whether it is the scan's",
+    "the marks of a camera that chance may have found are not matched there",
 )
 NOISE_LIKE_A_MARK = _limit(
     0.05, "noise as coarse as the window's answering as strongly as the best place", "nothing is matched there"

@@ -15,7 +15,7 @@ from measure.frames.frame_measurement import look_at_frame
 from measure.frames.frame_sighter import FrameSighter
 from measure.marks.shapes import FiducialLayout
 from measure.match_options import MatchOptions
-from measure.probabilities import CAMERA_BY_NOISE
+from measure.probabilities import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
 from measure.scans.scan import Scan
 from measure.search.candidates import Effort
 from measure.search.constellation import Placement
@@ -58,7 +58,7 @@ def seen(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.
         if len(places) > _PLACES:
             break
         enlarged = _enlarged(placement, times)
-        if _may_be_there(scan, layout, enlarged):
+        if answered.expected <= CAMERA_BY_CHANCE or _may_be_there(scan, layout, enlarged):
             frame = look_at_frame(scan, layout, enlarged, _LOOK)
             if frame.accepted:
                 return frame
