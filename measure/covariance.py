@@ -22,6 +22,7 @@ class Cause(StrEnum):
     LANDSCAPE = "landscape"
     COMPRESSION = "compression"
     TOUCHED = "touched"
+    OWN_TURN = "own turn"
     FILM = "film"
     SECOND_METHOD = "second method"
     GIVEN_PLACES = "given places"
@@ -39,6 +40,7 @@ MEANING = {
     Cause.LANDSCAPE: "The ground that shows within a notch is not even.",
     Cause.COMPRESSION: "JPEG rounded the mark's edges away.",
     Cause.TOUCHED: "Something may touch the mark, as its size or shape says.",
+    Cause.OWN_TURN: "It was only seen, as turned and as large as the frame says: it may be drawn a little otherwise.",
     Cause.FILM: "The film was bent or stretched, as the camera's frames show.",
     Cause.SECOND_METHOD: "Its edges put it elsewhere.",
     Cause.GIVEN_PLACES: "It contradicts the given places.",

@@ -32,9 +32,9 @@ _RING = 30.0  # times the background's: how far about the mark the texture is as
 _SELF = 0.1  # of the mark's own response: what is below it tells of the texture alone
 _SHOWN = 0.2  # of the mark's own weight: elsewhere the ground is too dark to tell
 _LINE = 0.25  # of the strongest: what counts as the mark's lines
-_ROUNDS = 3  # of rendering the mark anew where it was found
-_AGAIN_PX = 1.5  # about the place where it was found, for that
-_VERTEX_PX = 0.7  # of a paraboloid's top from the highest pixel, along either axis
+_ROUNDS = 8  # of rendering the mark anew where it was found
+_STEP_PX = 0.5  # between the places by which a response's top is told
+_OWN_LINEAR = 0.01  # by so much marks are turned (rad) and larger than the frame says: a real register glass's by 0.012
 _LEAST_DISTANCE_PX = 1.0  # predictions are no better
 _LEAST_PLACES = 200  # of the texture that a covariance can be taken from
 _FINEST_PX = 16.0  # of a mark's lines: what is wider is sought in a picture that is reduced so far
@@ -50,8 +50,10 @@ class FaintMark:
 
     @property
     def sigma_px(self) -> float:
-        """The standard deviation of its place, in the direction in which it is known least."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.fit.covariance_px2)[-1]))
+        """The standard deviation of where it is seen, in the direction in which that is known least."""
+        parts = self.fit.place_covariance.parts
+        seen_px2 = sum((part for cause, part in parts.items() if cause != Cause.OWN_TURN), np.zeros((2, 2)))
+        return float(np.sqrt(np.linalg.eigvalsh(seen_px2)[-1]))
 
 
 def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
@@ -79,46 +81,76 @@ def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px:
 
 def _found(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
     """By the scan's one curve."""
-    field = _Field(scan, expected, extreme_dn)
-    center, reach_px = field.predicted, expected.search_px / field.step
+    field = _Field(scan, expected, extreme_dn, blur_px)
+    first = field.response(field.predicted)
+    center = first.highest(field.predicted, expected.search_px / field.step)
+    if center is None:
+        return None
     for _ in range(_ROUNDS):
-        response = field.response(center, blur_px / field.step)
-        place = response.highest(center, reach_px)
-        if place is None:
-            return None
-        center, reach_px = place, _AGAIN_PX
-    return field.seen(response, center, blur_px)
+        center = field.response(center).top(center)
+    return field.seen(field.response(center), center)
 
 
 @dataclass(frozen=True, eq=False)
 class _Response:
     """value: the weighted correlation at every pixel, for a mark whose centre is off the pixel's by fraction.
-    norm: of the weighted template there."""
+    norm: of the weighted template there. weighted: what is correlated. templates (3, 3): of the mark as it looks with
+    its centre _STEP_PX less, not, and as much more off in row and column: a line may be finer than the pixels are far
+    apart, and how its picture changes between them no picture of whole pixels tells."""
 
+    weighted: Array
     value: Array
     norm: Array
-    template: Array
+    templates: Array
     fraction: Array
 
+    @property
+    def template(self) -> Array:
+        return np.asarray(self.templates[1, 1])
+
+    def pixel(self, center: Array) -> tuple[int, int]:
+        """Row and column of the value for a mark at a centre."""
+        col, row = np.rint(center - self.fraction)
+        return int(row), int(col)
+
+    def patch(self, center: Array) -> tuple[slice, slice]:
+        (row, col), half = self.pixel(center), self.template.shape[0] // 2
+        return slice(row - half, row + half + 1), slice(col - half, col + half + 1)
+
     def highest(self, center: Array, reach_px: float) -> Array | None:
-        """The top within reach of the centre, by a paraboloid; None at the window's edge."""
+        """The pixel of the highest value within reach of the centre; None at the window's edge."""
         rows, cols = np.indices(self.value.shape)
         near = np.hypot(cols + self.fraction[0] - center[0], rows + self.fraction[1] - center[1]) <= reach_px
         row, col = np.unravel_index(int(np.where(near, self.value, -np.inf).argmax()), self.value.shape)
-        if not (0 < row < self.value.shape[0] - 1 and 0 < col < self.value.shape[1] - 1) or self.value[row, col] <= 0:
-            return None
-        gradient, hessian = _paraboloid(self.value[row - 1 : row + 2, col - 1 : col + 2])
-        top: Array = np.array([col, row]) + self.fraction
+        half = self.template.shape[0] // 2 + 1
+        inside = all(half <= index < size - half for index, size in zip((row, col), self.value.shape, strict=True))
+        return np.array([col, row]) + self.fraction if inside and self.value[row, col] > 0 else None
+
+    def top(self, center: Array) -> Array:
+        """Of the paraboloid through the responses about a centre, as near as it tells."""
+        gradient, hessian = self.bend(self.weighted, center)
         if not np.all(np.linalg.eigvalsh(hessian) < 0):
-            return top
-        return np.asarray(top + np.clip(-np.linalg.solve(hessian, gradient), -_VERTEX_PX, _VERTEX_PX))
+            return center
+        return np.asarray(center + np.clip(-np.linalg.solve(hessian, gradient), -_STEP_PX, _STEP_PX))
+
+    def bend(self, weighted: Array, center: Array) -> tuple[Array, Array]:
+        """Gradient and Hessian of what a weighted picture answers to a mark at a centre that moves."""
+        answers = np.einsum("rcij,ij->rc", self.templates, weighted[self.patch(center)])
+        gradient, hessian = _paraboloid(answers / self.norm[self.pixel(center)])
+        return gradient / _STEP_PX, hessian / _STEP_PX**2
+
+    def slopes(self) -> Array:
+        """(2, rows, cols) by column and row, of the values."""
+        by_col, by_row = (self.templates[1, 2] - self.templates[1, 0], self.templates[2, 1] - self.templates[0, 1])
+        return np.stack([_correlated(self.weighted, by) / (2 * _STEP_PX) / self.norm for by in (by_col, by_row)])
 
 
 class _Field:
     """The window about a predicted place, freed of everything coarser than the mark's lines, step pixels of the scan to
     one of its own, in which all its places are."""
 
-    def __init__(self, scan: Scan, expected: MarkPrediction, extreme_dn: float) -> None:
+    def __init__(self, scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> None:
+        self.blur_px = blur_px
         self.step = step = max(1, int(detail_px(expected.mark, expected.linear) / _FINEST_PX))
         self.mark, self.linear, self.polarity = expected.mark, expected.linear / step, expected.polarity
         self.coarse_px = _BACKGROUND * detail_px(self.mark, self.linear)
@@ -143,32 +175,38 @@ class _Field:
         self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
         self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
 
-    def response(self, center: Array, blur_px: float) -> _Response:
+    def response(self, center: Array) -> _Response:
         """The response to the mark as it looks with its centre where given between the pixels."""
         fraction = center - np.rint(center)
-        size = 2 * self.half + 1
-        shown = picture(self.mark, np.column_stack([self.linear, fraction + self.half]), size, size, blur_px)
-        template: Array = np.asarray(shown - cv2.GaussianBlur(shown, (0, 0), self.coarse_px), dtype=float)
-        norm = np.sqrt(np.maximum(_correlated(self.room**2, template**2), 0.0) + 1e-6)
-        return _Response(_correlated(self.detail * self.room, template) / norm, norm, template, fraction)
+        steps = (-_STEP_PX, 0.0, _STEP_PX)
+        templates = np.array([[self._template(fraction + np.array([col, row])) for col in steps] for row in steps])
+        weighted, squared = self.detail * self.room, templates[1, 1] ** 2
+        norm = np.sqrt(np.maximum(_correlated(self.room**2, squared), 0.0) + 1e-6)
+        return _Response(weighted, _correlated(weighted, templates[1, 1]) / norm, norm, templates, fraction)
 
-    def seen(self, response: _Response, center: Array, blur_px: float) -> FaintMark | None:
+    def _template(self, off: Array) -> Array:
+        """The mark with its centre off the middle pixel's, freed of what is coarse."""
+        size = 2 * self.half + 1
+        pixel_from_mark = np.column_stack([self.linear, off + self.half])
+        shown = picture(self.mark, pixel_from_mark, size, size, self.blur_px / self.step)
+        return np.asarray(shown - cv2.GaussianBlur(shown, (0, 0), self.coarse_px), dtype=float)
+
+    def seen(self, response: _Response, center: Array) -> FaintMark | None:
         """What the response at the mark's place is worth, against what the texture about it answers."""
-        col, row = (int(index) for index in np.rint(center - response.fraction))
-        patch = np.s_[row - self.half : row + self.half + 1, col - self.half : col + self.half + 1]
+        (row, col), patch = response.pixel(center), response.patch(center)
         height = float(response.value[row, col])
         amplitude = height / float(response.norm[row, col])
-        own = np.zeros_like(self.room, dtype=float)
-        own[patch] = amplitude * self.room[patch] * response.template
-        signal = _correlated(own * self.room, response.template) / response.norm
+        own = np.zeros_like(self.detail)
+        own[patch] = amplitude * self.room[patch] ** 2 * response.template
+        signal = _correlated(own, response.template) / response.norm
         texture = self._texture(response, signal, (row, col))
-        bend = _paraboloid(signal[row - 1 : row + 2, col - 1 : col + 2])[1]
+        bend = response.bend(own, center)[1]
         if texture.sum() < _LEAST_PLACES or not np.all(np.linalg.eigvalsh(bend) < 0):
             return None
-        by_row, by_col = (np.gradient(response.value, axis=axis) for axis in (0, 1))
-        slopes = np.asarray(np.cov(np.stack([by_col[texture], by_row[texture]])), dtype=float)
+        slopes = np.asarray(np.cov(response.slopes()[:, texture]), dtype=float)
         scatter = float(np.sqrt(np.mean(response.value[texture] ** 2)))
         inverse, place = np.linalg.inv(bend) * self.step, center * self.step + self.origin
+        covariance = Covariance.of_noise(inverse @ slopes @ inverse)
         distance_px = float(np.hypot(*(center - self.predicted)))
         lines = np.abs(response.template)
         lit = lines * self.room[patch]
@@ -177,14 +215,14 @@ class _Field:
             converged=True,
             reason=NO_REASON,
             center_px=place,
-            place_covariance=Covariance.of_noise(inverse @ slopes @ inverse),
+            place_covariance=covariance.plus(Cause.OWN_TURN, self._leaning_px2(response, center)),
             pixel_from_mark=np.column_stack([self.linear * self.step, place]),
             contrast_dn=contrast_dn,
             stored_contrast_dn=self.coding.stored_contrast_dn(
                 float(np.average(self.ground_dn[patch], weights=lit)), contrast_dn
             ),
             noise_dn=float(np.average(self.texture_dn[patch], weights=lit)),
-            blur_px=blur_px,
+            blur_px=self.blur_px,
             damaged_fraction=max(1 - float((lit > _LINE * lit.max()).sum() / (lines > _LINE * lines.max()).sum()), 0.0),
             lost_fraction=0.0,
             redundancy=int((lit > 0).sum()) - 3,
@@ -194,6 +232,15 @@ class _Field:
             significance=height / scatter,
         )
         return FaintMark(fit, _chance(height / scatter, slopes / scatter**2, max(distance_px, _LEAST_DISTANCE_PX)))
+
+    def _leaning_px2(self, response: _Response, center: Array) -> Array:
+        """What the place of a mark whose lines lie to one side of its point takes from a turn and a size that are not
+        quite the frame's, as if its lines were all in their middle."""
+        lit = np.abs(response.template) * self.room[response.patch(center)] ** 2
+        lit /= lit.sum()
+        rows, cols = np.indices(lit.shape) - self.half
+        middle_px = self.step * (np.array([(lit * cols).sum(), (lit * rows).sum()]) - response.fraction)
+        return np.asarray(_OWN_LINEAR**2 * (middle_px @ middle_px) * np.eye(2))
 
     def _texture(self, response: _Response, signal: Array, place: tuple[int, int]) -> Mask:
         """Where about the mark responses are the texture's alone: on ground where the mark could show."""

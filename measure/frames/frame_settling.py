@@ -123,19 +123,19 @@ def count_tone(sighter: FrameSighter) -> None:
 
 def share_blur(sighter: FrameSighter) -> None:
     """Match marks that hardly tell their own blur once more, with that of the others, and marks that were only seen as
-    faint ones; what differs from the others' blur is doubted."""
-    fits = {**_adjusted(sighter), **_only_seen(sighter)}
+    faint ones, with that where it is known; what differs from the others' blur is doubted."""
+    seen_only = _only_seen(sighter)
+    fits = {**_adjusted(sighter), **seen_only}
     told = zip(fits, shared_blurs(list(fits.values())), strict=True)
-    shared = {index: blur for index, blur in told if blur is not None}
-    if not shared:
+    shared = {index: blur for index, blur in told if blur is not None or index in seen_only}
+    if not shared or sighter.belongs.sum() < 2:
         return
     frame_sigma = _frame_sigma(sighter)
     for index, blur in shared.items():
-        match = replace(sighter.options.match, blur_px=blur.blur_px, blur_sigma=blur.sigma)
-        if fits[index].covariance is None:
-            _match_faint(sighter, index, match, frame_sigma, blur)
+        if blur is None or index in seen_only:
+            _match_faint(sighter, index, frame_sigma, blur)
             continue
-        _match_again(sighter, index, match, frame_sigma)
+        _match_again(sighter, index, _with_blur(sighter.options.match, blur), frame_sigma)
         if blur.differs:
             own_px = fits[index].blur_px
             reason = f"its blur is {own_px:.2f} px, where the other marks have {blur.blur_px:.2f}"
@@ -245,13 +245,16 @@ def _match_again(sighter: FrameSighter, index: int, options: MatchOptions, frame
         _take(sighter, index, fit)
 
 
-def _match_faint(
-    sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float, blur: SharedBlur
-) -> None:
+def _with_blur(options: MatchOptions, blur: SharedBlur | None) -> MatchOptions:
+    return options if blur is None else replace(options, blur_px=blur.blur_px, blur_sigma=blur.sigma)
+
+
+def _match_faint(sighter: FrameSighter, index: int, frame_sigma: float, blur: SharedBlur | None) -> None:
     """A mark that was only seen, for that takes all that is finer than the mark for texture: in plain noise a match
     knows its place far better. It counts where it means the same mark, of the others' blur, and is the better known."""
-    seen, fit = sighter.sightings[index], _matched(sighter, index, options, frame_sigma)
-    if seen is None or seen.fit is None or fit is None or not blur.is_borne_out_by(fit):
+    seen = sighter.sightings[index]
+    fit = _matched(sighter, index, _with_blur(sighter.options.match, blur), frame_sigma)
+    if seen is None or seen.fit is None or fit is None or not (blur is None or blur.is_borne_out_by(fit)):
         return
     off = fit.center_px - seen.fit.center_px
     if fit.sigma_px < seen.fit.sigma_px and may_be_noise(off, seen.fit.covariance_px2 + fit.covariance_px2):
