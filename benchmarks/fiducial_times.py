@@ -5,8 +5,8 @@
 A large scan with eight marks, 16 bit in LZW tiles, as `large_scans` renders it; one of an archive, 2400 px, as
 `archive_real` draws it, in light and with its tone curve not known; and a small frame of four marks in a pose that is
 not known. Each is measured in a process of its own with one thread, which has imported everything: for the first time,
-and then again, the least of the rounds. Beside them one decode of the large scan, and `reseau measure` on it, targets and
-writing included.
+and then again, the least of the rounds. Beside them one decode of the large scan, and `reseau measure` on it, targets
+and writing included.
 """
 
 import argparse
