@@ -118,13 +118,11 @@ class _Response:
         return slice(row - half, row + half + 1), slice(col - half, col + half + 1)
 
     def highest(self, center: Array, reach_px: float) -> Array | None:
-        """The pixel of the highest value within reach of the centre; None at the window's edge."""
+        """The pixel of the highest value within reach of the centre; None where it is no mark of that polarity."""
         rows, cols = np.indices(self.value.shape)
         near = np.hypot(cols + self.fraction[0] - center[0], rows + self.fraction[1] - center[1]) <= reach_px
         row, col = np.unravel_index(int(np.where(near, self.value, -np.inf).argmax()), self.value.shape)
-        half = self.template.shape[0] // 2 + 1
-        inside = all(half <= index < size - half for index, size in zip((row, col), self.value.shape, strict=True))
-        return np.array([col, row]) + self.fraction if inside and self.value[row, col] > 0 else None
+        return np.array([col, row]) + self.fraction if self.value[row, col] > 0 else None
 
     def top(self, center: Array) -> Array:
         """Of the paraboloid through the responses about a centre, as near as it tells."""
@@ -156,7 +154,10 @@ class _Field:
         self.coarse_px = _BACKGROUND * detail_px(self.mark, self.linear)
         least, greatest = extent_px(self.mark, np.column_stack([self.linear, np.zeros(2)]))
         self.half = int(np.ceil(max(-least.min(), greatest.max()) + 2 * self.coarse_px)) + 1
-        side = self.half + int(np.ceil(max(expected.search_px / step, _RING)))
+        moves_px = (
+            _ROUNDS * _STEP_PX + 1.0
+        )  # between the pixels its place may come to lie farther off than was searched
+        side = self.half + int(np.ceil(max(expected.search_px / step, _RING) + moves_px))
         first = np.floor(expected.center_px).astype(int) - side * step - step // 2
         self.origin = first + (step - 1) / 2
         self.predicted = (expected.center_px - self.origin) / step

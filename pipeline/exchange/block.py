@@ -119,7 +119,12 @@ class WholeFrame:
 
     def camera_mm(self, marks: tuple[ComparatorPoint, ...]) -> Array:
         """Observed places (n, 2) of its marks in the camera's frame."""
-        return self._by_scan(marks, lambda scan, own: scan.model.camera_from_comparator(_places_mm(own)))  # type: ignore[union-attr]
+
+        def places(scan: OutFrame, own: tuple[ComparatorPoint, ...]) -> Array:
+            assert scan.model is not None  # of frames that have a part in the adjustment alone
+            return scan.model.camera_from_comparator(_places_mm(own))
+
+        return self._by_scan(marks, places)
 
     def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
         """The same in the resampled frame, whose lens may have been taken out."""

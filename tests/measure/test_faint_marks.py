@@ -96,6 +96,17 @@ def test_a_sharp_mark_to_one_side_of_its_point_may_be_turned_otherwise_than_the_
     assert sigmas_px[:, 1].max() < 0.6
 
 
+def test_what_answers_at_the_edge_of_a_wide_search_is_placed_within_the_window(tmp_path: Path) -> None:
+    """Between the pixels its place may come to lie farther off than was searched."""
+    wide = MarkShape(cross(0.5, 0.2), "dark")
+    grey, place = textured(4), places(4)[12]
+    grey -= 6000 * brute_picture(wide, np.column_stack([LINEAR, place]), grey.shape[1], grey.shape[0], 0.7)
+    with written_scan(grey, tmp_path) as scan:
+        for off_px in np.arange(38.0, 42.0, 0.5):
+            predicted = np.column_stack([LINEAR, place + np.array([off_px, 0.3])])
+            find_faint(scan, MarkPrediction(wide, predicted, 38.2, -1), 0.0, 0.7)
+
+
 def test_bare_texture_answers_as_often_as_chance_says(tmp_path: Path) -> None:
     answers = [found for seed in range(4) for found in seen_at(textured(seed + 50), places(seed), tmp_path)]
     chances = np.array([found.chance for found in answers if found is not None])
