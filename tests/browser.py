@@ -32,4 +32,4 @@ def browser_page(browser: Browser) -> Iterator[Page]:
     page.on("dialog", lambda dialog: faults.append(dialog.message))
     yield page
     context.close()
-    assert faults == []
+    assert faults == [], faults

@@ -256,9 +256,10 @@ function showAnswer(entry) {
   by("decided").textContent = !told ? "" : entry.answer ? `Decided: ${what}` : `Decided before, about another result: ${what}. Please look again.`;
 }
 
+// What could not be fetched is null there, and asked for again when it is opened.
 function prefetch(index) {
   const ahead = state.entries.slice(index + 1, index + 4).filter((entry) => entry.question === "mark");
-  const kept = ahead.map((entry) => [entry.key, state.ahead.get(entry.key) ?? fetched(entry)]);
+  const kept = ahead.map((entry) => [entry.key, state.ahead.get(entry.key) ?? fetched(entry).catch(() => null)]);
   state.ahead = new Map(kept);
   const next = state.entries[index + 1];
   if (next && ["pose", "frame"].includes(next.question)) ask("/api/frame.png", { image: next.image }).catch(() => {}); // is kept there
@@ -362,7 +363,7 @@ const markOf = (entry) => json("/api/mark", { image: entry.image, point: entry.p
 const zoomOf = (mark, width) => Math.max(1, width / (2 * mark.half));
 
 async function openMark(entry, generation) {
-  const { mark, view } = await (state.ahead.get(entry.key)?.catch(() => null) ?? fetched(entry)) ?? (await fetched(entry));
+  const { mark, view } = (await state.ahead.get(entry.key)) ?? (await fetched(entry));
   if (generation !== state.generation) return;
   state.mark = mark;
   for (const id of ["mark-view", "facts-view"]) by(id).hidden = false;
