@@ -1,10 +1,10 @@
 """How often `adjust.choices.comparison` says drift: of calibrations that are alike, and of ones that differ by 2, 3, 5
 sigmas.
 
-    python benchmarks/compare_power.py [pairs] [--adjustment]
+    python benchmarks/compare_power.py [pairs] [--series | --adjustment]
 
---adjustment: how often an adjustment says so of an earlier calibration that is an observation of it, by `pairs` of
-simulated networks each.
+--series: of four calibrations whose c changes steadily. --adjustment: how often an adjustment says so of an earlier
+calibration that is an observation of it, by `pairs` of simulated networks each.
 """
 
 import sys
@@ -27,6 +27,7 @@ SIGMAS = np.array([0.004, 0.003, 0.003, 8e-9, 4e-13, 6e-8, 6e-8])
 MARK_SIGMA_MM = 0.002
 TIED = {(3, 4): -0.9, (1, 5): 0.6}  # k3 and k5, x0 and p1, as in most calibrations
 LEVEL = 0.05
+YEARS = np.array([1952.0, 1958.0, 1961.0, 1970.0])
 
 
 def covariance() -> Array:
@@ -64,6 +65,20 @@ def main(pairs: int = 300) -> None:
         print(f"{sigmas:g} joint sigmas | {share(rng, c, pairs):.2f} | {share(rng, k5, pairs):.2f}")
 
 
+def in_series(count: int = 300) -> None:
+    """Drift as it is told, and the trend's own test; the change is that from the first to the last."""
+    rng = np.random.default_rng(10)
+    for sigmas in (0.0, 2.0, 3.0, 5.0):
+        change = np.zeros(len(NAMES))
+        change[0] = sigmas * np.sqrt(2) * SIGMAS[0] / np.ptp(YEARS)
+        series = [
+            compare([drawn(rng, change * (year - YEARS[0])) for year in YEARS], HALF, YEARS) for _ in range(count)
+        ]
+        told = np.mean([each.probability < LEVEL for each in series])
+        trends = np.mean([each.trend is not None and each.trend.probability < LEVEL for each in series])
+        print(f"c changes by {sigmas:g} joint sigmas: drift {told:.3f}, trend {trends:.3f}", flush=True)
+
+
 def in_adjustments(pairs: int = 200) -> None:
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
     from test_earlier_calibrations import contradicted
@@ -76,5 +91,7 @@ if __name__ == "__main__":
     given = [int(word) for word in sys.argv[1:] if word.isdigit()]
     if "--adjustment" in sys.argv:
         in_adjustments(*given)
+    elif "--series" in sys.argv:
+        in_series(*given)
     else:
         main(*given)

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lstsq, qr
+from scipy.linalg import qr
 from scipy.special import fdtrc
 
 from adjust.errors import AdjustmentError
@@ -68,9 +68,10 @@ class Comparison:
     """Calibrations as differences from the first of them, one entry a calibration after it.
 
     places_mm (m, 2) of the field, in the first one's frame. field_um (n, m, 2): how far apart both see a place, along
-    the film at the first one's c, after what orientation and datum take up; field_sigma_um (n, m, 2) its standard
-    deviations. fiducials: those that all have; fiducials_um, fiducials_sigma_um (n, f, 2) after a similarity.
+    the film at the first one's c, after what orientation and datum take up; field_covariance_um2 (n, m, 2, 2).
+    fiducials: those that all have; fiducials_um (n, f, 2), fiducials_covariance_um2 (n, f, 2, 2) after a similarity.
     same: whether all are one calibration. trend: whether they change with time beyond being the same; None for two.
+    trend_um (m, 2), trend_covariance_um2 (m, 2, 2): the steady change of the field from the first time to the last one.
     times (n + 1,).
     """
 
@@ -79,14 +80,21 @@ class Comparison:
     use: Use
     places_mm: Array
     field_um: Array
-    field_sigma_um: Array
+    field_covariance_um2: Array
     fiducials: tuple[str, ...]
     fiducials_um: Array
-    fiducials_sigma_um: Array
+    fiducials_covariance_um2: Array
     same: Test
     trend: Test | None
     trend_um: Array
-    trend_sigma_um: Array
+    trend_covariance_um2: Array
+
+    @property
+    def probability(self) -> float:
+        """How probable so much is for an unchanged camera: of a series, which has two tests, twice the smaller one."""
+        if self.trend is None:
+            return self.same.probability
+        return min(1.0, 2.0 * min(self.same.probability, self.trend.probability))
 
 
 def compare(
@@ -113,24 +121,29 @@ def compare(
     places = _grid(half_mm)
     views = [_View(each, calibrations[0], places, shared) for each in calibrations]
     system = _System(views, when, use)
-    field, sigma = system.differences()
+    field, covariance = (np.array(each) for each in zip(*map(system.difference, range(1, len(views))), strict=True))
     count = len(places)
-    trend, trend_sigma = system.trend_field()
+    trend, trend_covariance = system.trend_field()
     return Comparison(
         calibrations=tuple(calibrations),
         times=when,
         use=use,
         places_mm=places,
         field_um=field[:, :count],
-        field_sigma_um=sigma[:, :count],
+        field_covariance_um2=covariance[:, :count],
         fiducials=shared,
         fiducials_um=field[:, count:],
-        fiducials_sigma_um=sigma[:, count:],
+        fiducials_covariance_um2=covariance[:, count:],
         same=system.same,
         trend=system.trend if len(calibrations) > 2 else None,
         trend_um=trend[:count],
-        trend_sigma_um=trend_sigma[:count],
+        trend_covariance_um2=trend_covariance[:count],
     )
+
+
+def sigmas(covariance: Array) -> Array:
+    """Standard deviations (..., 2) of covariances (..., 2, 2)."""
+    return np.asarray(np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)))
 
 
 def _grid(half_mm: tuple[float, float]) -> Array:
@@ -191,13 +204,13 @@ class _View:
         return np.asarray(self.jacobian @ (sigmas[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))))
 
     def unseen(self, use: Use) -> Array:
-        """(2 (m + f), q): how the value changes with the similarity of the frame, and with the orientation."""
+        """(2 (m + f), q): how the first one's value changes with the similarity of its frame, and its orientation."""
         points = np.concatenate([self.points_mm, self.marks_mm])
         ones, zeros = np.ones(len(points)), np.zeros(len(points))
         x, y = points.T
         moves = np.array([(ones, zeros), (zeros, ones), (-y, x), (x, y)]).transpose(2, 1, 0)
         seen = self._by_ray(self.equations.by_xy @ moves[: len(self.ray)])
-        frame = np.concatenate([seen, -1e3 * self.turn.T @ moves[len(self.ray) :]])
+        frame = np.concatenate([seen, -1e3 * moves[len(self.ray) :]])
         u, v = self.ray.T
         one = np.ones_like(u)
         turns = [(u * v, one + v * v), (one + u * u, u * v), (-v, u)]
@@ -205,17 +218,6 @@ class _View:
         bundle = self.c_um * np.array([*turns, *stations]).transpose(2, 1, 0)
         orientation = np.concatenate([bundle, np.zeros((len(self.marks_mm), *bundle.shape[1:]))])
         return np.concatenate([frame, orientation], axis=2).reshape(2 * len(points), -1)
-
-    def freeing(self, use: Use) -> Array:
-        """(2 (m + f), 2 (m + f)): takes out of a change the similarity that its marks show, then the orientation that
-        its field shows, both by plain least squares: what is left is the smallest field there can be."""
-        unseen, fields = self.unseen(use), 2 * len(self.ray)
-        marks, everything = np.arange(len(unseen)) >= fields, np.eye(len(unseen))
-        frame = unseen[:, :_SIMILARITY] if len(self.marks_mm) > 1 else unseen[:, :0]
-        by_marks = everything - frame @ np.linalg.pinv(frame * marks[:, None], rcond=_RANK)
-        rest = unseen[:, frame.shape[1] :]
-        by_field = everything - rest @ np.linalg.pinv(rest * ~marks[:, None], rcond=_RANK)
-        return np.asarray(by_field @ by_marks)
 
 
 def _similarity(first: Array, second: Array) -> tuple[Array, Array]:
@@ -237,34 +239,43 @@ def _range(columns: Array) -> Array:
     return np.asarray(vectors[:, diagonal > _RANK * diagonal.max(initial=0.0)])
 
 
+def _freeing(unseen: Array, marks: int) -> Array:
+    """(2 (m + f), 2 (m + f)): takes out of a change the similarity that its marks show, then the orientation that its
+    field shows, both by plain least squares: what is left is the smallest field there can be."""
+    of_marks, everything = np.arange(len(unseen)) >= len(unseen) - 2 * marks, np.eye(len(unseen))
+    frame = unseen[:, :_SIMILARITY] if marks > 1 else unseen[:, :0]
+    by_marks = everything - frame @ np.linalg.pinv(frame * of_marks[:, None], rcond=_RANK)
+    rest = unseen[:, frame.shape[1] :]
+    by_field = everything - rest @ np.linalg.pinv(rest * ~of_marks[:, None], rcond=_RANK)
+    return np.asarray(by_field @ by_marks)
+
+
 class _System:
-    """All views in the directions in which anything is uncertain, whitened: each y = a (+ b t) + what is not seen."""
+    """All views in the directions in which anything is uncertain, whitened: each y = a (+ b t) + what is not seen.
+
+    What is not seen is the first one's for all, in whose axes they all are: a steady change along it is none then, too.
+    """
 
     def __init__(self, views: Sequence[_View], times: Array, use: Use) -> None:
-        self.views, self.times, self.use = views, times, use
-        roots = [view.root for view in views]
-        left, sizes, _ = np.linalg.svd(np.concatenate(roots, axis=1), full_matrices=False)
+        self.times, self.roots = times, [view.root for view in views]
+        left, sizes, _ = np.linalg.svd(np.concatenate(self.roots, axis=1), full_matrices=False)
         known = sizes > _UNSEEN_UM * np.sqrt(len(left))
         if not known.any():
             raise AdjustmentError("none of the calibrations has standard deviations: there is nothing to compare with.")
-        self.basis = left[:, known]
-        self.unseen = [self._within(view.unseen(use)) for view in views]
-        self.values = [self.basis.T @ (view.value - views[0].value).ravel() for view in views]
-        self.whitening = []
-        for root in roots:
-            covariance = self.basis.T @ root @ root.T @ self.basis + _UNSEEN_UM**2 * np.eye(known.sum())
-            self.whitening.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+        basis, unseen = left[:, known], views[0].unseen(use)
+        inside = basis.T @ unseen
+        # Without those of which nothing is in the basis, as a turn of the whole field.
+        self.unseen = inside * (np.linalg.norm(inside, axis=0) > _RANK * np.linalg.norm(unseen, axis=0))
+        self.freeing = _freeing(unseen, len(views[0].marks_mm))
+        self.changes = [(view.value - views[0].value).ravel() for view in views]
+        self.values = [basis.T @ change for change in self.changes]
+        covariances = [basis.T @ root @ root.T @ basis + _UNSEEN_UM**2 * np.eye(known.sum()) for root in self.roots]
+        self.whitening = [np.linalg.inv(np.linalg.cholesky(covariance)) for covariance in covariances]
         self.redundancy = min(view.own.redundancy for view in views)
 
-    def _within(self, changes: Array) -> Array:
-        """Changes of the value in the basis, without those of which nothing is in it, as a turn of the whole field."""
-        inside = self.basis.T @ changes
-        return np.asarray(inside * (np.linalg.norm(inside, axis=0) > _RANK * np.linalg.norm(changes, axis=0)))
-
-    def _design(self, powers: Sequence[int]) -> tuple[Array, Array]:
-        """The whitened rows of all views, for a value that is a polynomial of time, and their right side."""
-        size, count = self.basis.shape[1], len(self.views)
-        width = self.unseen[0].shape[1]
+    def _left_over(self, powers: Sequence[int]) -> tuple[float, int]:
+        """v'Pv for a value that is a polynomial of time, and the rank of its rows."""
+        (size, width), count = self.unseen.shape, len(self.values)
         rows = np.zeros((count * size, len(powers) * size + count * width))
         for k, whitening in enumerate(self.whitening):
             at = slice(k * size, (k + 1) * size)
@@ -272,12 +283,8 @@ class _System:
                 rows[at, p * size : (p + 1) * size] = whitening * (self.times[k] - self.times[0]) ** power
             if k:  # the first one's frame and attitude are everybody's
                 start = len(powers) * size + k * width
-                rows[at, start : start + width] = whitening @ self.unseen[k]
+                rows[at, start : start + width] = whitening @ self.unseen
         right = np.concatenate([w @ value for w, value in zip(self.whitening, self.values, strict=True)])
-        return rows, right
-
-    def _left_over(self, powers: Sequence[int]) -> tuple[float, int]:
-        rows, right = self._design(powers)
         explained = _range(rows)
         rest = right - explained @ (explained.T @ right)
         return float(rest @ rest), explained.shape[1]
@@ -297,23 +304,21 @@ class _System:
         probability = float(fdtrc(freedom, self.redundancy, chi / freedom)) if freedom and self.redundancy else 1.0
         return Test(chi, freedom, probability)
 
-    def differences(self) -> tuple[Array, Array]:
-        """Each view after the first less it, freed of what is not seen, and its standard deviations, (n, m + f, 2)."""
-        first, *others = self.views
-        fields, sigmas = [], []
-        for view in others:
-            freed = view.freeing(self.use)
-            root = np.concatenate([freed @ first.root, freed @ view.root], axis=1)
-            fields.append((freed @ (view.value - first.value).ravel()).reshape(-1, 2))
-            sigmas.append(np.sqrt(np.square(root).sum(axis=1)).reshape(-1, 2))
-        return np.array(fields), np.array(sigmas)
+    def difference(self, k: int) -> tuple[Array, Array]:
+        """View k less the first one."""
+        return self._freed(np.eye(len(self.changes))[k] - np.eye(len(self.changes))[0])
 
     def trend_field(self) -> tuple[Array, Array]:
-        """The change in a unit of time (m + f, 2), freed of what is not seen, and its standard deviations."""
-        rows, right = self._design((0, 1))
-        scale = np.linalg.norm(rows, axis=0)
-        scale[scale == 0] = 1.0
-        inverse = lstsq(rows / scale, np.eye(len(rows)), cond=_RANK, lapack_driver="gelsy")[0] / scale[:, None]
-        size = self.basis.shape[1]
-        by = self.views[-1].freeing(self.use) @ self.basis @ inverse[size : 2 * size]
-        return (by @ right).reshape(-1, 2), np.sqrt(np.square(by).sum(axis=1)).reshape(-1, 2)
+        """The change from the first time to the last one along straight lines through all views, each weighed by how
+        well it is known."""
+        variances = np.array([np.square(self.freeing @ root).sum(axis=1).mean() for root in self.roots])
+        weights = 1.0 / (variances + _UNSEEN_UM**2)
+        along = self.times - np.average(self.times, weights=weights)
+        return self._freed(weights * along * np.ptp(self.times) / np.sum(weights * along**2))
+
+    def _freed(self, factors: Array) -> tuple[Array, Array]:
+        """The sum of the views times factors, freed of what is not seen, (m + f, 2), and its covariance by place."""
+        change = np.sum([factor * each for factor, each in zip(factors, self.changes, strict=True)], axis=0)
+        root = np.hstack([factor * (self.freeing @ each) for factor, each in zip(factors, self.roots, strict=True)])
+        by_place = root.reshape(-1, 2, root.shape[1])
+        return (self.freeing @ change).reshape(-1, 2), by_place @ by_place.swapaxes(1, 2)

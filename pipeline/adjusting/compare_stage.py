@@ -1,7 +1,9 @@
 """`reseau compare`: the calibrations of a camera in several adjustment.json, compared as a field over the frame."""
 
 import json
+from collections import defaultdict
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from adjust.choices.comparison import CameraCalibration, Comparison, Test, Use, compare
+from adjust.choices.comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
 from adjust.functional_model.families import parameter_names
 from pipeline.adjusting.compare_picture import draw_comparison
 from pipeline.errors import InputError
@@ -35,9 +37,10 @@ def run_compare(
     Raises InputError or AdjustmentError for a file that holds no calibration of the camera, or for what cannot be
     compared.
     """
+    labels = _labels(paths)
     contents = [read_adjustment(path) for path in paths]
     names = [_camera(path, content, camera) for path, content in zip(paths, contents, strict=True)]
-    calibrations = [_calibration(*each) for each in zip(paths, contents, names, strict=True)]
+    calibrations = [_calibration(*each) for each in zip(paths, contents, names, labels, strict=True)]
     halves = [_half_mm(*each) for each in zip(paths, contents, names, strict=True)]
     comparison = compare(calibrations, (min(x for x, _ in halves), min(y for _, y in halves)), times, use)
     remarks = _remarks(paths, contents, names)
@@ -51,8 +54,19 @@ def run_compare(
 
 def verdict(comparison: Comparison, level: float) -> str:
     """`drift` where calibrations that are the same would differ as much in fewer than `level` of all cases."""
-    changed = comparison.same.probability < level
-    return DRIFT if changed else NO_DRIFT
+    return DRIFT if comparison.probability < level else NO_DRIFT
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """Names of the files: of what differs in their paths as many last parts as tell them apart."""
+    parts = [path.resolve().with_suffix("").parts for path in paths]
+    twice = next((path for k, path in enumerate(paths) if parts[k] in parts[:k]), None)
+    if twice is not None:
+        raise InputError(f"{twice}: is named twice; a calibration is compared with others, not with itself.")
+    while len(parts) > 1 and len({each[-1] for each in parts}) == 1:
+        parts = [each[:-1] for each in parts]
+    enough = next(n for n in count(1) if len({each[-n:] for each in parts}) == len(parts))
+    return ["/".join(each[-enough:]) for each in parts]
 
 
 def _camera(path: Path, content: Json, name: str | None) -> str:
@@ -66,7 +80,7 @@ def _camera(path: Path, content: Json, name: str | None) -> str:
     return name
 
 
-def _calibration(path: Path, content: Json, name: str) -> CameraCalibration:
+def _calibration(path: Path, content: Json, name: str, label: str) -> CameraCalibration:
     if not content["converged"]:
         raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
     camera = content["cameras"][name]
@@ -77,9 +91,7 @@ def _calibration(path: Path, content: Json, name: str) -> CameraCalibration:
     unknowns = [f"IO.{name}.{each}" for each in ("c", "x0", "y0", *parameter_names(distortion.family))]
     unknowns += [f"FID.{name}.{id}.{axis}" for id in marks for axis in "xy"]
     covariance = read_covariance(path).of(unknowns)
-    return CameraCalibration(
-        path.parent.name or path.stem, distortion, interior, parameters, marks, covariance, content["redundancy"]
-    )
+    return CameraCalibration(label, distortion, interior, parameters, marks, covariance, content["redundancy"])
 
 
 def _half_mm(path: Path, content: Json, name: str) -> tuple[float, float]:
@@ -102,6 +114,15 @@ def _remarks(paths: Sequence[Path], contents: Sequence[Json], names: Sequence[st
         for path, content in zip(paths, contents, strict=True)
         if content["calibrations"]
     ]
+    alike = defaultdict(list)
+    for path, content in zip(paths, contents, strict=True):
+        alike[content.get("made_from", {}).get("marks")].append(str(path))
+    remarks += [
+        f"{listed(same)} were adjusted from the same measured marks: they are not independent, and that they agree "
+        "says nothing of the camera."
+        for marks, same in alike.items()
+        if marks and len(same) > 1
+    ]
     if len(set(names)) > 1:
         remarks.append(f"the cameras have different names: {listed(names)}. Are they the same one?")
     return tuple(remarks)
@@ -112,6 +133,7 @@ def comparison_json(comparison: Comparison, remarks: Sequence[str], level: float
     first, *others = comparison.calibrations
     return {
         "verdict": verdict(comparison, level),
+        "probability": comparison.probability,
         "level": level,
         "use": comparison.use,
         "same": _test(comparison.same),
@@ -125,18 +147,21 @@ def comparison_json(comparison: Comparison, remarks: Sequence[str], level: float
             {
                 "parameters": parameter_differences(first, other),
                 "field_um": comparison.field_um[k].tolist(),
-                "field_sigma_um": comparison.field_sigma_um[k].tolist(),
+                "field_sigma_um": sigmas(comparison.field_covariance_um2[k]).tolist(),
                 "fiducials": {
                     id: {"um": um.tolist(), "sigma_um": sigma.tolist()}
                     for id, um, sigma in zip(
-                        comparison.fiducials, comparison.fiducials_um[k], comparison.fiducials_sigma_um[k], strict=True
+                        comparison.fiducials,
+                        comparison.fiducials_um[k],
+                        sigmas(comparison.fiducials_covariance_um2[k]),
+                        strict=True,
                     )
                 },
             }
             for k, other in enumerate(others)
         ],
         "trend_um": comparison.trend_um.tolist() if comparison.trend else None,
-        "trend_sigma_um": comparison.trend_sigma_um.tolist() if comparison.trend else None,
+        "trend_sigma_um": sigmas(comparison.trend_covariance_um2).tolist() if comparison.trend else None,
         "remarks": list(remarks),
     }
 
@@ -187,20 +212,24 @@ def _why(comparison: Comparison, level: float) -> str:
         "space": "the camera's attitude and a similarity of the fiducial marks",
         "flat": "the camera's attitude and station over flat ground, and a similarity of the fiducial marks",
     }[comparison.use]
-    test = comparison.same
+    of_what = _counted(comparison.same) if comparison.trend is None else "twice the smaller one of two tests"
     sentence = (
-        f"Calibrations of an unchanged camera would differ as much with a probability of {test.probability:.2g} "
-        f"(chi-square {test.chi_square:.1f}, {test.freedom} degrees of freedom; drift is said below {level:g}), after "
-        f"{taken} have taken up what they can."
+        f"Calibrations of an unchanged camera would differ as much with a probability of {comparison.probability:.2g} "
+        f"({of_what}; drift is said below {level:g}), after {taken} have taken up what they can."
     )
     if comparison.trend is None:
         return sentence
-    steady = comparison.trend.probability
-    size = float(np.sqrt(np.mean(np.square(comparison.trend_um)))) if comparison.trend_um.size else 0.0
+    first, last = comparison.calibrations[0].name, comparison.calibrations[-1].name
     return (
-        f"{sentence} A steady change with time: {size:.2f} um rms a unit of time; so much comes by chance with a "
-        f"probability of {steady:.2g}."
+        f"{sentence} That all are one: {comparison.same.probability:.2g} ({_counted(comparison.same)}). That there is "
+        f"no steady change with time: {comparison.trend.probability:.2g} ({_counted(comparison.trend)}); from {first} "
+        f"to {last} it is {_rms(comparison.trend_um):.2f} um rms over the frame, "
+        f"{_largest(comparison.trend_um, comparison.trend_covariance_um2)}."
     )
+
+
+def _counted(test: Test) -> str:
+    return f"chi-square {test.chi_square:.1f}, {test.freedom} degrees of freedom"
 
 
 def _print_difference(
@@ -215,18 +244,22 @@ def _print_difference(
         values = (f"{row[key]:.7g}" for key in ("first", "other"))
         table.add_row(row["name"], *values, f"{row['difference']:+.3g}", sigmas)
     console.print(table)
-    field, size = comparison.field_um[k], np.hypot(*comparison.field_um[k].T)
-    x, y = comparison.places_mm[size.argmax()]
-    largest = _largest(field, comparison.field_sigma_um[k])
-    console.print(Text(f"Over the frame {np.sqrt(np.mean(size**2)):.2f} um rms, {largest} at ({x:.0f}, {y:.0f}) mm."))
+    field = comparison.field_um[k]
+    x, y = comparison.places_mm[np.hypot(*field.T).argmax()]
+    largest = _largest(field, comparison.field_covariance_um2[k])
+    console.print(Text(f"Over the frame {_rms(field):.2f} um rms, {largest} at ({x:.0f}, {y:.0f}) mm."))
     if comparison.fiducials:
         marks = comparison.fiducials_um[k]
         which = comparison.fiducials[np.hypot(*marks.T).argmax()]
-        largest = _largest(marks, comparison.fiducials_sigma_um[k])
+        largest = _largest(marks, comparison.fiducials_covariance_um2[k])
         console.print(Text(f"Fiducial marks after a similarity: {largest} at {which!r}."))
 
 
-def _largest(differences_um: Array, sigmas_um: Array) -> str:
+def _rms(differences_um: Array) -> float:
+    return float(np.sqrt((differences_um**2).sum(axis=1).mean()))
+
+
+def _largest(differences_um: Array, covariance_um2: Array) -> str:
     size = np.hypot(*differences_um.T)
-    sx, sy = sigmas_um[size.argmax()]
+    sx, sy = sigmas(covariance_um2[size.argmax()])
     return f"at most {size.max():.2f} um (sigmas {sx:.2f} and {sy:.2f} um)"

@@ -136,7 +136,7 @@ def _reliability_table(expected: Expected) -> Table:
         sizes = () if unit == "mixed" else (one.median, one.largest)
         errors = [_sigma(size) + UNIT_WORDS[unit] if math.isfinite(size) else NONE for size in sizes] or [NONE, NONE]
         table.add_row(
-            KINDS.get(one.group, one.group), str(one.coordinates), f"{one.redundancy:.2f}", *errors, str(one.unchecked)
+            KINDS.get(one.group, one.group), str(one.coordinates), fixed(one.redundancy), *errors, str(one.unchecked)
         )
     return table
 

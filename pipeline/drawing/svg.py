@@ -1,6 +1,6 @@
 """Drawing in SVG: elements, the axes of a chart, and files that hold one picture."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri
 
 from pipeline.text.atomic import write_atomically
 
@@ -67,6 +68,26 @@ def strokes(starts: Array, ends: Array, class_: str) -> Markup:
 
 def words(x: float, y: float, content: str, class_: str = "label", anchor: str = "start") -> Markup:
     return tag("text", content, x=x, y=y, class_=class_, text_anchor=anchor)
+
+
+def ellipse_axes(covariance: Array) -> tuple[Array, Array]:
+    """Semi-axes (n, 2) of the ellipses that hold 95 %, the larger last, and its direction (n,), counter-clockwise from
+    x in degrees; covariance (n, 2, 2)."""
+    variances, directions = np.linalg.eigh(covariance)
+    angles = np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
+    return np.sqrt(chdtri(2, 0.05) * np.maximum(variances, 0.0)), angles
+
+
+def ellipses(centers: Array, radii_px: Array, angles_deg: Array) -> Iterator[Markup]:
+    """About centers (n, 2), as `ellipse_axes` gives them."""
+    for (x, y), (minor, major), angle in zip(centers, radii_px, angles_deg, strict=True):
+        yield tag(
+            "ellipse",
+            rx=float(major),
+            ry=float(minor),
+            transform=f"translate({x:.2f} {y:.2f}) rotate({-angle:.2f})",
+            class_="ellipse",
+        )
 
 
 @dataclass(frozen=True)

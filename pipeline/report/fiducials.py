@@ -1,12 +1,11 @@
 """Fiducial marks, given against estimated, as a figure that is free of the datum in which the camera stands."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from pipeline.drawing import svg
 from pipeline.report.data import Json
@@ -115,8 +114,7 @@ def figure_of_films(name: str, camera: Json, covariance: Covariance, kinds: Iter
 
 def figure_plot(change: Figure) -> Markup:
     """The given places, the change of each mark as a stroke, and the 95 % ellipse about its end."""
-    axes, angles = ellipse_axes(change.of_marks_um2)
-    radius = np.sqrt(chdtri(2, 0.05)) * axes
+    radius, angles = svg.ellipse_axes(change.of_marks_um2)
     reach = np.hypot(*change.change_um.T) + radius.max(axis=1)
     px_per_um = svg.round_step(LONGEST_PX / float(reach.max())) if reach.max() > 0.0 else 1.0
     low, high = change.given_mm.min(axis=0), change.given_mm.max(axis=0)
@@ -128,7 +126,7 @@ def figure_plot(change: Figure) -> Markup:
     x_corner, y_corner = (MARGIN_PX + px_per_mm * np.stack([corners[:, 0] - low[0], high[1] - corners[:, 1]], axis=1)).T
     content = [
         svg.line(x_corner, y_corner, "frame", closed=True),
-        *ellipses(ends, px_per_um * radius, angles),
+        *svg.ellipses(ends, px_per_um * radius, angles),
         svg.strokes(places, ends, "vector fiducial"),
         svg.strokes(places, places, "dot fiducial"),
         *(svg.words(x + 8.0, y + 16.0, id, "name") for id, (x, y) in zip(change.ids, places, strict=True)),
@@ -212,20 +210,3 @@ def _common_to_films(marks: Array, kinds: set[str]) -> Array:
             terms = [x ** (degree - k) * y**k for degree in range(2, order + 1) for k in range(degree + 1)]
             moved += [pair for term in terms for pair in ((term, zeros), (zeros, term))]
     return np.stack([np.stack(pair, axis=1).ravel() for pair in moved], axis=1)
-
-
-def ellipse_axes(covariance: Array) -> tuple[Array, Array]:
-    """Semi-axes (n, 2), the larger last, and its direction (n,), counter-clockwise from x in degrees."""
-    variances, directions = np.linalg.eigh(covariance)
-    return np.sqrt(np.maximum(variances, 0.0)), np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
-
-
-def ellipses(centers: Array, radii_px: Array, angles_deg: Array) -> Iterator[Markup]:
-    for (x, y), (minor, major), angle in zip(centers, radii_px, angles_deg, strict=True):
-        yield svg.tag(
-            "ellipse",
-            rx=float(major),
-            ry=float(minor),
-            transform=f"translate({x:.2f} {y:.2f}) rotate({-angle:.2f})",
-            class_="ellipse",
-        )

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from adjust.functional_model.scanner import Bend
 from pipeline.drawing import svg
 from pipeline.report.data import Json, ReportData
-from pipeline.report.fiducials import ellipse_axes, ellipses
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import ParameterRow, group_sentences, term_rows
 from pipeline.report.vectors import FOOT_PX, Plane, scale_bar
@@ -95,8 +93,7 @@ def _grid(scanner: Json) -> Array:
 
 
 def _drawn(field: Field, on: Plane) -> Markup:
-    axes, angles = ellipse_axes(field.covariance_um2)
-    radii_um = np.sqrt(chdtri(2, 0.05)) * axes
+    radii_um, angles = svg.ellipse_axes(field.covariance_um2)
     reach_um = float((np.hypot(*field.value_um.T) + radii_um.max(axis=1)).max())
     mesh_px = on.px_per_mm * float(np.ptp(field.xy_mm, axis=0).max()) / (GRID - 1)
     px_per_um = svg.round_step(LONGEST * mesh_px / reach_um) if reach_um > 0.0 else 1.0
@@ -107,7 +104,7 @@ def _drawn(field: Field, on: Plane) -> Markup:
         on.height_px + FOOT_PX,
         "The scanner's bend with 95 % ellipses over its scans",
         on.drawn(),
-        *ellipses(ends, px_per_um * radii_um, angles),
+        *svg.ellipses(ends, px_per_um * radii_um, angles),
         svg.strokes(starts, ends, "vector target"),
         svg.strokes(starts, starts, "dot target"),
         scale_bar(on, px_per_um),

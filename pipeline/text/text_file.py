@@ -45,7 +45,7 @@ def read_bytes(path: Path, most_mb: int = MOST_MB) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file; FileNotFoundError as above. Raises InputError, which says to make the file anew,
+    """The content of a JSON file; FileNotFoundError as above. Raises InputError, which says how to make the file anew,
     for what is no JSON: NaN, infinite and endless numbers, and tables nested beyond sense, too."""
     return parse_json(read_bytes(path), path)
 
@@ -55,7 +55,9 @@ def parse_json(data: bytes, path: Path) -> Any:
     try:
         return json.loads(data.decode("utf-8"), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not valid JSON ({error}). Delete it and run the stage again.") from None
+        raise InputError(
+            f"{path}: is not valid JSON ({error}). It is a file of another kind, or damaged: then run its stage again."
+        ) from None
 
 
 def _no_number(text: str) -> float:

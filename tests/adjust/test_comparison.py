@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from adjust.choices.comparison import CameraCalibration, compare
+from adjust.choices.comparison import CameraCalibration, compare, sigmas
 from adjust.errors import AdjustmentError
 from adjust.problem.network import Distortion
 
@@ -61,25 +61,36 @@ def test_false_alarms_come_as_often_as_stated() -> None:
 def test_a_trend_is_tested_at_its_level_and_found() -> None:
     rng = np.random.default_rng(2)
     years, drift = np.array([1952.0, 1955.0, 1961.0, 1970.0]), np.zeros(7)
-    trends = [compare([drawn(rng) for _ in years], HALF, years).trend for _ in range(100)]
-    alarms = sum(trend is not None and trend.probability < 0.05 for trend in trends)
-    assert abs(alarms - 5) < 3.5 * np.sqrt(5 * 0.95)
+    series = [compare([drawn(rng) for _ in years], HALF, years) for _ in range(100)]
+    for alarms in (
+        sum(each.trend is not None and each.trend.probability < 0.05 for each in series),
+        sum(each.probability < 0.05 for each in series),
+    ):
+        assert abs(alarms - 5) < 3.5 * np.sqrt(5 * 0.95)
+    corners = [0, 6, 42, 48]
+    roots = np.linalg.cholesky(series[0].trend_covariance_um2[corners])
+    standardised = np.linalg.solve(roots, np.array([each.trend_um[corners] for each in series])[..., None])
+    assert np.sqrt(np.mean(standardised**2)) == pytest.approx(1.0, abs=0.15)
     drift[3] = 4e-9  # k3 a year
     moving = compare([drawn(rng, drift * (year - years[0])) for year in years], HALF, years)
     assert moving.trend is not None
-    assert moving.trend.probability < 1e-3
+    assert moving.trend.freedom == moving.same.freedom / 3
+    assert moving.probability < 1e-3
+    still = compare([calibration(TRUE + drift * (year - years[0])) for year in years], HALF, years)
+    ends = compare([calibration(TRUE), calibration(TRUE + drift * 18.0)], HALF)
+    assert still.trend_um == pytest.approx(ends.field_um[0], abs=0.05)
 
 
 def test_the_sigmas_of_the_field_hold() -> None:
     rng = np.random.default_rng(3)
     compared = [compare([drawn(rng), drawn(rng)], HALF) for _ in range(200)]
-    claimed = compared[0].field_sigma_um[0]
+    claimed = sigmas(compared[0].field_covariance_um2[0])
     realised = np.std([each.field_um[0] for each in compared], axis=0)
     seen = claimed > 0.1
     assert seen.sum() > 60
     assert np.median(realised[seen] / claimed[seen]) == pytest.approx(1.0, abs=0.06)
-    marks = np.std([each.fiducials_um[0] for each in compared], axis=0) / compared[0].fiducials_sigma_um[0]
-    assert np.median(marks) == pytest.approx(1.0, abs=0.08)
+    of_marks = np.std([each.fiducials_um[0] for each in compared], axis=0)
+    assert np.median(of_marks / sigmas(compared[0].fiducials_covariance_um2[0])) == pytest.approx(1.0, abs=0.08)
 
 
 @pytest.mark.parametrize(("sigmas", "least"), [(3.0, 0.1), (8.0, 0.9)])

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from pipeline.adjusting.compare_stage import _labels
 from pipeline.cli import run
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -31,7 +32,10 @@ def moved(project: Path, name: str, change_mm: float) -> Path:
 def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = project / "out" / "adjustment.json"
     assert run(["compare", str(first), str(moved(project, "same", 0.0))]) == 0
-    assert capsys.readouterr().out.startswith("no drift\n")
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.startswith("no drift ")
+    assert "same less out" in told
+    assert "were adjusted from the same measured marks: they are not independent" in told
     out = project / "compared"
     assert run(["compare", str(first), str(moved(project, "later", 0.5)), "--out", str(out)]) == 1
     told = capsys.readouterr().out
@@ -53,6 +57,9 @@ def test_a_series_has_a_trend(project: Path, capsys: pytest.CaptureFixture[str])
     assert run(["compare", *paths, "--times", "1952,1958,1961,1970", "--json"]) == 1
     content = json.loads(capsys.readouterr().out)
     assert content["trend"]["probability"] < 1e-6
+    assert content["probability"] <= 2 * content["trend"]["probability"]
+    corner = np.array(content["trend_um"])[np.abs(content["places_mm"]).sum(axis=1).argmax()]
+    assert np.hypot(*corner) == pytest.approx(np.hypot(25.0, 25.0) * 0.36 / 60.3 * 1e3, rel=0.1)  # over 18 years
     assert [each["time"] for each in content["calibrations"]] == [1952.0, 1958.0, 1961.0, 1970.0]
 
 
@@ -65,6 +72,25 @@ def test_a_series_has_a_trend(project: Path, capsys: pytest.CaptureFixture[str])
     ],
 )
 def test_what_it_refuses(arguments: list[str], words: str, project: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = str(project / "out" / "adjustment.json")
-    assert run(["compare", path, path, *arguments]) == 2
+    paths = [str(project / "out" / "adjustment.json"), str(moved(project, "same", 0.0))]
+    assert run(["compare", *paths, *arguments]) == 2
     assert words in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_file_named_twice_is_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(project / "out" / "adjustment.json")
+    assert run(["compare", path, path]) == 2
+    assert "is named twice" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("files", "labels"),
+    [
+        (("a/out/adjustment.json", "b/out/adjustment.json"), ["a", "b"]),
+        (("1952/adjustment.json", "1959/adjustment.json"), ["1952", "1959"]),
+        (("a/x/adjustment.json", "b/x/adjustment.json", "b/y/adjustment.json"), ["a/x", "b/x", "b/y"]),
+        (("out/1952.json", "out/1959.json"), ["1952", "1959"]),
+    ],
+)
+def test_calibrations_are_named_by_what_differs_in_their_paths(files: tuple[str, ...], labels: list[str]) -> None:
+    assert _labels([Path(file) for file in files]) == labels
