@@ -42,17 +42,17 @@ def cluster_executor(address: str, scans: Sequence[str], workers: int | None = N
     with ExitStack() as stack:
         if address == LOCAL:
             count = workers or processes(len(scans) or 1)
-            cluster = LocalCluster(  # type: ignore[no-untyped-call]
+            cluster = LocalCluster(
                 n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
             )
             stack.callback(cluster.close)
-            client = Client(cluster, timeout=_ANSWER_S)  # type: ignore[no-untyped-call]
+            client = Client(cluster, timeout=_ANSWER_S)
         else:
             client = _client(Client, address)
         stack.callback(client.close)
         _check_workers(client, address, _one_a_folder(scans))
         client.register_plugin(_alone_plugin(), name="reseau")
-        executor = client.get_executor(retries=_RETRIES, pure=False)  # type: ignore[no-untyped-call]
+        executor = client.get_executor(retries=_RETRIES, pure=False)
         yield SubmittedAgain(executor)
 
 
@@ -182,7 +182,7 @@ def _alone_plugin() -> Any:
     """Every worker, also one that takes another's place, works in one thread."""
     from distributed.diagnostics.plugin import WorkerPlugin
 
-    class WorkAlone(WorkerPlugin):
+    class WorkAlone(WorkerPlugin):  # type: ignore[misc]
         def setup(self, worker: Any) -> None:
             work_alone()
 

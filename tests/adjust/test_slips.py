@@ -48,6 +48,12 @@ def place(sentence: str) -> Array:
     return np.array([float(part.split(" = ")[1]) for part in sentence.split("meet at ")[1].split(", ")[:3]])
 
 
+@pytest.fixture
+def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No slip of the whole network is sought, which takes longer than all the rest."""
+    monkeypatch.setattr("adjust.solution.adjustment._check_whole", lambda *_: None)
+
+
 def test_a_slip_without_a_minimum_is_named() -> None:
     network, xyz = field()
     result = adjusted(with_given(network, {WRONG: xyz[WRONG] * [1.0, -1.0, 1.0]}), iteration_limit=STOPPED)
@@ -68,6 +74,7 @@ def test_a_slip_with_a_wrong_minimum_is_named_alike(offset: float) -> None:
     assert f"control point {WRONG} X" in [suspect.tested.name for suspect in result.suspects]
 
 
+@pytest.mark.usefixtures("one_by_one")
 @pytest.mark.parametrize("options", [{"snooping": True}, {"robust": "igg3"}])
 def test_methods_that_leave_out_begin_without_a_slip(options: dict[str, bool | str]) -> None:
     network, xyz = field()
@@ -82,6 +89,7 @@ def test_methods_that_leave_out_begin_without_a_slip(options: dict[str, bool | s
     assert found == pytest.approx(xyz[WRONG], abs=0.5)
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_a_redescending_method_begins_without_a_slip_among_few_points() -> None:
     network, xyz = field(5018, 18)
     result = adjusted(with_given(network, {WRONG: xyz[WRONG] + [500.0, -400.0, 300.0]}), robust="igg3")
@@ -89,6 +97,7 @@ def test_a_redescending_method_begins_without_a_slip_among_few_points() -> None:
     assert {f"control point {WRONG} {axis}" for axis in "XYZ"} <= {each.tested.name for each in result.suspects}
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_a_point_behind_the_cameras_is_a_slip() -> None:
     network, xyz = field()
     spoilt = with_given(network, {WRONG: xyz[WRONG] + [0.0, 0.0, 3000.0]})
@@ -98,6 +107,7 @@ def test_a_point_behind_the_cameras_is_a_slip() -> None:
     assert [(each.tested.name, each.removed) for each in result.suspects] == [(f"control point {WRONG} Z", True)]
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_exchanged_points_are_both_named() -> None:
     network, xyz = field()
     warnings = adjusted(with_given(network, {0: xyz[WRONG], WRONG: xyz[0]}), iteration_limit=STOPPED).warnings
@@ -107,6 +117,7 @@ def test_exchanged_points_are_both_named() -> None:
         assert f"It lies where point {other} is given." in own
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_fixed_coordinates_are_slips_as_well() -> None:
     network, xyz = field(3, 20, sigma=0.0)
     result = adjusted(with_given(network, {WRONG: xyz[WRONG][[1, 0, 2]]}), iteration_limit=STOPPED)
@@ -124,6 +135,7 @@ def test_what_is_wrong_with_all_points_is_no_slip_of_one() -> None:
     assert shifted.converged
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_four_points_do_not_tell_which_is_wrong() -> None:
     network, xyz = field(4, 12)
     few = replace(
@@ -137,6 +149,7 @@ def test_four_points_do_not_tell_which_is_wrong() -> None:
         adjusted(with_given(few, {1: xyz[1] + [300.0, 0.0, 0.0]}))
 
 
+@pytest.mark.usefixtures("one_by_one")
 @pytest.mark.parametrize("seed", range(4))
 def test_a_lens_that_is_not_known_makes_no_slips(seed: int) -> None:
     """Half a millimetre of distortion, adjusted without any: points at the border are off, but none stands alone."""

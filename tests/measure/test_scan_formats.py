@@ -226,6 +226,17 @@ def test_the_first_full_picture_of_several_is_taken(tmp_path: Path) -> None:
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
 
 
+def test_a_stack_is_read_and_what_was_put_into_its_pixels_is_seen(tmp_path: Path) -> None:
+    """tifffile leaves room behind the tags of a further picture, and says the numbers of the first one's instead."""
+    tifffile.imwrite(tmp_path / "s.tif", np.stack([picture()] * 3), photometric="minisblack")
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
+    data = (tmp_path / "s.tif").read_bytes()
+    for put_in in (2, 12, 40):
+        (tmp_path / "s.tif").write_bytes(data[:400] + bytes(put_in) + data[400:])
+        with pytest.raises(MeasurementError, match="damaged or truncated"):
+            open_scan(tmp_path / "s.tif")
+
+
 def test_the_orientation_tag_is_said_and_not_applied(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "s.tif", picture(), extratags=[(274, 3, 1, 6, True)])
     with open_scan(tmp_path / "s.tif") as scan:

@@ -22,6 +22,7 @@ from synthetic_images.tone_curve import coded
 
 FULL = 65535.0
 DARK, LIGHT = 0.06, 0.55
+SETTLED = 1e-5  # the square of how far a curve may still move, in its prior standard deviations
 CURVES: tuple[float | str, ...] = (1.0, 2.2, "srgb", "s-curve")
 # A half-wedge that grows out of the border: its tip, and no more, holds it along its axis.
 TIP = Kind(
@@ -41,13 +42,13 @@ def fitted(mark: TrueMark, code: np.ndarray, tone: Tone) -> Match:
 
 
 def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tuple[list[Match], FrameTone]:
-    best, result = np.inf, None
+    """From the first start at which the marks agree on the curve that they were matched by, or the best."""
+    tried = []
     for start in (prior, prior.like_power(1.0), prior.like_power(2.2)):
-        fits, found = settled_from(start, marks, codes, prior)
-        if found.unsettled < best:
-            best, result = found.unsettled, (fits, found)
-    assert result is not None
-    return result
+        tried.append(settled_from(start, marks, codes, prior))
+        if tried[-1][1].unsettled < SETTLED:
+            break
+    return min(tried, key=lambda each: each[1].unsettled)
 
 
 def settled_from(
@@ -57,6 +58,8 @@ def settled_from(
         fits = [fitted(mark, code, tone) for mark, code in zip(marks, codes, strict=True)]
         told = {n: fit.tone for n, fit in enumerate(fits) if fit.tone is not None}
         found = FrameTone.of(prior, told, tone)
+        if found.apart < SETTLED:
+            break
         tone = found.step_from(tone)
     return fits, found
 

@@ -68,7 +68,7 @@ class Answers:
 def test_workers_are_asked_for_their_versions_and_their_way_to_the_scans() -> None:
     same = cluster.versions()
     good = (same, list[tuple[str, str]]())
-    cluster._check_workers(Answers({"a": good}), "x", [])  # type: ignore[arg-type]
+    cluster._check_workers(Answers({"a": good}), "x", [])
     other = ({**same, "numpy": "1.0"}, list[tuple[str, str]]())
     cases = {
         "b: has numpy 1.0, here": other,
@@ -81,7 +81,7 @@ def test_workers_are_asked_for_their_versions_and_their_way_to_the_scans() -> No
     }
     for words, answer in cases.items():
         with pytest.raises(InputError, match=words):
-            cluster._check_workers(Answers({"a": good, "b": answer}), "x", [])  # type: ignore[arg-type]
+            cluster._check_workers(Answers({"a": good, "b": answer}), "x", [])
 
 
 def test_one_scan_a_folder_is_looked_for(tmp_path: Path) -> None:

@@ -201,7 +201,10 @@ def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras
     frame: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Four scans of one size and one of another, in a folder and below it: three and one are tried. A scan that cannot
-    be read costs no other, and the project's camera, which the library has not, is named beside its twins."""
+    be read costs no other, and the project's camera, which the library has not, is named beside its twins. No other
+    pitch than the files' is tried."""
+    monkeypatch.setattr(LayoutSearch, "longer_one_way", LayoutSearch.at_pitch)
+    monkeypatch.setattr(camera_trials, "_at_any_pitch", lambda *_: [])
     (scan,) = (frame.parent / "scans").glob("*.tif")
     folder = tmp_path / "scans"
     (folder / "b").mkdir(parents=True)
