@@ -10,7 +10,7 @@ from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
 from pipeline.commands import adjusting, exchanging, measuring
 from pipeline.commands.shared import DONE, INTERNAL_ERROR, INTERRUPTED, LOOK, WRONG_INPUT
-from pipeline.errors import InputError, what_to_do
+from pipeline.errors import InputError, what_to_do, what_to_do_about_store
 from pipeline.terminal import plain, spell_out_missing_letters
 
 __all__ = ["DONE", "INTERNAL_ERROR", "INTERRUPTED", "LOOK", "WRONG_INPUT", "app", "run"]
@@ -76,7 +76,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         return _message(f"{place}{error.strerror or error}. {what_to_do(error)}", WRONG_INPUT)
-    except Exception:
+    except Exception as error:
+        if next_step := what_to_do_about_store(error):
+            return _message(f"the store of what is measured cannot be written ({error}). {next_step}", WRONG_INPUT)
         import traceback
 
         traceback.print_exc()

@@ -1,13 +1,20 @@
 """What the user's files and arguments can get wrong, and what helps where the machine refuses."""
 
 import errno
+import sqlite3
 
+_ROOM, _PERMISSION = "Make room there, or set another output folder.", "Give permission, or set another folder."
 _ADVICE = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "Make room there, or set another output folder."),
-    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "Give permission, or set another folder."),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _ROOM),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), _PERMISSION),
     **dict.fromkeys((errno.EMFILE, errno.ENFILE), "Close other programs, or allow more open files (ulimit -n)."),
     errno.ENAMETOOLONG: "Choose a shorter name.",
     errno.ENOMEM: "Close other programs: the memory is full.",
+}
+_OF_STORE = {
+    **dict.fromkeys((sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR), f"{_ROOM} What was measured is kept."),
+    **dict.fromkeys((sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM), _PERMISSION),
+    sqlite3.SQLITE_BUSY: "Another process has it: let that end first.",
 }
 
 
@@ -22,3 +29,8 @@ class WriteError(InputError):
 def what_to_do(error: OSError) -> str:
     """The next step after what the operating system refused."""
     return _ADVICE.get(error.errno or 0, "Check the path, and that the drive is there.")
+
+
+def what_to_do_about_store(error: BaseException) -> str:
+    """The next step after what the operating system refused to SQLite; empty where it was something else."""
+    return _OF_STORE.get(getattr(error, "sqlite_errorcode", 0) & 0xFF, "")

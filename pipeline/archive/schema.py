@@ -9,7 +9,7 @@ import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, what_to_do_about_store
 
 APPLICATION = 0x52455345  # "RESE": `file` and this program know the file by it
 
@@ -137,7 +137,8 @@ def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
         connection.create_function("sqrt", 1, _sqrt, deterministic=True)  # not every SQLite is built with it
     except sqlite3.DatabaseError as error:
         connection.close()
-        raise InputError(f"{path}: cannot be used as a store of {schema.what} ({error}). {_MOVE}") from error
+        next_step = what_to_do_about_store(error) or _MOVE
+        raise InputError(f"{path}: cannot be used as a store of {schema.what} ({error}). {next_step}") from error
     except BaseException:
         connection.close()
         raise

@@ -222,10 +222,11 @@ class Store:
         self._db.execute("begin immediate")
         try:
             yield
+            self._db.execute("commit")
         except BaseException:
-            self._db.execute("rollback")
+            if self._db.in_transaction:  # of a full disk SQLite takes it back itself
+                self._db.execute("rollback")
             raise
-        self._db.execute("commit")
 
     def pose_of(self, result: int) -> str | None:
         """The name of the pose in which a result's marks have their names."""

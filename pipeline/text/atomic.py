@@ -37,8 +37,10 @@ def writing(told: Path) -> Iterator[None]:
     try:
         yield
     except (FileExistsError, NotADirectoryError) as error:
+        named = Path(error.filename)
+        file = next(each for each in (named, *named.parents) if each.exists())
         raise WriteError(
-            f"{told}: cannot be written: {error.filename} is a file, and a folder is needed there. Set another output."
+            f"{told}: cannot be written: {file} is a file, and a folder is needed there. Set another output."
         ) from error
     except OSError as error:
         raise WriteError(

@@ -41,7 +41,8 @@ def _parse(path: Path) -> dict[str, Any]:
     except RecursionError:
         raise InputError(f"{path}: is not valid TOML here: lists or tables stand in one another too deep.") from None
     except ValueError as error:  # a syntax error, or a number of thousands of digits
-        raise InputError(f"{path}: is not valid TOML: {error}. Mend that line.") from None
+        in_path = " (a path has / in the place of \\)" if re.search("Unescaped|hex value", str(error)) else ""
+        raise InputError(f"{path}: is not valid TOML: {error}. Mend that line{in_path}.") from None
 
 
 def _toml_files_in(folder: Path) -> str:

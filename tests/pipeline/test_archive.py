@@ -18,6 +18,7 @@ from drawn_frames import layout_of
 from drawn_project import CAMERA, write_project
 
 from measure.marks.shapes import MarkShape, polygon
+from pipeline.archive.schema import opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.archive.witness import Witnessed, witnessed_scan
@@ -260,6 +261,29 @@ def test_an_interrupt_keeps_what_is_done(
     assert measure(tmp_path / "p") == 0
     assert len(measured) == 1
     assert "2 of 3 scans are measured already; 1 to measure" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_told_and_costs_nothing_that_was_measured(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: SAID
+) -> None:
+    before = marks(folder)
+    one_more(folder)
+
+    def full(path: Path) -> sqlite3.Connection:
+        store = opened(path)
+        store.execute("pragma max_page_count = 1")  # no page more than there are
+        return store
+
+    with monkeypatch.context() as patched:
+        patched.setattr("pipeline.archive.store.opened", full)
+        assert measure(folder) == 2
+    said = capsys.readouterr().err
+    assert "is full). Make room there" in said
+    assert "Traceback" not in said
+    assert marks(folder) == before
+    measured.clear()
+    assert measure(folder) in (0, 1)
+    assert measured == ["d"]
 
 
 def test_shards_joined_are_the_same_as_one_machine(folder: Path, three: Path, tmp_path: Path, capsys: SAID) -> None:
