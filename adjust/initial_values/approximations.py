@@ -37,6 +37,11 @@ def approximate(network: Network) -> Approximations:
     Raises AdjustmentError, naming the image, camera or point, where something cannot be found, and what would help.
     """
     validate(network)
+    return initial_values(network)
+
+
+def initial_values(network: Network) -> Approximations:
+    """As `approximate`, of a network that was validated."""
     if network.has_parts:
         return _of_parts(network)
     films = _film_transformations(network)
@@ -64,7 +69,7 @@ def _of_parts(network: Network) -> Approximations:
         joins |= {(frame.name, point): xy for point, xy in frame.joins.items()}
     films |= _film_transformations(network)
     whole = whole_frames(network, films)
-    found = approximate(whole) if whole.images else Approximations({}, {}, {}, {})
+    found = initial_values(whole) if whole.images else Approximations({}, {}, {}, {})
     return replace(
         found,
         exterior={image.name: found.exterior[image.frame] for image in network.images if image.frame in found.exterior},

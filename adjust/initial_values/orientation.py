@@ -1,6 +1,5 @@
 """Exterior orientations and unknown points: as given, from known points, or from the images alone."""
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -106,14 +105,12 @@ def _scale_by_distances(block: Block, distances: Sequence[Distance]) -> None:
 def _all_points(block: Block) -> dict[str, Array]:
     """Every point's coordinates: as known, else intersected, else as roughly given."""
     points = {**block.rough, **intersected(block, 0.0)}
-    seen_in = defaultdict(list)
-    for image in sorted(block.sights):
-        for name in block.sights[image].points:
-            seen_in[name].append(image)
-    for name in sorted(seen_in):
-        if np.isnan(points[name]).any():
-            raise AdjustmentError(_why_not_intersected(name, seen_in[name]))
-    return {name: xyz for name, xyz in points.items() if not np.isnan(xyz).any()}
+    unknown = {name for name, xyz in points.items() if np.isnan(xyz).any()}
+    for name in sorted(unknown):
+        seen_in = [image for image in sorted(block.sights) if name in block.sights[image].points]
+        if seen_in:
+            raise AdjustmentError(_why_not_intersected(name, seen_in))
+    return {name: xyz for name, xyz in points.items() if name not in unknown}
 
 
 def _why_not_intersected(point: str, images: Sequence[str]) -> str:

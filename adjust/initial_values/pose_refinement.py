@@ -12,7 +12,7 @@ from adjust.functional_model.rotation import rotation_from_vector
 Array = NDArray[np.float64]
 
 LM_ITERATIONS = 12
-SETTLED = 1e-9  # relative change of a sum of squares that is none
+SETTLED = 1e-6  # relative change of a sum of squares that is none
 BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
 LARGEST_CHANGE = 0.5  # of a principal distance's logarithm in a step
 USUAL_BEND = 0.3  # standard deviation of a lens's third-degree distortion, at an angle of 45 degrees
@@ -80,7 +80,7 @@ def refined_distance(
 def squared_residuals(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
     """Squared residuals (k, n) in units of the principal distance."""
     u, v, w = _in_camera(rotations, shifts, points)
-    x, y = np.moveaxis(tangents, -1, 0)
+    x, y = tangents[..., 0], tangents[..., 1]
     seen = w < 0.0
     depth = np.where(seen, w, -1.0)
     squared = (u / depth + x) ** 2 + (v / depth + y) ** 2
@@ -94,7 +94,7 @@ def _moved(rotations: Array, shifts: Array, step: Array) -> tuple[Array, Array]:
 
 def _in_camera(rotations: Array, shifts: Array, points: Array) -> Array:
     """U, V, W (3, k, n) of points (n, 3), or (k, n, 3), in the axes of k cameras."""
-    return np.asarray(np.moveaxis(rotations @ np.swapaxes(points, -1, -2) + shifts[..., None], 1, 0))
+    return np.asarray((rotations @ points.swapaxes(-1, -2) + shifts[..., None]).swapaxes(0, 1))
 
 
 def _normal_equations(
@@ -105,7 +105,7 @@ def _normal_equations(
     u, v, w = _in_camera(rotations, shifts, points)
     inverse = -1.0 / np.minimum(w, -1e-9)
     p, q = u * inverse, v * inverse
-    (x, y), n = np.moveaxis(tangents, -1, 0), w.shape[1]
+    x, y, n = tangents[..., 0], tangents[..., 1], w.shape[1]
     columns = [(p * q, 1 + q * q), (-1 - p * p, -p * q), (-q, p), (inverse, 0.0), (0.0, inverse)]
     columns.append((p * inverse, q * inverse))
     if by_bend is not None:

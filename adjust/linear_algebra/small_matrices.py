@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 
 def zeros(count: int, *shape: int, dtype: DTypeLike = np.float64) -> Array:
     """(count, *shape)."""
-    return np.asarray(np.moveaxis(np.zeros((*shape, count), dtype=dtype), -1, 0))
+    return _members_first(np.zeros((*shape, count), dtype=dtype))
 
 
 def vectors(*elements: Array) -> Array:
@@ -28,22 +28,32 @@ def vectors(*elements: Array) -> Array:
 def matrices(*rows: Sequence[Array]) -> Array:
     """(n, i, k) of i rows of k elements (n,) each."""
     stacked = np.stack([element for row in rows for element in row])
-    return np.asarray(np.moveaxis(stacked.reshape(len(rows), len(rows[0]), stacked.shape[1]), -1, 0))
+    return _members_first(stacked.reshape(len(rows), len(rows[0]), stacked.shape[1]))
 
 
 def columns(members: Sequence[Array]) -> Array:
     """(n, i, k) of k columns (n, i)."""
-    return np.asarray(np.moveaxis(np.stack([member.T for member in members]), (0, 1, 2), (2, 1, 0)))
+    return np.stack([member.T for member in members]).T
 
 
 def laid_out(array: Array) -> Array:
     """The same array (n, ...), in memory as it is described above."""
-    return np.asarray(np.moveaxis(np.ascontiguousarray(np.moveaxis(array, 0, -1)), -1, 0))
+    return _members_first(np.ascontiguousarray(_members_last(array)))
 
 
 def of_each(array: Array, numbers: Indices) -> Array:
     """The members (n, ...) of an array (m, ...) that have these numbers (n,)."""
-    return np.asarray(np.moveaxis(np.take(np.moveaxis(array, 0, -1), numbers, axis=-1), -1, 0))
+    return _members_first(np.take(_members_last(array), numbers, axis=-1))
+
+
+def _members_first(array: Array) -> Array:
+    """(n, ...) of (..., n); `numpy.moveaxis` takes longer than the arithmetic of few members."""
+    return array.transpose(-1, *range(array.ndim - 1))
+
+
+def _members_last(array: Array) -> Array:
+    """(..., n) of (n, ...)."""
+    return array.transpose(*range(1, array.ndim), 0)
 
 
 def product(left: Array, right: Array) -> Array:
@@ -61,9 +71,8 @@ def applied(matrix: Array, vector: Array) -> Array:
 
 def cross(left: Array, right: Array) -> Array:
     """left x right (n, k, 3) of vectors (n, k, 3) and (n, k, 3), k of one of them may be 1."""
-    (a, b, c), (u, v, w) = np.moveaxis(left, -1, 0), np.moveaxis(right, -1, 0)
-    elements = (b * w - c * v, c * u - a * w, a * v - b * u)
-    return np.asarray(np.moveaxis(np.stack([np.moveaxis(each, 0, -1) for each in elements]), (0, -1), (-1, 0)))
+    (a, b, c), (u, v, w) = left.T, right.T
+    return np.stack((b * w - c * v, c * u - a * w, a * v - b * u)).T
 
 
 def determinant(matrix: Array) -> Array:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from adjust.errors import AdjustmentError, DatumError, NoImageError
-from adjust.initial_values.approximations import approximate
+from adjust.initial_values.approximations import initial_values
 from adjust.initial_values.far_points import far_points
 from adjust.least_squares.kept_memory import keep_freed_memory
 from adjust.problem.network import STRAIGHT, Approximations, Network
@@ -56,7 +56,7 @@ def adjust(
         own = _own_start(network, options)
         _check_whole(network, _plainly(network, own, options), options)
     try:
-        start = approximations or own or approximate(with_held(network, options.datum_coordinates))
+        start = approximations or own or initial_values(with_held(network, options.datum_coordinates))
         result = _adjusted(network, start, options)
     except DatumError:  # whatever the observations say
         raise
@@ -86,7 +86,7 @@ def _check_whole(network: Network, given: Adjustment | None, options: Options) -
 def _own_start(network: Network, options: Options) -> Approximations | None:
     """A network's own approximations; None where it has none."""
     try:
-        return approximate(with_held(network, options.datum_coordinates))
+        return initial_values(with_held(network, options.datum_coordinates))
     except AdjustmentError:
         return None
 
@@ -171,7 +171,7 @@ def _begun_anew(network: Network, approximations: Approximations, options: Optio
     """The adjustment from the network's own approximations; what is there already where these are no better."""
     for known in (*_without_guesses(network), network):
         try:
-            own = approximate(with_held(known, options.datum_coordinates))
+            own = initial_values(with_held(known, options.datum_coordinates))
         except AdjustmentError:
             continue
         if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):
