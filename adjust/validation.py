@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family
 from adjust.functional_model.transformation import fewest_marks, marks_needed
-from adjust.problem.network import Camera, Image, Network, Observations, Prior
+from adjust.problem.camera import Camera, Prior
+from adjust.problem.network import Image, Network
+from adjust.problem.observations import Observations
 
 TARGETS_NEEDED = 3
 SHOWN_AS = {"fiducial": 1, "join": 2}  # all others are object points

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.choices.comparison import CameraCalibration, compare
-from adjust.problem.network import Distortion
+from adjust.problem.camera import Distortion
 
 Array = NDArray[np.float64]
 

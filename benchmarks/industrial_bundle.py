@@ -12,18 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.problem.network import (
-    Approximations,
-    Camera,
-    Distance,
-    Distortion,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.network import Approximations, Image, Network, ObjectPoint
+from adjust.problem.observations import Distance, ObservationKind, Observations
 from adjust.solution.adjustment import Options, adjust
 
 SIGMA_MM = 0.0005

@@ -8,16 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.problem.network import (
-    Approximations,
-    Camera,
-    Distortion,
-    Image,
-    Network,
-    ObjectPoint,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.network import Approximations, Image, Network, ObjectPoint
+from adjust.problem.observations import Observations
 
 Array = NDArray[np.float64]
 Seen = tuple[NDArray[np.intp], Array]  # of an image: numbers of points, and their places (m, 2) in mm, y up

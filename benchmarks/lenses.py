@@ -20,17 +20,9 @@ from scipy.stats import chi2
 
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import (
-    Board,
-    Camera,
-    Distortion,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.network import Board, Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import Distortion as SceneDistortion

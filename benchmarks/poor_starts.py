@@ -23,18 +23,9 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
 from adjust.functional_model.transformation import Film
-from adjust.problem.network import (
-    Approximations,
-    Camera,
-    Distortion,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.network import Approximations, Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
 

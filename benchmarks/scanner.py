@@ -20,7 +20,8 @@ from simulated import Truth, field_points, simulated
 
 from adjust.choices.scanner_choice import choose_bends
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Approximations, Network, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import Approximations, Network
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
+from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.network import Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust
 from measure.codes_and_boards.board_specs import SquareGridSpec
 from measure.codes_and_boards.boards import measure_board

@@ -10,19 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
 from adjust.problem.functions import compute, derivatives
-from adjust.problem.network import (
-    Approximations,
-    Camera,
-    Distortion,
-    Exterior,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    Observations,
-    Prior,
-)
+from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
+from adjust.problem.observations import Observations
 from adjust.problem.problem import ABSENT, Problem, number
 
 Array = NDArray[np.float64]

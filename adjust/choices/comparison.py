@@ -20,7 +20,7 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import ideal_from_observed
-from adjust.problem.network import Distortion
+from adjust.problem.camera import Distortion
 
 Array = NDArray[np.float64]
 Use = Literal["space", "flat"]

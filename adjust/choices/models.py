@@ -10,7 +10,9 @@ from adjust.choices.scanner_choice import with_terms
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.scanner import is_left
 from adjust.functional_model.transformation import marks_needed
-from adjust.problem.network import Calibration, Network, Prior, Transformation
+from adjust.problem.camera import Prior
+from adjust.problem.network import Network, Transformation
+from adjust.problem.observations import Calibration
 
 # A transformation and the simpler ones that it contains, simplest first.
 TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
+from adjust.problem.camera import Prior
 from adjust.problem.images import adjusted_image
-from adjust.problem.network import Network, Prior, Scanner
+from adjust.problem.network import Network, Scanner
 from adjust.problem.result import Adjustment
 from adjust.quality.significance import LEVEL
 from adjust.undetermined.scanner_directions import HARDLY, poses_of, untold_sentences

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class Settings(Protocol):
-    """What a family is told beside its parameters; see `adjust.problem.network.Distortion`."""
+    """What a family is told beside its parameters; see `adjust.problem.camera.Distortion`."""
 
     @property
     def decentering(self) -> str: ...

@@ -18,7 +18,8 @@ from adjust.initial_values.orientation import orient
 from adjust.initial_values.principal_distance import find_principal_distance
 from adjust.initial_values.resection import Pose
 from adjust.initial_values.wide_angle import find_wide_distance
-from adjust.problem.network import Approximations, Camera, Image, Network
+from adjust.problem.camera import Camera
+from adjust.problem.network import Approximations, Image, Network
 from adjust.validation import validate
 
 Array = NDArray[np.float64]

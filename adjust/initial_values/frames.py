@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from adjust.functional_model.projection import ideal_from_observed
 from adjust.functional_model.sight import Sight
 from adjust.functional_model.transformation import film_kind
-from adjust.problem.network import Camera, Network
+from adjust.problem.camera import Camera
+from adjust.problem.network import Network
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from adjust.errors import AdjustmentError
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import LATTICE, fit_transformation
-from adjust.problem.network import Image, Network, Observations
+from adjust.problem.network import Image, Network
+from adjust.problem.observations import Observations
 
 Array = NDArray[np.float64]
 Film = tuple[Array, bool]  # parameters, and whether the scan is mirrored

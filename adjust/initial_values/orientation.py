@@ -13,7 +13,9 @@ from adjust.initial_values.block import Block, extend, intersected, known_field,
 from adjust.initial_values.free_model import orient_free_model, typical_residual
 from adjust.initial_values.resection import Pose, image_distances
 from adjust.initial_values.vertical_block import orient_vertical_block
-from adjust.problem.network import Distance, Exterior, Network, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import Exterior, Network
+from adjust.problem.observations import Distance
 
 Array = NDArray[np.float64]
 

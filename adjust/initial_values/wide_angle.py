@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.projection import camera_from_ray, ideal_from_observed, rays
 from adjust.initial_values.closed_form import KnownField
 from adjust.initial_values.resection import resect
-from adjust.problem.network import Distortion
+from adjust.problem.camera import Distortion
 
 Array = NDArray[np.float64]
 

@@ -1,101 +1,28 @@
 """What is adjusted: cameras, images, object points and observations, each with what is known of it beforehand.
 
-Units: image mm, object units of the user's choice, angles rad. A standard deviation of 0 fixes a quantity,
-inf frees it.
+Units: image mm, object units of the user's choice, angles rad.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.board import board_form
-from adjust.functional_model.families import parameter_names
 from adjust.functional_model.line_of_sight import STRAIGHT as STRAIGHT
 from adjust.functional_model.line_of_sight import LineOfSight as LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND, Bend, is_term
 from adjust.functional_model.transformation import film_kind
+from adjust.problem.camera import Camera, Prior
+from adjust.problem.observations import Calibration, Distance, Observations
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-Decentering = Literal["reduced", "paper"]
 Transformation = str  # as `adjust.functional_model.transformation` spells it
-ObservationKind = Literal["target", "fiducial", "tie", "join"]
-
-
-@dataclass(frozen=True)
-class Prior:
-    """A quantity as it is known beforehand: its value and the value's standard deviation (0 fixed, inf free)."""
-
-    value: float
-    sigma: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not np.isfinite(self.value):
-            raise ValueError(f"a value must be a finite number, not {self.value}")
-        if not self.sigma >= 0.0:
-            raise ValueError(f"a standard deviation must be 0 (fixed), positive or inf (free), not {self.sigma}")
-
-
-@dataclass(frozen=True)
-class Distortion:
-    """A distortion family, a name in `functional_model.families`, and its parameters; one not named is fixed at 0.
-
-    decentering "paper": Torlegård's decentering terms with x', y' as printed and not reduced to the principal point.
-    r0_mm: radius of zero radial distortion of `torlegard`, of a period of `juhl`.
-    half_mm: half the frame in x' and y', the length 1 of `ebner`, `gruen`, `legendre(n)` and `fourier(n)`; 0 not given.
-    """
-
-    family: str = "none"
-    parameters: Mapping[str, Prior] = field(default_factory=dict)
-    decentering: Decentering = "reduced"
-    r0_mm: float = 0.0
-    half_mm: tuple[float, float] = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        parameter_names(self.family)  # refuses a family that there is not
-        if self.decentering not in get_args(Decentering):
-            raise ValueError(f'the decentering must be "reduced" or "paper", not {self.decentering}')
-        if not 0.0 <= self.r0_mm < np.inf:
-            raise ValueError(f"r0 must be 0 or a positive length in mm, not {self.r0_mm}")
-        if not all(0.0 <= half < np.inf for half in self.half_mm):
-            raise ValueError(f"half the frame must be two lengths in mm, not {self.half_mm}")
-
-    @property
-    def values(self) -> Array:
-        """(k,) what is given of the family's parameters, 0 where nothing is."""
-        given = self.parameters
-        return np.array([given[name].value if name in given else 0.0 for name in parameter_names(self.family)])
-
-
-@dataclass(frozen=True)
-class Fiducial:
-    """A fiducial mark in the camera frame: the datum observations F5 and F6."""
-
-    x_mm: Prior
-    y_mm: Prior
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Interior orientation, distortion and fiducial marks (by id), with their priors F5 to F9.
-
-    principal_distance_mm None: unknown, an approximation is found from the points. The principal point likewise; it
-    then starts at the centre of the frame, `center_mm` in the camera frame.
-    """
-
-    name: str
-    principal_distance_mm: Prior | None
-    x0_mm: Prior | None
-    y0_mm: Prior | None
-    distortion: Distortion = Distortion()
-    fiducials: Mapping[str, Fiducial] = field(default_factory=dict)
-    center_mm: tuple[float, float] = (0.0, 0.0)
 
 
 EXTERIOR_NAMES = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
@@ -205,63 +132,6 @@ class ObjectPoint:
     Z: Prior | None
 
 
-@dataclass(frozen=True, repr=False)
-class Observations:
-    """Measured comparator coordinates, one row a mark in an image.
-
-    image, point, kind: (n,) names; a fiducial's point is its id in the image's camera. A "join" is a point of the film
-    that is common to several scans of one frame: what it is in the object need not be known.
-    xy_mm (n, 2) in the comparator frame (y up); covariance_mm2 (n, 2, 2).
-    """
-
-    image: tuple[str, ...]
-    point: tuple[str, ...]
-    kind: tuple[ObservationKind, ...]
-    xy_mm: Array
-    covariance_mm2: Array
-
-    def __len__(self) -> int:
-        return len(self.image)
-
-    def __repr__(self) -> str:
-        return f"Observations({len(self)} of {len(set(self.point))} marks in {len(set(self.image))} images)"
-
-    @cached_property
-    def is_fiducial(self) -> NDArray[np.bool_]:
-        """(n,) whether it is a place in the camera frame that is observed, fiducial or join, and no object point."""
-        return np.array([kind in ("fiducial", "join") for kind in self.kind], dtype=bool)
-
-    @cached_property
-    def numbered_points(self) -> tuple[tuple[str, ...], Indices]:
-        """The names of all points and fiducials, each once, and every observation's (n,) by its number among them."""
-        number = {name: i for i, name in enumerate(dict.fromkeys(self.point))}
-        return tuple(number), np.array([number[name] for name in self.point], dtype=np.intp)
-
-    def only(self, rows: Indices) -> "Observations":
-        """Some of the rows."""
-        return Observations(
-            tuple(self.image[row] for row in rows),
-            tuple(self.point[row] for row in rows),
-            tuple(self.kind[row] for row in rows),
-            self.xy_mm[rows],
-            self.covariance_mm2[rows],
-        )
-
-
-@dataclass(frozen=True)
-class Distance:
-    """A measured distance between two object points, two stations or one of each.
-
-    start, end: a point's name; where no point has it, that of the image whose station it is. value and its standard
-    deviation in object units.
-    """
-
-    start: str
-    end: str
-    value: float
-    sigma: float
-
-
 @dataclass(frozen=True, eq=False)
 class Board:
     """A flat board that is bent: its points stand off their plane, see `functional_model.board`.
@@ -282,19 +152,6 @@ class Board:
         """(2, 3) by id: where a bend of 1 along each axis moves a point."""
         form = board_form(np.array(list(self.places.values())))
         return {id_: shape[:, None] * form.normal for id_, shape in zip(self.places, form.shapes, strict=True)}
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """What an earlier adjustment found of a camera, "equal to image observations" (Juhl).
-
-    names (m,) as in `Adjustment.names`: `IO.<camera>.c`, `FID.<camera>.<id>.x`; values (m,), covariance (m, m). What
-    was given beforehand in that adjustment is in it already: these quantities must be free of priors here.
-    """
-
-    names: tuple[str, ...]
-    values: Array
-    covariance: Array
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.problem.network import EXTERIOR_NAMES, Approximations, Camera, Image, Network, ObjectPoint, Prior
+from adjust.problem.camera import Camera, Prior
+from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import family
 from adjust.functional_model.rotation import rotation_from_angles, vector_by_angles
-from adjust.problem.network import EXTERIOR_NAMES, Camera, Network
+from adjust.problem.camera import Camera
+from adjust.problem.network import EXTERIOR_NAMES, Network
 from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.network import Observations
+from adjust.problem.observations import Observations
 from adjust.problem.result import Residuals
 
 Array = NDArray[np.float64]

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from adjust.problem.network import Camera, Exterior, Fiducial, Network, ObjectPoint, Prior
+from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.network import Exterior, Network, ObjectPoint
 from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]

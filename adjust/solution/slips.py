@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.initial_values.far_points import FarPoint
-from adjust.problem.network import Approximations, Network, ObjectPoint, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.result import Adjustment
 from adjust.solution.options import Options
 

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import DatumError
-from adjust.problem.network import Network, ObjectPoint, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.problem import Problem
 from adjust.undetermined.datum import FLAT, ObjectDatum, free_coordinates, object_datum
 from adjust.undetermined.directions import DATUM_LEADS

@@ -9,19 +9,9 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.transformation import fewest_marks, marks_needed
 from adjust.initial_values.joined_frames import FEWEST_COMMON
-from adjust.problem.network import (
-    Board,
-    Calibration,
-    Camera,
-    Distance,
-    Image,
-    LineOfSight,
-    Network,
-    ObjectPoint,
-    Observations,
-    Prior,
-    Transformation,
-)
+from adjust.problem.camera import Camera, Prior
+from adjust.problem.network import Board, Image, LineOfSight, Network, ObjectPoint, Transformation
+from adjust.problem.observations import Calibration, Distance, Observations
 from measure.results import ON_FILM
 from pipeline.adjusting.fiducial_check import check_fiducials
 from pipeline.errors import InputError

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.choices.planning import plan
-from adjust.problem.network import Camera, Fiducial, Prior
+from adjust.problem.camera import Camera, Fiducial, Prior
 from adjust.solution.adjustment import Options
 from pipeline.design.expected import INTERIOR, Expected
 from pipeline.design.setup import planned_network

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from adjust.functional_model.scanner import smooth_terms
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.problem import network
-from adjust.problem.network import Approximations, Network, Prior, Transformation
+from adjust.problem.camera import Camera, Prior
+from adjust.problem.network import Approximations, Network, Transformation
+from adjust.problem.observations import Distance, ObservationKind, Observations
 from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
@@ -167,11 +169,11 @@ def _image(setup: Setup, camera: str, image: SceneImage) -> network.Image:
     return network.Image(image.name, camera, setup.transformation, exterior, scanner)
 
 
-def _distances(setup: Setup, points: Mapping[str, Array]) -> tuple[network.Distance, ...]:
+def _distances(setup: Setup, points: Mapping[str, Array]) -> tuple[Distance, ...]:
     """Those whose ends take part."""
     places = {image.name: np.array(image.exterior[:3]) for image in setup.images} | dict(points)
     return tuple(
-        network.Distance(each.start, each.end, float(np.linalg.norm(places[each.end] - places[each.start])), each.sigma)
+        Distance(each.start, each.end, float(np.linalg.norm(places[each.end] - places[each.start])), each.sigma)
         for each in setup.settings.distances
         if each.start in places and each.end in places
     )
@@ -191,7 +193,7 @@ def _sigmas(point: PlannedPoint) -> tuple[float, float]:
     return point.sigma_planimetry, point.sigma_height
 
 
-def _camera(setup: Setup) -> network.Camera:
+def _camera(setup: Setup) -> Camera:
     """The camera with its priors; fiducials only where images are transformed by them."""
     point = setup.camera.principal_point_mm or (0.0, 0.0)
     fiducials = setup.camera.fiducials if setup.transformation != "none" else ()
@@ -204,10 +206,10 @@ def _object_point(point: PlannedPoint) -> network.ObjectPoint:
     return network.ObjectPoint(point.id, Prior(x, plane), Prior(y, plane), Prior(z, height))
 
 
-def _observations(setup: Setup, seen: dict[str, list[int]], used: set[int]) -> network.Observations:
+def _observations(setup: Setup, seen: dict[str, list[int]], used: set[int]) -> Observations:
     """One row a visible mark; the coordinates are computed when the network is planned."""
     film_um = setup.settings.film_sigma_um
-    rows: list[tuple[str, str, network.ObservationKind, float]] = []
+    rows: list[tuple[str, str, ObservationKind, float]] = []
     for image in setup.images:
         if setup.transformation != "none":
             sigma = math.hypot(setup.settings.sigma_fiducial_um, film_um)
@@ -217,9 +219,7 @@ def _observations(setup: Setup, seen: dict[str, list[int]], used: set[int]) -> n
         rows += [(image.name, setup.points[i].id, "target", sigma) for i in seen[image.name] if i in used]
     images, points, kinds, sigmas_um = zip(*rows, strict=True)
     variances_mm2 = (np.array(sigmas_um) / 1000.0) ** 2
-    return network.Observations(
-        images, points, kinds, np.zeros((len(rows), 2)), variances_mm2[:, None, None] * np.eye(2)
-    )
+    return Observations(images, points, kinds, np.zeros((len(rows), 2)), variances_mm2[:, None, None] * np.eye(2))
 
 
 def _values(setup: Setup, planned: Network, points: list[PlannedPoint]) -> Approximations:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from adjust.problem.network import Distortion, Prior
+from adjust.problem.camera import Distortion, Prior
 from pipeline.exchange.convention import Convention
 from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adjust.choices.lens_conversion import ConvertedLens, convert_lens
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
-from adjust.problem.network import Distortion, Prior
+from adjust.problem.camera import Distortion, Prior
 from pipeline.errors import InputError
 from pipeline.exchange.export_stage import README, check_folder, publish
 from pipeline.files.camera_file import read_camera

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import cast, get_args
 
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
-from adjust.problem import network
+from adjust.problem.camera import Camera, Decentering, Distortion, Fiducial, Prior
 from measure.marks import shapes
 from pipeline.errors import InputError
 from pipeline.files.camera_units import check_units
@@ -82,7 +82,7 @@ class CameraFile:
     principal_point_mm: tuple[float, float] | None
     principal_distance_sigma_mm: float
     principal_point_sigma_mm: tuple[float, float]
-    distortion: network.Distortion
+    distortion: Distortion
     fiducials: tuple[GivenFiducial, ...]
     number: str = ""
     writing: tuple[shapes.WrittenPlace, ...] = ()
@@ -124,21 +124,19 @@ class CameraFile:
                 )
         return shapes.FiducialLayout(self.drawn, self.frame_mm, self.writing)
 
-    def camera(self, center_mm: tuple[float, float] = (0.0, 0.0)) -> network.Camera:
+    def camera(self, center_mm: tuple[float, float] = (0.0, 0.0)) -> Camera:
         """The camera for the adjustment. center_mm: where the principal point is sought when the file has none."""
         distance, point = self.principal_distance_mm, self.principal_point_mm
         sx, sy = self.principal_point_sigma_mm
-        return network.Camera(
+        return Camera(
             name=self.name,
-            principal_distance_mm=None
-            if distance is None
-            else network.Prior(distance, self.principal_distance_sigma_mm),
-            x0_mm=None if point is None else network.Prior(point[0], sx),
-            y0_mm=None if point is None else network.Prior(point[1], sy),
+            principal_distance_mm=None if distance is None else Prior(distance, self.principal_distance_sigma_mm),
+            x0_mm=None if point is None else Prior(point[0], sx),
+            y0_mm=None if point is None else Prior(point[1], sy),
             distortion=self.distortion,
             fiducials={
-                fiducial.id: network.Fiducial(
-                    *(network.Prior(*pair) for pair in zip(fiducial.xy_mm, fiducial.prior_sigma_mm, strict=True))
+                fiducial.id: Fiducial(
+                    *(Prior(*pair) for pair in zip(fiducial.xy_mm, fiducial.prior_sigma_mm, strict=True))
                 )
                 for fiducial in self.fiducials
             },
@@ -277,9 +275,9 @@ def _placed(
     return shapes.turned(mark, math.degrees(math.atan2(xy_mm[1], xy_mm[0]))) if radial else mark
 
 
-def _distortion(table: Table, frame_mm: tuple[float, float] | None) -> network.Distortion:
+def _distortion(table: Table, frame_mm: tuple[float, float] | None) -> Distortion:
     name = _family(table)
-    decentering = cast(network.Decentering, table.text("decentering", "reduced", ("reduced", "paper")))
+    decentering = cast(Decentering, table.text("decentering", "reduced", ("reduced", "paper")))
     # Juhl counts in decimetres.
     in_dm = name == "juhl"
     r0_mm = 100.0 * table.number("r0_dm", above=0.0) if in_dm else table.number("r0_mm", 0.0, least=0.0)
@@ -288,11 +286,11 @@ def _distortion(table: Table, frame_mm: tuple[float, float] | None) -> network.D
     table.done()
     known = parameter_names(name)
     of_all = sigmas.sigma("all", 0.0)  # a set of 44 parameters is not named one by one
-    parameters = {each: network.Prior(values.number(each, 0.0), sigmas.sigma(each, of_all)) for each in known}
+    parameters = {each: Prior(values.number(each, 0.0), sigmas.sigma(each, of_all)) for each in known}
     values.done()
     sigmas.done()
     named = {each: prior for each, prior in parameters.items() if each in values or each in sigmas or of_all > 0.0}
-    return network.Distortion(name, named, decentering, r0_mm, half_mm)
+    return Distortion(name, named, decentering, r0_mm, half_mm)
 
 
 def _family(table: Table) -> str:

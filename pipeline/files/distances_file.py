@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from adjust.problem.network import Distance
+from adjust.problem.observations import Distance
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, read_csv
 

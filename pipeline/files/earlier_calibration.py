@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.problem.network import Calibration, Camera, Distortion, Fiducial, Prior
+from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.observations import Calibration
 from pipeline.results.adjustment_reader import Covariance, covariance_path, read_adjustment, read_covariance
 from pipeline.text.tables import Table
 

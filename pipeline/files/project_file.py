@@ -8,7 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, cast, get_args
 
-from adjust.problem.network import ObjectPoint, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import ObjectPoint
 from measure.fiducial_options import Reads
 from measure.film import ANY_FILM, BelievedFilm
 from measure.marks.poses import POSES

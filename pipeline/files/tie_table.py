@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from adjust.problem.network import ObjectPoint, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import ObjectPoint
 from pipeline.text.tables import Table
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adjust.problem.network import Distortion, Exterior, Prior
+from adjust.problem.camera import Distortion, Prior
+from adjust.problem.network import Exterior
 from measure.errors import MissingError
 from measure.fiducial_options import FiducialOptions
 from measure.results import Pose

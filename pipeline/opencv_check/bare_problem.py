@@ -7,19 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
+from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.images import adjusted_image, adjusted_places
-from adjust.problem.network import (
-    EXTERIOR_NAMES,
-    Approximations,
-    Camera,
-    Distortion,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
+from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment
 from pipeline.opencv_check.opencv_calibration import ImagePoints, can_begin
 from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, Freedom

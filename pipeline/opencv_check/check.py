@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from adjust.errors import AdjustmentError
-from adjust.problem.network import Camera
+from adjust.problem.camera import Camera
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model

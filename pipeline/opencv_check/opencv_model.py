@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adjust.choices.lens_conversion import ConvertedLens, convert_lens
 from adjust.functional_model.families import parameter_names
-from adjust.problem.network import Distortion, Prior
+from adjust.problem.camera import Distortion, Prior
 
 Array = NDArray[np.float64]
 

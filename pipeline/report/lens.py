@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.projection import ideal_from_observed
-from adjust.problem.network import Distortion
+from adjust.problem.camera import Distortion
 from pipeline.drawing import svg
 from pipeline.report.data import Json
 from pipeline.results.adjustment_reader import Covariance, calibrated_lens

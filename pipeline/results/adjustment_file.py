@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.transformation import film_parameter_names
+from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.images import adjusted_image
-from adjust.problem.network import EXTERIOR_NAMES, Board, Camera, Distortion, Image, ObjectPoint, Prior, Scanner
+from adjust.problem.network import EXTERIOR_NAMES, Board, Image, ObjectPoint, Scanner
 from adjust.problem.result import Adjustment, Contradiction, FurtherResidual
 from adjust.quality.correlation import correlations
 from adjust.quality.significance import SignificanceTest, board_tests, group_tests, parameter_tests, scanner_tests

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.problem.network import Distortion
+from adjust.problem.camera import Distortion
 from pipeline.errors import InputError
 from pipeline.text.text_file import MOST_MB, read_bytes, read_json, shown
 

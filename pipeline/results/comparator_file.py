@@ -16,7 +16,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.network import ObservationKind
+from adjust.problem.observations import ObservationKind
 from measure.results import FrameMeasurement
 from measure.status import Status
 from pipeline.errors import InputError

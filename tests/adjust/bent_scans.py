@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.network import Camera, Fiducial, Image, Network, Observations, Prior, Scanner, Transformation
+from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.network import Image, Network, Scanner, Transformation
+from adjust.problem.observations import Observations
 
 Array = NDArray[np.float64]
 

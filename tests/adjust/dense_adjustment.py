@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.network import EXTERIOR_NAMES, Network, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import EXTERIOR_NAMES, Network
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

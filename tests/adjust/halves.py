@@ -13,17 +13,9 @@ from simulated import (
     film_parameters,
 )
 
-from adjust.problem.network import (
-    Camera,
-    Distortion,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.network import Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.problem.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
+from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.network import Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import Distortion as SceneDistortion
 from synthetic_images.scene import SceneCamera

@@ -7,7 +7,8 @@ import numpy as np
 from setups import CONVERGENT, FREE, HEIGHT, LEVEL_STATIONS, UNKNOWN, Setup, given, vertical
 from simulated import STATIONS, field_points
 
-from adjust.problem.network import Approximations, Network, Observations
+from adjust.problem.network import Approximations, Network
+from adjust.problem.observations import Observations
 from adjust.problem.result import Adjustment
 from adjust.quality.correlation import correlations
 from adjust.solution.adjustment import Options

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
 from adjust.errors import AdjustmentError
-from adjust.problem.network import Exterior, Fiducial, Network, ObjectPoint, Prior
+from adjust.problem.camera import Fiducial, Prior
+from adjust.problem.network import Exterior, Network, ObjectPoint
 from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]

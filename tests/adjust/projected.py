@@ -8,18 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.problem.network import (
-    Camera,
-    Distortion,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-    Transformation,
-)
+from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.network import Image, Network, ObjectPoint, Transformation
+from adjust.problem.observations import ObservationKind, Observations
 
 Array = NDArray[np.float64]
 

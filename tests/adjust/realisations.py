@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from reference_cases import CAMERA, Case, approximations_of, network_of, own_name
 
+from adjust.problem.camera import Camera, Fiducial, Prior
 from adjust.problem.functions import computed_observations
-from adjust.problem.network import Approximations, Camera, Fiducial, Network, ObjectPoint, Prior
+from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.problem import number
 
 Array = NDArray[np.float64]

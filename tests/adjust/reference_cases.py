@@ -8,18 +8,9 @@ import numpy as np
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.problem.network import (
-    EXTERIOR_NAMES,
-    Approximations,
-    Camera,
-    Distortion,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
+from adjust.problem.observations import Observations
 
 CASES = Path(__file__).parents[1] / "cases"
 CAMERA = "K"

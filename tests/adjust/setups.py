@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from simulated import STATIONS, Truth, field_points, simulated
 
-from adjust.problem.network import Approximations, Camera, Fiducial, Network, ObjectPoint, Prior, Transformation
+from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.network import Approximations, Network, ObjectPoint, Transformation
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]

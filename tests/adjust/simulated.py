@@ -6,19 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.network import (
-    Approximations,
-    Camera,
-    Decentering,
-    Distortion,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    Observations,
-    Prior,
-    Transformation,
-)
+from adjust.problem.camera import Camera, Decentering, Distortion, Fiducial, Prior
+from adjust.problem.network import Approximations, Image, Network, ObjectPoint, Transformation
+from adjust.problem.observations import Observations
 
 Array = NDArray[np.float64]
 

@@ -12,17 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import (
-    EXTERIOR_NAMES,
-    Approximations,
-    Distortion,
-    Exterior,
-    Network,
-    ObjectPoint,
-    Observations,
-    Prior,
-    Transformation,
-)
+from adjust.problem.camera import Distortion, Prior
+from adjust.problem.network import EXTERIOR_NAMES, Approximations, Exterior, Network, ObjectPoint, Transformation
+from adjust.problem.observations import Observations
 from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]

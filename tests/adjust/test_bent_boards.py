@@ -12,19 +12,11 @@ from adjust.choices.model_choice import choose
 from adjust.errors import AdjustmentError
 from adjust.functional_model.board import board_form
 from adjust.initial_values.approximations import approximate
+from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.functions import compute, computed_observations, derivatives
 from adjust.problem.images import adjusted_places
-from adjust.problem.network import (
-    Board,
-    Camera,
-    Distortion,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
+from adjust.problem.network import Board, Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.problem import number
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust

@@ -13,7 +13,9 @@ from real_data import DATA, needs
 from scipy.io import loadmat
 
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
+from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.network import Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 

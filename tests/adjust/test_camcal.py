@@ -14,7 +14,9 @@ import pytest
 from real_data import DATA, needs
 
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
+from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.network import Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import Options, adjust
 
 FOLDER = DATA / "coded" / "camcal" / "camcaldemo"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.choices.comparison import CameraCalibration, compare, sigmas
 from adjust.errors import AdjustmentError
-from adjust.problem.network import Distortion
+from adjust.problem.camera import Distortion
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,8 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.rotation import angles_from_rotation
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import EXTERIOR_NAMES, Exterior, Fiducial, Image, Network, ObjectPoint, Prior
+from adjust.problem.camera import Fiducial, Prior
+from adjust.problem.network import EXTERIOR_NAMES, Exterior, Image, Network, ObjectPoint
 from adjust.problem.problem import number
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Datum, Options, adjust

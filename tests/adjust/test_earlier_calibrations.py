@@ -8,7 +8,9 @@ import pytest
 from simulated import field_points, simulated
 
 from adjust.errors import AdjustmentError
-from adjust.problem.network import Approximations, Calibration, Fiducial, Network, Observations, Prior, Transformation
+from adjust.problem.camera import Fiducial, Prior
+from adjust.problem.network import Approximations, Network, Transformation
+from adjust.problem.observations import Calibration, Observations
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 

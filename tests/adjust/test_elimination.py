@@ -16,7 +16,8 @@ from adjust.least_squares.rows import prior_root_weights
 from adjust.linear_algebra import elimination, multifrontal, triangle
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
-from adjust.problem.network import Approximations, Network, Observations
+from adjust.problem.network import Approximations, Network
+from adjust.problem.observations import Observations
 from adjust.problem.problem import number
 from adjust.solution.adjustment import adjust
 

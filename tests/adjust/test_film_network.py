@@ -21,7 +21,9 @@ from simulated import (
 
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Network, Observations, Prior, Transformation
+from adjust.problem.camera import Prior
+from adjust.problem.network import Network, Transformation
+from adjust.problem.observations import Observations
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 

@@ -18,7 +18,9 @@ from adjust.linear_algebra import elimination, fronts, triangle
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.fronts import Fronts, fronts_of
-from adjust.problem.network import Approximations, Fiducial, Network, ObjectPoint, Observations, Prior
+from adjust.problem.camera import Fiducial, Prior
+from adjust.problem.network import Approximations, Network, ObjectPoint
+from adjust.problem.observations import Observations
 from adjust.problem.problem import number
 from adjust.solution.adjustment import adjust
 from adjust.undetermined import diagnosis

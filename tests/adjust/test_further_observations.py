@@ -12,13 +12,9 @@ from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
 from adjust.least_squares.numbering import Numbering
-from adjust.problem.network import (
-    Distance,
-    Exterior,
-    Network,
-    ObjectPoint,
-    Prior,
-)
+from adjust.problem.camera import Prior
+from adjust.problem.network import Exterior, Network, ObjectPoint
+from adjust.problem.observations import Distance
 from adjust.problem.problem import number
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust

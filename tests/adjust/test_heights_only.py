@@ -7,7 +7,8 @@ import pytest
 from simulated import Truth, field_points, simulated
 
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Network, ObjectPoint, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import Network, ObjectPoint
 from adjust.solution.adjustment import adjust
 from adjust.solution.options import Options
 

@@ -12,7 +12,8 @@ from adjust.choices.lens_conversion import convert_lens
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Distortion, Network, Prior
+from adjust.problem.camera import Distortion, Prior
+from adjust.problem.network import Network
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 

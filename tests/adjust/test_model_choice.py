@@ -13,7 +13,8 @@ from adjust.choices.cross_validation import CrossValidation, cross_validate, fol
 from adjust.choices.model_choice import Choice, choose, weighed
 from adjust.choices.models import Model, lenses
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Distortion, Network, ObjectPoint, Prior, Transformation
+from adjust.problem.camera import Distortion, Prior
+from adjust.problem.network import Network, ObjectPoint, Transformation
 from adjust.quality.reweighting import WeightFunction
 from adjust.solution.adjustment import Options, adjust
 

@@ -9,17 +9,9 @@ import pytest
 from simulated import Truth, simulated
 
 from adjust.errors import AdjustmentError
-from adjust.problem.network import (
-    Approximations,
-    Camera,
-    Distortion,
-    Exterior,
-    Image,
-    Network,
-    ObjectPoint,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
+from adjust.problem.observations import Observations
 from adjust.solution.adjustment import Datum, Options, adjust
 
 Change = Callable[[Network], Network]

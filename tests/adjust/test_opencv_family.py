@@ -16,8 +16,10 @@ from adjust.functional_model.projection import ImageModel, camera_from_ray, idea
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.functional_model.transformation import Film
 from adjust.initial_values.approximations import approximate
+from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.images import adjusted_image, approximate_image
-from adjust.problem.network import Approximations, Camera, Distortion, Image, Network, ObjectPoint, Observations, Prior
+from adjust.problem.network import Approximations, Image, Network, ObjectPoint
+from adjust.problem.observations import Observations
 from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]

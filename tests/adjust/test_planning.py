@@ -9,18 +9,9 @@ from simulated import simulated
 
 from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
-from adjust.problem.network import (
-    Approximations,
-    Camera,
-    Exterior,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import Datum, Options, adjust
 
 TARGETS: tuple[ObservationKind, ...] = ("target",) * 5

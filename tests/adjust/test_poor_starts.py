@@ -8,7 +8,8 @@ from reference_cases import approximations_of, load, network_of, own_name
 from simulated import Truth, field_points, simulated
 
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
-from adjust.problem.network import Approximations, Network, ObjectPoint, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.solution.adjustment import Options, adjust
 
 ANGLE = np.deg2rad(30.0)

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from scipy import special
 from simulated import Truth, field_points, simulated
 
-from adjust.problem.network import Approximations, Calibration, Camera, Exterior, Network, ObservationKind, Prior
+from adjust.problem.camera import Camera, Prior
+from adjust.problem.network import Approximations, Exterior, Network
+from adjust.problem.observations import Calibration, ObservationKind
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.result import Adjustment, Reliability
 from adjust.solution.adjustment import Options, adjust

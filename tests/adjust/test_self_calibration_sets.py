@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
-from adjust.problem.network import Distortion
+from adjust.problem.camera import Distortion
 
 Array = NDArray[np.float64]
 

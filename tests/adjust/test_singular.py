@@ -8,7 +8,8 @@ import pytest
 from reference_cases import CAMERA, CAUSES, DROPPED, Case, approximations_of, load, network_of
 from simulated import Truth, field_points, simulated
 
-from adjust.problem.network import Network, Observations
+from adjust.problem.network import Network
+from adjust.problem.observations import Observations
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Datum, Options, adjust
 

@@ -9,7 +9,8 @@ from simulated import Truth, field_points, simulated
 
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Network, ObjectPoint, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
 

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from simulated import Truth, field_points, simulated
 
-from adjust.problem.network import Camera, Exterior, Fiducial, Network, ObservationKind, Observations, Prior
+from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.network import Exterior, Network
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment
 from adjust.quality.reweighting import robust_weights
 from adjust.solution.adjustment import Options, adjust

@@ -10,18 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.network import (
-    Camera,
-    Distortion,
-    Exterior,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.network import Exterior, Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import (
     Adjustment,
     Contradiction,

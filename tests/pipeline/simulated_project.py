@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.problem.network import Network, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import Network
 
 
 def write_project(network: Network, folder: Path) -> Path:

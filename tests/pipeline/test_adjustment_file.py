@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from setups import Setup, vertical
 
-from adjust.problem.network import ObjectPoint, Prior
+from adjust.problem.camera import Prior
+from adjust.problem.network import ObjectPoint
 from adjust.problem.result import Adjustment, Residuals
 from adjust.solution.adjustment import adjust
 from pipeline.errors import InputError

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from simulated import FIDUCIALS, affine, rotation
 
 from adjust.functional_model.transformation import Film
-from adjust.problem.network import Distortion, ObjectPoint, Prior
+from adjust.problem.camera import Distortion, Prior
+from adjust.problem.network import ObjectPoint
 from measure.status import Status
 from pipeline.blocks.block_stage import written_block
 from pipeline.blocks.mapping import Mapped, Sight, camera_params

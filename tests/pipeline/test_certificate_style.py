@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adjust.functional_model.families import parameter_names
-from adjust.problem.network import Distortion
+from adjust.problem.camera import Distortion
 from pipeline.exchange.certificate import fit, read_certificate
 from pipeline.report.certificate import ANGLES_DEG, certificate_view
 from pipeline.report.lens import Lens

@@ -13,17 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import (
-    Camera,
-    Distortion,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
+from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.network import Image, Network, ObjectPoint
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import Options, adjust
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate

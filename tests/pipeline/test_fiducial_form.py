@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Camera, Fiducial, Image, Network, ObservationKind, Observations, Prior
+from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.network import Image, Network
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 from pipeline.report.fiducials import Figure, figure_of_films

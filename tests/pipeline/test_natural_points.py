@@ -9,7 +9,7 @@ import pytest
 from in_process import Loses
 from scipy.spatial.distance import pdist
 
-from adjust.problem.network import Prior
+from adjust.problem.camera import Prior
 from measure.natural_points.tie_candidates import TieCandidate
 from measure.natural_points.tie_frame import TieFrame
 from measure.natural_points.ties import TieOptions, measure_ties

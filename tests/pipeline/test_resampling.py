@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import Film
-from adjust.problem.network import Distortion
+from adjust.problem.camera import Distortion
 from measure.errors import MeasurementError
 from measure.scans.scan import open_scan
 from pipeline.cli import run

@@ -17,7 +17,7 @@ from kept_scans import keep_scans
 from test_command_line import replaced, results, rewritten_scans
 
 from adjust.errors import AdjustmentError
-from adjust.problem.network import Prior
+from adjust.problem.camera import Prior
 from measure.errors import MeasurementError
 from measure.status import Status
 from pipeline import stages

@@ -13,7 +13,8 @@ from simulated_project import write_project
 from small_scene import OBLIQUE, SCANNER, scene
 
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Network, Prior, Scanner
+from adjust.problem.camera import Prior
+from adjust.problem.network import Network, Scanner
 from adjust.solution.adjustment import adjust
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.rendered.against_truth import Comparison, bend_quantities
