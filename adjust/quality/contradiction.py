@@ -40,7 +40,7 @@ def contradictions_of_groups(
         chi_square = float((u[seen] ** 2 / free[seen]).sum())
         left = redundancy - freedom
         variance = (vpv - chi_square) / left if left > 0 and vpv > chi_square else 1.0
-        along = root @ directions
+        along = _as_marks_show(root @ directions, ~seen, each.names)
         difference = along[:, seen] @ (u[seen] / free[seen])
         sigma = np.sqrt(variance * (along[:, seen] ** 2 / free[seen]).sum(axis=1))
         hidden = (along[:, ~seen] ** 2).sum(axis=1) > UNSEEN * np.diag(each.covariance)
@@ -54,3 +54,14 @@ def contradictions_of_groups(
             freedom=freedom,
             probability=float(fdtrc(freedom, left, test) if left > 0 else chdtrc(freedom, chi_square)),
         )
+
+
+def _as_marks_show(along: Array, unseen: NDArray[np.bool_], names: Sequence[str]) -> Array:
+    """Changes (n, m) of the quantities, each with so much of the unseen ones that the fiducial marks move least.
+
+    The frame of the marks can shift, turn and grow, and the camera with it: as where two calibrations are compared,
+    what is told of c is then what changes beside the marks. What marks do not show of the unseen changes stays.
+    """
+    is_mark = np.array([name.startswith("FID.") for name in names])
+    by_marks = np.linalg.pinv(along[:, unseen] * is_mark[:, None], rcond=UNSEEN)
+    return np.asarray(along - along[:, unseen] @ (by_marks @ along))

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from simulated import field_points, simulated
 
 from adjust.errors import AdjustmentError
 from adjust.problem.camera import Fiducial, Prior
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.observations import Calibration, Observations
-from adjust.problem.result import Adjustment
+from adjust.problem.result import Adjustment, Contradiction
 from adjust.solution.adjustment import adjust
 
 
@@ -208,11 +209,25 @@ def test_a_contradiction_is_told_as_often_as_stated(sigmas: float, least: float,
     assert least < contradicted(sigmas, 80) <= most
 
 
-def test_what_the_images_do_not_tell_is_not_said_to_differ() -> None:
-    """Fiducials and films together can shift, turn and grow: images alone say nothing of that against a calibration."""
+def test_a_contradiction_is_told_beside_what_the_marks_show() -> None:
+    """Fiducials, films and camera together can shift, turn and grow, of which images alone say nothing: what is told is
+    what is left where the marks lie over one another."""
     (a, start_a), (b, start_b), _ = two_networks("affine", 1.0)
-    (found,) = adjust(with_calibration(b, calibration_of(adjust(a, start_a), True)), start_b).contradictions
-    assert found.freedom == len(found.names) - 4
-    marks = [name.startswith("FID.") for name in found.names]
-    assert np.isnan(found.difference[marks]).all()
-    assert found.probability > 1e-3
+    calibration = calibration_of(adjust(a, start_a), True)
+    c, x0 = calibration.names.index("IO.K.c"), calibration.names.index("IO.K.x0")
+    along_x = np.array([name == "IO.K.x0" or name.endswith(".x") for name in calibration.names])
+
+    def found(change: NDArray[np.float64]) -> Contradiction:
+        given = with_calibration(b, replace(calibration, values=calibration.values + change))
+        (told,) = adjust(given, start_b).contradictions
+        return told
+
+    same, shifted = found(0.0 * along_x), found(0.05 * along_x)
+    longer = found(0.3 * (np.arange(len(along_x)) == c))
+    assert same.freedom == len(same.names) - 4
+    assert same.probability > 1e-3
+    assert np.isfinite(same.difference).all()
+    np.testing.assert_allclose(shifted.difference / same.sigma, same.difference / same.sigma, atol=0.05)
+    assert longer.direction[0] == c
+    assert longer.difference[c] == pytest.approx(same.difference[c] - 0.3, abs=0.01)
+    assert longer.difference[x0] == pytest.approx(same.difference[x0], abs=0.2 * same.sigma[x0])
