@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.adjusting.compare_stage import _labels
 from pipeline.cli import run
+from pipeline.results.fingerprints import of_file
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -24,6 +25,7 @@ def moved(project: Path, name: str, change_mm: float) -> Path:
     copy.write_text(json.dumps(content), encoding="utf-8")
     with np.load(project / "out" / "adjustment.npz") as arrays:
         whole = dict(arrays)
+    whole["fingerprint"] = np.array(of_file(copy))
     whole["values"] = whole["values"] + change_mm * np.char.endswith(whole["names"], ".c")
     np.savez(copy.with_suffix(".npz"), **whole)
     return copy
@@ -75,6 +77,13 @@ def test_what_it_refuses(arguments: list[str], words: str, project: Path, capsys
     paths = [str(project / "out" / "adjustment.json"), str(moved(project, "same", 0.0))]
     assert run(["compare", *paths, *arguments]) == 2
     assert words in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_the_covariance_of_another_adjustment_is_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = moved(project, "other", 0.1)
+    other.with_suffix(".npz").write_bytes((project / "out" / "adjustment.npz").read_bytes())
+    assert run(["compare", str(project / "out" / "adjustment.json"), str(other)]) == 2
+    assert "belongs to another adjustment than" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_a_file_named_twice_is_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
