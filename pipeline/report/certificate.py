@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 # Of the U.S. Geological Survey's reports, as far as the frame reaches.
 ANGLES_DEG = (7.5, 15.0, 22.7, 30.0, 35.0, 40.0)
-_FEWEST_ANGLES = 3
+_FEWEST_ANGLES = 5  # from which the principal distance and three powers come back, with one value over
 _RADII, _DIRECTIONS = 240, 36
 _NEAR_AXIS = 1e-3  # of the largest radius: there the distortion is linear in it
 _STEP_SIGMAS = 0.1  # of the numerical derivatives
@@ -65,12 +65,12 @@ def certificate_view(of: Lens, covariance: Covariance, largest_radius_mm: float)
 
 
 def _angles_deg(of: Lens, largest_radius_mm: float) -> list[float]:
-    """Those of the reports that the frame shows; of a narrow camera six steps."""
+    """Those of the reports that the frame shows; of a narrower camera six steps, to the tenths that are printed."""
     largest = float(np.degrees(np.arctan(_tangents(of, largest_radius_mm)[1][-1])))
     usual = [angle for angle in ANGLES_DEG if angle <= largest]
     if len(usual) >= _FEWEST_ANGLES:
         return usual
-    return [float(angle) for angle in np.linspace(0.0, largest, len(ANGLES_DEG) + 1)[1:]]
+    return [float(angle) for angle in np.floor(10.0 * np.linspace(0.0, largest, len(ANGLES_DEG) + 1)[1:]) / 10.0]
 
 
 def _quantities(of: Lens, angles_deg: list[float], largest_radius_mm: float) -> Array:
