@@ -64,17 +64,13 @@ def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
     """The first page that is neither a thumbnail nor a mask."""
     pages = [page.aspage() for page in file.pages]
     full = [page for page in pages if not int(page.subfiletype) & (_REDUCED_IMAGE | _TRANSPARENCY_MASK)]
-    full = [page for page in full if _is_picture(page)]
+    full = [page for page in full if page.imagewidth > 0 and page.imagelength > 0]
     if not full:
         raise broken(path, "it holds no picture")
     notes = []
     if len(full) > 1:
         notes.append(f"the file holds {len(full)} pictures: the first was taken")
     return full[0], (*notes, *orientation_notes(full[0]))
-
-
-def _is_picture(page: TiffPage) -> bool:
-    return page.imagewidth > 0 and page.imagelength > 0
 
 
 def _overviews(file: TiffFile, full: TiffPage, path: Path) -> tuple[Segments, ...]:
@@ -153,7 +149,7 @@ def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
         lies_over |= beyond < len(starts) and starts[beyond] < after
     if lies_over:
         raise broken(path, f"its {part} lie over one another or over its tags")
-    if any(other.offset >= ends[-1] and _is_picture(other.aspage()) for other in page.parent.pages):
+    if any(other.offset >= ends[-1] for other in page.parent.pages):
         return  # another picture's tags stand behind the pixels, where they are said to: nothing was put in before them
     with path.open("rb") as file:
         last = max(end for _, end in taken)

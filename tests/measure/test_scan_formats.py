@@ -226,9 +226,10 @@ def test_the_first_full_picture_of_several_is_taken(tmp_path: Path) -> None:
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
 
 
-def test_a_stack_is_read_and_what_was_put_into_its_pixels_is_seen(tmp_path: Path) -> None:
+@pytest.mark.parametrize("pictures", [1, 3])
+def test_a_stack_is_read_and_what_was_put_into_its_pixels_is_seen(tmp_path: Path, pictures: int) -> None:
     """tifffile leaves room behind the tags of a further picture, and says the numbers of the first one's instead."""
-    tifffile.imwrite(tmp_path / "s.tif", np.stack([picture()] * 3), photometric="minisblack")
+    tifffile.imwrite(tmp_path / "s.tif", np.stack([picture()] * pictures), photometric="minisblack")
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
     data = (tmp_path / "s.tif").read_bytes()
     for put_in in (2, 12, 40):
