@@ -1,0 +1,153 @@
+"""The searches for approximate orientations among gross errors, beside OpenCV's RANSAC and USAC.
+
+OPENBLAS_NUM_THREADS=1 python benchmarks/robust_searches.py [--count 60]
+
+Orientations of aerial images from 12 or 40 points of which a share is somewhere else in the frame. Right is an
+orientation under which the true points lie where they were seen to 10 standard deviations (one image), or that is right
+to 0.03 rad (two). RANSAC must be told how far a point may be off: once as the noise is, and once as a lens of which
+nothing is known yet may bend the picture. The searches of `adjust` estimate it.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.initial_values.relative_orientation import relative_poses
+from adjust.initial_values.resection import Pose, resect
+
+Array = NDArray[np.float64]
+Found = Sequence[Pose]
+
+SEED, C_MM, HALF_MM, SIGMA_MM = 5, 150.0, 110.0, 0.005
+GATES_MM = {"3 sigma": 3 * SIGMA_MM, "0.15 mm": 0.15}
+RIGHT_RAD = 0.03
+CAMERA = np.diag([C_MM, C_MM, 1.0])
+FLIP = np.diag([1.0, -1.0, -1.0])  # between a camera that looks along -z with y up, and OpenCV's
+
+
+def pose(rng: np.random.Generator) -> Pose:
+    """About 1000 m above the field, tilted by some degrees."""
+    turn = cv2.Rodrigues(rng.normal(0.0, [0.08, 0.08, 1.0]))[0]
+    return Pose(np.asarray(turn, float), np.array([*rng.normal(0.0, 100.0, 2), 1000.0]))
+
+
+def seen(of: Pose, xyz: Array) -> Array:
+    """(n, 2) mm, y up."""
+    u, v, w = of.rotation @ (xyz - of.center).T
+    return np.stack([-C_MM * u / w, -C_MM * v / w], axis=1)
+
+
+def with_errors(xy_mm: Array, share: float, rng: np.random.Generator) -> Array:
+    xy_mm = xy_mm + rng.normal(0.0, SIGMA_MM, xy_mm.shape)
+    wrong = rng.permutation(len(xy_mm))[: round(share * len(xy_mm))]
+    xy_mm[wrong] = rng.uniform(-HALF_MM, HALF_MM, (len(wrong), 2))
+    return xy_mm
+
+
+def of_opencv(rotation: Array, shift: Array) -> Pose:
+    turned = FLIP @ rotation
+    return Pose(turned, -rotation.T @ shift.ravel())
+
+
+def resected(xyz: Array, xy_mm: Array, rng: np.random.Generator) -> Found:
+    found = resect(xyz, xy_mm, C_MM, rng)
+    return [] if found is None else [found.pose]
+
+
+def solved_pnp(gate_mm: float, usac: bool, xyz: Array, xy_mm: Array, _rng: np.random.Generator) -> Found:
+    pixels = xy_mm * [1.0, -1.0]
+    try:
+        if usac:
+            params = cv2.UsacParams()
+            params.threshold, params.maxIterations, params.confidence = gate_mm, 5000, 0.9999
+            params.score = cv2.SCORE_METHOD_MAGSAC
+            done, _, turn, shift, _ = cv2.solvePnPRansac(xyz, pixels, CAMERA, None, params=params)
+        else:
+            done, turn, shift, _ = cv2.solvePnPRansac(
+                xyz, pixels, CAMERA, None, iterationsCount=5000, reprojectionError=gate_mm, confidence=0.9999
+            )
+    except cv2.error:
+        return []
+    return [of_opencv(np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift))] if done else []
+
+
+def essential(gate_mm: float, usac: bool, first: Array, second: Array, _rng: np.random.Generator) -> Found:
+    method = cv2.USAC_MAGSAC if usac else cv2.RANSAC
+    one, other = first * [1.0, -1.0], second * [1.0, -1.0]
+    matrix, inside = cv2.findEssentialMat(one, other, CAMERA, method, 0.9999, gate_mm)
+    if matrix is None or matrix.shape != (3, 3):
+        return []
+    _, rotation, shift, _ = cv2.recoverPose(matrix, one, other, CAMERA, mask=inside)
+    turn = np.asarray(rotation, float)
+    return [Pose(FLIP @ turn @ FLIP, FLIP @ (-turn.T @ np.asarray(shift, float)).ravel())]
+
+
+def from_rays(first: Array, second: Array, rng: np.random.Generator) -> Found:
+    """As `approximate` takes them: all candidates are tried in the block."""
+    one, other = (np.column_stack([each, np.full(len(each), -C_MM)]) for each in (first, second))
+    return relative_poses(one, other, rng)
+
+
+def one_image(method: Callable[..., Found], points: int, share: float, relief: float, number: int) -> bool:
+    rng = np.random.default_rng([SEED, number])
+    xyz = np.column_stack([rng.uniform(-600.0, 600.0, (points, 2)), rng.uniform(0.0, relief, points)])
+    true = pose(rng)
+    clean = seen(true, xyz)
+    found = method(xyz, with_errors(clean, share, rng), rng)
+    return any(np.sqrt(np.mean((seen(each, xyz) - clean) ** 2)) < 10 * SIGMA_MM for each in found)
+
+
+def two_images(method: Callable[..., Found], points: int, share: float, relief: float, number: int) -> bool:
+    rng = np.random.default_rng([SEED, number])
+    xyz = np.column_stack([rng.uniform(-600.0, 600.0, (points, 2)), rng.uniform(0.0, relief, points)])
+    true = [pose(rng), pose(rng)]
+    true[1].center[0] += 600.0
+    found = method(
+        *(with_errors(seen(each, xyz), wrong, rng) for each, wrong in zip(true, (0.0, share), strict=True)), rng
+    )
+    rotation = true[1].rotation @ true[0].rotation.T
+    base = true[0].rotation @ (true[1].center - true[0].center)
+    return any(
+        _angle(each.rotation @ rotation.T) < RIGHT_RAD
+        and base @ each.center / np.linalg.norm(base) / np.linalg.norm(each.center) > np.cos(RIGHT_RAD)
+        for each in found
+    )
+
+
+def _angle(rotation: Array) -> float:
+    return float(np.linalg.norm(cv2.Rodrigues(rotation)[0]))
+
+
+def main() -> None:
+    """Print the table: orientations found right of `count`, and milliseconds of CPU an orientation."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--count", type=int, default=60)
+    count = parser.parse_args().count
+    for what, study, own, theirs in (
+        ("resection", one_image, resected, solved_pnp),
+        ("relative orientation", two_images, from_rays, essential),
+    ):
+        methods: dict[str, Callable[..., Found]] = {"own": own}
+        for usac in (False, True):
+            for said, gate in GATES_MM.items():
+                methods[f"{'USAC' if usac else 'RANSAC'}, {said}"] = _told(theirs, gate, usac)
+        for relief in (200.0, 0.0):
+            for points, share in ((12, 0.0), (12, 1 / 4), (12, 1 / 3), (40, 1 / 3)):
+                told = []
+                for name, method in methods.items():
+                    start = time.process_time()
+                    right = sum(study(method, points, share, relief, number) for number in range(count))
+                    told.append(f"{name} {right}, {1000 * (time.process_time() - start) / count:.1f} ms")
+                print(f"{what}, {points} points, {share:.0%} wrong, relief {relief:g} m: {'; '.join(told)}", flush=True)
+
+
+def _told(theirs: Callable[..., Found], gate_mm: float, usac: bool) -> Callable[..., Found]:
+    return lambda *given: theirs(gate_mm, usac, *given)
+
+
+if __name__ == "__main__":
+    main()
