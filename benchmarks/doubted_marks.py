@@ -1,12 +1,12 @@
 """How many good marks are doubted: true marks on clean frames, whose error is below three of their standard deviations,
 that are called `weak`, by all rules together.
 
-python benchmarks/doubted_marks.py OUT.jsonl [--rounds 1] [--seed 1]
+python benchmarks/doubted_marks.py OUT.jsonl [--rounds 1] [--seed 1] [--first 0]
 
 Every kind of mark at pitches of 7, 20 and 60 um, with radii of 5 to 150 px and 10 to 500 times the noise: two frames of
 eight marks each, on film that scatters them by 3 um, of a camera whose marks are given to 5 um. One line a pair of
-frames is added to OUT.jsonl, and pairs that stand there already are left out. Then the tables of all its lines are
-printed: by pitch, radius and signal-to-noise, and why marks were doubted.
+frames is added to OUT.jsonl, and pairs that stand there already, or come before --first, are left out. Then the tables
+of all its lines are printed: by pitch, radius and signal-to-noise, and why marks were doubted.
 """
 
 import argparse
@@ -53,8 +53,9 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0)
     given = parser.parse_args()
-    done = {line["frame"] for line in lines(given.out)}
+    done = {*range(given.first), *(line["frame"] for line in lines(given.out))}
     cells = product(range(given.rounds), RADII_PX, KINDS, SNRS, PITCHES_UM)
     for number, (_, radius_px, kind, snr, pitch_um) in enumerate(cells):
         if number not in done:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from drawn import scan_of
 from numpy.typing import NDArray
-from true_marks import TrueMark
+from true_marks import ALL_MOVES, TrueMark
 
 from measure.fiducial_options import FiducialOptions
 from measure.frames.frame import CLEAR_DAMAGE
@@ -86,9 +86,10 @@ def _squares(errors: list[Array], covariances: list[Array]) -> Array:
 
 
 def start_off(mark: TrueMark, rng: np.random.Generator, exact: bool = False) -> Array:
-    """(2,) by how much the scale and the rotation (rad) are off with which a match begins: 0.3 % and 3 mrad or, where
-    the frame gives them, 0.01 % and 0.1 mrad, exact a tenth of that."""
-    return np.asarray(rng.normal(0, min(mark.kind.known * (0.1 if exact else 1), 0.003), 2))
+    """(n,) by how much the first of `ALL_MOVES` are off with which a match begins: scale and rotation by 0.3 % and
+    3 mrad or, where the frame gives them, all four as it does, exact a tenth of that."""
+    moves = len(mark.kind.unknown) if np.isfinite(mark.kind.known) else 2
+    return np.asarray(rng.normal(0, min(mark.kind.known * (0.1 if exact else 1), 0.003), moves))
 
 
 def best_errors(mark: TrueMark, noise: Array, sigma: float, off: Array, correlation: Array | None = None) -> Array:
@@ -104,14 +105,15 @@ def measured(
     step_dn: float = 0.0,
     off: Array | None = None,
 ) -> Found | None:
-    """The mark as the program measures it, from a start off by some px, and by off (2,), as `start_off` gives it."""
+    """The mark as the program measures it, from a start off by some px, and by off (n,), as `start_off` gives it."""
     scan = scan_of(grey, full_scale, step_dn)
     center = mark.place[:, 2] + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
     if mark.kind.name == "ellipse":
         disk = fit_disk(scan, mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1))
         return None if disk.reason else Found(disk.center_px, disk.covariance_px2, disk.weakness)
-    scale, turn = start_off(mark, rng) if off is None else off
-    start = np.column_stack([np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ mark.place[:, :2], center])
+    off = start_off(mark, rng) if off is None else off
+    change = np.tensordot(off, np.reshape(ALL_MOVES[: len(off)], (-1, 2, 2)), 1)
+    start = np.column_stack([(np.eye(2) + change) @ mark.place[:, :2], center])
     polarity = 1 if grey_is_light(mark, grey) else -1
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
     options = FiducialOptions().match

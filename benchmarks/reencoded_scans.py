@@ -1,12 +1,13 @@
 """Real scans stored anew by other tone curves: their marks have to stay where they are.
 
-    python benchmarks/reencoded_scans.py FOLDER [--linear]
+    python benchmarks/reencoded_scans.py FOLDER [--linear] [--frame NAME]
 
 FOLDER holds the frames of aerial film (film_scans/aerial of the test data). Each is decoded and coded anew, in 16 bits,
 by light = code ** 2.2 and by its inverse, so that what the scanner coded with one curve now has three. Every copy is
 measured and judged by itself, with nothing said of its curve; --linear takes grey values as light, as a comparison.
 Told is how far each mark lies elsewhere in one copy than in another, in px and in the standard deviations of both
-claims together, with its statuses; then the largest of each frame, of marks `measured` in both copies and of all.
+claims together, but for the film, which is the same in all copies; with its statuses. Then the largest of each frame,
+of marks `measured` in both copies and of all.
 """
 
 import argparse
@@ -16,8 +17,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from measure.checks.judgement import judged
+from measure.covariance import Cause, Covariance
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.results import FrameMeasurement, MarkMeasurement
@@ -28,6 +31,8 @@ from measure.scans.tone import LINEAR, Tone
 from measure.status import Status
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path
+
+Array = NDArray[np.float64]
 
 CAMERAS = {
     "0b4cb981": "zeiss-rmk-a-153",
@@ -101,11 +106,15 @@ def differences(frame: str, results: Mapping[str, FrameMeasurement]) -> list[Row
 def _row(frame: str, copies: str, a: MarkMeasurement, b: MarkMeasurement) -> Row:
     assert a.center_px is not None
     assert b.center_px is not None
-    assert a.covariance is not None
-    assert b.covariance is not None
     off = np.asarray(a.center_px) - np.asarray(b.center_px)
-    sigmas = float(np.sqrt(off @ np.linalg.solve(a.covariance.px2 + b.covariance.px2, off)))
+    sigmas = float(np.sqrt(off @ np.linalg.solve(_of_copy(a) + _of_copy(b), off)))
     return Row(frame, copies, a.point, (a.status, b.status), float(np.hypot(*off)), sigmas)
+
+
+def _of_copy(mark: MarkMeasurement) -> Array:
+    """(2, 2) px2, without what all copies share."""
+    assert mark.covariance is not None
+    return Covariance({cause: part for cause, part in mark.covariance.parts.items() if cause is not Cause.FILM}).px2
 
 
 def print_table(rows: Sequence[Row]) -> None:

@@ -16,8 +16,8 @@ class MatchOptions:
     blur_px: standard deviation of the scan's blur; the start of its estimation, if estimate_blur has it estimated.
     blur_sigma: prior standard deviation of the logarithm of the blur, the pixel's share included, as known from the
     other marks.
-    linear_sigma: prior standard deviation of rotation (rad), scale and shear, as known from the other marks; the
-    default holds only what the picture does not show at all.
+    linear_sigma: prior standard deviation of rotation (rad) and scale, and strain_sigma of stretch and shear, as known
+    from the other marks; the defaults hold only what the picture does not show at all.
     margin_px: how far about the mark grey values are used; in a blurred scan margin_blurs standard deviations of the
     blur, where that is more.
     plain_px: where grey values farther from the mark vary much more than the nearer ones, the match fails.
@@ -31,6 +31,7 @@ class MatchOptions:
     blur_sigma: float = inf
     estimate_blur: bool = True
     linear_sigma: float = 0.3
+    strain_sigma: float = 0.3
     margin_px: float = 6.0
     margin_blurs: float = 4.0
     plain_px: float = inf
@@ -40,7 +41,7 @@ class MatchOptions:
     def __post_init__(self) -> None:
         if self.freedom not in FREEDOMS:
             raise ValueError(f"freedom is {self.freedom!r}; one of {', '.join(FREEDOMS)} is right")
-        for name in ("blur_px", "blur_sigma", "linear_sigma", "margin_px", "plain_px", "max_shift_px"):
+        for name in ("blur_px", "blur_sigma", "linear_sigma", "strain_sigma", "margin_px", "plain_px", "max_shift_px"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
         for name in ("margin_blurs", "damage_rounds"):

@@ -23,6 +23,12 @@ def generators(freedom: Freedom, mark: Mark) -> NDArray[np.float64]:
     return np.array(shown).reshape(-1, 2, 2)
 
 
+def are_strains(generators: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(n,) which of the changes (n, 2, 2) are of stretch or shear: symmetric, and the area stays."""
+    symmetric = np.all(generators == generators.swapaxes(1, 2), axis=(1, 2))
+    return np.asarray(symmetric & (np.trace(generators, axis1=1, axis2=2) == 0))
+
+
 def is_round(mark: Mark) -> bool:
     """Whether every rotation leaves the mark as it is."""
     if isinstance(mark, MarkTemplate):

@@ -397,7 +397,9 @@ def _tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, about: _Surroun
     drawn, linear = model.drawn, replace(linear, noise=linear.noise.at_least(fit.floor_dn**2))
     clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
     landscape = _landscape(model, about)
-    return told_tone(linear, drawn, model.grey, clear, priors_dn2, coding.tone, coding.full_scale_dn, landscape)
+    return told_tone(
+        linear, drawn, model.grey, clear, priors_dn2, model.departures(), coding.tone, coding.full_scale_dn, landscape
+    )
 
 
 def _blur_sigma(model: PictureModel, covariance: Array) -> float:

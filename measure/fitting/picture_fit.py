@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
+_DRAWN = 0.001  # of the contrast: a picture is drawn and linearised no better, which no prior must give way to
 _FLOOR = 0.005  # of the contrast: residuals below it may be the drawing's own
 _ITERATIONS, _HALVINGS = 15, 4  # more steps, or shorter ones, settle no fit that these do not
 _DAMAGE_SIGMAS = 3.2  # of smoothed residuals: one pixel in seven hundred of a window without damage goes beyond
@@ -181,8 +182,7 @@ class PictureFit:
 
     def _covariance(self, weights: Array, smeared: Array, held: float = 1.0) -> tuple[Array, Array]:
         """As `weigh` gives them, from weighted derivatives and the noise's covariance matrix times these. held: how
-        many times as much as their variances say the priors counted: the floor under the fit's scale holds rotation
-        and scale of a clear mark on a clean scan close, and their errors then go into its place."""
+        many times as much as their variances say the priors counted."""
         priors = np.diag(self.model.prior_weights())
         inverse: Array = np.asarray(np.linalg.inv(products(weights, self.model.design) + held * priors))
         covariance = np.asarray(inverse @ (products(weights, smeared) + held**2 * priors) @ inverse.T)
@@ -271,9 +271,9 @@ class PictureFit:
                 noise_dn = noise_scale(model.uncensored[self.used], model.clipped[self.used], noise_dn, least_dn)
             model.take_noise(noise_dn)
         model.linearise(self.used)
-        tukey_dn = self._tukey_scale()
-        self.variance_dn2 = tukey_dn**2
-        scale_dn = tukey_dn if robust else np.inf
+        noise_dn = max(robust_scale(model.residuals[self.telling]), _DRAWN * self.contrast_dn, 1e-9)
+        self.variance_dn2 = max(noise_dn**2, self.least_variance_dn2)
+        scale_dn = max(noise_dn, _SCALE_FLOOR * self.contrast_dn) if robust else np.inf
         cost = self._cost(scale_dn)
         for _ in range(_ITERATIONS):
             weights = model.design * (self.used * tukey_weights(model.residuals, scale_dn))
@@ -308,9 +308,6 @@ class PictureFit:
         """What the adjustment makes small: Tukey's loss, squares where the scale is infinite, and the priors'."""
         priors = np.sum(self.model.prior_weights() * self.model.departures() ** 2)
         return float(tukey_loss(self.model.residuals * self.used, scale_dn) + self.variance_dn2 * priors)
-
-    def _tukey_scale(self) -> float:
-        return max(robust_scale(self.model.residuals[self.telling]), _SCALE_FLOOR * self.contrast_dn, 1e-9)
 
     def _solve(self, weights: Array, variance_dn2: float) -> Array | None:
         """The step by weighted derivatives (unknowns, height, width), a pixel's weight being the share of this variance

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.clipping import Sides, censored, tells
-from measure.fitting.generators import generators
+from measure.fitting.generators import are_strains, generators
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
 from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
 from measure.match_options import MatchOptions
@@ -94,6 +94,8 @@ class PictureModel:
         self.light, self.grey = seen, self.detail(seen)
         self.generators = generators(options.freedom, mark)
         self.linear = slice(2, 2 + len(self.generators))
+        strains = are_strains(self.generators)
+        self._linear_weights = np.where(strains, options.strain_sigma, options.linear_sigma) ** -2.0
         self.blur = 2 + len(self.generators) if options.estimate_blur else None
         # A chip already has its scan's blur: where none is estimated, none is added.
         added_px2 = 0.0 if is_chip and not options.estimate_blur else options.blur_px**2
@@ -323,9 +325,10 @@ class PictureModel:
         return not low < self.state.variance_px2 < high
 
     def prior_weights(self) -> Array:
-        """1 / variance of the priors of rotation, scale and shear, and of the blur's variance; 0 for all else."""
+        """1 / variance of the priors of rotation, scale, stretch and shear, and of the blur's variance; 0 for all
+        else."""
         weights = np.zeros(len(self.design))
-        weights[self.linear] = 1 / self.options.linear_sigma**2
+        weights[self.linear] = self._linear_weights
         if self.blur is not None:
             seen = self.options.blur_px**2 + PIXEL_VARIANCE_PX2
             weights[self.blur] = 1 / (2 * seen * self.options.blur_sigma) ** 2

@@ -31,14 +31,15 @@ def told_tone(
     grey: Array,
     clear: Mask,
     priors_dn2: Array,
+    departures: Array,
     tone: Tone,
     full_scale_dn: float,
     landscape: Landscape,
 ) -> ToldTone:
     """Beside the unknowns of a linearised fit. drawn, grey (height, width): the light that it draws, and that it was
     fitted to; clear, alike: where that is not near an end of the scanner's range, where noise is cut off, which bends
-    an edge as a curve does; priors_dn2 (unknowns,): weights of what was known of the unknowns before. landscape: in the
-    mark.
+    an edge as a curve does; priors_dn2 (unknowns,): weights of what was known of the unknowns before, and departures
+    (unknowns,) of the fit from that, which are residuals like those of pixels. landscape: in the mark.
 
     With the departures d the residuals are r + H d - D x. The score H'r of what D leaves of H grows with d by N and has
     the covariance S that the noise gives it: N' S^-1 N is the information, also where the noise is not white. H is
@@ -62,7 +63,7 @@ def told_tone(
     left = changes - combined(shares.T, known)
     normal = products(left, changes)
     residuals = np.where(counts, fit.residuals, 0.0)
-    score = -products(left, residuals[None])[:, 0]
+    score = -products(left, residuals[None])[:, 0] - shares[: len(departures)].T @ (priors_dn2 * departures)
     covariance = fit.covariance(left) + landscape.covariance(left) + fit.noise.variance_dn2 * shares.T @ priors @ shares
     # Of departures that the picture's own unknowns take up whole, only rounding is left: it must not tell of the curve.
     whole = float(np.trace(fit.covariance(changes)))

@@ -13,7 +13,7 @@ from measure.frames.refinement import Sighting
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FrameCorner, Mark
 from measure.probabilities import TEXTURE_LIKE_A_FAINT_MARK
-from measure.reason import Code, Reason
+from measure.reason import NO_REASON, Code, Reason
 from measure.search.prediction import MarkPrediction
 
 Array = NDArray[np.float64]
@@ -118,7 +118,8 @@ def _about(sighter: FrameSighter, mark: Mark, pixel_from_mark: Array, times: flo
 
 
 def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark | None, unseen: Reason) -> None:
-    """Keep a clear fit where what was seen is the same mark; else what was seen counts, or that nothing was."""
+    """Keep a clear fit where what was seen is the same mark; else what was seen counts, or that nothing was. Texture
+    does not feign what was seen; but where a clear fit lies elsewhere, either may be the mark."""
     clear, away = sighter.clear(index), np.inf
     if seen is not None and sighting.fit is not None:
         away = float(np.hypot(*(sighting.fit.center_px - seen.fit.center_px)))
@@ -128,8 +129,8 @@ def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark
     if seen is None and not clear:
         sighter.sightings[index] = Sighting(sighting.predicted_px, True, None, unseen)
     elif seen is not None and (not clear or away > _SAME_PX):
-        told = f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
-        sighter.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, Reason(told, Code.CONTRAST))
+        told = Reason(f"{away:.0f} px from it something looks like it, too", Code.AMBIGUOUS) if clear else NO_REASON
+        sighter.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, told)
 
 
 def _is_certain(sighter: FrameSighter, seen: FaintMark) -> bool:

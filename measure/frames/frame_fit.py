@@ -11,6 +11,7 @@ from measure.probabilities import TRUE_MARK_AN_OUTLIER
 Array = NDArray[np.float64]
 
 _MANY = 8  # marks whose scatter says more than the gate
+_LINEAR = [0, 1, 4, 5]  # of the unknowns: all but the shift
 _LEAST_GATE = 0.1  # of the gate: film bends marks so far off, however well most agree
 
 
@@ -18,13 +19,15 @@ _LEAST_GATE = 0.1  # of the gate: film bends marks so far off, however well most
 class FrameFit:
     """up_from_camera: (2, 3), camera mm to the scan's mm (right, up). residuals_mm: (n, 2) measured less predicted.
 
-    chi_square holds the affinity's two pseudo-observations too; redundancy counts them: 2 n - 4.
+    chi_square holds the affinity's two pseudo-observations too; redundancy counts them: 2 n - 4. linear_sigma: standard
+    deviation of rotation (rad), scale, stretch and shear, the root of their mean variance.
     """
 
     up_from_camera: Array
     residuals_mm: Array
     chi_square: float
     redundancy: int
+    linear_sigma: float
 
 
 def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array) -> FrameFit:
@@ -44,12 +47,15 @@ def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array) -> F
     design = np.concatenate([rows * weight[:, None], prior])
     right = np.concatenate([values * weight, np.zeros(2)])
     size = np.linalg.norm(design, axis=0)
-    solution = np.linalg.lstsq(design / size, right, rcond=None)[0] / size
+    inverse = np.linalg.pinv(design / size) / size[:, None]
+    solution = inverse @ right
     a, b, shift_x, shift_y, stretch, shear = solution
     linear = np.array([[a + stretch, -b + shear], [b + shear, a - stretch]]) @ turn
     residuals = (values - rows @ solution).reshape(2, -1).T
     chi_square = float(np.sum((design @ solution - right) ** 2))
-    return FrameFit(np.column_stack([linear, [shift_x, shift_y]]), residuals, chi_square, 2 * len(camera_mm) - 4)
+    up_from_camera = np.column_stack([linear, [shift_x, shift_y]])
+    linear_sigma = float(np.sqrt(np.sum(inverse[_LINEAR] ** 2, axis=1).mean()) / np.hypot(a, b))
+    return FrameFit(up_from_camera, residuals, chi_square, 2 * len(camera_mm) - 4, linear_sigma)
 
 
 def outliers(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, gate_mm: float) -> NDArray[np.bool_]:

@@ -77,7 +77,8 @@ def _settle_from(sighter: FrameSighter, tone: Tone) -> None:
 
 def _leans_or_is_strained(sighter: FrameSighter, index: int, fit: Match) -> bool:
     mark, linear = sighter.layout.marks[index].mark, sighter.pixel_from_camera[:, :2]
-    return leans_on_frame(mark) or strained_px(mark, fit.pixel_from_mark[:, :2], linear) > _STRAINED * fit.sigma_px
+    off_px = strained_px(mark, fit.pixel_from_mark[:, :2], linear, _frame_sigma(sighter))
+    return leans_on_frame(mark) or off_px > _STRAINED * fit.sigma_px
 
 
 def _moved_by_tone(sighter: FrameSighter, found: FrameTone) -> set[int]:
@@ -231,10 +232,12 @@ def _only_seen(sighter: FrameSighter) -> dict[int, Match]:
 
 
 def _frame_sigma(sighter: FrameSighter) -> float:
-    """The standard deviation of the frame's rotation (rad) and scale."""
+    """The standard deviation of rotation (rad), scale, stretch and shear at a mark: of the frame by its marks, and
+    by as much as film bends between them."""
     belonging = sighter.camera[sighter.belongs]
     radius_mm = float(np.hypot(*(belonging - belonging.mean(axis=0)).T).mean())
-    return float(np.hypot(sighter.options.film_sigma_mm, sighter.scatter_mm())) / radius_mm
+    bent = float(np.hypot(sighter.options.film_sigma_mm, sighter.scatter_mm())) / radius_mm
+    return float(np.hypot(sighter.linear_sigma, bent))
 
 
 def _match_again(sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float) -> None:

@@ -50,7 +50,8 @@ class FrameSighter:
     """A frame of n marks in the making.
 
     camera (n, 2): given places, mm; turn (2, 2): of the pose; pitch (2,): mm of a pixel. pixel_from_camera (2, 3): as
-    the placement has it, or the marks that belong. sightings: None for a mark that was not looked at yet. belongs (n,):
+    the placement has it, or the marks that belong; linear_sigma: how well these know its rotation (rad), scale, stretch
+    and shear, inf before. sightings: None for a mark that was not looked at yet. belongs (n,):
     marks that were seen and agree; certain (n,): those that stand out so much of their texture that they need not.
     weights: of the channels. prior_tone: what was believed of the scan's curve; tone: what its marks made of that.
     gate_px, first_search_px, near_px, faint_px: how far from its predicted place a mark is
@@ -70,7 +71,7 @@ class FrameSighter:
         self.pitch = np.asarray(placement.pitch_mm)
         self.camera = np.array([mark.xy_mm for mark in layout.marks])
         self.turn = up_from_camera(placement.pose)
-        self.pixel_from_camera = placement.pixel_from_camera
+        self.pixel_from_camera, self.linear_sigma = placement.pixel_from_camera, np.inf
         self.sightings: list[Sighting | None] = [None] * len(layout.marks)
         self.belongs: Mask = np.zeros(len(layout.marks), dtype=bool)
         self.certain: Mask = np.zeros(len(layout.marks), dtype=bool)
@@ -156,6 +157,7 @@ class FrameSighter:
         out = outliers(self.camera[index], up, sigma, self.turn, self.options.gate_mm) & ~told[index]
         self.belongs[index[out]] = False
         fit = fit_frame(self.camera[index[~out]], up[~out], sigma[~out], self.turn)
+        self.linear_sigma = fit.linear_sigma
         self.pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / self.pitch[:, None]
 
     def sure(self) -> bool:

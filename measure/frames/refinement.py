@@ -150,20 +150,23 @@ def _matched(
 
 
 def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:
-    """A solid mark gets more ground. Where the mark leans on the frame, its rotation, scale, stretch and shear stay
-    as predicted, or as near it as the frame knows them."""
+    """A solid mark gets more ground. What a mark's own picture may not tell stays as predicted, or as near it as the
+    frame knows it: rotation and scale where the mark leans on the frame, and stretch and shear where more of it lies
+    to one side."""
     if _is_solid(mark):
         options = replace(
             options,
             margin_px=max(options.margin_px, _SOLID_MARGIN_PX),
             margin_blurs=max(options.margin_blurs, _SOLID_MARGIN_BLURS),
         )
-    if not leans_on_frame(mark):
-        return options
+    leans = leans_on_frame(mark)
     if frame_sigma is None:
-        return replace(options, freedom="shift")
+        return replace(options, freedom="shift") if leans else options
+    if not leans and np.allclose(_one_sided_px(mark, np.eye(2)), 0.0):
+        return options
     in_part = isinstance(mark, MarkShape) and mark.true_mm is not None
-    return replace(options, freedom="affine", linear_sigma=np.hypot(frame_sigma, _DRAWN_SIGMA if in_part else 0.0))
+    held = float(np.hypot(frame_sigma, _DRAWN_SIGMA if in_part else 0.0))
+    return replace(options, freedom="affine", linear_sigma=held if leans else options.linear_sigma, strain_sigma=held)
 
 
 def _is_solid(mark: Mark) -> bool:
@@ -177,10 +180,16 @@ def leans_on_frame(mark: Mark) -> bool:
     return isinstance(mark, MarkTemplate) or all(isinstance(part, Polygon) for part in mark.parts)
 
 
-def strained_px(mark: Mark, fitted: Array, linear: Array) -> float:
-    """How far about a mark is off because it was fitted with the stretch and shear of fitted (2, 2) instead of those of
-    linear: by as much as they move what of its drawing reaches farther to one side than to the other."""
+def strained_px(mark: Mark, fitted: Array, linear: Array, sigma: float) -> float:
+    """How far about a mark may be off because it was fitted with the stretch and shear of fitted (2, 2) instead of
+    those of linear, of that standard deviation: by as much as they move what of its drawing lies to one side."""
     change = linear @ np.linalg.inv(fitted) - np.eye(2)
     strain = (change + change.T) / 2 - np.trace(change) / 2 * np.eye(2)
+    one_sided = _one_sided_px(mark, linear)
+    return float(np.hypot(np.hypot(*(strain @ one_sided)), sigma * np.hypot(*one_sided)))
+
+
+def _one_sided_px(mark: Mark, linear: Array) -> Array:
+    """(2,) how much farther a mark's drawing reaches to one side than to the other."""
     least, greatest = extent_px(mark, np.column_stack([linear, np.zeros(2)]))
-    return float(np.hypot(*(strain @ (least + greatest))))
+    return least + greatest

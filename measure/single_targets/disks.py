@@ -164,6 +164,7 @@ def _fit_by_margin(
         plain_px=sure_px,
         max_shift_px=max(_mean_radius_px(start[:, :2]), _LEAST_SHIFT_PX),
         linear_sigma=_FORM_SIGMA,
+        strain_sigma=_FORM_SIGMA,
     )
     window = read_window(scan, window_about(shape, start, wide_px + BESIDE_PX))
 

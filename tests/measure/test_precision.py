@@ -21,7 +21,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.fitting.matching import Match
 from measure.frames.refinement import sight
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
+from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
 from measure.search.prediction import MarkPrediction
 from measure.single_targets.disks import fit_disk
 
@@ -55,13 +55,14 @@ def test_marks_are_at_the_bound_with_honest_sigmas_in_white_noise_and_in_grain(n
     assert 0.9 < whitened_rms(errors, covariances) / whitened_rms(best, bounds) < 1.1
 
 
-def test_wedges_and_wings_say_how_well_their_frame_s_stretch_and_shear_are_known() -> None:
+def test_marks_say_how_well_the_frame_s_stretch_and_shear_are_known_that_move_them() -> None:
     """A few marks close together, say, that are given a little off: all their tips are then off alike."""
     rng, roughly = np.random.default_rng(8), 2e-3
-    errors, covariances, best = [], [], []
-    for name in ("wedge", "wing"):
-        true = some_mark(replace(KIND[name], known=roughly), 1.0, rng)
-        for _ in range(10):
+    dots = MarkShape((*cross(0.5, 0.15), *(Disk((1.6, y), 0.18) for y in (-0.5, 0.0, 0.5))))
+    errors, covariances, best, bounds = [], [], [], []
+    for kind in (KIND["wedge"], KIND["wing"], Kind("identification dots", dots, ALL_MOVES)):
+        true = some_mark(replace(kind, known=roughly), 1.0, rng)
+        for _ in range(6):
             unit = rng.standard_normal((true.size, true.size)) / 200
             off = rng.normal(0, roughly, len(ALL_MOVES))
             told = (np.eye(2) + np.tensordot(off, np.reshape(ALL_MOVES, (-1, 2, 2)), 1)) @ true.place[:, :2]
@@ -70,8 +71,9 @@ def test_wedges_and_wings_say_how_well_their_frame_s_stretch_and_shear_are_known
             errors.append(fit.center_px - true.place[:, 2])
             covariances.append(fit.covariance_px2)
             best.append(true.best_errors(unit, 1 / 200, told=off))
-    assert np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(best))) < 1.6  # by rotation and scale only: 3.4
-    assert 0.8 < whitened_rms(errors, covariances) < 1.25  # likewise, or by the noise's part only: 1.4 and more
+            bounds.append(true.bound(1 / 200))
+    assert np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(best))) < 1.15
+    assert 0.9 < whitened_rms(errors, covariances) / whitened_rms(best, bounds) < 1.1
 
 
 def test_a_disk_on_plain_ground_uses_more_of_it() -> None:

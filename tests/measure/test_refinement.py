@@ -24,9 +24,9 @@ def test_a_stretch_moves_what_lies_to_one_side_of_its_centre(mark: MarkShape) ->
     grey = 100.0 + 100.0 * brute_picture(mark, true, 81, 81, 1.0)
     grey += np.random.default_rng(1).normal(0.0, 2.0, grey.shape)
     off = match(ScanWindow(grey), mark, START, MatchOptions(freedom="shift")).center_px - true[:, 2]
-    assert strained_px(mark, START[:, :2], true[:, :2]) == pytest.approx(np.hypot(*off), abs=0.025)
+    assert strained_px(mark, START[:, :2], true[:, :2], 0.0) == pytest.approx(np.hypot(*off), abs=0.025)
     assert (np.hypot(*off) > 0.05) == (mark is WING)
-    assert strained_px(mark, 1.02 * true[:, :2], true[:, :2]) == pytest.approx(0.0, abs=1e-12)
+    assert strained_px(mark, 1.02 * true[:, :2], true[:, :2], 0.0) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("along_px", [-10.0, 9.0])

@@ -74,11 +74,13 @@ def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the
     clear[5, 6:9] = True
     used, landscape = np.ones(shape, bool), Landscape(drawn, np.zeros(shape, bool), design[3])
     fit = LinearFit(rng.normal(size=shape), used, design, design / 576.0, noise, np.ones(shape))
-    said = told_tone(fit, drawn, drawn, clear, np.zeros(7), Tone.unknown(), FULL, landscape).said
+    said = told_tone(fit, drawn, drawn, clear, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape).said
     assert np.abs(said.information).max() < 1e-3
     blank = replace(fit, residuals=np.zeros(shape), noise=NoiseModel(4e-35, np.full((1, 1), 4e-35), 0.0))
     even = np.full(shape, 87.8)
-    assert not told_tone(blank, even, even, used, np.zeros(7), Tone.unknown(), FULL, landscape).said.information.any()
+    assert not told_tone(
+        blank, even, even, used, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape
+    ).said.information.any()
 
 
 def test_noise_that_is_none_is_raised_to_a_floor() -> None:
@@ -256,3 +258,20 @@ def test_a_mark_whose_detail_alone_was_fitted_moves_with_the_curve_and_says_noth
     assert found.scatter == 0.0
     assert np.array_equal(found.tone.covariance, np.eye(5))
     assert 0.005 < np.sqrt(np.trace(found.covariance_px2(told))) < 0.1
+
+
+def test_what_a_mark_says_of_the_curve_is_the_same_however_closely_the_fit_held_the_frame() -> None:
+    """Only the residuals, and how far the unknowns lie from where the frame has them, together say it."""
+    rng, shape = np.random.default_rng(4), (24, 24)
+    row, col = np.indices(shape) / 24.0
+    design = np.stack([np.cos(7 * col), np.sin(7 * row), np.exp(-col), col * row + 0.5, np.ones(shape), col, row])
+    by_grey, noise = np.linalg.pinv(design.reshape(7, -1)).T.reshape(design.shape), NoiseModel(1.0, np.ones((1, 1)), 0)
+    drawn, everywhere = 30000.0 * (0.1 + 0.8 * col), np.ones(shape, bool)
+    residuals, landscape = 0.01 * rng.normal(size=shape), Landscape(drawn, np.zeros(shape, bool), design[3])
+    rights = []
+    for change in (0.0, 0.003):
+        fit = LinearFit(residuals - change * design[2], everywhere, design, by_grey, noise, np.ones(shape))
+        priors, departures = np.array([0, 0, 50.0, 0, 0, 0, 0]), np.array([0, 0, 0.002 + change, 0, 0, 0, 0])
+        told = told_tone(fit, drawn, drawn, everywhere, priors, departures, Tone.unknown(), FULL, landscape)
+        rights.append(told.said.right)
+    np.testing.assert_allclose(rights[1], rights[0], rtol=1e-6)
