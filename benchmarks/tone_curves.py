@@ -11,7 +11,7 @@ Told are, for each kind, curve, way to store, difficulty and noise: marks that c
 and the per cent `measured`; of the marks `measured` the rms error, the rms of error over claim, the largest one, and
 how many are off by more than 5 standard deviations. Of tips: the mean error along their axes, outwards.
 
---scans 8: eight frames in a row, of tips alone, are scans of one camera by one scanner, as in a folder. What four of
+--scans 8: eight frames in a row, of tips alone, are scans of one camera by one scanner, as in a folder. What eight of
 them say of the curve is believed of the others, as `reseau measure` does; --frames counts scans.
 """
 
@@ -36,14 +36,14 @@ from measure.status import Status
 
 Row = dict[str, Any]
 
-_GROSS, _SAMPLES = 5.0, 4
+_GROSS, _SAMPLES = 5.0, 8
 _NOISES = (8.0, 15.0, 30.0, 60.0, 101.0)
 
 
 def rows_of(case: Case, index: int, said: Sequence[SaidOfTone] = ()) -> list[Row]:
     """One for each mark of a frame; said: by other scans of its scanner."""
     start = time.process_time()
-    frame = measured(case, Tone.unknown().told(said).tone)
+    frame = measured(case, Tone.unknown().hearing(said))
     seconds = time.process_time() - start
     rows = []
     for mark in frame.marks:

@@ -71,8 +71,8 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
     fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     if fit.tone is not None:
-        variance = tone_variance(scan.rounding_step_dn, fit.stored_contrast_dn)
-        fit = replace(fit, tone=replace(fit.tone, said=fit.tone.said.loosened(variance)))
+        alike = tone_variance(scan.rounding_step_dn, fit.stored_contrast_dn)
+        fit = replace(fit, tone=replace(fit.tone, said=replace(fit.tone.said, alike=alike)))
     return Sighting(predicted, True, fit, chance=chance)
 
 

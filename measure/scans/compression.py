@@ -8,8 +8,8 @@ Neelamani et al., "JPEG compression history estimation for color images", IEEE T
 The fine detail goes, a mark's edges and the grain alike. Residuals show most of it, so that a standard deviation from
 them is right, where the mark's contrast is many of the file's rounding steps; what faint marks lose of their edges they
 do not show. Nor that the two sides of an edge are more alike in grey values than a tone curve leaves them, for rounding
-knows of no light: that is common to a frame's marks, and does not average. The grain that is left is the compression's
-own making, and no weights are taken from it.
+knows of no light: that is common to a scanner's marks, and does not average. The grain that is left is of the
+compression's own making, and no weights are taken from it.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ _STEPS_DN = np.arange(2, 51)  # a step of 1 takes nothing away; 50 is that of qu
 _BIN_DN = 0.25
 _LARGEST_DN = 150.0  # of a coefficient that is looked at: three times the largest step
 _LOST_PX = 0.25  # times the square of step over contrast: rms of what residuals do not show (benchmarks/marks.py)
-_TONE_LOST = 10.0  # times step over contrast, of what is not known of any curve (benchmarks/tone_curves.py)
+_TONE_LOST = 3.5  # times step over contrast, of what is not known of any curve (benchmarks/tone_curves.py)
 _MOST_LOST_PX = 1.0  # where the contrast is hardly two steps, there is nothing left to measure
 
 
@@ -136,5 +136,5 @@ def covariance_of_compression(rounding_step_dn: float, contrast_dn: float) -> Ar
 
 def tone_variance(rounding_step_dn: float, contrast_dn: float) -> float:
     """By how much a scan's compression makes a mark of that contrast speak of another tone curve than the scanner's:
-    of each departure, in squares of what is not known of any curve."""
+    of each departure, in squares of what is not known of any curve; alike in all marks of a scanner."""
     return (_TONE_LOST * rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2

@@ -53,10 +53,12 @@ class FrameTone:
         """By what each mark says, and edges that are no marks."""
         if not told:
             return cls(prior)
-        found = prior.told([*(one.said for one in told.values()), *edges])
+        each = [*(one.said for one in told.values()), *edges]
+        found = prior.told(each)
         least, greatest = min(one.least for one in told.values()), max(one.greatest for one in told.values())
         apart = found.tone.mean - matched_by.mean
-        return cls(found.tone, found.said, least, greatest, found.scatter, float(apart @ apart))
+        said = None if prior.is_known else SaidOfTone.together(each, found.scatter)
+        return cls(found.tone, said, least, greatest, found.scatter, float(apart @ apart))
 
     @property
     def unsettled(self) -> float:

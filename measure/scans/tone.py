@@ -25,6 +25,7 @@ _TOE = 0.005  # of full scale: the slope of a power has no logarithm at black
 _POWER, _POWER_SIGMA = 1.6, 0.6
 _WAVE_SIGMAS = (0.3, 0.5, 0.2, 0.15)
 _SIGMAS = np.array([_POWER_SIGMA, *_WAVE_SIGMAS])
+_COUNT = len(_SIGMAS)
 # What is believed of a curve that the file says: programs round it, and a scanner's light and dark are not exactly its.
 _DECLARED_SIGMA = 0.1  # of the standard deviations above
 # By how much pictures' own curves may differ from the scanner's: variances of each departure that are tried.
@@ -55,17 +56,19 @@ def sampled(light: Array) -> Array:
 class SaidOfTone:
     """What pictures say of the departures of a curve: information (k, k), right (k,), the information times the most
     likely departures, and square, the sum of squares of departures of none in units of their standard deviations;
-    count: of independent figures."""
+    count: of independent figures. alike: the variance of each departure by which all of them speak of another curve
+    than the scanner's in the same way, as JPEG's rounding makes them: it is not in the information, and no number of
+    pictures averages it."""
 
     information: Array
     right: Array
     square: float
     count: int
+    alike: float = 0.0
 
     @classmethod
     def nothing(cls) -> "SaidOfTone":
-        size = len(_SIGMAS)
-        return cls(np.zeros((size, size)), np.zeros(size), 0.0, 0)
+        return cls(np.zeros((_COUNT, _COUNT)), np.zeros(_COUNT), 0.0, 0)
 
     @classmethod
     def by_score(cls, normal: Array, score: Array, covariance: Array) -> "SaidOfTone":
@@ -75,33 +78,36 @@ class SaidOfTone:
         return cls((information + information.T) / 2, weighted[-1] @ normal, float(weighted[-1] @ score), len(score))
 
     @classmethod
-    def together(cls, each: Sequence["SaidOfTone"]) -> "SaidOfTone":
-        """What several pictures say."""
+    def together(cls, each: Sequence["SaidOfTone"], scatter: float = 0.0) -> "SaidOfTone":
+        """What several pictures say, each of them of a curve of its own, each departure of which differs from the
+        scanner's with the variance scatter. What they have alike counts by how much each says."""
+        information, right = (
+            np.array([one.information for one in each]),
+            np.array([one.right for one in each])[..., None],
+        )
+        says, alike = np.trace(information, axis1=1, axis2=2), np.array([one.alike for one in each])
+        taken = scatter * np.linalg.inv(np.eye(_COUNT) + scatter * information)
+        less = (information - information @ taken @ information).sum(axis=0)
         return cls(
-            np.sum([one.information for one in each], axis=0),
-            np.sum([one.right for one in each], axis=0),
-            sum(one.square for one in each),
+            (less + less.T) / 2,
+            (right - information @ taken @ right).sum(axis=(0, 2)),
+            sum(one.square for one in each) - float((right.swapaxes(1, 2) @ taken @ right).sum()),
             sum(one.count for one in each),
+            float(says @ alike / max(says.sum(), 1e-30)),
         )
 
-    def loosened(self, variance: float) -> "SaidOfTone":
-        """The same where what the picture says is of a curve of its own, each departure of which differs from the
-        scanner's with that variance."""
-        if not variance or not self.count:
-            return self
-        less = np.linalg.inv(np.eye(len(self.right)) + variance * self.information)
-        information, right = less @ self.information, less @ self.right
-        square = self.square - variance * float(self.right @ right)
-        return SaidOfTone((information + information.T) / 2, right, square, self.count)
+    @property
+    def of_scanner(self) -> "SaidOfTone":
+        """The same of the scanner's curve."""
+        return replace(SaidOfTone.together([self], self.alike), alike=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """A tone curve after pictures have said something. said: what that is together, None where nothing; scatter: the
-    variance of each departure of their own curves from it."""
+    """A tone curve after pictures have said something. scatter: the variance of each departure of their own curves
+    from it."""
 
     tone: "Tone"
-    said: SaidOfTone | None = None
     scatter: float = 0.0
 
 
@@ -111,23 +117,25 @@ class Tone:
 
     base (nodes,): light, 0 to 1, at evenly spaced codes. mean (k,), covariance (k, k): of the departures from it, each
     in units of the standard deviation that it has where nothing is known. source: where the curve is from, a part of a
-    sentence; is_declared: whether the file says it, which the picture may contradict.
+    sentence; is_declared: whether the file says it, which the picture may contradict. heard: what was believed before
+    other scans said something, and what they said; None where none did.
     """
 
     base: Array = field(default_factory=lambda: power(1.0))
-    mean: Array = field(default_factory=lambda: np.zeros(len(_SIGMAS)))
-    covariance: Array = field(default_factory=lambda: np.zeros((len(_SIGMAS),) * 2))
+    mean: Array = field(default_factory=lambda: np.zeros(_COUNT))
+    covariance: Array = field(default_factory=lambda: np.zeros((_COUNT, _COUNT)))
     source: str = "grey values are taken as light"
     is_declared: bool = False
+    heard: "tuple[Tone, tuple[SaidOfTone, ...]] | None" = field(default=None, compare=False)
 
     @classmethod
     def unknown(cls) -> "Tone":
-        return cls(power(_POWER), covariance=np.eye(len(_SIGMAS)), source="estimated from the edges of marks")
+        return cls(power(_POWER), covariance=np.eye(_COUNT), source="estimated from the edges of marks")
 
     @classmethod
     def declared(cls, base: Array, source: str) -> "Tone":
         """A curve that the file says."""
-        return cls(base, covariance=_DECLARED_SIGMA**2 * np.eye(len(_SIGMAS)), source=source, is_declared=True)
+        return cls(base, covariance=_DECLARED_SIGMA**2 * np.eye(_COUNT), source=source, is_declared=True)
 
     @property
     def is_identity(self) -> bool:
@@ -139,9 +147,9 @@ class Tone:
 
     def forgetting(self) -> "Tone":
         """The same base, of whose departures nothing is known but that the curve lies between linear and sRGB."""
-        mean = np.zeros(len(_SIGMAS))
+        mean = np.zeros(_COUNT)
         mean[0] = (_POWER - self._base_power) / _POWER_SIGMA
-        return replace(self, mean=mean, covariance=np.eye(len(_SIGMAS)))
+        return replace(self, mean=mean, covariance=np.eye(_COUNT))
 
     def like_power(self, value: float) -> "Tone":
         """The same with the departure that makes it most like a power."""
@@ -158,12 +166,20 @@ class Tone:
         """The curves that it may be: itself where it is known, else one standard deviation of power to either side."""
         if self.is_known:
             return (self,)
-        sigma = np.sqrt(self.covariance[0, 0]) * np.eye(len(_SIGMAS))[0]
+        sigma = np.sqrt(self.covariance[0, 0]) * np.eye(_COUNT)[0]
         return self.at(self.mean - sigma), self.at(self.mean + sigma)
+
+    def hearing(self, others: Sequence[SaidOfTone]) -> "Tone":
+        """What is believed where other scans of the scanner have said something: it is put together anew with what a
+        scan says itself, for what is wrong alike in all of them does not average."""
+        return replace(self.told(others).tone, heard=(self, tuple(others))) if others else self
 
     def told(self, each: Sequence[SaidOfTone]) -> "Believed":
         """What is believed when pictures have said something, too. What the file says they may contradict, where they
         agree."""
+        if self.heard is not None:
+            before, others = self.heard
+            return before.told([*others, *each])
         if self.is_known or not each:
             return Believed(self)
         believed, odds = self._told(each)
@@ -185,15 +201,14 @@ class Tone:
         return max((self._scattered(each, scatter) for scatter in _SCATTERS), key=itemgetter(1))
 
     def _scattered(self, each: Sequence[SaidOfTone], scatter: float) -> tuple["Believed", float]:
-        said = SaidOfTone.together([one.loosened(scatter) for one in each])
-        prior = np.linalg.inv(self.covariance)
+        together = SaidOfTone.together(each, scatter)
+        said, prior = together.of_scanner, np.linalg.inv(self.covariance)
         covariance = np.linalg.inv(prior + said.information)
         right = prior @ self.mean + said.right
         mean = covariance @ right
         chance = np.linalg.slogdet(prior @ covariance)[1] + right @ mean - self.mean @ prior @ self.mean - said.square
-        chance -= sum(np.linalg.slogdet(np.eye(len(mean)) + scatter * one.information)[1] for one in each)
-        chance -= 2 * np.log1p(scatter)
-        return Believed(replace(self, mean=mean, covariance=(covariance + covariance.T) / 2), said, scatter), chance / 2
+        chance -= _spread(scatter, each) + _spread(together.alike, [together]) + 2 * np.log1p(scatter)
+        return Believed(replace(self, mean=mean, covariance=(covariance + covariance.T) / 2), scatter), chance / 2
 
     def light(self, code: NDArray[np.floating] | NDArray[np.integer], full_scale: float) -> NDArray[np.float32]:
         """Light of grey values of a file whose largest is full_scale, on the same scale: 0 stays 0, and white white."""
@@ -243,7 +258,7 @@ class Tone:
     def _by_departure(self) -> Array:
         """(k, nodes) derivatives of the table, but for a constant share of light: a fit's gain takes that."""
         sums = np.cumsum(self._steps * _WAVES, axis=1) / self._steps.sum()
-        return np.concatenate([np.zeros((len(_SIGMAS), 1)), sums], axis=1)
+        return np.concatenate([np.zeros((_COUNT, 1)), sums], axis=1)
 
     @cached_property
     def _fast(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -252,6 +267,12 @@ class Tone:
     def __repr__(self) -> str:
         value, sigma = self.power_between(0.1, 0.9)
         return f"Tone(like a power of {value:.2f} +- {sigma:.2f}: {self.source})"
+
+
+def _spread(variance: float, each: Sequence[SaidOfTone]) -> float:
+    """The logarithm of the determinant by which the covariance of what pictures say grows with that variance."""
+    information = np.array([one.information for one in each])
+    return float(np.linalg.slogdet(np.eye(_COUNT) + variance * information)[1].sum())
 
 
 def _waves(code: Array) -> Array:

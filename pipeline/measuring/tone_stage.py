@@ -20,15 +20,14 @@ from pipeline.progress import Reporter
 from pipeline.results.fingerprints import fingerprint
 from pipeline.results.measured_record import said_of, said_record
 
-_SAMPLES = 4  # scans of a scanner that tell its curve to the others
+_SAMPLES = 8  # scans of a scanner that tell its curve to the others
 _SET = "it is set in the project"
 
 
 def tone_before(setting: float | str, said: Sequence[SaidOfTone], scan: Path) -> Tone:
     """What is believed of the curve of a scan before it is measured, as the project, the file and other scans say: what
     it says itself is not in it yet. setting: as the project has it; said: by the others."""
-    prior = _prior(setting, scan)
-    return prior.told(said).tone
+    return _prior(setting, scan).hearing(said)
 
 
 def said_of_tones(

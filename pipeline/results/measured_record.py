@@ -207,8 +207,10 @@ def said_record(said: SaidOfTone) -> Json:
         "right": _numbers(said.right),
         "square": _numbers(said.square),
         "count": said.count,
+        "alike": _numbers(said.alike),
     }
 
 
 def said_of(said: Mapping[str, Any]) -> SaidOfTone:
-    return SaidOfTone(_some(said["information"]), _some(said["right"]), float(said["square"]), int(said["count"]))
+    information, right = _some(said["information"]), _some(said["right"])
+    return SaidOfTone(information, right, float(said["square"]), int(said["count"]), float(said["alike"]))

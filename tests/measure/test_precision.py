@@ -22,6 +22,7 @@ from measure.fiducials import measure_fiducials
 from measure.fitting.matching import Match
 from measure.frames.refinement import sight
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
+from measure.scans.tone import Tone
 from measure.search.prediction import MarkPrediction
 from measure.single_targets.disks import fit_disk
 
@@ -153,3 +154,17 @@ def test_lines_far_wider_than_the_mark_s_are_not_the_mark() -> None:
     sighting = sight(scan_of(grey, 255), MarkPrediction(fine, mark.place, 3.0, 1), FiducialOptions().match)
     assert sighting.fit is None
     assert "far wider than the mark's lines" in sighting.reason
+
+
+def test_what_compression_makes_of_the_tone_curve_is_alike_in_all_marks() -> None:
+    rng = np.random.default_rng(4)
+    mark = some_mark(KIND["wedge"], 1.0, rng)
+    grey = GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 100)
+    expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
+    for step, alike in ((0.0, 0.0), (0.1, 0.35**2)):  # 3.5 times the step over the contrast
+        scan = scan_of(grey, rounding_step_dn=step * CONTRAST).seen_through(Tone.unknown())
+        fit = sight(scan, expected, FiducialOptions().match, mark.kind.known).fit
+        assert fit is not None
+        assert fit.tone is not None
+        assert fit.tone.said.information.any()
+        assert fit.tone.said.alike == pytest.approx(alike, rel=0.1)

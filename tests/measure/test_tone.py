@@ -119,7 +119,7 @@ def test_a_declared_curve_holds_until_pictures_contradict_it() -> None:
     declared = Tone.declared(power(2.2), "the file says so")
     assert declared.power_between(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.01)
     linear = -1.2 / 0.6 * np.eye(5)[0]  # departures that make a power of 1 of it
-    strong, faint = (SaidOfTone(w * np.eye(5), w * linear, w * float(linear @ linear), 5) for w in (400.0, 0.1))
+    strong, faint = (said_of(linear, w) for w in (400.0, 0.1))
     believed = declared.told([faint]).tone
     assert believed.power_between(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.05)
     assert "contradict" not in believed.source
@@ -218,10 +218,27 @@ def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
 
 def test_what_a_picture_says_of_a_curve_of_its_own_has_the_variance_of_that_beside_its_own() -> None:
     said = told_of(np.arange(5.0)).said
-    loose = said.loosened(0.5)
+    loose = SaidOfTone.together([said], 0.5)
     np.testing.assert_allclose(np.linalg.inv(loose.information), np.linalg.inv(said.information) + 0.5 * np.eye(5))
     np.testing.assert_allclose(np.linalg.solve(loose.information, loose.right), np.arange(5.0), atol=1e-9)
     assert loose.square == pytest.approx(float(np.arange(5.0) @ loose.information @ np.arange(5.0)))
+
+
+def test_what_is_wrong_alike_in_all_pictures_of_a_scanner_does_not_average() -> None:
+    """By simulation: twenty pictures each say the curve with noise of their own, and all of them the same wrong of it;
+    five of them are the scan's own, fifteen of other scans."""
+    rng = np.random.default_rng(4)
+    variance, squares = 0.16, []
+    for _ in range(60):
+        truth, wrong = rng.standard_normal(5), np.sqrt(variance) * rng.standard_normal(5)
+        each = [
+            replace(said_of(truth + wrong + 0.1 * rng.standard_normal(5), 100.0), alike=variance) for _ in range(20)
+        ]
+        at_once, in_turn = Tone.unknown().told(each).tone, Tone.unknown().hearing(each[5:]).told(each[:5]).tone
+        np.testing.assert_allclose(in_turn.mean, at_once.mean, atol=1e-9)
+        error = at_once.mean - truth
+        squares.append(error @ np.linalg.solve(at_once.covariance, error) / 5)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.25)  # as if each were wrong by itself: 16
 
 
 def test_noise_that_is_cut_off_at_black_feigns_no_curve() -> None:
@@ -241,9 +258,12 @@ def test_noise_that_is_cut_off_at_black_feigns_no_curve() -> None:
 
 def told_of(departures: np.ndarray) -> ToldTone:
     """A mark that says them with a standard deviation of 0.1, and moves by 1 px for each."""
-    information = 100 * np.eye(5)
-    said = SaidOfTone(information, information @ departures, float(departures @ information @ departures), 5)
-    return ToldTone(said, np.eye(2, 5), 0.1, 0.7)
+    return ToldTone(said_of(departures, 100.0), np.eye(2, 5), 0.1, 0.7)
+
+
+def said_of(departures: np.ndarray, weight: float) -> SaidOfTone:
+    """Each of them known to 1 / sqrt(weight)."""
+    return SaidOfTone(weight * np.eye(5), weight * departures, weight * float(departures @ departures), 5)
 
 
 def test_a_mark_whose_detail_alone_was_fitted_moves_with_the_curve_and_says_nothing_of_it() -> None:
@@ -256,7 +276,7 @@ def test_a_mark_whose_detail_alone_was_fitted_moves_with_the_curve_and_says_noth
     assert told.said.count == 0
     found = FrameTone.of(prior, {0: told}, prior)
     assert found.scatter == 0.0
-    assert np.array_equal(found.tone.covariance, np.eye(5))
+    assert np.array_equal(found.tone.covariance, prior.covariance)
     assert 0.005 < np.sqrt(np.trace(found.covariance_px2(told))) < 0.1
 
 
