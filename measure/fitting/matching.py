@@ -32,7 +32,7 @@ from measure.marks.rendering import extent_px, frame_beside, known
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Polygon
 from measure.match_options import MatchOptions
 from measure.noise.grain import blank_patches, grain_model, is_coloured
-from measure.noise.noise import NoiseModel, is_textured, noise_model
+from measure.noise.noise import NoiseModel, as_if_white, is_textured, noise_model
 from measure.noise.pixel_sums import combined, factors, products
 from measure.reason import Reason
 from measure.scans.told_tone import ToldTone
@@ -226,8 +226,8 @@ def _may_hide_border(mark: Mark, fit: PictureFit) -> bool:
     has_lines = isinstance(mark, MarkShape) and not all(isinstance(part, Polygon) for part in mark.parts)
     if fit.reason or not has_lines or fit.options.freedom == "ellipse":
         return False
-    noise = noise_model(fit.model.residuals, fit.telling, len(fit.model.design))
-    is_noise = noise.is_white or noise.variance_dn2 < fit.floor_dn**2
+    noise, is_white = as_if_white(fit.model.residuals, fit.telling, len(fit.model.design))
+    is_noise = is_white or noise.variance_dn2 < fit.floor_dn**2
     return not is_noise or fit.damaged_fraction > 0
 
 
@@ -297,7 +297,8 @@ def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[
 def _result(fit: PictureFit, about: _Surroundings) -> Match:
     """The match in the pixels of the fit's own window."""
     model, used = fit.model, fit.telling
-    noise = noise_model(model.scores, fit.used, len(model.design), float(model.information[fit.used].sum()))
+    told = float(model.information[fit.used].sum())
+    noise, is_white = as_if_white(model.scores, fit.used, len(model.design), told)
     if fit.least_variance_dn2:  # nor does blank film show more than its rounding
         noise = noise.at_least(fit.least_variance_dn2)
         about = about._replace(free=np.zeros_like(about.free))
@@ -305,7 +306,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
     precision = _Precision(Covariance.of_noise(unknown[:2, :2]), unknown, np.inf)
     if not fit.reason:
         patches = blank_patches(about.grey, about.free, noise.variance_dn2)
-        if not noise.is_white or is_coloured(patches):
+        if not is_white or is_coloured(patches):
             taken = taken_out_of(fit, used)
             noise = grain_model(model.residuals, used, taken, noise.neighbour_correlation, patches)
         precision = _weighed(fit, used, noise, about)

@@ -230,6 +230,8 @@ class PictureFit:
     @property
     def lost_fraction(self) -> float:
         """What lies on damage of what the picture tells of the place, in the direction in which least is left."""
+        if not np.any(self.area & ~self.used):
+            return 0.0
         priors = np.diag(self.model.prior_weights()) * self.variance_dn2
         by_all, by_used = (
             np.linalg.inv(design @ design.T + priors)[:2, :2]

@@ -3,9 +3,9 @@ look so."""
 
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.special import ndtr
 
 from measure.fitting.matching import window_about
@@ -84,10 +84,10 @@ class _Look:
         noise = self._flat - self._flat.mean()
         here = noise[self._best[0] :, self._best[1] :][: chip.shape[0], : chip.shape[1]]
         here -= chip * np.float32((here * chip).sum() / (chip**2).sum())
-        rows, cols = chip.shape
-        beyond = np.pad(noise, ((rows - 1, rows - 1), (cols - 1, cols - 1)))
-        answers = cv2.matchTemplate(beyond, chip, cv2.TM_CCORR).astype(float)
+        shape = [fft.next_fast_len(sum(sides), real=True) for sides in zip(noise.shape, chip.shape, strict=True)]
+        power = np.abs(fft.rfft2(noise, s=shape) * fft.rfft2(chip, s=shape)) ** 2
+        answers = float(fft.irfft(power.sum(axis=0), n=shape[1])[0]) / shape[0]  # their squares (Parseval)
         energy = max(float((noise**2).sum() * (chip**2).sum()), 1e-12)
-        variance = max((answers**2).sum() / energy, 1e-12) / float(self._counts.sum())
+        variance = max(answers / energy, 1e-12) / float(self._counts.sum())
         unlike = max(1 - self.height**2, 1e-12)
         return float(self._places * ndtr(-self.height / np.sqrt(unlike * variance)))

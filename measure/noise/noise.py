@@ -47,17 +47,21 @@ def noise_model(residuals: Array, used: Mask, unknowns: int, told: float | None 
 
     Noise counts as white where the correlation of neighbours is within three standard errors of nothing.
     """
-    count = int(used.sum())
+    noise, is_white = as_if_white(residuals, used, unknowns, told)
+    if is_white:
+        return noise
+    lags = autocovariance(np.where(used, residuals, 0.0), used, REACH_PX) * _taper(REACH_PX)
+    return replace(noise, autocovariance_dn2=lags * (noise.variance_dn2 / lags[REACH_PX, REACH_PX]))
+
+
+def as_if_white(residuals: Array, used: Mask, unknowns: int, told: float | None = None) -> tuple[NoiseModel, bool]:
+    """The same without correlations, and whether it has none."""
+    count = max(int(used.sum()), 1)
     kept = np.where(used, residuals, 0.0)
-    variance = float((kept**2).sum() / max((count if told is None else told) - unknowns, 1))
-    if variance == 0.0:
-        return NoiseModel(0.0, np.zeros((1, 1)), 0.0)
-    by_residuals = float((kept**2).sum() / count)
-    correlation = _covariance_along(kept, used, 1) / by_residuals
-    if abs(correlation) < 3 / np.sqrt(2 * count):
-        return NoiseModel(variance, np.array([[variance]]), correlation)
-    lags = autocovariance(kept, used, REACH_PX) * (variance / by_residuals)
-    return NoiseModel(variance, lags * _taper(REACH_PX), correlation)
+    squares = float((kept**2).sum())
+    variance = squares / max((count if told is None else told) - unknowns, 1)
+    correlation = _covariance_along(kept, used, 1) / (squares / count) if squares else 0.0
+    return NoiseModel(variance, np.array([[variance]]), correlation), abs(correlation) < 3 / np.sqrt(2 * count)
 
 
 def is_textured(residuals: Array, used: Mask, floor_dn: float) -> bool:
