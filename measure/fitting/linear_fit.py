@@ -76,16 +76,16 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
     being 1. The bends are compared pixel by pixel, with grain in the covariance only: its weights amplify them as no
     noise does."""
     moving = len(design) - GREY + 1  # all but the ground's
-    among, seen = covariance[:moving, :moving], design[:, used]
+    among, seen = covariance[:moving, :moving], design * used
     # All that moves with the mark changes by its slope, against the move.
     whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
-    changes = -np.concatenate(np.gradient(whole, axis=(2, 1)))[:, used] * slopes[used]
-    normal, shared = seen @ seen.T, seen @ changes.T
+    changes = np.concatenate(np.gradient(whole, axis=(2, 1))) * (-slopes * used)
+    normal, shared = products(seen, seen), products(seen, changes)
     inverse: Array = np.asarray(np.linalg.inv(normal + np.diag(priors_dn2)), float)
     taken_up = np.asarray(inverse @ shared, float)
     by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # of the variance's logarithm, negative
     both = taken_up.T @ shared
-    left = changes @ changes.T - both - both.T + taken_up.T @ normal @ taken_up
+    left = products(changes, changes) - both - both.T + taken_up.T @ normal @ taken_up
     turning = np.einsum("jl,ijml->im", among, left.reshape(2, moving, 2, moving))
     by_noise = np.asarray(inverse @ normal @ inverse, float)
     curvature = np.trace(by_noise[:2, :2] @ turning) / 2

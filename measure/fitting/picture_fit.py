@@ -33,6 +33,7 @@ _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean d
 _DRAWN = 0.001  # of the contrast: a picture is drawn and linearised no better, which no prior must give way to
 _FLOOR = 0.005  # of the contrast: residuals below it may be the drawing's own
 _ITERATIONS, _HALVINGS = 15, 4  # more steps, or shorter ones, settle no fit that these do not
+_AREA_PX = 0.5  # of the margin: by so much an area may be another one
 _DAMAGE_SIGMAS = 3.2  # of smoothed residuals: one pixel in seven hundred of a window without damage goes beyond
 _PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
 _LEAST_VARIANCE_DN2 = 1e-12
@@ -61,6 +62,7 @@ class PictureFit:
 
     def approach(self) -> None:
         """Plain, then roughly robust; stops with a reason where something gives way."""
+        begun = self.model.state
         self.choose_area()
         if not self.reason and np.ptp(self.model.grey[self.area]) == 0.0:
             self.reason = Reason("the picture is even there: nothing stands out", Code.CONTRAST)
@@ -69,7 +71,7 @@ class PictureFit:
             self._adjust(robust=False, tolerance_px=0.1)
         if self.reason == _UNSETTLED:  # dust may keep squares from settling, and not what holds against it
             self.reason = NO_REASON
-        if not self.reason:
+        if not self.reason and self.model.has_moved(begun, _AREA_PX):
             self.choose_area()
         if not self.reason:
             self._steady()

@@ -118,9 +118,8 @@ class PictureModel:
         where the design was last computed it stays, and the residuals follow from it."""
         if self._linearised is not None:
             at, residuals = self._linearised
-            change = self._change(at)
-            if self._length_px(change) < _LINEAR * self.seen_blur_px and not self._is_bent():
-                self.residuals = residuals - combined(change, self.design)
+            if not self.has_moved(at, _LINEAR * self.seen_blur_px) and not self._is_bent():
+                self.residuals = residuals - combined(self._change(at), self.design)
                 return
         height, width = self.grey.shape
         place = self.state.pixel_from_mark
@@ -187,6 +186,10 @@ class PictureModel:
         change[self.border] = self.state.border - before.border
         change[-GREY:] = self.state.greys - before.greys
         return change
+
+    def has_moved(self, before: State, by_px: float) -> bool:
+        """Whether the mark's outline lies farther from that of a state before."""
+        return self._length_px(self._change(before)) > by_px
 
     def _length_px(self, change: Array) -> float:
         """How far a change moves the mark's outline; blurring counts double, for the standard deviations' sake."""

@@ -93,9 +93,9 @@ def robust_scales(values: NDArray[np.floating]) -> Array:
 
 
 def _median(values: Array) -> float:
-    below, above = (values.size - 1) // 2, values.size // 2  # numpy's own takes four times as long for a small window
-    rising = np.partition(values, (below, above), axis=None)
-    return float(rising[below] + rising[above]) / 2
+    middle = values.size // 2  # numpy's own takes many times as long for a small window
+    parted = np.partition(values, middle, axis=None)
+    return float(parted[middle] if values.size % 2 else (parted[:middle].max() + parted[middle]) / 2)
 
 
 def correlated(columns: Array, noise: NoiseModel) -> Array:

@@ -66,8 +66,9 @@ def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -
     of the noise times them."""
     covariance = _Covariance(noise, used, max(_WHITE * noise.variance_dn2, (_MISFIT * contrast_dn) ** 2))
     # The columns are scaled for single precision, and all are solved at once.
-    size = np.sqrt(np.square(design[:, used]).sum(axis=1))[:, None, None]
-    right = (design * (used / size)).astype(np.float32)
+    right = (design * used).astype(np.float32)
+    size = np.sqrt(_dots(right, right))
+    right /= size
     solution, product = np.zeros_like(right), np.zeros_like(right)
     # Columns that are close leave the rounds: those of a mark's edges are so at once, the ground's later.
     left, rest = np.arange(len(right)), right
@@ -86,8 +87,9 @@ def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -
         ahead = covariance.roughly_inverse(rest)
         strength = _dots(rest, ahead)
         direction = np.asarray(ahead + strength / np.maximum(before, 1e-30) * direction, np.float32)
-    scale = size / covariance.scale_dn2
-    return np.asarray(solution * scale, float), np.asarray(product * size, float)
+    solution *= size / covariance.scale_dn2
+    product *= size
+    return solution.astype(float), product.astype(float)
 
 
 class _Covariance:
