@@ -69,27 +69,25 @@ def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -
     right = (design * used).astype(np.float32)
     size = np.sqrt(_dots(right, right))
     right /= size
-    solution, product = np.zeros_like(right), np.zeros_like(right)
     # Columns that are close leave the rounds: those of a mark's edges are so at once, the ground's later.
-    left, rest = np.arange(len(right)), right
-    direction = ahead = covariance.roughly_inverse(rest)
-    strength = _dots(rest, ahead)
+    solution, left, rests = np.zeros_like(right), np.arange(len(right)), right.copy()
+    direction = ahead = covariance.roughly_inverse(right)
+    strength = _dots(right, ahead)
     for _ in range(_ROUNDS):
         seen = covariance.times(direction)
         length = strength / np.maximum(_dots(direction, seen), 1e-30)
         solution[left] += length * direction
-        product[left] += length * seen
-        rest = rest - length * seen
+        rests[left] -= np.multiply(length, seen, out=seen)
+        rest = rests[left]
         far = _dots(rest, rest)[:, 0, 0] >= _CLOSE**2  # of columns of unit length
         if not far.any():
             break
         left, rest, direction, before = left[far], rest[far], direction[far], strength[far]
         ahead = covariance.roughly_inverse(rest)
         strength = _dots(rest, ahead)
-        direction = np.asarray(ahead + strength / np.maximum(before, 1e-30) * direction, np.float32)
-    solution *= size / covariance.scale_dn2
-    product *= size
-    return solution.astype(float), product.astype(float)
+        direction *= strength / np.maximum(before, 1e-30)
+        direction += ahead
+    return solution * (size / covariance.scale_dn2).astype(float), (right - rests) * size.astype(float)
 
 
 class _Covariance:
