@@ -1,7 +1,8 @@
 """Where in a mark's window the ground has a border, by what a fit that knows of none leaves.
 
 Straight borders of all directions are tried, with a contrast of the mark of its own beyond each, in a linear fit beside
-all that the mark's unknowns change. The best counts if the noise that is left is hardly able to feign it.
+all that the mark's unknowns change: first on sums over wide squares, where hardly any mark has one, and then more
+closely. The best counts if the noise that is left is hardly able to feign it.
 """
 
 from typing import NamedTuple
@@ -25,7 +26,7 @@ _POWERS = 3  # of the picture that an edge is summed with: 0 to 2
 _LEAST_SIDE = 0.05  # of the area: a smaller one is no ground beyond a border
 _APART_PX = 8  # squares as wide hardly share any grain
 _MISSED = 2.0  # times what borders in these explain is as much as any border does, at most
-_FEWEST_SQUARES = 60  # that show a border, however strong, by themselves
+_SQUARES = 100  # so many, or smaller ones: fewer do not tell noise from a strong border
 _FEWEST = 3  # pixels to an unknown
 _LEAST_LEFT = 1e-4  # of a change of contrast, beside the step: less cannot be told from it
 
@@ -44,7 +45,8 @@ def likely_border(model: PictureModel, area: Mask, floor_dn: float) -> LikelyBor
     if tells.sum() < _FEWEST * len(model.design):
         return None
     left = _Left(model, tells)
-    if not left.in_squares(_APART_PX, _APART_PX).may_have_border(left.reach_px):
+    side_px = max(min(int(np.sqrt(tells.sum() / _SQUARES)), _APART_PX), 1)
+    if not left.in_squares(side_px, max(side_px, left.soft_px)).may_have_border(left.reach_px):
         return None
     squares = left.in_squares(max(round(left.soft_px), 1), left.soft_px)
     best = squares.best(*squares.everywhere(left.reach_px))
@@ -76,9 +78,7 @@ class _Left:
 
     def __init__(self, model: PictureModel, used: Mask) -> None:
         self.used, even = used, used / model.steadiness
-        self.place = (
-            np.stack(np.meshgrid(*(np.arange(size) for size in used.shape[::-1]))) - model.start[:, 2, None, None]
-        )
+        self.place = np.indices(used.shape)[::-1] - model.start[:, 2, None, None]
         self.reach_px = float(np.hypot(*self.place)[used].max())
         self.design = model.design * even
         self.orthonormal = to_orthonormal(products(self.design, self.design))
@@ -136,15 +136,12 @@ class _Squares:
         self.pixels = float(rows[:, -_POWERS].sum())
 
     def may_have_border(self, reach_px: float) -> bool:
-        """Whether some border explains so much that noise hardly feigns it, or there are too few squares to tell. In
-        squares wider than grain reaches, noise is as good as independent: what varies from one to the next is all that
-        it does to a border."""
-        if len(self.rows) < _FEWEST_SQUARES:
-            return True
+        """Whether some border explains so much that noise hardly feigns it. In squares wider than grain reaches, noise
+        is as good as independent: what varies from one to the next is all that it does to a border."""
         gained = float(self._gained(*self.everywhere(reach_px)).max())
         left = self.rows[:, (self.rows.shape[1] - _POWERS) // 2 - 1] ** 2 / self.rows[:, -_POWERS]
         variance = (float(left.sum()) - gained) / len(left)
-        return _MISSED * gained > variance * chdtri(2, BORDER_FEIGNED)
+        return bool(_MISSED * gained > variance * chdtri(2, BORDER_FEIGNED))
 
     def everywhere(self, reach_px: float) -> tuple[Array, Array]:
         """off_px and turn_rad of borders as far as the reach."""
