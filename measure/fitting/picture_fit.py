@@ -276,7 +276,8 @@ class PictureFit:
             model.take_noise(noise_dn)
         model.linearise(self.used)
         noise_dn = max(robust_scale(model.residuals[self.telling]), _DRAWN * self.contrast_dn, 1e-9)
-        self.variance_dn2 = max(noise_dn**2, self.least_variance_dn2)
+        judged_dn = model.noise_dn if model.is_clipped else 0.0  # what clipped grey values were judged by
+        self.variance_dn2 = max(noise_dn**2, judged_dn**2, self.least_variance_dn2)
         scale_dn = max(noise_dn, _SCALE_FLOOR * self.contrast_dn) if robust else np.inf
         cost = self._cost(scale_dn)
         for _ in range(_ITERATIONS):
