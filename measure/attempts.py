@@ -1,7 +1,8 @@
 """The search for a frame as a list of attempts: where, under which pitches, and what beside a mark counts.
 
 One loop tries them in their order, as far as what was found before does not settle it; one limit judges what they find:
-the number of frames that chance would make in all attempts so far.
+the number of frames that chance would make in all attempts so far, or in those under the given pitch, which is likelier
+than all others together.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,11 +27,11 @@ from measure.search.centred_frame import is_worth_a_look, outermost
 from measure.search.constellation import Placement
 from measure.search.correlation import CLOSE
 from measure.search.frame_search import FrameSearch
-from measure.search.pitches import PitchHypothesis, slightly_longer
+from measure.search.pitches import Hypotheses, slightly_longer
 from measure.writing.line import Line
 
 Array = NDArray[np.float64]
-Hypotheses = Sequence[PitchHypothesis]
+
 Seen = tuple[list[Placement], list[tuple[float, Frame]]]
 
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
@@ -40,8 +41,8 @@ _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks
 @dataclass(frozen=True, eq=False)
 class Found:
     """What the attempts have found so far. search, placements: of the attempt that found the frame, the latter best
-    first. is_taken: whether chance hardly made it. unsure: frames that chance may have made. misfit: why there is
-    none."""
+    first. is_taken: whether chance hardly made it. unsure: frames that chance may have made under so many other
+    pitches, and that would be taken if theirs were given. misfit: why there is none."""
 
     search: FrameSearch
     placements: Sequence[Placement] = ()
@@ -73,6 +74,7 @@ class Attempt:
     look: Callable[[FrameSearch, Hypotheses, int], Seen]
     is_settled: Callable[[Found], bool]
     is_given: bool = False
+    at_given: bool = False
 
 
 def find_frame(
@@ -80,11 +82,13 @@ def find_frame(
 ) -> Found:
     """The frame of a scan. hypotheses: about its pitch, the likelier groups first; is_given: whether the first is that
     which the user or the file gives."""
-    found, tried = Found(FrameSearch(scan, layout, options)), 0
+    found, every, at_given = Found(FrameSearch(scan, layout, options)), 0, 0
     for attempt in _attempts(found.search, hypotheses, is_given):
         if attempt.is_settled(found):
             continue
-        tried += len(attempt.hypotheses)
+        every += len(attempt.hypotheses)
+        at_given += len(attempt.hypotheses) if attempt.is_given or attempt.at_given else 0
+        tried = at_given if attempt.at_given else every
         placements, frames = attempt.look(attempt.search, attempt.hypotheses, tried)
         expected, frame = frames[0] if frames else (np.inf, None)
         if expected <= FRAMES_BY_CHANCE:
@@ -92,8 +96,9 @@ def find_frame(
         elif attempt.is_given:
             misfit = frame.misfit() if frame else Found.misfit
             found = replace(found, placements=placements, frame=frame, is_taken=False, misfit=misfit)
-        else:
-            found = replace(found, unsure=(*found.unsure, *(frame for _, frame in frames)))
+        elif not attempt.at_given:
+            given = (frame for each, frame in frames if frame.accepted or each / tried * at_given <= FRAMES_BY_CHANCE)
+            found = replace(found, unsure=(*found.unsure, *given))
     return found if found.is_taken else replace(found, frame=None, misfit=found.misfit + _pitch_to_try(found.unsure))
 
 
@@ -103,7 +108,7 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
     mark counts there, for the frame's edge may drown it else."""
     given, *others = hypotheses
     close = FrameSearch(wide.scan, wide.layout, wide.options, CLOSE)
-    closer = slightly_longer(given[0], _STRETCH) if is_given else given
+    near, nearly = slightly_longer(given[0], _STRETCH) if is_given else ([], given)
     is_whole = not wide.options.part
     is_fetched = isinstance(wide.scan.path, Address)
     is_centred = is_whole and is_given and is_worth_a_look(wide.scan, wide.layout, given[0].mm)
@@ -112,7 +117,8 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
         *([Attempt(wide, given, _beside_it, lambda found: found.is_taken, True)] if is_centred and is_fetched else []),
         Attempt(wide, given, _anywhere, lambda found: found.is_complete, True),
         *(Attempt(wide, group, _in_spite_of_pitch, lambda found: found.is_undoubted) for group in others),
-        Attempt(close, closer, _at_a_closer_look, lambda found: found.is_taken),
+        *([Attempt(close, near, _at_a_closer_look, lambda found: found.is_taken, at_given=True)] if is_given else []),
+        Attempt(close, nearly, _at_a_closer_look, lambda found: found.is_taken),
     ]
 
 

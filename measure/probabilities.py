@@ -19,7 +19,7 @@ def _limit(value: float, of: str, decides: str) -> float:
 # The search for a frame.
 FRAMES_BY_CHANCE = _limit(
     0.01,
-    "frames that chance is expected to find in a scan without any, over all attempts so far",
+    "frames that chance is expected to find in a scan without any, over all attempts so far, or those at its pitch",
     "a frame under another pitch, or seen at a closer look only, is not taken",
 )
 PLACEMENTS_BY_CHANCE = _limit(
@@ -45,6 +45,11 @@ NOISE_LIKE_A_MARK = _limit(
 )
 TEXTURE_LIKE_A_FAINT_MARK = _limit(  # one in some five hundred places
     1e-4, "texture feigning a faint mark so strongly so near to its place", "a faint mark is not taken for seen"
+)
+FAINT_MARK_BY_NOISE = _limit(  # counted: in some four hundred places
+    1e-3,
+    "noise looking like a faint mark so strongly so near to its place, at a closer look",
+    "it has no part in the frame, which all its marks together decide",
 )
 
 # The marks of a frame.

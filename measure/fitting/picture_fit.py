@@ -253,16 +253,17 @@ class PictureFit:
         if isinstance(mark, MarkTemplate):
             # Where it is known how steady each pixel is, those count by it that are not.
             shown = mark if mark.steadiness is None else replace(mark, steady=None)
-            near = chip_mask(shown, place, width, height)
+            own = near = chip_mask(shown, place, width, height)
         else:
             outside = (picture(mark, place, width, height, _OUTLINE_BLUR_PX) < _SHOWN).astype(np.uint8)
             distance = cv2.distanceTransform(outside, cv2.DIST_L2, 5)
-            near, self.far = distance <= self.options.margin_px, distance > self.options.plain_px
+            own, near = distance == 0, distance <= self.options.margin_px
+            self.far = distance > self.options.plain_px
             if outside.all():
                 self.reason = Reason("the mark lies outside of its window", Code.NO_FIT)
-        near &= true(mark, place, width, height, EDGE_BLURS * self.model.seen_blur_px)
+        near = near & true(mark, place, width, height, EDGE_BLURS * self.model.seen_blur_px)
         self.area = self.used = self.usable & near
-        if self.area.sum() < 0.5 * near.sum() or self.area.sum() < 40:
+        if (self.area & own).sum() < 0.5 * (near & own).sum() or self.area.sum() < 40:
             self.reason = self.reason or Reason("most of the mark lies outside of the scan", Code.OUTSIDE)
 
     def _adjust(self, robust: bool, tolerance_px: float) -> None:

@@ -21,7 +21,7 @@ _LEVELS = 256  # of grey between which the edge's two sides are told apart
 _BESIDE_PX = 6.0  # about the drawing: the mark's own ground
 _FAR = 5.0  # standard deviations of the mark's side, the mark being part of it: so far off is no ground of this mark
 _EDGE_PX = 4.0  # an edge's blur: of 1.4 px it leaves a five hundredth of the edge so far off
-_DRAWN = 0.05  # of the mark's contrast
+_DRAWN, _SHOWN = 0.05, 0.5  # of the mark's contrast: all of it, and what is plainly its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,18 +114,17 @@ def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequen
     )
 
 
-def beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array, polarity: int) -> Mask:
+def beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array) -> Mask:
     """Which pixels of a window (height, width), in which the mark stands about as pixel_from_mark (2, 3) says, lie
-    beyond an edge that is far stronger than the mark is, or in its blur. Only what changes the ground the other way
-    than the mark does can be told from it: none elsewhere."""
-    grey = polarity * window
-    split = _between(grey)
-    drawn = picture(mark, pixel_from_mark, window.shape[1], window.shape[0], 1.0) > _DRAWN
-    away_px = cv2.distanceTransform((~drawn).astype(np.uint8), cv2.DIST_L2, 5)
-    here, beyond = grey > split, grey <= split
-    ground = (away_px > 0) & (away_px <= _BESIDE_PX)
-    stands_here = beyond.any() and here[ground].mean() > 0.5
-    if not stands_here or grey[here].mean() - grey[beyond].mean() < _FAR * grey[here].std():
+    beyond an edge that is far stronger than the mark is, or in its blur: that of the frame, or of the pad on which the
+    mark stands. None where there is no such edge, or the mark itself lies beyond it."""
+    drawn = picture(mark, pixel_from_mark, window.shape[1], window.shape[0], 1.0)
+    away_px = cv2.distanceTransform((drawn <= _DRAWN).astype(np.uint8), cv2.DIST_L2, 5)
+    near, shown = away_px <= _BESIDE_PX, drawn > _SHOWN * drawn.max()
+    lighter = window > _between(window[near])
+    here = lighter if lighter[near & (away_px > 0)].mean() > 0.5 else ~lighter
+    own, beyond = window[near & here], window[near & ~here]
+    if not len(beyond) or here[shown].mean() <= 0.5 or abs(own.mean() - beyond.mean()) < _FAR * own.std():
         return np.zeros(window.shape, dtype=bool)
     return np.asarray(cv2.distanceTransform(here.astype(np.uint8), cv2.DIST_L2, 5) <= _EDGE_PX)
 

@@ -16,7 +16,7 @@ from measure.frames.frame_fit import fit_frame, outliers
 from measure.frames.refinement import Sighting, nothing_within, sight
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
-from measure.probabilities import TEXTURE_LIKE_A_FAINT_MARK
+from measure.probabilities import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
 from measure.reason import Reason
 from measure.scans.parallel import side_by_side
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
@@ -221,10 +221,11 @@ class FrameSighter:
         return sighting
 
     def _sight_within(self, index: int, search_px: float) -> Sighting:
-        """At a closer look a mark may be as faint as what texture feigns, where it hardly ever does so near by."""
+        """At a closer look a mark may be as faint as what texture feigns, where it seldom does so near by: all marks
+        together decide of the frame."""
         sighting = sight(self.scan, self.expected(index, search_px), self.options.match)
         fit, closer = sighting.fit, self.placement.surroundings == CLOSE
-        sure = closer and sighting.chance <= TEXTURE_LIKE_A_FAINT_MARK
+        sure = closer and sighting.chance <= FAINT_MARK_BY_NOISE
         least = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
         if fit is not None and (fit.likeness < least[0] or fit.significance < least[1]):
             return Sighting(sighting.predicted_px, True, None, nothing_within(search_px))

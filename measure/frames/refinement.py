@@ -145,7 +145,7 @@ def _matched(
     window = read_window(seen_in, window_about(mark, start, options.margin_px + BESIDE_PX), expected.weights)
     if expected.surroundings == CLOSE and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
-        window = window.without(beyond_edge(window.grey, mark, inner, expected.polarity))
+        window = window.without(beyond_edge(window.grey, mark, inner))
     return match(window, mark, start, options_for(mark, options, frame_sigma))
 
 

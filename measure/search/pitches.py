@@ -23,12 +23,16 @@ class PitchHypothesis:
     drawn_mm: tuple[float, float]
 
 
+Hypotheses = Sequence[PitchHypothesis]
+
+
 def pitch_hypotheses(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
-) -> list[Sequence[PitchHypothesis]]:
+) -> list[Hypotheses]:
     """The hypotheses, the likelier ones first: those of a later group are for a scan in which the earlier ones fail.
 
-    pitch_um: as given; None where it is not known: then the frame's size is all there is.
+    pitch_um: as given; None where it is not known: then the frame's size is all there is, as it is where the frame
+    would be far from filling the scan at that pitch.
     """
     long_mm, short_mm = max(layout.frame_mm), min(layout.frame_mm)
     long_px, short_px = max(scan.width_px, scan.height_px), min(scan.width_px, scan.height_px)
@@ -36,21 +40,25 @@ def pitch_hypotheses(
     filling = [
         PitchHypothesis(pair, _STEP_TOLERANCE, pair) for s in _SCALE_STEPS for pair in [(1 / (s * largest),) * 2]
     ]
-    filling_longer = [_longer(each, stretch) for each in filling for stretch in _STRETCHES]
+    filling_longer = [longer(each, stretch) for each in filling for stretch in _STRETCHES]
     if pitch_um is None:
         return [filling, filling_longer]
     pair = (pitch_um[0] / 1000, pitch_um[1] / 1000)
     given = PitchHypothesis(pair, options.scale_tolerance, pair)
-    as_given: list[Sequence[PitchHypothesis]] = [[given], [_longer(given, stretch) for stretch in _STRETCHES]]
-    return as_given if options.pitch_is_right or options.part else [*as_given, filling]
+    as_given: list[Hypotheses] = [[given], [longer(given, stretch) for stretch in _STRETCHES]]
+    if options.pitch_is_right or options.part:
+        return as_given
+    fills = any(abs(pair[0] / each.mm[0] - 1) < _STEP_TOLERANCE for each in filling)
+    return [*as_given, filling] if fills else [*as_given, filling, filling_longer]
 
 
-def slightly_longer(given: PitchHypothesis, tolerance: float) -> list[PitchHypothesis]:
+def slightly_longer(given: PitchHypothesis, tolerance: float) -> tuple[Hypotheses, Hypotheses]:
     """A given pitch as it is, and with pixels slightly longer one way, each right by a tolerance."""
     near = replace(given, tolerance=tolerance)
-    return [near, *(_longer(near, stretch) for stretch in _SLIGHT)]
+    return [near], [longer(near, stretch) for stretch in _SLIGHT]
 
 
-def _longer(given: PitchHypothesis, stretch: float) -> PitchHypothesis:
+def longer(given: PitchHypothesis, stretch: float) -> PitchHypothesis:
+    """The same with pixels that are longer across than down by a share, or less long."""
     x, y = given.mm
     return replace(given, mm=(x * (1 + stretch / 2), y * (1 - stretch / 2)))

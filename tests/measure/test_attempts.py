@@ -1,7 +1,6 @@
 """The list of attempts to find a frame: which are made, by how many hypotheses each is judged, and what is taken."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -14,6 +13,7 @@ from measure.attempts import Attempt, Found, find_frame
 from measure.fiducial_options import FiducialOptions
 from measure.frames.frame import Frame
 from measure.probabilities import FRAMES_BY_CHANCE
+from measure.search.correlation import CLOSE
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 
@@ -25,16 +25,19 @@ class Stand:
     """What an attempt finds, in a frame's stead."""
 
     def __init__(self, name: str) -> None:
-        self.name, self.is_complete, self.measured = name, False, 0
+        self.name, self.is_complete, self.accepted, self.measured = name, False, False, 0
         self.belongs, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
 
     def misfit(self) -> str:
         return f"not {self.name}"
 
 
-def found_by(monkeypatch: pytest.MonkeyPatch, *expected: float | None, given: int = 1) -> tuple[Found, list[int]]:
+def found_by(
+    monkeypatch: pytest.MonkeyPatch, *expected: float | None, given: int = 1, at_given: int | None = None
+) -> tuple[Found, list[int]]:
     """What a list of attempts comes to, each of two hypotheses and with so many frames that chance is expected to make
-    a hypothesis, and how many hypotheses each was judged by. given: how many of them believe what they find."""
+    a hypothesis, and how many hypotheses each was judged by. given: how many of them believe what they find; at_given:
+    which of the others is under the given pitch."""
     judged: list[int] = []
 
     def attempt(number: int, each: float | None) -> Attempt:
@@ -43,7 +46,7 @@ def found_by(monkeypatch: pytest.MonkeyPatch, *expected: float | None, given: in
             return [], [] if each is None else [(tried * each, cast(Frame, Stand(str(number))))]
 
         search = cast(FrameSearch, None)
-        return Attempt(search, [GIVEN, GIVEN], look, lambda found: found.is_taken, number < given)
+        return Attempt(search, [GIVEN, GIVEN], look, lambda found: found.is_taken, number < given, number == at_given)
 
     monkeypatch.setattr(attempts, "_attempts", lambda *_: [attempt(*each) for each in enumerate(expected)])
     return find_frame(SCAN, ALIKE, [[GIVEN]], True, FiducialOptions()), judged
@@ -54,14 +57,22 @@ def name(found: Found) -> str:
 
 
 def test_each_attempt_is_judged_by_all_hypotheses_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What would be taken by itself may be chance after so many others."""
+    """What would be taken by itself may be chance after so many others; its pitch is worth to be given then."""
     found, judged = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5)
     assert judged == [2, 4, 6]
     assert name(found) == ""
-    assert [cast(Stand, frame).name for frame in found.unsure] == ["1", "2"]
+    assert [cast(Stand, frame).name for frame in found.unsure] == ["2"]
     assert found.misfit.startswith("not 0; under another pitch 3 of them lie as they should")
     found, _ = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 7)
     assert (name(found), found.is_taken) == ("2", True)
+
+
+def test_attempts_under_the_given_pitch_are_judged_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, judged = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5, at_given=2)
+    assert judged == [2, 4, 4]
+    assert name(found) == "2"
+    found, _ = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 3, at_given=2)
+    assert (name(found), found.unsure) == ("", ())
 
 
 def test_what_is_settled_is_not_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,13 +87,19 @@ def test_where_nothing_was_seen_the_reason_says_so(monkeypatch: pytest.MonkeyPat
     assert found.misfit == "nothing in the scan looks like two or more of the camera's marks"
 
 
-@pytest.mark.parametrize(("is_given", "looks"), [(True, 4), (False, 3)])
-def test_the_attempts_in_their_order(is_given: bool, looks: int, tmp_path: Path) -> None:
-    """As given, longer one way and filling the scan, at a closer look; a small scan is searched as a whole at once.
-    Where no pitch is given, two groups of sizes stand in the place of three."""
-    hypotheses = pitch_hypotheses(SCAN, ALIKE, (50.0, 50.0) if is_given else None, FiducialOptions())
+@pytest.mark.parametrize(("times", "looks"), [(1.0, 5), (2.0, 6), (0.5, 6), (None, 3)])
+def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
+    """As given, longer one way and filling the scan, at a closer look as given and slightly longer; a small scan is
+    searched as a whole at once.
+    Where no pitch is given, or one at which the frame is far from filling the scan, pixels of any size may be longer
+    one way, too."""
+    filling_um = 1000 * max(ALIKE.frame_mm) / SCAN.width_px
+    given_um, is_given = None if times is None else (times * filling_um,) * 2, times is not None
+    hypotheses = pitch_hypotheses(SCAN, ALIKE, given_um, FiducialOptions())
     listed = attempts._attempts(FrameSearch(SCAN, ALIKE, FiducialOptions()), hypotheses, is_given)
     assert len(listed) == looks
     assert [each.is_given for each in listed] == [True, *[False] * (looks - 1)]
     assert [each.hypotheses for each in listed[: len(hypotheses)]] == hypotheses
-    assert listed[-1].search is not listed[-2].search is listed[0].search
+    close = [each for each in listed if each.search.surroundings == CLOSE]
+    assert close == listed[len(hypotheses) :]
+    assert [each.at_given for each in close] == ([True, False] if is_given else [False])

@@ -1,5 +1,8 @@
 """Faint marks beside the frame's edge, as overexposed film shows them: found at a closer look, and none elsewhere."""
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 from brute_marks import placed
@@ -8,7 +11,13 @@ from drawn_frames import layout_of, paint
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
+from measure.fitting.matching import Match
+from measure.frames import frame_sighter
+from measure.frames.frame_sighter import FrameSighter
+from measure.frames.refinement import Sighting
 from measure.marks.shapes import MarkShape, polygon, turned_part
+from measure.search.constellation import Placement
+from measure.search.correlation import CLOSE, WIDE, Surroundings
 from measure.status import Status
 
 PX_PER_MM = 20.0
@@ -45,3 +54,21 @@ def test_wings_are_found_beside_an_edge_that_is_nine_times_as_strong(contrast: f
         assert found.status is Status.WEAK, found
         assert found.center_px is not None
         assert np.hypot(*(found.center_px - matrix @ (*given.xy_mm, 1.0))) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("surroundings", "chance", "is_taken"), [(CLOSE, 5e-4, True), (CLOSE, 5e-3, False), (WIDE, 5e-4, False)]
+)
+def test_at_a_closer_look_marks_are_taken_that_noise_seldom_makes_for_all_together_decide(
+    surroundings: Surroundings, chance: float, is_taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faint = cast(Match, SimpleNamespace(likeness=0.1, significance=3.0))
+    monkeypatch.setattr(
+        frame_sighter, "sight", lambda _, expected, __: Sighting(expected.center_px, True, faint, chance=chance)
+    )
+    matrix = placed(PX_PER_MM, (MIDDLE_PX, MIDDLE_PX))
+    layout = layout_of([wing(*place) for place in PLACES], PLACES, (2 * HALF_MM, 2 * HALF_MM))
+    placement = Placement("0", matrix, 1.0, 4, 1, 1, (1 / PX_PER_MM,) * 2, surroundings)
+    sighter = FrameSighter(scan_of(np.zeros((300, 300))), layout, placement, FiducialOptions())
+    sighter.look(range(4), sighter.near_px)
+    assert [seen is not None and seen.fit is faint for seen in sighter.sightings] == [is_taken] * 4

@@ -85,8 +85,8 @@ def test_the_pitch_to_try_is_what_the_marks_say(tmp_path: Path) -> None:
 def test_a_closer_look_tries_pixels_slightly_longer_one_way_so_that_no_mark_lies_beyond_its_reach() -> None:
     """Of an aerial camera, pixels longer by up to 1 % either way."""
     layout, options = layout_of([MarkShape(RING_CROSS)] * 4, AERIAL, (228.0, 228.0)), FiducialOptions()
-    pitches = slightly_longer(PitchHypothesis((0.127, 0.127), 0.04, (0.127, 0.127)), 0.015)
-    tried = np.array([each.mm for each in pitches]) / 0.127
+    near, longer = slightly_longer(PitchHypothesis((0.127, 0.127), 0.04, (0.127, 0.127)), 0.015)
+    tried = np.array([each.mm for each in (*near, *longer)]) / 0.127
     for stretch in np.linspace(-0.01, 0.01, 9):
         true = np.array([1 + stretch / 2, 1 - stretch / 2])
         off_mm = np.hypot(*((true / tried - 1) * AERIAL[0]).T).min()
