@@ -1,7 +1,7 @@
 """Layouts of marks looked for in thumbnails of one scan. What is looked for is the boldest marks of each: cameras in
 which these are alike, and lie alike, share one search."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,15 +12,14 @@ from measure.frames.frame import Frame
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon, thinnest_mm
 from measure.scans.scan import Scan
 from measure.scans.thumbnail import thumbnail
-from measure.search.pitches import PitchHypothesis, pitch_hypotheses
-
-Hypotheses = Sequence[PitchHypothesis]
+from measure.search.pitches import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 
 _LARGEST_PX = 1600  # of what is searched: of aerial film a seventh of a millimetre, about as wide as fine lines
 _COARSE_PX = 1024  # the same while the pitch is sought: fine lines are half a pixel wide then
 _SOLID_PX = 800  # of solid marks, which are some millimetres large
 _COARSE_SOLID_PX = 512  # of these while the pitch is sought
 _PITCH_TOLERANCE = 0.02  # of the pitch that a layout came to
+_STRETCHES = (-0.025, 0.025)  # of pixels longer one way: each reaches those of 1.1 to 3.9 % of an aerial camera
 _ALIKE_MM = 0.1  # two cameras whose marks lie so near to one another look alike in a scan
 _BOLD = 4  # marks that are looked for, at least
 _ENOUGH = 12  # marks that are looked at: of more, as of a lattice, only every second
@@ -53,20 +52,26 @@ class LayoutSearch:
 
     def at_pitch(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
         """At the scan's pitch."""
-        return self._as_given(layout, pitch_um, 0)
+        return self._as_given(layout, pitch_um, lambda given: [given], 0)
 
     def longer_one_way(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
-        """With pixels that are longer one way than the other."""
-        return self._as_given(layout, pitch_um, 1)
+        """With pixels that are longer one way than the other, by more than a search at the scan's pitch allows for."""
+        return self._as_given(layout, pitch_um, lambda given: [longer(given, each) for each in _STRETCHES], 1)
 
-    def _as_given(self, layout: FiducialLayout, pitch_um: tuple[float, float], number: int) -> Tried:
-        """By one of the groups of hypotheses about a given pitch."""
+    def _as_given(
+        self,
+        layout: FiducialLayout,
+        pitch_um: tuple[float, float],
+        hypotheses: Callable[[PitchHypothesis], Hypotheses],
+        before: int,
+    ) -> Tried:
+        """By hypotheses that follow from a given pitch."""
         bold = _boldest(layout)
         picture = self._solid if all(_is_solid(mark) for mark in bold.marks) else self._fine
         times = self._scan.width_px / picture.width_px
         options = FiducialOptions(pitch_is_right=True)
-        groups = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
-        return self._tried(_some(layout), bold, picture, groups[number], sum(map(len, groups[:number])))
+        ((given,), *_) = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
+        return self._tried(_some(layout), bold, picture, hypotheses(given), before)
 
     def at_any_pitch(self, layout: FiducialLayout) -> Tried:
         """Where the frame may fill the scan, its pixels being square."""
