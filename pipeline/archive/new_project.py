@@ -50,11 +50,11 @@ class NewProject:
 
     @property
     def named(self) -> list[tuple[Group, ScanKind]]:
-        return [(group, kind) for group, kind in zip(self.found.groups, self.kinds, strict=True) if kind.cameras]
+        return [(group, kind) for group, kind in zip(self.found.groups, self.kinds, strict=True) if chosen(kind)]
 
     @property
     def unknown(self) -> list[tuple[Group, ScanKind]]:
-        return [(group, kind) for group, kind in zip(self.found.groups, self.kinds, strict=True) if not kind.cameras]
+        return [(group, kind) for group, kind in zip(self.found.groups, self.kinds, strict=True) if not chosen(kind)]
 
     @property
     def cameras(self) -> dict[Path, str]:
@@ -69,7 +69,7 @@ class NewProject:
         yield (
             "are of no camera that could be told"
             + ("" if self.named else ": draw it in camera.toml (`reseau template camera`), or have its marks learned"),
-            [f"{_told(group.folder, group.head, len(group.paths))}: {kind.why_not()}" for group, kind in self.unknown],
+            [f"{_told(group.folder, group.head, len(group.paths))}: {_why_not(kind)}" for group, kind in self.unknown],
         )
         yield (
             "have marks that several cameras have: that of most calibration reports is taken, images.csv sets another",
@@ -78,11 +78,6 @@ class NewProject:
                 for group, kind in self.named
                 if kind.cameras[1:]
             ],
-        )
-        yield (
-            "are told by the form of their marks alone, and others have marks much like them: look at the marks of one "
-            "scan of each (`reseau cameras --scan`) before you measure",
-            [*self._told_by_form()],
         )
         numbers = defaultdict[str, set[str]](set)
         for _, kind in self.named:
@@ -132,14 +127,6 @@ class NewProject:
             "notes": list(self.notes()),
         }
 
-    def _told_by_form(self) -> Iterator[str]:
-        for group, kind in self.named:
-            others = dict.fromkeys(name for sample in kind.samples for name in sample.much_alike())
-            marks = [trial for sample in kind.samples for trial in sample.best[:1]]
-            found = f"{sum(trial.found for trial in marks)} of {sum(trial.drawn for trial in marks)} marks seen"
-            if others:
-                yield f"{group.folder}: {chosen(kind)}, {found}; beside {', '.join(others)}"
-
     def _contradicted_pitches(self) -> Iterator[str]:
         for group, kind in self.named:
             told = next((against for sample in kind.samples if (against := sample.against_pitch())), "")
@@ -180,8 +167,19 @@ def _named(given: Path) -> list[Path]:
 
 
 def chosen(kind: ScanKind) -> str:
-    """Of cameras with the same marks the one that rests on most calibration reports; "" without any."""
-    return max(kind.cameras, key=_reports, default="")
+    """Of cameras with the same marks the one that rests on most calibration reports; "" without any, and where they
+    are told by the form of marks alone: then they may be of a camera that is not in the library."""
+    return "" if kind.much_alike else max(kind.cameras, key=_reports, default="")
+
+
+def _why_not(kind: ScanKind) -> str:
+    if not kind.cameras:
+        return kind.why_not()
+    found, drawn = np.sum([(trial.found, trial.drawn) for sample in kind.samples for trial in sample.best[:1]], axis=0)
+    return (
+        f"perhaps {' or '.join(kind.cameras)}, {found} of {drawn} marks seen, but that rests on the form of its marks "
+        f"alone, and {' or '.join(kind.much_alike)} has marks much like them: compare the drawings with a scan"
+    )
 
 
 def project_text(new: NewProject) -> str:
@@ -241,9 +239,9 @@ def print_new_project(new: NewProject, console: Console) -> None:
 def _left_out(found: Catalogue, kinds: Sequence[ScanKind]) -> dict[str, list[Path]]:
     """By reason. Where no camera is told at all, the project's own file has to say it, and is of all scans."""
     groups = list(zip(found.groups, kinds, strict=True))
-    is_named = any(kind.cameras for kind in kinds)
+    is_named = any(chosen(kind) for kind in kinds)
     broken = [path for path in found.broken if isinstance(path, Address) or path.exists() or path.is_symlink()]
-    unknown = [path for group, kind in groups if is_named and not kind.cameras for path in group.paths]
+    unknown = [path for group, kind in groups if is_named and not chosen(kind) for path in group.paths]
     taken = set(broken) | set(unknown)
     whole = [(path, group.head) for group in found.groups for path in group.paths if path not in taken]
     return {_BROKEN: broken, _COPIES: list(found.copies), _NAMESAKES: _namesakes(whole), _UNKNOWN: unknown}

@@ -19,6 +19,7 @@ Json = dict[str, Any]
 _ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".png")
 _ALIKE = 0.03  # of their sides: scans of one roll are cut by hand
 SAMPLES = 3  # scans of each kind
+_TELLING = {"camera_type", "principal_distance_mm"}  # of a plate's fields: what tells cameras apart
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,14 @@ class ScanKind:
             return ()
         against = frozenset(name for sample in self.samples for name in sample.contradicted)
         return tuple(sorted(frozenset.intersection(*named) - against))
+
+    @property
+    def much_alike(self) -> tuple[str, ...]:
+        """Other cameras whose solid marks are drawn much like those that are named, where no plate says which."""
+        if any(_TELLING & sample.plate.keys() for sample in self.samples):
+            return ()
+        others = dict.fromkeys(name for sample in self.samples for name in sample.much_alike())
+        return tuple(others) if self.cameras else ()
 
     @property
     def numbers(self) -> tuple[str, ...]:
