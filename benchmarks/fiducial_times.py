@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
@@ -111,10 +111,10 @@ def _measured(path: Path, layout: FiducialLayout, pitch_um: float, pose: str, to
         measure_fiducials(scan.seen_through(tone), layout, (pitch_um, pitch_um), FiducialOptions(pose=pose))
 
 
-def _by_stage_s(rounds: int, path: Path, layout: FiducialLayout, pitch_um: float) -> Counter[str]:
+def _by_stage_s(rounds: int, path: Path, layout: FiducialLayout, pitch_um: float) -> dict[str, float]:
     """Of the quickest of the rounds, what each stage takes without those that it calls."""
     cv2.setNumThreads(1)
-    spent, within_s, every = Counter[str](), [0.0], list[Counter[str]]()
+    spent, within_s, every = defaultdict[str, float](float), [0.0], list[dict[str, float]]()
 
     def counted(stage: str, function: Callable[..., object]) -> Callable[..., object]:
         def call(*arguments: Any, **named: Any) -> object:
@@ -136,8 +136,8 @@ def _by_stage_s(rounds: int, path: Path, layout: FiducialLayout, pitch_um: float
         for _ in range(1 + rounds):
             spent.clear()
             measured(path, layout, pitch_um, "auto", LINEAR)
-            every.append(spent.copy())
-    return min(every, key=Counter.total)
+            every.append(dict(spent))
+    return min(every, key=lambda stages: sum(stages.values()))
 
 
 def _processor_s(function: Callable[[], object]) -> float:

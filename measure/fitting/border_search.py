@@ -193,7 +193,7 @@ class _Squares:
                 ((across.T**power).ravel(), cells.T.ravel(), of_pixel), shape=(shape[0] * shape[1], len(rows))
             )
             sums = np.empty((shape[0], len(bounds), rows.shape[1]))
-            sums[:, order] = np.cumsum((moments @ rows).reshape(*shape, -1)[:, ::-1], axis=1)[:, -2::-1]
+            sums[:, order] = np.cumsum(np.asarray(moments @ rows).reshape(*shape, -1)[:, ::-1], axis=1)[:, -2::-1]
             return sums
 
         at = bounds[:, None]
