@@ -30,7 +30,7 @@ _STEPS_DN = np.arange(2, 51)  # a step of 1 takes nothing away; 50 is that of qu
 _BIN_DN = 0.25
 _LARGEST_DN = 150.0  # of a coefficient that is looked at: three times the largest step
 _LOST_PX = 0.25  # times the square of step over contrast: rms of what residuals do not show (benchmarks/marks.py)
-_TONE_LOST = 3.5  # times step over contrast, of what is not known of any curve (benchmarks/tone_curves.py)
+_TONE_LOST = 3.5  # times step over contrast, of what is not known of any curve (benchmarks/tone_said.py)
 _MOST_LOST_PX = 1.0  # where the contrast is hardly two steps, there is nothing left to measure
 
 
