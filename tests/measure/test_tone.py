@@ -12,12 +12,13 @@ from measure.fitting.linear_fit import LinearFit
 from measure.fitting.matching import Match, match
 from measure.fitting.scan_window import read_window
 from measure.fitting.tone_estimate import told_tone
-from measure.frames.refinement import options_for
+from measure.frames.refinement import options_for, sight
 from measure.marks.shapes import MarkShape, polygon
 from measure.match_options import MatchOptions
 from measure.noise.noise import NoiseModel
 from measure.scans.told_tone import FrameTone, ToldTone
 from measure.scans.tone import LINEAR, SaidOfTone, Tone, power, sampled, srgb
+from measure.search.prediction import MarkPrediction
 from synthetic_images.tone_curve import coded
 
 FULL = 65535.0
@@ -239,6 +240,26 @@ def test_what_is_wrong_alike_in_all_pictures_of_a_scanner_does_not_average() -> 
         error = at_once.mean - truth
         squares.append(error @ np.linalg.solve(at_once.covariance, error) / 5)
     assert np.mean(squares) == pytest.approx(1.0, abs=0.25)  # as if each were wrong by itself: 16
+
+
+def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -> None:
+    """The same wedge of 8 bits, as if sixteen scans showed it so: what noise makes of it averages, rounding by 12 grey
+    values does not."""
+    rng = np.random.default_rng(9)
+    mark = some_mark(TIP, 1.0, rng)
+    code = code_of(mark, 2.2, 80.0, rng) / 257
+    known = []
+    for step_dn in (0.0, 12.0):
+        scan = scan_of(code, 255, step_dn).seen_through(Tone.unknown())
+        expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
+        fit = sight(scan, expected, MatchOptions(linear_sigma=0.05), mark.kind.known).fit
+        assert fit is not None
+        assert fit.tone is not None
+        told = [SaidOfTone.together([fit.tone.said] * count).of_scanner for count in (1, 16)]
+        known.append([np.linalg.norm(said.information, 2) for said in told])
+    (one, many), (one_rounded, many_rounded) = known
+    assert many == pytest.approx(16 * one)
+    assert many_rounded < 4 * one_rounded
 
 
 def test_noise_that_is_cut_off_at_black_feigns_no_curve() -> None:
