@@ -17,8 +17,7 @@ from adjust.choices.comparison import CameraCalibration, Comparison, Test, Use, 
 from adjust.functional_model.families import parameter_names
 from pipeline.adjusting.compare_picture import draw_comparison
 from pipeline.errors import InputError
-from pipeline.results.adjustment_reader import calibrated_lens, covariance_path, read_adjustment, read_covariance
-from pipeline.results.fingerprints import of_file
+from pipeline.results.adjustment_reader import calibrated_lens, read_adjustment, read_own_covariance
 from pipeline.text.atomic import check_writable, write_atomically
 from pipeline.text.finite import without_nan
 from pipeline.text.spelling import did_you_mean
@@ -91,15 +90,8 @@ def _calibration(path: Path, content: Json, name: str, label: str) -> CameraCali
     marks = {id: np.array([mark["x_mm"]["value"], mark["y_mm"]["value"]]) for id, mark in camera["fiducials"].items()}
     unknowns = [f"IO.{name}.{each}" for each in ("c", "x0", "y0", *parameter_names(distortion.family))]
     unknowns += [f"FID.{name}.{id}.{axis}" for id in marks for axis in "xy"]
-    covariance = read_covariance(path)
-    if covariance.adjustment not in ("", of_file(path)):
-        raise InputError(
-            f"{covariance_path(path)}: belongs to another adjustment than {path}. Bring both files of one adjustment "
-            "together, or run `reseau adjust` again."
-        )
-    return CameraCalibration(
-        label, distortion, interior, parameters, marks, covariance.of(unknowns), content["redundancy"]
-    )
+    covariance = read_own_covariance(path).of(unknowns)
+    return CameraCalibration(label, distortion, interior, parameters, marks, covariance, content["redundancy"])
 
 
 def _half_mm(path: Path, content: Json, name: str) -> tuple[float, float]:

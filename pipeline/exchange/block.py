@@ -17,7 +17,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import UNITS_MM, Project
 from pipeline.publishing.made_from import adjusted_from, differing
 from pipeline.resampling.frame_chain import FrameChain, Lens, image_chain
-from pipeline.results.adjustment_reader import Covariance, calibrated_lens, read_adjustment, read_covariance
+from pipeline.results.adjustment_reader import Covariance, calibrated_lens, read_adjustment, read_own_covariance
 from pipeline.results.comparator_file import ComparatorPoint, pitches_of, pixel_from_comparator, read_comparator
 
 Array = NDArray[np.float64]
@@ -154,7 +154,7 @@ class Block:
 
     @cached_property
     def covariance(self) -> Covariance:
-        return read_covariance(self.project.adjustment_path)
+        return read_own_covariance(self.project.adjustment_path)
 
     @cached_property
     def points(self) -> dict[str, Array]:

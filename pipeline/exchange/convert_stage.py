@@ -26,7 +26,7 @@ from pipeline.results.adjustment_reader import (
     calibrated_lens,
     covariance_path,
     read_adjustment,
-    read_covariance,
+    read_own_covariance,
 )
 from pipeline.results.fingerprints import of_content
 from pipeline.text.spelling import did_you_mean
@@ -107,7 +107,7 @@ def _converted(
 
 def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
     """The whole adjustment.json and adjustment.npz, with one camera's lens converted."""
-    content, covariance = read_adjustment(path), read_covariance(path)
+    content, covariance = read_adjustment(path), read_own_covariance(path)
     if not content["converged"]:
         raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
     cameras = list(content["cameras"])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.families import parameter_names
 from adjust.problem.camera import Distortion
 from pipeline.errors import InputError
+from pipeline.results.fingerprints import of_file
 from pipeline.text.text_file import MOST_MB, read_bytes, read_json, shown
 
 Array = NDArray[np.float64]
@@ -86,6 +87,17 @@ def read_covariance(path: Path) -> Covariance:
         raise InputError(f"{file}: {twice!r} is named twice. {_AGAIN}")
     adjustment = str(_array(data, "fingerprint", file)) if b"fingerprint.npy" in data else ""
     return Covariance(texts, values.astype(np.float64), matrix.astype(np.float64), adjustment)
+
+
+def read_own_covariance(path: Path) -> Covariance:
+    """The same, refused where it says that it is of another adjustment than that at `path`."""
+    covariance = read_covariance(path)
+    if covariance.adjustment not in ("", of_file(path)):
+        raise InputError(
+            f"{covariance_path(path)}: belongs to another adjustment than {path}. Bring both files of one adjustment "
+            "together, or run `reseau adjust` again."
+        )
+    return covariance
 
 
 def _array(data: bytes, name: str, file: Path) -> NDArray[Any]:

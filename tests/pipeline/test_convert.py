@@ -63,6 +63,9 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
     assert converted["converted"]["same"]
     assert converted["distortion"]["k1"]["value"] == pytest.approx(-before["distortion"]["k1"]["value"], rel=1e-9)
     assert run(["compare", str(first), str(there / "adjustment.json")]) == DONE
+    (there / "adjustment.npz").write_bytes(first.with_suffix(".npz").read_bytes())
+    assert run(["convert", str(there / "adjustment.json"), "australis", str(tmp_path / "mixed")]) == 2
+    assert not (tmp_path / "mixed").exists()
 
 
 def test_a_converted_calibration_is_taken_in(tmp_path: Path) -> None:
