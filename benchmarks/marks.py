@@ -257,6 +257,41 @@ def borders(kinds: Sequence[Kind], count: int) -> None:
         ROWS.print(f"borders {count} {kind.name}", partial(row, kind))
 
 
+def misfit(kinds: Sequence[Kind], count: int) -> None:
+    """By how much the cause `misfit` makes claims larger under noise alone, where there is none."""
+    print(
+        f"\nclaims with `misfit` over those without, mean; error over claim without it, and with it; SNR {GRAIN_SNR:g}"
+    )
+    ways = ("white", *(f"grain {grain_px:g} px" for grain_px in GRAINS_PX), f"JPEG {QUALITIES[1]}")
+    print(f"{'':14}" + "".join(f"{way:>20}" for way in ways))
+
+    def row(kind: Kind) -> str:
+        rng = np.random.default_rng([SEED, KINDS.index(kind), 3])
+        marks = [some_mark(kind, 1.0, rng) for _ in range(min(POOL, count))]
+        words = []
+        for grain_px in (0.0, *GRAINS_PX, None):
+            larger, errors, known, with_it = [], [], [], []
+            for number in range(count):
+                mark = marks[number % len(marks)]
+                noise = grainy(mark.size, grain_px, rng) if grain_px else rng.standard_normal((mark.size, mark.size))
+                if grain_px is None:
+                    grey = drawn(mark, rng, JPEG_CONTRASTS[0], 60.0)[0] + JPEG_CONTRASTS[0] * noise / JPEG_SNR
+                    shown, step_dn = compressed(grey, QUALITIES[1], rng)
+                    found = measured(mark, shown, rng, 255, step_dn=step_dn)
+                else:
+                    found = measured(mark, drawn(mark, rng)[0] + CONTRAST * noise / GRAIN_SNR, rng)
+                if found is not None and not found.flagged:
+                    errors.append(found.center_px - mark.place[:, 2])
+                    with_it.append(found.covariance_px2)
+                    known.append(found.covariance_px2 - found.misfit_px2)
+                    larger.append(np.sqrt(np.trace(with_it[-1]) / np.trace(known[-1])))
+            words.append(f"{np.mean(larger):.3f} {whitened_rms(errors, known):.2f} {whitened_rms(errors, with_it):.2f}")
+        return f"{kind.name:14}" + "".join(f"{each:>20}" for each in words)
+
+    for kind in kinds:
+        ROWS.print(f"misfit {count} {kind.name}", partial(row, kind))
+
+
 STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
     "accuracy": accuracy,
     "clean": clean,
@@ -265,6 +300,7 @@ STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
     "clipping": clipping,
     "jpeg": jpeg,
     "borders": borders,
+    "misfit": misfit,
 }
 
 

@@ -7,6 +7,7 @@ from drawn import scan_of
 from numpy.typing import NDArray
 from true_marks import ALL_MOVES, TrueMark
 
+from measure.covariance import Cause
 from measure.fiducial_options import FiducialOptions
 from measure.frames.frame import CLEAR_DAMAGE
 from measure.frames.refinement import sight
@@ -21,11 +22,12 @@ SHIFT_PX, SEARCH_PX = 1.5, 3.0  # of the start, and the radius of the search
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A place with its covariance; flagged: `weak`, or not measured at all."""
+    """A place with its covariance; flagged: `weak`, or not measured at all; misfit_px2: a part of the covariance."""
 
     center_px: Array
     covariance_px2: Array
     flagged: str = ""
+    misfit_px2: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 @dataclass
@@ -120,7 +122,9 @@ def measured(
     fit = sight(scan, MarkPrediction(mark.kind.shape, start, SEARCH_PX, polarity), options, frame_sigma).fit
     if fit is None:
         return None
-    return Found(fit.center_px, fit.covariance_px2, "damaged" if fit.damaged_fraction > CLEAR_DAMAGE else "")
+    misfit_px2 = fit.place_covariance.parts.get(Cause.MISFIT, np.zeros((2, 2)))
+    flagged = "damaged" if fit.damaged_fraction > CLEAR_DAMAGE else ""
+    return Found(fit.center_px, fit.covariance_px2, flagged, misfit_px2)
 
 
 def grey_is_light(mark: TrueMark, grey: Array) -> bool:

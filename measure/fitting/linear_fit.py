@@ -1,10 +1,11 @@
 """A fit linearised at its solution: what else the same grey values say, a second place for example, and how well it is
 known where residuals are uneven, and where the model bends.
 
-The sandwich covariance: what a chip leaves of another picture is no noise alone: detail that was sampled too coarsely
-returns at the edges, which are what tells the place. A covariance that takes residuals as alike everywhere promises too
-much there. This one asks each pixel what it left and how much that weighs, and its neighbours whether they left the
-same (Conley, 1999, GMM estimation with cross sectional dependence).
+Where a mark is not quite as it is drawn, what its fit leaves is no noise alone: a scanner's sharpening, film that is
+uneven, detail that a chip was sampled too coarsely for lie at the edges, which are what tells the place. A covariance
+that takes residuals as alike everywhere promises too much there. The sandwich covariance asks each pixel what it left
+and how much that weighs, and its neighbours whether they left the same (Conley, 1999, GMM estimation with cross
+sectional dependence). What it is larger by than noise makes it is a cause of its own.
 
 Where a mark is soft and faint, its place, blur and contrast are unknown by so much that the picture bends within their
 errors. Two terms of the second order count, both in what the picture's slopes change by as the mark moves:
@@ -21,16 +22,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
 
 from measure.fitting.picture_model import GREY
-from measure.noise.noise import NoiseModel, correlated
+from measure.noise.noise import NoiseModel, coloured, correlated
 from measure.noise.pixel_sums import products
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_ALIKE_PX = 1.0  # standard deviation of the weights by distance: what is sampled too coarsely is alike no farther
+_ALIKE_PX = 1.5  # standard deviation of the weights by distance of what neighbours leave alike
 _LEAST_SLOPE = 1e-3  # of a clipped grey value: what tells less tells nothing
 
 
@@ -54,17 +56,20 @@ class LinearFit:
         covariance = products(by_grey, white if self.noise.is_white else correlated(by_grey, self.noise))
         return np.asarray((covariance + covariance.T) / 2)
 
-
-def sandwich_covariance(inverse: Array, weights: Array, residuals: Array, used: Mask) -> Array:
-    """(unknowns, unknowns) covariance of an adjustment that has `sum weights * residuals = 0` over the pixels used.
-
-    inverse: (unknowns, unknowns) of its normal matrix; weights: (unknowns, height, width), weighted derivatives;
-    residuals, used: (height, width).
-    """
-    shares = weights * np.where(used, residuals, 0.0)
-    about = gaussian_filter(shares, (0.0, _ALIKE_PX, _ALIKE_PX), mode="constant") * (2 * np.pi * _ALIKE_PX**2)
-    scatter = np.einsum("ihw,jhw->ij", about, shares)
-    return np.asarray(inverse @ ((scatter + scatter.T) / 2) @ inverse.T)
+    def misfit_px2(self, by_noise: Array) -> Array:
+        """(2, 2) by which the place is known less well than by_noise, (2, 2) px2, says: by what is left at the mark's
+        edges, and alike in neighbours, beyond the noise."""
+        place, left = self.by_grey[:2], np.where(self.used, self.residuals, 0.0)[None]
+        expected = self.covariance(place)
+        if self.noise.is_grain:  # that weighed the fit: as if it were white, so that neighbours share none
+            place, left = coloured(place, self.noise, 0.5), coloured(left, self.noise, -0.5)
+            expected = products(place, place)
+        shares = place * left
+        about = gaussian_filter(shares, (0.0, _ALIKE_PX, _ALIKE_PX), mode="constant") * (2 * np.pi * _ALIKE_PX**2)
+        more = products(about, shares) - expected
+        sizes, axes = eigh((more + more.T) / 2, by_noise)
+        axes = by_noise @ axes
+        return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
 
 def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, priors_dn2: Array) -> float:

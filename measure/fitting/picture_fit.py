@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.clipping import noise_scale
-from measure.fitting.linear_fit import sandwich_covariance
 from measure.fitting.picture_model import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.fitting.rounding import (
     COARSEST_VARIANCE,
@@ -190,9 +189,6 @@ class PictureFit:
         covariance = np.asarray(inverse @ (products(weights, smeared) + held**2 * priors) @ inverse.T)
         if not np.all(np.linalg.eigvalsh(covariance[:2, :2] + covariance[:2, :2].T) > 0):
             covariance = inverse  # lags that are noise themselves: as if it were white
-        if isinstance(self.model.mark, MarkTemplate):
-            uneven = sandwich_covariance(inverse, weights, self.model.residuals, self.used)
-            covariance = max(covariance, uneven, key=lambda each: float(np.trace(each[:2, :2])))
         return np.asarray((covariance + covariance.T) / 2), combined(inverse, weights)
 
     def _step_by(self, weights: Array) -> Array | None:

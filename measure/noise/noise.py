@@ -13,6 +13,7 @@ _ODDS = 13.8  # chi-square of two coordinates: one in a thousand
 _TEXTURE = 0.25  # correlation at REACH_PX that grain never has
 SIGMA_OF_DEVIATION = 1.4826  # the standard deviation of normal values over their median absolute deviation
 
+WHITE = 0.02  # of the variance at least is taken as white: no film's grain is known better at the finest frequencies
 REACH_PX = 5  # the coarsest grain that matters at scanning pitch: correlated over 1.5 px, gone beyond 5
 
 
@@ -100,12 +101,20 @@ def _median(values: Array) -> float:
 
 def correlated(columns: Array, noise: NoiseModel) -> Array:
     """The noise's covariance matrix times images (n, height, width), without ever forming it."""
+    return coloured(columns, noise, 1.0)
+
+
+def coloured(columns: Array, noise: NoiseModel, power: float) -> Array:
+    """A power of the noise's covariance matrix, as if the picture had no border, times images (n, height, width)."""
     height, width = columns.shape[1:]
     reach = len(noise.autocovariance_dn2) // 2
     shape = padded((height, width), reach)
     kernel, index = np.zeros(shape), np.arange(-reach, reach + 1)
     kernel[np.ix_(index, index)] = noise.autocovariance_dn2
-    smeared = fft.irfft2(fft.rfft2(columns, s=shape) * fft.rfft2(kernel).real, s=shape)
+    spectrum = fft.rfft2(kernel).real
+    if power != 1.0:
+        spectrum = np.maximum(spectrum, WHITE * noise.variance_dn2) ** power
+    smeared = fft.irfft2(fft.rfft2(columns, s=shape) * spectrum, s=shape)
     return np.asarray(smeared[:, :height, :width])
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from measure.noise.noise import NoiseModel, padded, robust_scale
+from measure.noise.noise import WHITE, NoiseModel, padded, robust_scale
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,7 +32,6 @@ _DARKEST = 5e-4  # of full scale: nearer to black no scanner's noise is less
 
 _ROUNDS = 8  # of conjugate gradients, at most
 _CLOSE = 0.03  # of a derivative: so little left costs a thousandth of the standard deviation
-_WHITE = 0.02  # of the variance at least is taken as white: no film's grain is known better at the finest frequencies
 _MISFIT = 0.003  # of the contrast: what the drawing itself gets wrong from pixel to pixel
 
 
@@ -64,7 +63,7 @@ def steadiness(residuals: Array, light: Array, ground: Mask, used: Mask) -> Arra
 def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -> tuple[Array, Array]:
     """B and C B', each (unknowns, height, width) and 0 where not used: weighted derivatives, and the covariance matrix
     of the noise times them."""
-    covariance = _Covariance(noise, used, max(_WHITE * noise.variance_dn2, (_MISFIT * contrast_dn) ** 2))
+    covariance = _Covariance(noise, used, max(WHITE * noise.variance_dn2, (_MISFIT * contrast_dn) ** 2))
     # The columns are scaled for single precision, and all are solved at once.
     right = (design * used).astype(np.float32)
     size = np.sqrt(_dots(right, right))

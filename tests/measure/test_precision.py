@@ -17,6 +17,7 @@ from true_marks import (
     whitened_rms,
 )
 
+from measure.covariance import Cause
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.fitting.matching import Match
@@ -142,7 +143,7 @@ def test_a_notch_in_a_soft_scan_is_matched_with_enough_of_its_ground() -> None:
     for _ in range(3):
         mark = some_mark(KIND["notch"], 1.6, rng)
         fit = sighted(mark, GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / SNR), rng)
-        shares.append(np.trace(fit.covariance_px2) / np.trace(mark.bound(1 / SNR)))
+        shares.append(np.trace(fit.place_covariance.parts[Cause.NOISE]) / np.trace(mark.bound(1 / SNR)))
     assert np.sqrt(np.mean(shares)) < 1.08  # with four standard deviations of the blur: 1.11 and more
 
 
