@@ -80,8 +80,7 @@ class Frame:
     @property
     def accepted(self) -> bool:
         """Whether enough marks agree for the frame not to be chance, three of them clear ones."""
-        clear = sum(fit is not None and fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
-        return self.agrees and clear >= self._least
+        return self.agrees and self._clear >= self._least
 
     @property
     def unblemished(self) -> list[int]:
@@ -111,6 +110,11 @@ class Frame:
         return bool(self.accepted and len(self.belongs) >= _CHECKED and self.belongs.all() and self.all_clear)
 
     @property
+    def _clear(self) -> int:
+        """How many marks are plainly there."""
+        return sum(fit is not None and fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
+
+    @property
     def _least(self) -> int:
         return 2 if self.part else max(min(_AGREEING, len(self.sightings)), 2)
 
@@ -131,9 +135,12 @@ class Frame:
 
     def misfit(self) -> str:
         """A sentence for a frame that is not accepted."""
+        found = f"{int(self.belongs.sum())} of {len(self.sightings)} marks were found where the others put them"
+        if not self.agrees:
+            return f"the constellation does not fit: only {found}"
         return (
-            f"the constellation does not fit: only {int(self.belongs.sum())} of {len(self.sightings)} marks were found "
-            "where the others put them"
+            f"{found}, but only {self._clear} of them look plainly like their drawings, where {self._least} have to: "
+            "compare the drawings with the scan, or say by which curve it stores light (tone)"
         )
 
     def verdict(self, index: int) -> tuple[Status, Reason]:

@@ -110,3 +110,15 @@ def test_a_mark_whose_place_hangs_on_a_remnant_is_weak_however_little_of_it_is_d
     for lost, status in ((0.5, Status.MEASURED), (0.95, Status.WEAK)):
         one = replace(sighting, fit=replace(sighting.fit, damaged_fraction=0.05, lost_fraction=lost))
         assert replace(frame, sightings=(one, *frame.sightings[1:])).verdict(0)[0] is status
+
+
+def test_a_frame_in_which_marks_lie_as_they_should_but_look_unlike_their_drawings_says_so() -> None:
+    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    assert frame.accepted
+    unlike = [
+        replace(sighting, fit=replace(sighting.fit, likeness=0.4)) if sighting.fit and number > 1 else sighting
+        for number, sighting in enumerate(frame.sightings)
+    ]
+    refused = replace(frame, sightings=tuple(unlike))
+    assert not refused.accepted
+    assert refused.misfit().startswith("8 of 8 marks were found where the others put them, but only 2 of them look")
