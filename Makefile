@@ -14,8 +14,10 @@ demo: $(READY)
 test: lint
 	$(MAKE) --no-print-directory --jobs=2 types suite
 
-# One BLAS thread a worker: two on two cores make the small factorisations ten times slower.
+# One BLAS thread a worker: two on two cores make the small factorisations ten times slower. And byte code is kept, also
+# where the environment forbids it: every process that a test starts would compile the program anew.
 suite: export OPENBLAS_NUM_THREADS = 1
+suite: export PYTHONDONTWRITEBYTECODE =
 suite: $(TESTED)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 

@@ -1,11 +1,13 @@
 """Who may import whom: measure, adjust and synthetic_images know none of the others, pipeline knows them all."""
 
 import ast
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.xdist_group("packages")  # their files are read once for all
 ROOT = Path(__file__).parent.parent
 PACKAGES = {"measure", "adjust", "pipeline", "synthetic_images"}
 ALLOWED = {"measure": set[str](), "adjust": set[str](), "synthetic_images": set[str](), "pipeline": PACKAGES}
@@ -26,13 +28,20 @@ ADJUST_FROM_THE_GROUND_UP = (
 FORBIDDEN_LIBRARIES = {"adjust": {"cv2", "skimage", "tifffile", "imagecodecs"}}
 
 
+@cache
+def import_statements(file: Path) -> tuple[ast.Import | ast.ImportFrom, ...]:
+    """Of a file, wherever they stand in it."""
+    nodes = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+    return tuple(node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom))
+
+
 def imported(file: Path) -> set[str]:
     """The top-level names that a file imports."""
     names = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in import_statements(file):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
+        else:
             assert node.level == 0, f"{file}: relative imports hide who depends on whom"
             names.add((node.module or "").split(".")[0])
     return names
@@ -95,10 +104,10 @@ def rooms_used(room: Path, package: str) -> set[str]:
     files = room.rglob("*.py") if room.is_dir() else [room]
     modules = set[str]()
     for file in files:
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in import_statements(file):
             if isinstance(node, ast.ImportFrom):
                 named = node.module or ""
                 modules |= {f"{named}.{alias.name}" for alias in node.names} if named == package else {named}
-            elif isinstance(node, ast.Import):
+            else:
                 modules |= {alias.name for alias in node.names}
     return {f"{name}.__init__".split(".")[1] for name in modules if name.split(".")[0] == package}

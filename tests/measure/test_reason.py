@@ -3,6 +3,7 @@
 import ast
 import pickle
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +32,7 @@ def test_every_reason_of_the_code_has_a_code() -> None:
     """Each call of Reason in measure and pipeline: a sentence, then at least one code."""
     calls = [
         (f"{file.relative_to(ROOT)}:{node.lineno}", len(node.args))
-        for package in ("measure", "pipeline")
-        for file in (ROOT / package).rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        for file, node in nodes_of_files_with("Reason(")
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Reason"
     ]
     assert len(calls) > 80
@@ -43,13 +42,19 @@ def test_every_reason_of_the_code_has_a_code() -> None:
 def test_every_code_is_used() -> None:
     used = {
         node.attr
-        for package in ("measure", "pipeline")
-        for file in (ROOT / package).rglob("*.py")
+        for file, node in nodes_of_files_with("Code.")
         if file.name != "reason.py"
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "Code"
     }
     assert used == set(Code.__members__)
+
+
+def nodes_of_files_with(text: str) -> Iterator[tuple[Path, ast.AST]]:
+    for package in ("measure", "pipeline"):
+        for file in (ROOT / package).rglob("*.py"):
+            content = file.read_text(encoding="utf-8")
+            if text in content:
+                yield from ((file, node) for node in ast.walk(ast.parse(content)))
 
 
 def test_joined_reasons_keep_their_codes_once_each() -> None:
