@@ -52,9 +52,9 @@ def drawn(rng: np.random.Generator, change: Array | float = 0.0) -> CameraCalibr
 
 def test_false_alarms_come_as_often_as_stated() -> None:
     rng = np.random.default_rng(1)
-    probabilities = np.array([compare([drawn(rng), drawn(rng)], HALF).same.probability for _ in range(300)])
+    probabilities = np.array([compare([drawn(rng), drawn(rng)], HALF).same.probability for _ in range(160)])
     for level in (0.05, 0.5):
-        expected = 300 * level
+        expected = 160 * level
         assert abs(int((probabilities < level).sum()) - expected) < 3.5 * np.sqrt(expected * (1 - level))
 
 

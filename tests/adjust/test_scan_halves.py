@@ -28,7 +28,7 @@ def errors(halves: Halves, adjustment: Adjustment) -> dict[str, np.ndarray]:
 
 def test_errors_are_as_large_as_the_standard_deviations_say() -> None:
     collected: dict[str, list[np.ndarray]] = {}
-    for seed in range(40):
+    for seed in range(16):
         simulated = halves(np.random.default_rng(seed), join_count=12, turned=seed % 2 == 1)
         adjustment = adjust(simulated.network)
         assert adjustment.converged

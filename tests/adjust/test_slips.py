@@ -55,6 +55,7 @@ def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("adjust.solution.adjustment._check_whole", lambda *_: None)
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_a_slip_without_a_minimum_is_named() -> None:
     network, xyz = field()
     result = adjusted(with_given(network, {WRONG: xyz[WRONG] * [1.0, -1.0, 1.0]}), iteration_limit=STOPPED)

@@ -70,7 +70,7 @@ def check_monte_carlo(runs: int) -> None:
 
 
 def test_claimed_standard_deviations_are_realised() -> None:
-    check_monte_carlo(60)
+    check_monte_carlo(40)
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ def exchanged(network: Network, image: str, first: str, second: str) -> Network:
     return replace(network, observations=replace(observations, point=points))
 
 
-@pytest.mark.parametrize(("seed", "known"), [(0, POINTS), (8, POINTS), (3, 7), (7, 7)])
+@pytest.mark.parametrize(("seed", "known"), [(8, POINTS), (7, 7)])
 def test_exchanged_numbers_are_named_whether_the_adjustment_ends_or_not(seed: int, known: int) -> None:
     rng = np.random.default_rng(seed)
     network, _ = simulated(rng, points=field_points(rng, POINTS), free={"k3": np.inf})

@@ -40,24 +40,23 @@ def seen_at(grey: Array, predicted: Array, folder: Path) -> list[FaintMark | Non
 
 def test_a_cross_of_the_grounds_own_contrast_is_measured_with_an_honest_sigma(tmp_path: Path) -> None:
     squares = []
-    for seed in range(2):
-        grey, true = textured(seed), places(seed)
-        for place in true:
-            col0, row0 = np.rint(place).astype(int) - 25
-            shown = brute_picture(CROSS, np.column_stack([LINEAR, place - (col0, row0)]), 51, 51, 0.7)
-            grey[row0 : row0 + 51, col0 : col0 + 51] -= 5000 * shown
-        for found, place in zip(seen_at(grey, np.rint(true), tmp_path), true, strict=True):
-            assert found is not None
-            assert found.chance < 1e-4
-            error = found.fit.center_px - place
-            squares.append(float(error @ np.linalg.solve(found.fit.covariance_px2, error)) / 2)
+    grey, true = textured(0), places(0)
+    for place in true:
+        col0, row0 = np.rint(place).astype(int) - 25
+        shown = brute_picture(CROSS, np.column_stack([LINEAR, place - (col0, row0)]), 51, 51, 0.7)
+        grey[row0 : row0 + 51, col0 : col0 + 51] -= 5000 * shown
+    for found, place in zip(seen_at(grey, np.rint(true), tmp_path), true, strict=True):
+        assert found is not None
+        assert found.chance < 1e-4
+        error = found.fit.center_px - place
+        squares.append(float(error @ np.linalg.solve(found.fit.covariance_px2, error)) / 2)
     assert 0.7 < float(np.sqrt(np.mean(squares))) < 1.4
 
 
 def test_a_mark_many_pixels_wide_is_sought_in_a_reduced_picture_with_an_honest_sigma(tmp_path: Path) -> None:
     """A disk of 116 pixels, of half of the texture's contrast; at full size too little texture lies about it."""
     wide, side_px, errors, squares = MarkShape(dot(1.6), "dark"), 801, [], []
-    for seed in range(16):
+    for seed in range(10):
         rng = np.random.default_rng(seed)
         place, texture = 400 + rng.uniform(-3.0, 3.0, 2), gaussian_filter(rng.normal(0.0, 1.0, (side_px,) * 2), 1.0)
         grey = 20000 + 2000 * texture / texture.std()
@@ -108,10 +107,10 @@ def test_what_answers_at_the_edge_of_a_wide_search_is_placed_within_the_window(t
 
 
 def test_bare_texture_answers_as_often_as_chance_says(tmp_path: Path) -> None:
-    answers = [found for seed in range(4) for found in seen_at(textured(seed + 50), places(seed), tmp_path)]
+    answers = [found for seed in range(2) for found in seen_at(textured(seed + 50), places(seed), tmp_path)]
     chances = np.array([found.chance for found in answers if found is not None])
-    assert (chances < 1e-3).sum() <= 2  # of a hundred places
-    assert 5 <= (chances < 0.1).sum() <= 45  # the strongest of those within three pixels, not one drawn blindly
+    assert (chances < 1e-3).sum() <= 1  # of fifty places
+    assert 3 <= (chances < 0.1).sum() <= 22  # the strongest of those within three pixels, not one drawn blindly
 
 
 def test_where_the_ground_is_black_nothing_is_seen(tmp_path: Path) -> None:

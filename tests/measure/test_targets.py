@@ -20,13 +20,13 @@ WIDTH, HEIGHT = 700, 500
 class Field:
     """A picture with disks at known places, and predictions of them that are off by a common shift and a little."""
 
-    def __init__(self, seed: int, shift_px: Array, search_px: float = 25.0, sign: float = 1.0) -> None:
+    def __init__(self, seed: int, shift_px: Array, search_px: float = 25.0, sign: float = 1.0, count: int = 35) -> None:
         self.rng = np.random.default_rng(seed)
         self.picture = 40000 * (sign < 0) + sign * GROUND + self.rng.normal(0, NOISE, (HEIGHT, WIDTH))
         self.sign = sign
         self.places: dict[str, Array] = {}
         self.predictions: list[TargetPrediction] = []
-        for number in range(35):
+        for number in range(count):
             place = np.array([70 + 90 * (number % 7), 60 + 90 * (number // 7)]) + self.rng.uniform(-12, 12, 2)
             radius = self.rng.uniform(3.0, 7.0)
             self.add(f"t{number}", place, radius, shift_px, search_px)
@@ -140,7 +140,7 @@ def test_small_disks_are_flagged_where_too_few_others_tell_what_they_look_like()
 
 def test_the_order_of_predictions_does_not_matter() -> None:
     """Every disk lies near several places, so that another one is the first to have it fitted."""
-    field = Field(7, np.array([5.0, 3.0]), search_px=110.0)
+    field = Field(7, np.array([5.0, 3.0]), search_px=110.0, count=14)
     marks = field.measured()
     field.predictions.reverse()
     for name, mark in field.measured().items():

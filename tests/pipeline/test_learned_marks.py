@@ -304,7 +304,7 @@ def test_clicks_that_cannot_be_are_refused(rendered: Path) -> None:
 
 def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_path: Path) -> None:
     """Crosses clicked beside their middles in one frame: no pose is decided, and all frames repeat them."""
-    poses = ("0", "90", "180m", "270")
+    poses = ("0", "90", "180m")
     images = tuple(
         scene.SceneImage(f"f{k}", (40.0 * k, 10.0 * k, 100.0, 0.0, 0.0, 0.5 * k), pose=pose, turn_rad=0.004 * k)
         for k, pose in enumerate(poses)
@@ -325,7 +325,7 @@ def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_p
     lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, px.tolist(), strict=True))
     project = project_of(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="auto")
     known = learned(project)
-    frames = [measure_scan(known, f"f{k}").frame for k in range(4)]
+    frames = [measure_scan(known, f"f{k}").frame for k in range(len(poses))]
     outward, across = [], []
     for frame in frames:
         assert frame.pose is not None
@@ -343,5 +343,5 @@ def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_p
     np.testing.assert_allclose(across, 0.0, atol=0.02)
     template = known.default_camera.fiducials[0].mark
     assert isinstance(template, MarkTemplate)
-    assert len(template.shares) == 4
+    assert len(template.shares) == len(poses)
     assert_measured_alike(project, frames[0])
