@@ -65,7 +65,7 @@ def chosen(network: Network) -> Choice:
 
 
 def test_the_true_lens_is_chosen_and_the_simpler_ones_are_told_to_be_too_simple() -> None:
-    choice = chosen(network_of(2, "k3 k5", "none", points=25))
+    choice = chosen(network_of(2, "k3 k5", "none", points=16))
     assert choice.chosen is not None
     assert choice.chosen.model == Model("none", "torlegard", ("k3", "k5"))
     assert choice.verdict.startswith("The data ask for torlegard k3 k5.")

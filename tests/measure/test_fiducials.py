@@ -241,7 +241,7 @@ def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> No
     for given in lattice.marks:
         if given.id not in dark:
             paint(grey, mark, given.xy_mm, matrix, -6000.0)
-    result = measured(grey + rng.normal(0, NOISE_DN, grey.shape), lattice, tmp_path)
+    result = measured(grey + rng.normal(0, NOISE_DN, grey.shape), lattice, tmp_path, FiducialOptions(pose="0"))
     found = {mark.point for mark in result.marks if mark.status.is_observation}
     assert found <= {given.id for given in lattice.marks} - dark
     assert len(found) >= 18

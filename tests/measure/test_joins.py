@@ -14,7 +14,7 @@ from measure.status import Status
 
 Array = NDArray[np.float64]
 
-SIDE, ROWS = 700, 450  # px: of the picture, and of its upper part that is scanned
+SIDE, ROWS = 700, 320  # px: of the picture, and of its upper part that is scanned
 
 
 def picture(blur: float) -> Array:
