@@ -37,7 +37,7 @@ def test_noise_alone_hardly_makes_any_misfit(is_grain: bool) -> None:
     line = -np.gradient(np.exp(-(cols**2) / 2), axis=1)
     design, used = np.stack([line, line.T, np.ones_like(line)]), np.ones(line.shape, dtype=bool)
     weights = weighted(design, used, noise, 0.0)[0] if is_grain else design
-    by_grey = combined(np.linalg.inv(products(weights, design)), weights)
+    by_grey = combined(np.asarray(np.linalg.inv(products(weights, design)), np.float64), weights)
     for _ in range(30):
         white = rng.standard_normal(line.shape)
         left = coloured(white[None], noise, 0.5)[0] if is_grain else white
@@ -64,9 +64,13 @@ def test_ragged_lines_are_known_as_badly_as_they_are() -> None:
 
 def ragged(axis: int, rng: np.random.Generator) -> list[Bar]:
     """The pieces of a line of 3 mm along an axis."""
-    ends, off_mm = np.linspace(-1.5, 1.5, 31), rng.normal(0, 0.008, 30)
-    pieces = [((a, off), (b, off)) for a, b, off in zip(ends[:-1], ends[1:], off_mm, strict=True)]
-    return [Bar(*(point[::-1] if axis else point for point in piece), 0.15) for piece in pieces]
+    ends, off_mm = np.linspace(-1.5, 1.5, 31).tolist(), rng.normal(0, 0.008, 30).tolist()
+
+    def place(along: float, off: float) -> tuple[float, float]:
+        return (off, along) if axis else (along, off)
+
+    pieces = zip(ends[:-1], ends[1:], off_mm, strict=True)
+    return [Bar(place(begin, off), place(end, off), 0.15) for begin, end, off in pieces]
 
 
 def test_a_chip_sampled_too_coarsely_is_found_in_pictures_shifted_by_known_parts_of_a_pixel() -> None:
