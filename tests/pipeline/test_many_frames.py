@@ -26,7 +26,8 @@ from pipeline.report_data import report_data
 from pipeline.results.comparator_file import ComparatorPoint, mark_rows, measurement_of, write_comparator
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
-FRAMES, MARKS = 3000, 8
+pytestmark = pytest.mark.xdist_group("many frames")  # made up once for all
+FRAMES, MARKS = 2100, 8  # more of them are bad than a report shows
 BAD, FAILED = range(0, FRAMES, 10), range(5, FRAMES, 100)
 KNOWN = Covariance({Cause.NOISE: np.eye(2) * 4e-4})
 SIGMA_UM = (3.0, 4.0)
