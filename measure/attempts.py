@@ -25,7 +25,7 @@ from measure.scans.addresses import Address
 from measure.scans.scan import Scan
 from measure.search.centred_frame import is_worth_a_look, outermost
 from measure.search.constellation import Placement
-from measure.search.correlation import CLOSE
+from measure.search.correlation import CLOSE, GRAINY
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import Hypotheses, slightly_longer
 from measure.writing.line import Line
@@ -42,13 +42,15 @@ _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks
 class Found:
     """What the attempts have found so far. search, placements: of the attempt that found the frame, the latter best
     first. is_taken: whether chance hardly made it. unsure: frames that chance may have made under so many other
-    pitches, and that would be taken if theirs were given. misfit: why there is none."""
+    pitches, and that would be taken if theirs were given; faint: the likeliest that would not be taken even so, and how
+    many such frames chance would make. misfit: why there is none."""
 
     search: FrameSearch
     placements: Sequence[Placement] = ()
     frame: Frame | None = None
     is_taken: bool = False
     unsure: tuple[Frame, ...] = ()
+    faint: tuple[float, Frame] | None = None
     misfit: str = "nothing in the scan looks like two or more of the camera's marks"
 
     @property
@@ -96,18 +98,31 @@ def find_frame(
         elif attempt.is_given:
             misfit = frame.misfit() if frame else Found.misfit
             found = replace(found, placements=placements, frame=frame, is_taken=False, misfit=misfit)
-        elif not attempt.at_given:
-            given = (frame for each, frame in frames if frame.accepted or each / tried * at_given <= FRAMES_BY_CHANCE)
-            found = replace(found, unsure=(*found.unsure, *given))
-    return found if found.is_taken else replace(found, frame=None, misfit=found.misfit + _pitch_to_try(found.unsure))
+        else:
+            likely = [each for each in frames if _is_taken_if_given(each, attempt, at_given / tried)]
+            unsure = (*found.unsure, *(frame for _, frame in likely))
+            faint = min(
+                (each for each in (found.faint, *frames) if each and each not in likely), key=_expected, default=None
+            )
+            found = replace(found, unsure=unsure, faint=faint)
+    if found.is_taken:
+        return found
+    what_to_do = _pitch_to_try(found.unsure) or _too_faint(found.faint)
+    return replace(found, frame=None, misfit=found.misfit + what_to_do)
+
+
+def _is_taken_if_given(seen: tuple[float, Frame], attempt: Attempt, at_given: float) -> bool:
+    """Whether a frame under another pitch would be taken if that were given; at_given: the share of the hypotheses that
+    are under the given one."""
+    return not attempt.at_given and (seen[1].accepted or seen[0] * at_given <= FRAMES_BY_CHANCE)
 
 
 def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: bool) -> list[Attempt]:
     """In the middle of the scan where the pitch is given, of one that is fetched also beside it, then anywhere; where
     what is found may be chance, under other pitches; where nothing is, at a closer look: less of what lies beside a
-    mark counts there, for the frame's edge may drown it else."""
+    mark counts there, for the frame's edge may drown it else, and then less of what grain hides."""
     given, *others = hypotheses
-    close = FrameSearch(wide.scan, wide.layout, wide.options, CLOSE)
+    closer = [FrameSearch(wide.scan, wide.layout, wide.options, surroundings) for surroundings in (CLOSE, GRAINY)]
     near, nearly = slightly_longer(given[0], _STRETCH) if is_given else ([], given)
     is_whole = not wide.options.part
     is_fetched = isinstance(wide.scan.path, Address)
@@ -117,8 +132,12 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
         *([Attempt(wide, given, _beside_it, lambda found: found.is_taken, True)] if is_centred and is_fetched else []),
         Attempt(wide, given, _anywhere, lambda found: found.is_complete, True),
         *(Attempt(wide, group, _in_spite_of_pitch, lambda found: found.is_undoubted) for group in others),
-        *([Attempt(close, near, _at_a_closer_look, lambda found: found.is_taken, at_given=True)] if is_given else []),
-        Attempt(close, nearly, _at_a_closer_look, lambda found: found.is_taken),
+        *(
+            Attempt(close, group, _at_a_closer_look, lambda found: found.is_taken, at_given=group is near)
+            for close in closer
+            for group in (near, nearly)
+            if group
+        ),
     ]
 
 
@@ -262,6 +281,16 @@ def _pitch_to_try(unsure: Sequence[Frame]) -> str:
     pair = ", ".join(f"{um:.2f}" for um in 1000 / np.hypot(*best.pixel_from_camera[:, :2].T))
     seen = f"under another pitch {int(best.belongs.sum())} of them lie as they should, which may be chance"
     return f"; {seen}: try pitch_um = [{pair}]"
+
+
+def _too_faint(likeliest: tuple[float, Frame] | None) -> str:
+    """A clause about a frame that no pitch tells from chance, where chance would make fewer than one."""
+    if likeliest is None or likeliest[0] >= 1:
+        return ""
+    expected, frame = likeliest
+    seen = f"{int(frame.belongs.sum())} marks that are hardly there lie as they should"
+    by_chance = f"where chance makes {expected:.1g} such frames"
+    return f"; {seen}, {by_chance}: no other pitch tells them from it, click those that you see in reseau review"
 
 
 def named(

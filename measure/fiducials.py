@@ -22,7 +22,6 @@ from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, Pose
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
-from measure.search.correlation import CLOSE
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 from measure.writing.line import KnownLine, Line
@@ -117,7 +116,7 @@ def _as_if_set(search: FrameSearch, hypotheses: Sequence[Sequence[PitchHypothesi
 
 
 def _worth(frame: Frame) -> tuple[bool, int, int]:
-    return frame.accepted and frame.placement.surroundings != CLOSE, frame.measured, int(frame.belongs.sum())
+    return frame.accepted and not frame.placement.surroundings.robust, frame.measured, int(frame.belongs.sum())
 
 
 def _read(

@@ -40,6 +40,9 @@ _UNROUNDED_PX, _MOST_UNROUNDED = 0.0001, 30  # a move by other grey values that 
 _WEIGHTED_STEPS = 4  # by the grain's weights: the place is nearly right before
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # a last step that needs no further one; the longest that may be the last
 _UNSETTLED = Reason("the adjustment did not converge", Code.NO_FIT)
+_HARDLY_SHOWN = Reason(
+    "most of the mark lies outside of the scan, or beyond an edge far stronger than it", Code.OUTSIDE
+)
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
 _GROUND = 0.1  # of the mark: what shows less is its ground
 EDGE_BLURS = 3.0  # from the frame's border, in which a mark ends: a thousandth of its step is seen farther off
@@ -260,7 +263,7 @@ class PictureFit:
         near = near & true(mark, place, width, height, EDGE_BLURS * self.model.seen_blur_px)
         self.area = self.used = self.usable & near
         if (self.area & own).sum() < 0.5 * (near & own).sum() or self.area.sum() < 40:
-            self.reason = self.reason or Reason("most of the mark lies outside of the scan", Code.OUTSIDE)
+            self.reason = self.reason or _HARDLY_SHOWN
 
     def _adjust(self, robust: bool, tolerance_px: float) -> None:
         """Gauss-Newton until the mark moves less than tolerance_px; a step that does not improve the fit is halved."""

@@ -18,7 +18,6 @@ from measure.probabilities import FRAME_BY_CHANCE
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.search.constellation import sign_of
-from measure.search.correlation import CLOSE
 from measure.search.frame_search import FrameSearch
 from measure.search.prediction import MarkPrediction
 
@@ -38,7 +37,7 @@ _APART = 2.0  # search radii off: beyond what a mark itself answers
 def doubt(search: FrameSearch, frame: Frame) -> Reason:
     """A sentence where chance may have made the frame; empty where it is unlikely to. One that was found at a closer
     look is taken only where chance hardly makes it, though none of its marks may be clear."""
-    if frame.placement.surroundings == CLOSE:
+    if frame.placement.surroundings.robust:
         return NO_REASON
     inside = [index for index, sighting in enumerate(frame.sightings) if sighting.inside]
     clear = {

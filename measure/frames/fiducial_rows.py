@@ -13,7 +13,6 @@ from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
-from measure.search.correlation import CLOSE
 from measure.special_marks.learned import honest_covariance
 from measure.status import Status
 
@@ -62,7 +61,7 @@ def present_frame(
     certain, nor if it was found at a closer look."""
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
     marks = tuple(_of_assumed_name(row, mark, pose) for row, mark in zip(marks, layout.marks, strict=True))
-    weak = chance or (_FAINT if frame.placement.surroundings == CLOSE else NO_REASON)
+    weak = chance or (_FAINT if frame.placement.surroundings.robust else NO_REASON)
     if weak:
         marks = tuple(
             replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks

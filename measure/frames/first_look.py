@@ -13,6 +13,7 @@ from measure.marks.rendering import extent_px, known_picture
 from measure.probabilities import NOISE_LIKE_A_MARK
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT, detail_px
+from measure.search.correlation import correlation, variation
 from measure.search.prediction import MarkPrediction
 from measure.search.response_layers import highest
 
@@ -61,8 +62,9 @@ class _Look:
         template = known_picture(mark, centred, int(size[0]), int(size[1]), blur_px)
         window = scan.reduced_window(reduction, col0, row0, width, tall, expected.weights)
         self._flat = expected.polarity * surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
-        self._pattern, self._counts = surroundings.pattern(template, finest_px)
-        response = surroundings.correlated(self._flat, template, finest_px)
+        self._pattern, self._counts = surroundings.pattern(template, finest_px, self._flat)
+        varied = variation(self._flat, self._counts)
+        response = correlation(self._flat, self._pattern, self._counts, varied)
         place = np.stack(np.meshgrid(*(np.arange(count, dtype=float) for count in response.shape[::-1])), axis=-1)
         place += np.array([col0, row0]) - low
         near = np.hypot(*np.moveaxis(place - reduced[:, 2], -1, 0)) <= search_px

@@ -81,7 +81,7 @@ class FrameSighter:
         self.first_search_px = first_search_px(placement, layout, options)
         self.near_px = first_search_px(placement, layout, options, NARROW)
         # Where the frame is hardly known to be there, texture must not feign a mark of it so far off.
-        self.faint_px = self.near_px if placement.surroundings == CLOSE else gate_px
+        self.faint_px = self.near_px if placement.surroundings.robust else gate_px
         self.gate_px = gate_px
 
     def choose_channels(self) -> None:
@@ -215,7 +215,7 @@ class FrameSighter:
     def _sight(self, index: int, search_px: float) -> Sighting:
         """At a closer look what is not seen is looked for nearer by, too: noise feigns fewer marks there."""
         sighting = self._sight_within(index, search_px)
-        if sighting.fit is None and self.placement.surroundings == CLOSE and self.near_px < search_px:
+        if sighting.fit is None and self.placement.surroundings.robust and self.near_px < search_px:
             near = self._sight_within(index, self.near_px)
             return near if near.fit is not None else sighting
         return sighting
@@ -224,7 +224,7 @@ class FrameSighter:
         """At a closer look a mark may be as faint as what texture feigns, where it seldom does so near by: all marks
         together decide of the frame."""
         sighting = sight(self.scan, self.expected(index, search_px), self.options.match)
-        fit, closer = sighting.fit, self.placement.surroundings == CLOSE
+        fit, closer = sighting.fit, self.placement.surroundings.robust
         sure = closer and sighting.chance <= FAINT_MARK_BY_NOISE
         least = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
         if fit is not None and (fit.likeness < least[0] or fit.significance < least[1]):

@@ -17,7 +17,6 @@ from measure.scans.compression import covariance_of_compression, tone_variance
 from measure.scans.scan import Scan
 from measure.scans.tone import LINEAR
 from measure.search.candidates import FAINT
-from measure.search.correlation import CLOSE
 from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_corner import corner_of_edges
 
@@ -143,7 +142,7 @@ def _matched(
         scan.seen_through(LINEAR) if isinstance(mark, MarkTemplate) else scan
     )  # chips are cut as the file has them
     window = read_window(seen_in, window_about(mark, start, options.margin_px + BESIDE_PX), expected.weights)
-    if expected.surroundings == CLOSE and isinstance(mark, MarkShape):
+    if expected.surroundings.robust and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
         window = window.without(beyond_edge(window.grey, mark, inner))
     return match(window, mark, start, options_for(mark, options, frame_sigma))

@@ -1,6 +1,6 @@
 """Normalised correlation with a mark's picture: in a scan freed of its ground, and of what lies beside the mark."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,17 +16,22 @@ _MEAN = 0.3  # of the coarse: the side of the squares whose median is background
 _DRAWN = 0.05  # of the mark's own contrast: what differs by more from the ground is the mark
 _SMOOTHED_PX = 3.0  # the standard deviation of a Gaussian that a reduced picture still shows
 _EVEN = 1e-5  # mean square in units of the local contrast: a three hundredth of it is rounding
+_TOLD_PX = 1 << 20  # pixels tell how noise is correlated
+_NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns off, each with the one opposite
 
 
 @dataclass(frozen=True)
 class Surroundings:
     """coarse: times the mark's finest detail: coarser structure is ground. beside: times the same: how far about the
     drawing pixels count. robust: whether the local contrast is a median, which an edge that is far stronger than the
-    mark does not change, and not a mean square, which takes less of what noise there is for contrast."""
+    mark does not change, and not a mean square, which takes less of what noise there is for contrast: that is a closer
+    look. whitened: whether the drawing is weighed by the inverse covariance that neighbouring pixels have: grain hides
+    the coarse of a faint mark, and little of its fine lines; what is blurred more than it is drawn has none of them."""
 
     coarse: float
     beside: float
     robust: bool
+    whitened: bool
 
     def flattened(self, image: Map, detail_px: float, faint_dn: float) -> Map:
         """The picture freed of what is much coarser than detail_px, in units of its contrast about every pixel: a thin
@@ -50,15 +55,17 @@ class Surroundings:
 
         OpenCV's own correlation under a mask gives the same for three times the price.
         """
-        chip, about = self.pattern(template, detail_px)
+        chip, about = self.pattern(template, detail_px, image)
         return correlation(image, chip, about, variation(image, about))
 
-    def pattern(self, template: Array, detail_px: float) -> tuple[Map, Map]:
+    def pattern(self, template: Array, detail_px: float, image: Map) -> tuple[Map, Map]:
         """What a flattened picture is correlated with, of mean 0, and how much each of its pixels counts: one that is
         nan in the template does not."""
         about = self._about(template, detail_px)
         template = np.nan_to_num(template)
         chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), self.coarse * detail_px), np.float32)
+        if self.whitened:
+            chip = np.asarray(cv2.filter2D(chip, -1, _inverse_covariance(image)), np.float32)
         return about * (chip - np.average(chip, weights=about)), about
 
     def _about(self, template: Array, detail_px: float) -> Map:
@@ -93,8 +100,25 @@ def correlation(image: Map, chip: Map, about: Map, varied: Map) -> Map:
     return np.asarray(products, np.float32)
 
 
-WIDE = Surroundings(coarse=4.0, beside=2.0, robust=False)
-CLOSE = Surroundings(coarse=2.0, beside=1.0, robust=True)  # for faint marks beside the frame's edge
+WIDE = Surroundings(coarse=4.0, beside=2.0, robust=False, whitened=False)
+CLOSE = Surroundings(coarse=2.0, beside=1.0, robust=True, whitened=False)  # for faint marks beside the frame's edge
+GRAINY = replace(CLOSE, whitened=True)  # for such marks in grain as wide as their lines
+
+
+def _inverse_covariance(image: Map) -> Map:
+    """(3, 3) a row of the inverse covariance of a picture's pixels, but for a factor: each less what its neighbours say
+    of it, by least squares (a conditional autoregression: Besag, 1974)."""
+    rows, cols = (np.arange(1, side - 1) for side in image.shape)
+    rows = rows[:: max(1, image.size // _TOLD_PX)]
+    pairs = np.stack(
+        [(image[np.ix_(rows + r, cols + c)] + image[np.ix_(rows - r, cols - c)]).ravel() for r, c in _NEIGHBOURS]
+    )
+    shares = np.linalg.lstsq(pairs @ pairs.T, pairs @ image[np.ix_(rows, cols)].ravel(), rcond=None)[0]
+    row = np.zeros((3, 3), np.float32)
+    row[1, 1] = 1.0
+    for (r, c), share in zip(_NEIGHBOURS, shares.tolist(), strict=True):
+        row[1 + r, 1 + c] = row[1 - r, 1 - c] = -share
+    return row
 
 
 def _median(image: Map, coarse_px: float) -> Map:

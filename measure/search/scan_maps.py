@@ -69,9 +69,9 @@ class Sought:
         the picture's variation is the same."""
         kinds, maps = list(kinds), dict[Key, Map]()
         detail_px = self.details_px[kinds[0]]
-        patterns = {kind: self.surroundings.pattern(self.templates[kind], detail_px) for kind in kinds}
         for picture in pictures:
             image = self.surroundings.flattened(picture, detail_px, self.faint_dn)
+            patterns = {kind: self.surroundings.pattern(self.templates[kind], detail_px, image) for kind in kinds}
             inner = tuple(side - 2 * self.half_px for side in image.shape)
             for own in _grouped(kinds, {kind: patterns[kind][1].tobytes() for kind in kinds}):
                 varied = variation(image, patterns[own[0]][1])

@@ -13,7 +13,7 @@ from measure.attempts import Attempt, Found, find_frame
 from measure.fiducial_options import FiducialOptions
 from measure.frames.frame import Frame
 from measure.probabilities import FRAMES_BY_CHANCE
-from measure.search.correlation import CLOSE
+from measure.search.correlation import CLOSE, GRAINY
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 
@@ -73,6 +73,10 @@ def test_attempts_under_the_given_pitch_are_judged_by_themselves(monkeypatch: py
     assert name(found) == "2"
     found, _ = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 3, at_given=2)
     assert (name(found), found.unsure) == ("", ())
+    assert "3 marks that are hardly there lie as they should, where chance makes 0.01 such frames" in found.misfit
+    assert "no other pitch tells them from it, click those that you see in reseau review" in found.misfit
+    found, _ = found_by(monkeypatch, np.inf, 1.0, 0.3, at_given=2)
+    assert found.misfit == "not 0"  # chance makes more than one
 
 
 def test_what_is_settled_is_not_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,10 +91,10 @@ def test_where_nothing_was_seen_the_reason_says_so(monkeypatch: pytest.MonkeyPat
     assert found.misfit == "nothing in the scan looks like two or more of the camera's marks"
 
 
-@pytest.mark.parametrize(("times", "looks"), [(1.0, 5), (2.0, 6), (0.5, 6), (None, 3)])
+@pytest.mark.parametrize(("times", "looks"), [(1.0, 7), (2.0, 8), (0.5, 8), (None, 4)])
 def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
-    """As given, longer one way and filling the scan, at a closer look as given and slightly longer; a small scan is
-    searched as a whole at once.
+    """As given, longer one way and filling the scan, at a closer look as given and slightly longer, with what grain
+    hides and without it; a small scan is searched as a whole at once.
     Where no pitch is given, or one at which the frame is far from filling the scan, pixels of any size may be longer
     one way, too."""
     filling_um = 1000 * max(ALIKE.frame_mm) / SCAN.width_px
@@ -100,6 +104,7 @@ def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
     assert len(listed) == looks
     assert [each.is_given for each in listed] == [True, *[False] * (looks - 1)]
     assert [each.hypotheses for each in listed[: len(hypotheses)]] == hypotheses
-    close = [each for each in listed if each.search.surroundings == CLOSE]
-    assert close == listed[len(hypotheses) :]
-    assert [each.at_given for each in close] == ([True, False] if is_given else [False])
+    close = listed[len(hypotheses) :]
+    looks_each = [True, False] if is_given else [False]
+    assert [each.search.surroundings for each in close] == [CLOSE for _ in looks_each] + [GRAINY for _ in looks_each]
+    assert [each.at_given for each in close] == 2 * looks_each
