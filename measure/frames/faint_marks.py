@@ -8,6 +8,7 @@ known, the mark is sought by two curves, and how far apart it is seen is in its 
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -32,11 +33,13 @@ _RING = 30.0  # times the background's: how far about the mark the texture is as
 _SELF = 0.1  # of the mark's own response: what is below it tells of the texture alone
 _SHOWN = 0.2  # of the mark's own weight: elsewhere the ground is too dark to tell
 _LINE = 0.25  # of the strongest: what counts as the mark's lines
-_ROUNDS = 8  # of rendering the mark anew where it was found
+_ROUNDS = 8  # of rendering the mark anew where it was found, at most
+_SETTLED_PX = 1e-3  # a move that needs no further one: a fiftieth of what a faint mark is known to
 _STEP_PX = 0.5  # between the places by which a response's top is told
 _OWN_LINEAR = 0.01  # by so much marks are turned (rad) and larger than the frame says: a real register glass's by 0.012
 _LEAST_DISTANCE_PX = 1.0  # predictions are no better
 _LEAST_PLACES = 200  # of the texture that a covariance can be taken from
+_LEAST_NORM = 1e-6  # squared: where nothing shows of the mark nothing is divided by nothing
 _FINEST_PX = 16.0  # of a mark's lines: what is wider is sought in a picture that is reduced so far
 
 
@@ -87,26 +90,44 @@ def _found(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: flo
     if center is None:
         return None
     for _ in range(_ROUNDS):
-        center = field.response(center).top(center)
+        response = field.response(center)
+        top = response.top(center)
+        if np.hypot(*(top - center)) < _SETTLED_PX:
+            return field.seen(response, center)
+        center = top
     return field.seen(field.response(center), center)
 
 
 @dataclass(frozen=True, eq=False)
 class _Response:
-    """value: the weighted correlation at every pixel, for a mark whose centre is off the pixel's by fraction.
-    norm: of the weighted template there. weighted: what is correlated. templates (3, 3): of the mark as it looks with
-    its centre _STEP_PX less, not, and as much more off in row and column: a line may be finer than the pixels are far
-    apart, and how its picture changes between them no picture of whole pixels tells."""
+    """What a field answers to a mark whose centre is off the pixel's by fraction."""
 
-    weighted: Array
-    value: Array
-    norm: Array
-    templates: Array
+    field: "_Field"
     fraction: Array
 
-    @property
+    @cached_property
     def template(self) -> Array:
-        return np.asarray(self.templates[1, 1])
+        """The mark as it looks so."""
+        return self.field.template(self.fraction)
+
+    @cached_property
+    def templates(self) -> Array:
+        """(3, 3, rows, columns): the same with its centre _STEP_PX less, not, and as much more off in row and column: a
+        line may be finer than the pixels are far apart, and how its picture changes between them no picture of whole
+        pixels tells."""
+        off = (-_STEP_PX, 0.0, _STEP_PX)
+        moved = [[self.field.template(self.fraction + np.array([col, row])) for col in off] for row in off]
+        return np.array(moved)
+
+    @cached_property
+    def norm(self) -> Array:
+        """Of the weighted template at every pixel."""
+        return np.sqrt(np.maximum(_correlated(self.field.room**2, self.template**2), 0.0) + _LEAST_NORM)
+
+    @cached_property
+    def value(self) -> Array:
+        """The weighted correlation at every pixel."""
+        return _correlated(self.field.weighted, self.template) / self.norm
 
     def pixel(self, center: Array) -> tuple[int, int]:
         """Row and column of the value for a mark at a centre."""
@@ -126,21 +147,23 @@ class _Response:
 
     def top(self, center: Array) -> Array:
         """Of the paraboloid through the responses about a centre, as near as it tells."""
-        gradient, hessian = self.bend(self.weighted, center)
+        gradient, hessian = self.bend(self.field.weighted, center)
         if not np.all(np.linalg.eigvalsh(hessian) < 0):
             return center
         return np.asarray(center + np.clip(-np.linalg.solve(hessian, gradient), -_STEP_PX, _STEP_PX))
 
     def bend(self, weighted: Array, center: Array) -> tuple[Array, Array]:
         """Gradient and Hessian of what a weighted picture answers to a mark at a centre that moves."""
-        answers = np.einsum("rcij,ij->rc", self.templates, weighted[self.patch(center)])
-        gradient, hessian = _paraboloid(answers / self.norm[self.pixel(center)])
+        patch = self.patch(center)
+        answers = np.einsum("rcij,ij->rc", self.templates, weighted[patch])
+        norm = np.sqrt(((self.field.room[patch] * self.template) ** 2).sum() + _LEAST_NORM)
+        gradient, hessian = _paraboloid(answers / norm)
         return gradient / _STEP_PX, hessian / _STEP_PX**2
 
     def slopes(self) -> Array:
         """(2, rows, cols) by column and row, of the values."""
         by_col, by_row = (self.templates[1, 2] - self.templates[1, 0], self.templates[2, 1] - self.templates[0, 1])
-        return np.stack([_correlated(self.weighted, by) / (2 * _STEP_PX) / self.norm for by in (by_col, by_row)])
+        return np.stack([_correlated(self.field.weighted, by) / (2 * _STEP_PX) / self.norm for by in (by_col, by_row)])
 
 
 class _Field:
@@ -175,17 +198,13 @@ class _Field:
         self.room_dn = np.where(inside, room_dn, 0.0).astype(np.float32)
         self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
         self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
+        self.weighted = self.detail * self.room
 
     def response(self, center: Array) -> _Response:
         """The response to the mark as it looks with its centre where given between the pixels."""
-        fraction = center - np.rint(center)
-        steps = (-_STEP_PX, 0.0, _STEP_PX)
-        templates = np.array([[self._template(fraction + np.array([col, row])) for col in steps] for row in steps])
-        weighted, squared = self.detail * self.room, templates[1, 1] ** 2
-        norm = np.sqrt(np.maximum(_correlated(self.room**2, squared), 0.0) + 1e-6)
-        return _Response(weighted, _correlated(weighted, templates[1, 1]) / norm, norm, templates, fraction)
+        return _Response(self, center - np.rint(center))
 
-    def _template(self, off: Array) -> Array:
+    def template(self, off: Array) -> Array:
         """The mark with its centre off the middle pixel's, freed of what is coarse."""
         size = 2 * self.half + 1
         pixel_from_mark = np.column_stack([self.linear, off + self.half])

@@ -5,6 +5,7 @@ Places are complex numbers here, x + iy in mm of the scan's own axes (right, up)
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +127,18 @@ class PlacementSearch:
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
         self.layers = layers
 
+    @cached_property
+    def steps_mm(self) -> Array:
+        """(n, 2) the steps from the middle mark to the nearest ones that take most marks to others."""
+        places = np.array([mark.xy_mm for mark in self.marks])
+        tree = cKDTree(places)
+        order = np.argsort(np.hypot(*(places - places.mean(axis=0)).T), kind="stable")
+        middle = places[order[0]]
+        _, near = tree.query(middle, k=min(len(places), _NEIGHBOURS + 1))
+        steps = places[np.ravel(near)[1:]] - middle
+        onto = [np.mean(tree.query(places + step)[0] < self.bounds.misfit_mm) for step in steps]
+        return np.asarray(steps[np.array(onto) > _ALIKE])
+
     def of_pose(self, pose: str, look_of_mark: Sequence[int]) -> list[Placement]:
         """The best placements of a pose that differ from one another, best first; none where no two marks respond.
 
@@ -179,7 +192,8 @@ class _Constellation:
     def _slid(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
         """Of a lattice too large for all its marks to be candidates the best hypothesis may be many steps off: these,
         moved step by step as long as more marks answer. None where the marks are no lattice."""
-        steps = np.concatenate([[0.0], self._steps()])
+        turned = self.search.steps_mm @ up_from_camera(self.pose).T
+        steps = np.concatenate([[0.0], turned @ [1.0, 1.0j]])
         moving = len(steps) > 1
         while moving:
             tried = offset[:, None] + scale[:, None] * steps
@@ -189,17 +203,6 @@ class _Constellation:
             moving = bool(best.any())
             offset = tried[np.arange(len(best)), best]
         return (scale, offset) if len(steps) > 1 else (scale[:0], offset[:0])
-
-    def _steps(self) -> Complex:
-        """The steps (mm) from the middle mark to the nearest ones that take most marks to others."""
-        places = np.stack([self.camera.real, self.camera.imag], axis=1)
-        tree = cKDTree(places)
-        order = np.argsort(np.hypot(*(places - places.mean(axis=0)).T), kind="stable")
-        middle = places[order[0]]
-        _, near = tree.query(middle, k=min(len(places), _NEIGHBOURS + 1))
-        steps = places[np.ravel(near)[1:]] - middle
-        onto = [np.mean(tree.query(places + step)[0] < self.bounds.misfit_mm) for step in steps]
-        return np.asarray((steps @ [1.0, 1.0j])[np.array(onto) > _ALIKE])
 
     def _complex(self, scan_px: Array) -> Complex:
         scaled = scan_px * self.pitch
@@ -221,9 +224,8 @@ class _Constellation:
             scale = (of_second[None, :] - of_first[:, None]) / base
             size = np.abs(scale)
             allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (scale.real > upright * size)
-            offset = of_first[:, None] - scale * self.camera[first]
             scales.append(scale[allowed])
-            offsets.append(offset[allowed])
+            offsets.append(of_first[np.nonzero(allowed)[0]] - scales[-1] * self.camera[first])
         return np.concatenate(scales), np.concatenate(offsets)
 
     def _pairs(self) -> list[tuple[int, int]]:
