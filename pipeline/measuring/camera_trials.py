@@ -93,14 +93,24 @@ def _plate(picture: Scan) -> dict[str, str]:
 def _first_that_stand_out(
     search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float] | None, count: Count
 ) -> list[Trial]:
-    """The trials at the given pitch; where none stands out, with pixels that are longer one way; where still none does,
-    at any pitch."""
+    """The trials at the given pitch, where marks answer there that chance does not put so; where none of them stands
+    out, with pixels that may be longer one way; where still none does, at any pitch."""
     if pitch_um is not None:
-        for at_pitch in (search.at_pitch, search.longer_one_way):
-            trials = _trials(search, _each(layouts, partial(at_pitch, pitch_um=pitch_um), count), count)
+        given = _each(layouts, partial(search.at_pitch, pitch_um=pitch_um), count)
+        if any(each.answer.expected <= CAMERA_BY_CHANCE for each in given.values()):
+            trials = _trials(search, given, count)
             if any(trial.stands_out for trial in trials):
                 return trials
+        longer = _each(layouts, partial(search.longer_one_way, pitch_um=pitch_um), count)
+        likelier = {names: min(each, longer[names], key=_expected) for names, each in given.items()}
+        trials = _trials(search, likelier, count)
+        if any(trial.stands_out for trial in trials):
+            return trials
     return _at_any_pitch(search, layouts, count)
+
+
+def _expected(each: Tried) -> float:
+    return each.answer.expected
 
 
 def _each(

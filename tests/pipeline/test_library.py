@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import resources
 from itertools import combinations
@@ -25,7 +26,7 @@ from pipeline.measuring import camera_trials
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.measuring.camera_trials import _alike, identify
 from pipeline.measuring.drawn_alike import drawn_alike
-from pipeline.measuring.layout_search import LayoutSearch
+from pipeline.measuring.layout_search import LayoutSearch, Tried
 from pipeline.progress import Reporter
 from pipeline.rendered.against_truth import compare_with_truth
 from pipeline.rendered.scene_file import render_project
@@ -230,6 +231,35 @@ def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras
 def test_a_folder_without_scans_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["cameras", "--scan", str(tmp_path)]) == 2
     assert "the folder holds no scan" in capsys.readouterr().err
+
+
+@one_frame
+@pytest.mark.parametrize(
+    ("at_pitch", "looked_at"), [((1e-3, 5.0), [0]), ((0.5, 5.0), [1]), ((5.0, 0.5), [1, 0])], ids=str
+)
+def test_marks_are_looked_at_once_a_search_answers_that_chance_does_not_make(
+    frame: Path, monkeypatch: pytest.MonkeyPatch, at_pitch: tuple[float, float], looked_at: list[int]
+) -> None:
+    """The first search, with pixels alike, or else after the second, with pixels longer one way: then each camera's
+    where it answers best."""
+    (scan,) = (frame.parent / "scans").glob("*.tif")
+    two = {name: LIBRARY[name] for name in (RENDERED, "fairchild-t5-153")}
+
+    def answers(before: int, *expected: float) -> Callable[..., Tried]:
+        left = iter(expected)
+        return lambda search, layout, pitch_um: Tried(layout, layout, search._fine, [], before, Answer(next(left), ()))
+
+    seen = list[int]()
+
+    def looked(_: LayoutSearch, names: tuple[str, ...], each: Tried, __: float) -> Trial:
+        seen.append(each.before)
+        return replace(trial(names, 0.5, None), expected=each.answer.expected)
+
+    monkeypatch.setattr(LayoutSearch, "at_pitch", answers(0, *at_pitch))
+    monkeypatch.setattr(LayoutSearch, "longer_one_way", answers(1, 0.02 if at_pitch[0] > 1 else 1e-3, 7.0))
+    monkeypatch.setattr(camera_trials, "_trial", looked)
+    identify(scan, two, 100.0, Reporter())
+    assert seen == looked_at
 
 
 @one_frame
