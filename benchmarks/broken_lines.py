@@ -47,7 +47,7 @@ LINES = (
         "measure/fitting/linear_fit.py",
         " * (2 * np.pi * _ALIKE_PX**2)",
         "",
-        "measure/test_misfit.py",
+        "measure/test_unlike_drawing.py",
     ),
     Broken("measure/noise/noise.py", " - unknowns, 1)", ", 1)", "measure/test_noise.py"),
     Broken(

@@ -257,10 +257,10 @@ def borders(kinds: Sequence[Kind], count: int) -> None:
         ROWS.print(f"borders {count} {kind.name}", partial(row, kind))
 
 
-def misfit(kinds: Sequence[Kind], count: int) -> None:
-    """By how much the cause `misfit` makes claims larger under noise alone, where there is none."""
+def unlike_drawing(kinds: Sequence[Kind], count: int) -> None:
+    """By how much the cause `unlike drawing` makes claims larger under noise alone, where there is none."""
     print(
-        f"\nclaims with `misfit` over those without, mean; error over claim without it, and with it; SNR {GRAIN_SNR:g}"
+        f"\nclaims with `unlike drawing` over those without; error over claim without, and with it; SNR {GRAIN_SNR:g}"
     )
     ways = ("white", *(f"grain {grain_px:g} px" for grain_px in GRAINS_PX), f"JPEG {QUALITIES[1]}")
     print(f"{'':14}" + "".join(f"{way:>20}" for way in ways))
@@ -283,13 +283,13 @@ def misfit(kinds: Sequence[Kind], count: int) -> None:
                 if found is not None and not found.flagged:
                     errors.append(found.center_px - mark.place[:, 2])
                     with_it.append(found.covariance_px2)
-                    known.append(found.covariance_px2 - found.misfit_px2)
+                    known.append(found.covariance_px2 - found.unlike_drawing_px2)
                     larger.append(np.sqrt(np.trace(with_it[-1]) / np.trace(known[-1])))
             words.append(f"{np.mean(larger):.3f} {whitened_rms(errors, known):.2f} {whitened_rms(errors, with_it):.2f}")
         return f"{kind.name:14}" + "".join(f"{each:>20}" for each in words)
 
     for kind in kinds:
-        ROWS.print(f"misfit {count} {kind.name}", partial(row, kind))
+        ROWS.print(f"unlike {count} {kind.name}", partial(row, kind))
 
 
 STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
@@ -300,7 +300,7 @@ STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
     "clipping": clipping,
     "jpeg": jpeg,
     "borders": borders,
-    "misfit": misfit,
+    "unlike": unlike_drawing,
 }
 
 

@@ -22,12 +22,12 @@ SHIFT_PX, SEARCH_PX = 1.5, 3.0  # of the start, and the radius of the search
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A place with its covariance; flagged: `weak`, or not measured at all; misfit_px2: a part of the covariance."""
+    """A place with its covariance; flagged: `weak`, or not measured at all; unlike_drawing_px2: of that cause."""
 
     center_px: Array
     covariance_px2: Array
     flagged: str = ""
-    misfit_px2: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    unlike_drawing_px2: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 @dataclass
@@ -122,9 +122,9 @@ def measured(
     fit = sight(scan, MarkPrediction(mark.kind.shape, start, SEARCH_PX, polarity), options, frame_sigma).fit
     if fit is None:
         return None
-    misfit_px2 = fit.place_covariance.parts.get(Cause.MISFIT, np.zeros((2, 2)))
+    unlike_drawing_px2 = fit.place_covariance.parts.get(Cause.UNLIKE_DRAWING, np.zeros((2, 2)))
     flagged = "damaged" if fit.damaged_fraction > CLEAR_DAMAGE else ""
-    return Found(fit.center_px, fit.covariance_px2, flagged, misfit_px2)
+    return Found(fit.center_px, fit.covariance_px2, flagged, unlike_drawing_px2)
 
 
 def grey_is_light(mark: TrueMark, grey: Array) -> bool:

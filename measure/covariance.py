@@ -17,7 +17,7 @@ class Cause(StrEnum):
     NOISE = "noise"
     ROUNDING = "rounding"
     SECOND_ORDER = "second order"
-    MISFIT = "misfit"
+    UNLIKE_DRAWING = "unlike drawing"
     TONE = "tone"
     CHANGED_TONES = "changed tones"
     LANDSCAPE = "landscape"
@@ -36,7 +36,7 @@ MEANING = {
     Cause.NOISE: "Grain of the film and noise of the scanner, as the picture shows them.",
     Cause.ROUNDING: "The grey values are whole numbers.",
     Cause.SECOND_ORDER: "A soft and faint mark's picture bends within the errors of its place, blur and contrast.",
-    Cause.MISFIT: "At its edges the picture differs from the drawing by more than noise: it is not quite as drawn.",
+    Cause.UNLIKE_DRAWING: "At its edges the picture differs by more than noise: it is not quite as drawn.",
     Cause.TONE: "The curve through which light was stored as grey values is not known well enough.",
     Cause.CHANGED_TONES: "A learned mark's half tones may be others than where it was learned.",
     Cause.LANDSCAPE: "The ground that shows within a notch is not even.",

@@ -56,7 +56,7 @@ class LinearFit:
         covariance = products(by_grey, white if self.noise.is_white else correlated(by_grey, self.noise))
         return np.asarray((covariance + covariance.T) / 2)
 
-    def misfit_px2(self, by_noise: Array) -> Array:
+    def unlike_drawing_px2(self, by_noise: Array) -> Array:
         """(2, 2) by which the place is known less well than by_noise, (2, 2) px2, says: by what is left at the mark's
         edges, and alike in neighbours, beyond the noise."""
         place, left = self.by_grey[:2], np.where(self.used, self.residuals, 0.0)[None]

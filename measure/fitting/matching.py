@@ -369,7 +369,7 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
         place = place.plus(Cause.CHANGED_TONES, covariance_of_changed_tone(model.half_tones, by_grey, change))
     place = place.plus(Cause.LANDSCAPE, _landscape(model, about).covariance(by_grey[:2]))
     linear = LinearFit(model.residuals, used, model.design, by_grey, noise, model.steadiness)
-    place = place.plus(Cause.MISFIT, linear.misfit_px2(by_noise))
+    place = place.plus(Cause.UNLIKE_DRAWING, linear.unlike_drawing_px2(by_noise))
     freedom = model.options.freedom
     tells_shape = freedom in ("similarity", "affine") and not is_round(model.mark)
     shape, strain = slice(2, 4), slice(4, model.linear.stop)

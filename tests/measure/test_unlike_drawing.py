@@ -27,7 +27,7 @@ def coarse(fine: NDArray[np.float64], col: int, row: int) -> NDArray[np.float64]
 
 
 @pytest.mark.parametrize("is_grain", [False, True])
-def test_noise_alone_hardly_makes_any_misfit(is_grain: bool) -> None:
+def test_noise_alone_hardly_is_hardly_taken_for_it(is_grain: bool) -> None:
     """Of a line's place under noise that is alike everywhere, white or grain of 1.5 px."""
     rng, shares = np.random.default_rng(2), []
     cols = np.mgrid[0:40, 0:40][1] - 19.5
@@ -43,7 +43,7 @@ def test_noise_alone_hardly_makes_any_misfit(is_grain: bool) -> None:
         left = coloured(white[None], noise, 0.5)[0] if is_grain else white
         fit = LinearFit(left, used, design, by_grey, noise, np.ones_like(line))
         by_noise = fit.covariance(by_grey[:2])
-        shares.append(np.trace(fit.misfit_px2(by_noise)) / np.trace(by_noise))
+        shares.append(np.trace(fit.unlike_drawing_px2(by_noise)) / np.trace(by_noise))
     assert np.mean(shares) < 0.1
 
 
