@@ -120,8 +120,12 @@ class Table:
 
     def number_or_text(self, key: str, default: float | str, choices: Sequence[str], *, above: float) -> float | str:
         """A number above a limit, or one of some words."""
-        if isinstance(self._get(key, default), str):
-            return self.text(key, default if isinstance(default, str) else None, choices)
+        value = self._get(key, default)
+        if isinstance(value, str) and value not in choices:
+            also = f"{did_you_mean(value, choices)} A number above {above:g}, without quotes, is possible, too."
+            raise self.error(key, f"is {shown(value)}; possible are {_listed(choices)}.{also}")
+        if isinstance(value, str):
+            return value
         return self.number(key, default if isinstance(default, float) else None, above=above)
 
     def whole(self, key: str, default: int | None = None, *, least: int = 0, most: int = 10**9) -> int:

@@ -431,7 +431,10 @@ def test_the_tone_curve_of_a_project(tmp_path: Path, said: str, tone: float | st
     assert read_project(written(tmp_path, "project.toml", f'camera = "camera.toml"\n[measure]\n{said}\n')).tone == tone
 
 
-@pytest.mark.parametrize(("said", "words"), [('"gamma"', ["tone", "linear"]), ("-1.0", ["tone", "greater than 0"])])
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [('"2.2"', ["tone", "linear", "A number above 0, without quotes"]), ("-1.0", ["tone", "greater than 0"])],
+)
 def test_a_tone_curve_that_is_none(tmp_path: Path, said: str, words: list[str]) -> None:
     path = written(tmp_path, "project.toml", f'camera = "camera.toml"\n[measure]\ntone = {said}\n')
     message = refused(read_project, path)
