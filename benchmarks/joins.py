@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust import Adjustment, adjust
-from measure.natural_points.joins import measure_joins
-from measure.natural_points.tie_frame import TieFrame
+from measure.tie_points.features import TieFrame
+from measure.tie_points.joins import measure_joins
 from pipeline.cli import run
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.natural_points.tie_frame import TieFrame
-from measure.natural_points.ties import TieOptions, Ties, measure_ties
 from measure.results import MarkMeasurement
 from measure.status import Status
+from measure.tie_points.features import TieFrame
+from measure.tie_points.find_points import TieOptions, Ties, measure_ties
 from synthetic_images.film import FrameGeometry
 from synthetic_images.render import render_scene
 from synthetic_images.scene import DiskField, Distortion, Film, Scanner, Scene, SceneCamera, SceneImage

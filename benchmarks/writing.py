@@ -22,6 +22,8 @@ from lone_frames import fiducials_of, image_of, lone_frame, painted
 from search_frames import SIDES
 from writing_lines import ALIKE, line_text
 
+from measure.annotations.fields import is_plate
+from measure.annotations.line import Line, Reading
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.marks.poses import POSES
@@ -29,8 +31,6 @@ from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Side, Wr
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from measure.writing.fields import is_plate
-from measure.writing.line import Line, Reading
 from synthetic_images.scene import (
     Background,
     Film,

@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.annotations.detect_text import MISSING, networks
+from measure.annotations.read import read_writing
 from measure.marks.poses import POSES, pose_in_camera
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from measure.writing.networks import MISSING, networks
-from measure.writing.reading import read_writing
 from synthetic_images.areas import coverage
 from synthetic_images.writing import FONTS, written_area
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.annotations.line import Line
 from measure.fiducial_options import FiducialOptions
 from measure.film import AFFINITY_SIGMA
 from measure.frames.chance import doubt, expected_as_good, expected_where_seen
@@ -28,7 +29,6 @@ from measure.search.constellation import Placement
 from measure.search.correlation import CLOSE, GRAINY
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import Hypotheses, slightly_longer
-from measure.writing.line import Line
 
 Array = NDArray[np.float64]
 

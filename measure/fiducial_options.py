@@ -5,11 +5,11 @@ from typing import Literal
 
 import numpy as np
 
+from measure.annotations.line import KnownLine
 from measure.film import SCATTER_MM
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.match_options import MatchOptions
-from measure.writing.line import KnownLine
 
 Reads = Literal["none", "pose", "all"]
 

@@ -6,6 +6,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.annotations.detect_text import networks
+from measure.annotations.line import KnownLine, Line
+from measure.annotations.read import read_writing
 from measure.attempts import best_of, find_frame, named, posed
 from measure.fiducial_options import FiducialOptions
 from measure.frames.chance import doubt
@@ -24,9 +27,6 @@ from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
-from measure.writing.line import KnownLine, Line
-from measure.writing.networks import networks
-from measure.writing.reading import read_writing
 
 Array = NDArray[np.float64]
 

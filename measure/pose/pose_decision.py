@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.annotations.line import Line
 from measure.fiducial_options import FiducialOptions
 from measure.film import SCATTER_DEGREES
 from measure.fitting.matching import Match
@@ -26,7 +27,6 @@ from measure.results import Pose
 from measure.scans.parallel import side_by_side
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
-from measure.writing.line import Line
 
 Array = NDArray[np.float64]
 

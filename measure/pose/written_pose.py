@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.annotations.fields import is_of_film, is_plate, signs
+from measure.annotations.line import Line
 from measure.marks.poses import pose_in_camera, up_from_camera
 from measure.marks.shapes import Side, WrittenPlace
-from measure.writing.fields import is_of_film, is_plate, signs
-from measure.writing.line import Line
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from adjust.problem.network import ObjectPoint
 from pipeline.text.tables import Table
 
 if TYPE_CHECKING:
-    from measure.natural_points.ties import TieOptions
+    from measure.tie_points.find_points import TieOptions
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class TieSettings:
 
 def read_ties(table: Table) -> TieSettings:
     """Read the table. Raises InputError naming the key that is wrong."""
-    from measure.natural_points.ties import TieOptions
+    from measure.tie_points.find_points import TieOptions
 
     usual = TieOptions()
     wanted, images = table.whole("wanted", usual.wanted), table.whole("images", usual.images)

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from measure.annotations.fields import CAMERA, fields_of
+from measure.annotations.line import Line
 from measure.reason import Code, Reason
-from measure.writing.fields import CAMERA, fields_of
-from measure.writing.line import Line
 from pipeline.files.camera_file import CameraFile
 from pipeline.results.measured_scan import MeasuredScan
 

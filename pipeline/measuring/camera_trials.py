@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
+from measure.annotations.detect_text import networks
+from measure.annotations.read import read_writing
 from measure.fiducial_options import FiducialOptions
 from measure.frames.camera_recognition import likeness
 from measure.frames.frame import Frame
@@ -19,8 +21,6 @@ from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.probabilities import CAMERA_BY_CHANCE
 from measure.scans.scan import Scan, open_scan
 from measure.scans.thumbnail import thumbnail
-from measure.writing.networks import networks
-from measure.writing.reading import read_writing
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_answer import CLOSE, Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, is_whole_plate, plate_of

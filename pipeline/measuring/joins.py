@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.natural_points.joins import measure_joins
-from measure.natural_points.tie_frame import TieFrame
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.addresses import scan_path
 from measure.status import Status
+from measure.tie_points.features import TieFrame
+from measure.tie_points.joins import measure_joins
 from pipeline.files.project_file import Project
 from pipeline.progress import Count
 from pipeline.results.measured_scan import MeasuredScan

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from measure.annotations.detect_text import MISSING, networks
 from measure.checks.lost_pixels import with_damage
 from measure.checks.pitch_check import pitch_problem
 from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
@@ -19,7 +20,6 @@ from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.status import Status
-from measure.writing.networks import MISSING, networks
 from pipeline.errors import InputError, what_to_do
 from pipeline.measuring.camera_model import misplaced_principal_point
 from pipeline.measuring.handed_out import Submits, results_of

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.natural_points.tie_frame import TieFrame
-from measure.natural_points.ties import measure_ties
 from measure.reason import Code, Reason
 from measure.scans.addresses import scan_path
+from measure.tie_points.features import TieFrame
+from measure.tie_points.find_points import measure_ties
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.tie_table import TieSettings

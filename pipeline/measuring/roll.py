@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from measure.annotations.line import KnownLine, Line, without_numbers
 from measure.marks.poses import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import WrittenPlace
 from measure.pose.pose_decision import DECIDED, TOLD
 from measure.pose.written_pose import bounded, line_score
 from measure.results import FrameMeasurement, Pose
 from measure.status import Status
-from measure.writing.line import KnownLine, Line, without_numbers
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, few_of
 from pipeline.progress import Reporter
 from pipeline.results.measured_scan import MeasuredScan

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 from adjust.problem.camera import Distortion, Prior
 from adjust.problem.network import Exterior
+from measure.annotations.line import KnownLine
 from measure.errors import MissingError
 from measure.fiducial_options import FiducialOptions
 from measure.results import Pose
 from measure.scans.addresses import scan_path
 from measure.scans.tone import SaidOfTone
-from measure.writing.line import KnownLine
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.results.fingerprints import canonical_json

@@ -2,8 +2,8 @@
 
 from markupsafe import Markup
 
+from measure.annotations.line import Line
 from measure.marks.poses import up_from_camera
-from measure.writing.line import Line
 from pipeline.drawing import svg
 from pipeline.results.measured_scan import MeasuredScan
 

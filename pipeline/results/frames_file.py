@@ -4,9 +4,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+from measure.annotations.fields import Field, fields_of
+from measure.annotations.line import Line
 from measure.results import FrameMeasurement
-from measure.writing.fields import Field, fields_of
-from measure.writing.line import Line
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line

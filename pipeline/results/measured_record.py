@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.annotations.line import Line, Reading
 from measure.covariance import Cause, Covariance
 from measure.reason import Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.told_tone import FrameTone
 from measure.scans.tone import SaidOfTone, Tone, power, srgb
 from measure.status import Status
-from measure.writing.line import Line, Reading
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
 Json = dict[str, Any]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.natural_points.bending import Bending, bending_variance
+from measure.tie_points.multi_image import Bending, bending_variance
 
 Array = NDArray[np.float64]
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from measure.writing.fields import fields_of, is_of_film, is_plate, signs
-from measure.writing.line import Line, Reading
+from measure.annotations.fields import fields_of, is_of_film, is_plate, signs
+from measure.annotations.line import Line, Reading
 
 
 def line(text: str) -> Line:

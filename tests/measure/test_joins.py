@@ -8,9 +8,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from measure.covariance import Cause
-from measure.natural_points.joins import Joins, measure_joins
-from measure.natural_points.tie_frame import TieFrame
 from measure.status import Status
+from measure.tie_points.features import TieFrame
+from measure.tie_points.joins import Joins, measure_joins
 
 Array = NDArray[np.float64]
 

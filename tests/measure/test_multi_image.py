@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Piece, match_pieces
+from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Piece, match_pieces
 
 Array = NDArray[np.float64]
 

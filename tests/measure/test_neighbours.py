@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.natural_points.local_maps import outliers
+from measure.tie_points.verification import neighbour_outliers
 
 Array = NDArray[np.float64]
 
@@ -27,13 +27,13 @@ def test_a_tree_of_the_next_row_is_an_outlier() -> None:
     for _ in range(20):
         first, second = seen_twice(rng, relief=1.0)
         second[7] += [TREES_PX, 0.0]
-        assert np.flatnonzero(outliers(first, second)).tolist() == [7]
+        assert np.flatnonzero(neighbour_outliers(first, second)).tolist() == [7]
 
 
 def test_in_which_frame_a_point_is_wrong_does_not_matter() -> None:
     first, second = seen_twice(np.random.default_rng(2), relief=2.0)
     first[7] += [0.0, 400.0]
-    assert np.flatnonzero(outliers(first, second)).tolist() == [7]
+    assert np.flatnonzero(neighbour_outliers(first, second)).tolist() == [7]
 
 
 def test_a_false_point_takes_none_of_its_neighbours_with_it() -> None:
@@ -42,16 +42,18 @@ def test_a_false_point_takes_none_of_its_neighbours_with_it() -> None:
         first, second = seen_twice(rng, relief=1.0)
         false = np.sort(rng.choice(len(first), 8, replace=False))
         second[false] += rng.choice([-60.0, 60.0, 400.0], (8, 1)) * [1.0, 0.0]
-        assert np.flatnonzero(outliers(first, second)).tolist() == false.tolist()
+        assert np.flatnonzero(neighbour_outliers(first, second)).tolist() == false.tolist()
 
 
 def test_hills_are_no_outliers() -> None:
     rng = np.random.default_rng(3)
-    alarms = sum(int(outliers(*seen_twice(rng, relief)).sum()) for relief in (0.0, 2.0, 20.0) for _ in range(20))
+    alarms = sum(
+        int(neighbour_outliers(*seen_twice(rng, relief)).sum()) for relief in (0.0, 2.0, 20.0) for _ in range(20)
+    )
     assert alarms <= 4, "of 12,000 points 1.2 may be"
 
 
 def test_too_few_points_tell_nothing() -> None:
     first, second = seen_twice(np.random.default_rng(4), relief=0.0, count=20)
     second[7] += [0.0, 400.0]
-    assert not outliers(first, second).any()
+    assert not neighbour_outliers(first, second).any()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from brute_marks import Array, written_scan
 
-from measure.writing import networks as networks_module
-from measure.writing.line import Line
-from measure.writing.networks import Networks, networks
-from measure.writing.reading import read_writing
+from measure.annotations import detect_text as networks_module
+from measure.annotations.detect_text import Networks, networks
+from measure.annotations.line import Line
+from measure.annotations.read import read_writing
 
 SIZE_PX = 640
 TITLE, PLATE = "RUN 20 CST 7300", "Nr 13043"

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from measure.natural_points.features import Features
-from measure.natural_points.tie_candidates import candidates, join_tracks, verified
-from measure.natural_points.tie_frame import TieFrame
+from measure.tie_points.features import Features, TieFrame
+from measure.tie_points.tracks import find_candidates, tracks_of_pairs, verify_pairs
 
 
 def pairs(*rows: tuple[int, int]) -> np.ndarray:
@@ -15,23 +14,23 @@ def pairs(*rows: tuple[int, int]) -> np.ndarray:
 
 def test_a_point_that_all_pairs_share_is_a_track() -> None:
     shared = {(0, 1): pairs((4, 5)), (0, 2): pairs((4, 6)), (1, 2): pairs((5, 6))}
-    assert join_tracks(shared) == [{0: 4, 1: 5, 2: 6}]
+    assert tracks_of_pairs(shared) == [{0: 4, 1: 5, 2: 6}]
 
 
 def test_a_frame_that_one_pair_alone_shows_is_left_out() -> None:
     shared = {(0, 1): pairs((4, 5)), (0, 2): pairs((4, 6)), (1, 2): pairs((5, 6)), (2, 3): pairs((6, 7))}
-    assert join_tracks(shared) == [{0: 4, 1: 5, 2: 6}]
+    assert tracks_of_pairs(shared) == [{0: 4, 1: 5, 2: 6}]
     chain = {(0, 1): pairs((4, 5)), (1, 2): pairs((5, 6))}
-    assert join_tracks(chain) == []
+    assert tracks_of_pairs(chain) == []
 
 
 def test_what_one_pair_alone_has_is_a_track_of_two() -> None:
-    assert join_tracks({(0, 1): pairs((4, 5)), (1, 2): pairs((7, 8))}) == [{0: 4, 1: 5}, {1: 7, 2: 8}]
+    assert tracks_of_pairs({(0, 1): pairs((4, 5)), (1, 2): pairs((7, 8))}) == [{0: 4, 1: 5}, {1: 7, 2: 8}]
 
 
 def test_two_features_in_one_frame_are_no_track() -> None:
     shared = {(0, 1): pairs((4, 5), (8, 9)), (0, 2): pairs((4, 6), (8, 6)), (1, 2): pairs((5, 6), (9, 6))}
-    assert join_tracks(shared) == []
+    assert tracks_of_pairs(shared) == []
 
 
 def test_scans_of_one_exposed_frame_are_one_sight_of_a_point() -> None:
@@ -56,10 +55,10 @@ def test_scans_of_one_exposed_frame_are_one_sight_of_a_point() -> None:
         features.append(Features(places, seen, np.ones(len(places)), np.ones(len(places)), (end - first, 1200)))
         none = np.zeros((0, 3))
         frames.append(TieFrame(image, Path(f"{image}.tif"), pixel_from_camera, None, none, part_of=part_of))
-    shared = verified(frames, features, None)
+    shared = verify_pairs(frames, features, None)
     assert set(shared) == {(0, 2), (0, 3), (1, 2), (1, 3), (2, 3)}
     assert min(len(pairs) for pairs in shared.values()) > 40
-    found = candidates(frames, features, shared, 3)
+    found = find_candidates(frames, features, shared, 3)
     sights = [set(candidate.maps) for candidate in found]
     assert all(sight in ({0, 2, 3}, {1, 2, 3}) for sight in sights)
     assert min(sum(k in sight for sight in sights) for k in (0, 1)) > 40

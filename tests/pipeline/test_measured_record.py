@@ -11,13 +11,13 @@ import pytest
 from drawn_project import PROJECT, write_project
 from single_scans import measure_scan
 
+from measure.annotations.line import Line, Reading
 from measure.covariance import Cause, Covariance
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.told_tone import FrameTone
 from measure.scans.tone import SaidOfTone, Tone, power, sampled, srgb
 from measure.status import Status
-from measure.writing.line import Line, Reading
 from pipeline.files.project_file import read_project
 from pipeline.results.measured_record import record_of, scan_of
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan

@@ -10,11 +10,11 @@ from in_process import Loses
 from scipy.spatial.distance import pdist
 
 from adjust.problem.camera import Prior
-from measure.natural_points.tie_candidates import TieCandidate
-from measure.natural_points.tie_frame import TieFrame
-from measure.natural_points.ties import TieOptions, measure_ties
 from measure.reason import Code
 from measure.status import Status
+from measure.tie_points.features import TieFrame
+from measure.tie_points.find_points import TieOptions, measure_ties
+from measure.tie_points.tracks import TieCandidate
 from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project

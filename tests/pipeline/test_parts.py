@@ -15,8 +15,8 @@ import pytest
 import tifffile
 from foreign_readers import asp_px, colmap_px, opencv_px
 
-from measure.natural_points.joins import measure_joins
-from measure.natural_points.tie_frame import TieFrame
+from measure.tie_points.features import TieFrame
+from measure.tie_points.joins import measure_joins
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.errors import InputError

@@ -9,6 +9,8 @@ import pytest
 from kept_scans import keep_scans
 from rich.console import Console
 
+from measure.annotations import detect_text as networks_module
+from measure.annotations.line import Line, Reading
 from measure.covariance import Cause, Covariance
 from measure.fiducial_options import FiducialOptions, Reads
 from measure.marks.poses import POSES, pose_in_camera
@@ -17,8 +19,6 @@ from measure.pose.written_pose import side_in_camera, writing_likelihoods
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
-from measure.writing import networks as networks_module
-from measure.writing.line import Line, Reading
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.errors import InputError

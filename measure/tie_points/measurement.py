@@ -16,16 +16,14 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from measure.errors import MeasurementError
-from measure.natural_points.bending import Bending, bending_variance
-from measure.natural_points.epipolar import contradicting
-from measure.natural_points.local_maps import outliers
-from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
-from measure.natural_points.tie_candidates import TieCandidate, out_of_reach, widened
-from measure.natural_points.tie_frame import TieFrame
 from measure.noise.noise import robust_scale
 from measure.probabilities import POINT_REFUSED
 from measure.reason import Code, Reason
 from measure.scans.parallel import mapped_or_lost
+from measure.tie_points.features import TieFrame
+from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Bending, Matched, Piece, bending_variance, match_pieces
+from measure.tie_points.tracks import TieCandidate, candidates_with_radius, unreachable
+from measure.tie_points.verification import epipolar_outliers, neighbour_outliers
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -80,7 +78,7 @@ class TiePoint:
         return [frame for frame in self.matched if frame not in self.refused and frame not in self.unmatched]
 
 
-def measured_points(
+def measure_points(
     frames: Sequence[TieFrame],
     sizes_px: Sequence[tuple[int, int]],
     candidates: Sequence[TieCandidate],
@@ -98,7 +96,7 @@ def measured_points(
     """
     points, matched, sharp = list[TiePoint](), list[TiePoint](), np.zeros(0, dtype=bool)
     for radius_px in _RADII_PX:
-        left = widened(candidates, radius_px, frames, sizes_px, fewest)
+        left = candidates_with_radius(candidates, radius_px, frames, sizes_px, fewest)
         if not left or sharp.sum() >= wanted:
             break
         settled = [bool(own or point.refused) and bool(point.matched) for own, point in zip(sharp, points, strict=True)]
@@ -163,19 +161,19 @@ def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate], wor
     """The windows of every candidate by frame; each scan is opened once, by one worker."""
     windows: list[Windows] = [{} for _ in candidates]
     shown = [[k for k, candidate in enumerate(candidates) if i in candidate.maps] for i in range(len(frames))]
-    sought = [
+    task = [
         (frame, [(candidates[k].maps[i], candidates[k].radius_px) for k in own])
         for i, (frame, own) in enumerate(zip(frames, shown, strict=True))
     ]
-    for i, found in enumerate(mapped_or_lost(workers, _windows_of, sought, lambda _, why: out_of_reach(why))):
+    for i, found in enumerate(mapped_or_lost(workers, _windows_of, task, lambda _, why: unreachable(why))):
         for number, k in enumerate(shown[i]):
             windows[k][i] = found if isinstance(found, Reason) else found[number]
     return windows
 
 
-def _windows_of(sought: tuple[TieFrame, Sequence[tuple[Array, int]]]) -> list[Window] | Reason:
+def _windows_of(task: tuple[TieFrame, Sequence[tuple[Array, int]]]) -> list[Window] | Reason:
     """About places in one scan, by their maps and radii, read from top to bottom."""
-    frame, patches = sought
+    frame, patches = task
     windows: dict[int, Window] = {}
     try:
         with frame.open() as scan:
@@ -185,17 +183,17 @@ def _windows_of(sought: tuple[TieFrame, Sequence[tuple[Array, int]]]) -> list[Wi
                 col0, row0 = (int(value) - half for value in np.round(matrix[:, 2]))
                 windows[k] = (scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0))
     except MeasurementError as error:
-        return out_of_reach(str(error))
+        return unreachable(str(error))
     return [windows[k] for k in range(len(patches))]
 
 
-def _lost_point(sought: tuple[TieCandidate, Windows], why: str) -> TiePoint:
-    return TiePoint(sought[0], {}, {i: out_of_reach(why) for i in sought[0].maps})
+def _lost_point(task: tuple[TieCandidate, Windows], why: str) -> TiePoint:
+    return TiePoint(task[0], {}, {i: unreachable(why) for i in task[0].maps})
 
 
-def _point(fewest: int, sought: tuple[TieCandidate, Windows]) -> TiePoint:
+def _point(fewest: int, task: tuple[TieCandidate, Windows]) -> TiePoint:
     """The candidate measured; a frame that cannot be matched is left out where enough others remain."""
-    candidate, windows = sought
+    candidate, windows = task
     failed = {i: window for i, window in windows.items() if isinstance(window, Reason)}
     shown = {i: window for i, window in windows.items() if not isinstance(window, Reason)}
     members, unmatched = sorted(candidate.maps), dict[int, Reason]()
@@ -255,8 +253,8 @@ def _judge(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
     for point in points:
         point.refused = {frame: _UNEVEN for frame in point.standing if point.matched[frame].unevenness < POINT_REFUSED}
     _refuse_strange_pictures(points)
-    _refuse_contradictions(frames, points, partial(contradicting, tolerance=_FINE_PX), _OFF_LINES)
-    _refuse_contradictions(frames, points, outliers, _UNLIKE_NEIGHBOURS)
+    _refuse_contradictions(frames, points, partial(epipolar_outliers, tolerance=_FINE_PX), _OFF_LINES)
+    _refuse_contradictions(frames, points, neighbour_outliers, _UNLIKE_NEIGHBOURS)
 
 
 def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:

@@ -17,21 +17,20 @@ from numpy.typing import NDArray
 
 from measure.covariance import Cause, Covariance
 from measure.errors import MeasurementError
-from measure.natural_points.features import Features, find_features, in_turn, shared_features
-from measure.natural_points.local_maps import outliers
-from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
-from measure.natural_points.tie_frame import TieFrame
 from measure.probabilities import POINT_REFUSED
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.parallel import mapped_or_lost
 from measure.status import Status
+from measure.tie_points.features import Features, TieFrame, find_features, in_turn, shared_features
+from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
+from measure.tie_points.verification import neighbour_outliers
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WANTED = 60  # joins of two scans
-_FEW = 12  # joins: from fewer on they are told
+_FEW = 12  # joins: fewer are a problem
 _FEATURES = 6000  # of a scan: the overlap may be a tenth of it
 _TRIED = 3  # places, for every join that is wanted
 _AGREE_PX = 3.0  # in the reduced scan: what a feature's place, film and scanner leave
@@ -47,8 +46,8 @@ _UNEVEN = Reason("parts of the picture about the place move unlike each other", 
 _LOST = Reason("the process that matched it was ended", Code.UNREACHABLE)
 _UNLIKE = Reason("the places about it map elsewhere from scan to scan: dust on the glass, or chance", Code.OTHER_SCANS)
 
-_Sought = tuple[Piece, Piece]
-_Measured = tuple[Matched, ...]
+_Pair = tuple[Piece, Piece]
+_MatchedPair = tuple[Matched, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +65,9 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
     result does not depend on the number of workers.
     """
     found_or_not = list(mapped_or_lost(workers, _features, parts, lambda _, why: _out_of_reach(why)))
-    unseen = {part.image: each for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Reason)}
-    seen = [(part, each) for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Features)]
-    parts, features = [part for part, _ in seen], [each for _, each in seen]
+    unreadable = {part.image: each for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Reason)}
+    readable = [(part, each) for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Features)]
+    parts, features = [part for part, _ in readable], [each for _, each in readable]
     marks: dict[str, list[MarkMeasurement]] = {part.image: [] for part in parts}
     shared: dict[tuple[int, int], _Shared] = {}
     number, problems = 0, dict[str, Reason]()
@@ -86,7 +85,7 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
         if len(found) < _FEW:
             problems |= {part.image: _few(parts[i], parts[j], len(found), refused) for part in (parts[i], parts[j])}
     unjoined = dict(_unjoined(parts, shared, marks))
-    return Joins({image: tuple(own) for image, own in marks.items()}, problems | unjoined | unseen)
+    return Joins({image: tuple(own) for image, own in marks.items()}, problems | unjoined | unreadable)
 
 
 def _features(part: TieFrame) -> Features | Reason:
@@ -140,7 +139,7 @@ def _joined(
     second_from_first: Array,
     wanted: int,
     workers: Executor | None,
-) -> tuple[list[_Measured], Counter[str]]:
+) -> tuple[list[_MatchedPair], Counter[str]]:
     """Both places of every join, so many at most, and why other places are none."""
     places = _places(both[1], features, second_from_first, wanted)
     try:
@@ -151,7 +150,7 @@ def _joined(
     refused = Counter(str(_refused(pair)) for pair in matched if _refused(pair))
     good = [pair for pair in matched if not _refused(pair)]
     if good:
-        unlike = outliers(*(np.array([pair[of].center_px for pair in good]) for of in (0, 1)))
+        unlike = neighbour_outliers(*(np.array([pair[of].center_px for pair in good]) for of in (0, 1)))
         refused[_UNLIKE] += int(unlike.sum())
         good = list(compress(good, ~unlike))
     return good[:wanted], refused
@@ -194,11 +193,11 @@ def _pieces(part: TieFrame, maps: Sequence[Array]) -> list[Piece]:
     return [pieces[k] for k in range(len(maps))]
 
 
-def _match(pieces: _Sought) -> _Measured:
+def _match(pieces: _Pair) -> _MatchedPair:
     return match_pieces(pieces, 0)
 
 
-def _refused(pair: _Measured) -> Reason:
+def _refused(pair: _MatchedPair) -> Reason:
     """Why its own pictures are no join; empty where they are."""
     if not pair:
         return _LOST
@@ -239,17 +238,17 @@ def _unjoined(
     for number, part in enumerate(parts):
         if any(mark.status.is_observation for mark in marks[part.image]):
             continue
-        told = "; ".join(
-            f"with {parts[i].image if j == number else parts[j].image} {each.agree} of {each.alike} features that look "
-            "alike agree on one movement"
+        pairs_message = "; ".join(
+            f"with {parts[i].image if j == number else parts[j].image} {each.agree} of {each.alike} similar features "
+            "agree on one similarity"
             for (i, j), each in shared.items()
             if number in (i, j)
         )
         yield (
             part.image,
             Reason(
-                f"Nothing joins it to the other scans of its frame: {told}; at least {_FEWEST} would show that they "
-                "overlap. Look whether it is a scan of that frame, and whether the scans overlap.",
+                f"Nothing joins it to the other scans of its frame: {pairs_message}; at least {_FEWEST} are needed. "
+                "Check whether it is a scan of that frame, and whether the scans overlap.",
                 Code.FEW_TIES,
             ),
         )

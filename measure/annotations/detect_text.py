@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.writing.line import Reading
+from measure.annotations.line import Reading
 
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from measure.writing.line import Line
+from measure.annotations.line import Line
 
 CAMERA = ("camera_type", "camera_number", "principal_distance_mm")  # what a camera's own plate says
 STRIP = ("run", "frames", "date", "time", "height", "scale")  # what a title says that was made for the flight

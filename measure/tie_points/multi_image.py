@@ -8,8 +8,7 @@ Rosenholm 1987, the patch eliminated).
 
 Covariance: a frame's own noise alone moves its own point, the reference's as much as another's. The definition of the
 point is free of error, for the unknown object point takes it up: so frames are uncorrelated, each with the covariance
-of its own noise, and what separates two frames has the sum of both.
-"""
+of its own noise, and what separates two frames has the sum of both."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +19,17 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import chdtrc
 
-from measure.natural_points.bending import Bending
 from measure.noise.noise import NoiseModel, correlated, noise_model
 from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
+
+# Of the coefficients of u², uv and v² of a surface whose curvature has no preferred direction, but for their scale.
+_ISOTROPIC = np.array([[0.75, 0.0, 0.25], [0.0, 1.0, 0.0], [0.25, 0.0, 0.75]])
+_DIRECTIONS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
+_ROUNDS = 8  # of scoring
+_LEAST_NOISE_EIGENVALUE = 1e-9  # of a covariance, over its largest
+_FEWEST = 20  # patches whose bendings have a variance worth the name
 Mask = NDArray[np.bool_]
 
 RADIUS_PX = 15  # of a round patch: texture enough nearly everywhere, and small enough for the ground to be plane
@@ -37,6 +42,78 @@ _LEAST_EIGENVALUE = 1e-4  # of the normal equations scaled to unit diagonal
 _ITERATIONS = 30  # under each smoothing, at most
 _STILL_PX = 0.005  # a last step well below the precision
 _FARTHEST_STEP_PX = 3.0  # beyond it the matching has run away
+
+
+@dataclass(frozen=True, eq=False)
+class Bending:
+    """What a piece shows of its bending q (6,) against the reference's: coefficients of u², uv and v² in units of the
+    usual patch's radius, whatever the size of this one, of the columns' shift and then of the rows', px of the patch.
+
+    observed (6,) is response (6, 6) @ q and noise of covariance noise (6, 6); on_place (2, 6) @ q is its effect on the
+    place, px of the patch.
+    """
+
+    observed: Array
+    response: Array
+    noise: Array
+    on_place: Array
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether the noise is a covariance that can be weighed by: pictures copied from one another have none."""
+        values = np.linalg.eigvalsh(self.noise)
+        return bool(values[0] > _LEAST_NOISE_EIGENVALUE * values[-1])
+
+    def estimated(self, variance: Array) -> tuple[Array, Array]:
+        """The shift (2,) of the place, px of the patch, and the covariance (2, 2) that stays, where bendings have that
+        covariance (6, 6)."""
+        gain = variance @ self.response.T @ np.linalg.inv(self.response @ variance @ self.response.T + self.noise)
+        left = variance - gain @ self.response @ variance
+        return self.on_place @ gain @ self.observed, self.on_place @ left @ self.on_place.T
+
+
+def bending_variance(bendings: Sequence[Bending]) -> Array:
+    """The covariance (6, 6) of the bendings of one scan's patches against another's; zero where too few are known.
+
+    Relief bends along the epipolar lines, and curves in all directions alike: unknown are the variances of a shift's
+    two components and their covariance.
+    """
+    if len(bendings) < _FEWEST:
+        return np.zeros((6, 6))
+    observed, noise = np.array([each.observed for each in bendings]), np.array([each.noise for each in bendings])
+    response = np.array([each.response for each in bendings])
+    shapes = np.array([np.kron(direction, _ISOTROPIC) for direction in _DIRECTIONS])
+    parts = np.einsum("nij,kjl,nml->knim", response, shapes, response)
+    components = np.zeros(3)
+    for _ in range(_ROUNDS):
+        inverse = np.linalg.inv(noise + np.tensordot(components, parts, 1))
+        weighted = np.einsum("nij,knjl->knil", inverse, parts)
+        free = np.einsum("nij,nj->ni", inverse, observed)
+        normal = np.einsum("knij,lnji->kl", weighted, weighted)
+        squares = np.einsum("ni,knij,nj->k", free, parts, free)
+        expected = np.einsum("knij,nji->k", weighted, np.einsum("nij,njl->nil", inverse, noise))
+        components = _valid(np.linalg.solve(normal, squares - expected))
+    return np.asarray(np.tensordot(components, shapes, 1))
+
+
+def _valid(components: Array) -> Array:
+    """The nearest components that some shift can have."""
+    values, vectors = np.linalg.eigh(np.tensordot(components, _DIRECTIONS, 1))
+    matrix = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return np.array([matrix[0, 0], matrix[0, 1], matrix[1, 1]])
+
+
+# Multi-image least-squares matching: one natural point in all frames that show it, none of them a perfect original.
+#
+# The same small piece of ground is resampled from every frame onto one grid. All frames' pieces are one unknown common
+# patch, each with an offset and a gain of its own and with an affine geometry; the grid of one frame, the reference,
+# says which point is meant. The patch being unknown too, its best estimate is the pieces' mean, and a frame's geometry
+# follows from the difference of its piece and the reference's (the object-based matching of Gruen and Baltsavias 1988
+# and of Rosenholm 1987, the patch eliminated).
+#
+# Covariance: a frame's own noise alone moves its own point, the reference's as much as another's. The definition of the
+# point is free of error, for the unknown object point takes it up: so frames are uncorrelated, each with the covariance
+# of its own noise, and what separates two frames has the sum of both.
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,8 +323,8 @@ class _Fit:
         spreads = [np.tensordot(correlated(columns, each), columns, axes=([1, 2], [1, 2])) for each in noises]
         bendings: list[Bending | None] = []
         for values, spread in zip(self.values, spreads, strict=True):
-            seen = np.tensordot(columns, values - self.values[self.reference], axes=2)
-            bending = Bending(seen, response, spread + spreads[self.reference], np.negative(through[:2]))
+            observed = np.tensordot(columns, values - self.values[self.reference], axes=2)
+            bending = Bending(observed, response, spread + spreads[self.reference], np.negative(through[:2]))
             bendings.append(bending if bending.has_noise else None)
         bendings[self.reference] = None
         return bendings
@@ -262,11 +339,13 @@ class _Fit:
         free = flat - whole @ np.linalg.solve(self.normal, whole.T @ flat)
         moves = np.zeros_like(moves)
         moves[:, self.used] = free.T
-        seen = np.einsum("kij,ij->k", moves, residuals)
+        observed = np.einsum("kij,ij->k", moves, residuals)
         spread = np.tensordot(correlated(moves, noise), moves, axes=([1, 2], [1, 2]))
         values, vectors = np.linalg.eigh(spread)
         real = values > 1e-9 * values[-1]
-        return float(chdtrc(real.sum(), np.sum((vectors.T @ seen)[real] ** 2 / values[real]))) if real.any() else 1.0
+        return (
+            float(chdtrc(real.sum(), np.sum((vectors.T @ observed)[real] ** 2 / values[real]))) if real.any() else 1.0
+        )
 
 
 def _products(first: Array, second: Array) -> Array:

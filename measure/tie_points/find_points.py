@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from measure.covariance import Covariance
-from measure.natural_points.epipolar import FEWEST_PAIRS
-from measure.natural_points.features import Features
-from measure.natural_points.tie_candidates import Shared, candidates, found_features, verified
-from measure.natural_points.tie_frame import TieFrame
-from measure.natural_points.tie_points import TiePoint, measured_points
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.status import Status
+from measure.tie_points.features import Features, TieFrame
+from measure.tie_points.measurement import TiePoint, measure_points
+from measure.tie_points.tracks import Shared, find_all_features, find_candidates, verify_pairs
+from measure.tie_points.verification import FEWEST_PAIRS
 
 Progress = Callable[[str, int, int], None]
 
@@ -58,23 +57,23 @@ def measure_ties(
     """
     options, tell = options or TieOptions(), progress or (lambda *_: None)
     steps = len(frames) + 2
-    seen, unseen = list[tuple[TieFrame, Features]](), dict[str, tuple[Reason, ...]]()
-    found = found_features(frames, options.wanted, workers)
+    readable, unreadable = list[tuple[TieFrame, Features]](), dict[str, tuple[Reason, ...]]()
+    found = find_all_features(frames, options.wanted, workers)
     for done, (frame, features_or_reason) in enumerate(zip(frames, found, strict=True), 1):
         if isinstance(features_or_reason, Reason):
-            unseen[frame.image] = (features_or_reason,)
+            unreadable[frame.image] = (features_or_reason,)
         else:
-            seen.append((frame, features_or_reason))
+            readable.append((frame, features_or_reason))
         tell(frame.image, done, steps)
-    frames, features = [frame for frame, _ in seen], [each for _, each in seen]
-    shared = verified(frames, features, workers)
-    tell("pairs of scans", len(unseen) + len(frames) + 1, steps)
-    sought = candidates(frames, features, shared, options.images)
+    frames, features = [frame for frame, _ in readable], [each for _, each in readable]
+    shared = verify_pairs(frames, features, workers)
+    tell("pairs of scans", len(unreadable) + len(frames) + 1, steps)
+    candidates = find_candidates(frames, features, shared, options.images)
     sizes_px = [each.size_px for each in features]
-    points = measured_points(frames, sizes_px, sought, options.wanted, options.images, workers)
+    points = measure_points(frames, sizes_px, candidates, options.wanted, options.images, workers)
     tell("all scans together", steps, steps)
-    found_all = _result(frames, points, len(sought), shared, options)
-    return replace(found_all, problems={**unseen, **found_all.problems})
+    found_all = _result(frames, points, len(candidates), shared, options)
+    return replace(found_all, problems={**unreadable, **found_all.problems})
 
 
 def _result(
@@ -118,8 +117,8 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
             Reason(f"only {len(point.standing)} scans agree on the point, {options.images} are to", Code.FEW_SCANS),
         )
     elif not point.is_sharp(frame):
-        told = f"the texture fixes it to {point.error_px(frame):.2f} px only"
-        status, reason = Status.WEAK, Reason(told, Code.IMPRECISE)
+        message = f"the texture fixes it to {point.error_px(frame):.2f} px only"
+        status, reason = Status.WEAK, Reason(message, Code.IMPRECISE)
     covariance = Covariance.of_noise(piece.covariance_px2)
     return MarkMeasurement(name, "tie", piece.center_px, covariance, status, reason, quality)
 
@@ -138,13 +137,13 @@ def _problems(
         counts = ", ".join(
             f"{frames[i].image} and {frames[j].image} {len(pairs)}" for (i, j), pairs in sorted(shared.items())
         )
-        told = (
+        message = (
             f"No natural point was found: none is in {options.images} scans. Features that pairs of scans share, of "
             f"{FEWEST_PAIRS} at least: {counts or 'none'}. Overlapping photographs of one season would have some."
         )
     else:
-        told = (
+        message = (
             f"Of {options.wanted} natural points wanted, {found} were found: {candidate_count} features are in "
             f"{options.images} scans or more."
         )
-    return (Reason(told, Code.FEW_TIES),)
+    return (Reason(message, Code.FEW_TIES),)

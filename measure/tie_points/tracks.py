@@ -2,8 +2,7 @@
 maps from scan to scan.
 
 Features of all scans are compared in pairs; what one epipolar geometry explains is joined to tracks, and the tracks are
-ordered so that the first of them, however many, spread evenly over the frames.
-"""
+ordered so that the first of them, however many, spread evenly over the frames."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,18 +13,24 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from measure.errors import MeasurementError
-from measure.natural_points.epipolar import agreeing
-from measure.natural_points.features import Features, find_features, in_turn, shared_features
-from measure.natural_points.local_maps import LocalMaps
-from measure.natural_points.multi_image import RADIUS_PX
-from measure.natural_points.tie_frame import TieFrame
+from measure.noise.least_squares import least_distances
 from measure.reason import Code, Reason
 from measure.scans.parallel import mapped_or_lost
+from measure.tie_points.features import Features, TieFrame, find_features, in_turn, shared_features
+from measure.tie_points.multi_image import RADIUS_PX
+from measure.tie_points.verification import epipolar_inliers
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+_PLACE_PX, _LOCAL = 5.0, 0.1  # how far places depart from an affine map, and that from the whole pair's
+_REWEIGHTINGS = 6  # of least distances
+_STRETCH = 2.0  # the most by which a small piece of ground can differ in scale between photographs to be matched
+_NEIGHBOURS = 12  # that tell the map about a point: four times its unknowns, for some of them may be false
 Shared = Mapping[tuple[int, int], Indices]
 Place = tuple[int, int]  # a frame, and a feature of it
 Track = dict[int, int]  # the feature in every frame
@@ -34,6 +39,54 @@ _FEATURES = 25  # a scan, for every point wanted; one in five or so has a partne
 _LEAST_FEATURES = 3000
 _AGREE_PX = 2.0  # in the reduced scan: what a feature's place and a lens leave
 _CELLS = 8  # a side of a frame, over which points are spread
+
+
+class LocalMaps:
+    """Affine maps about a place from one scan to another."""
+
+    def __init__(self, features: Sequence[Features], shared: Mapping[tuple[int, int], Indices]) -> None:
+        self._places: dict[tuple[int, int], tuple[Array, Array]] = {}
+        for (i, j), pairs in shared.items():
+            if len(pairs):
+                first, second = features[i].places_px[pairs[:, 0]], features[j].places_px[pairs[:, 1]]
+                self._places[i, j], self._places[j, i] = (first, second), (second, first)
+        self._trees = {pair: cKDTree(here) for pair, (here, _) in self._places.items()}
+        self._whole = {pair: _affine_map(*places, np.zeros((2, 2)), 0.0) for pair, places in self._places.items()}
+
+    def reached(self, start: int) -> list[int]:
+        """The scans that share features with this one."""
+        return sorted(end for begin, end in self._places if begin == start)
+
+    def map(self, start: int, end: int, place_px: Array) -> Array | None:
+        """(2, 3) map of offsets from a place (2,) of one scan to places of another; None where the scans differ too
+        much in scale there.
+
+        It is that of the nearest matches, held by those of the whole pair where they lie close together.
+        """
+        here, there = self._places[start, end]
+        near = np.atleast_1d(self._trees[start, end].query(place_px, min(_NEIGHBOURS, len(here)))[1])
+        whole = self._whole[start, end][:, :2]
+        local = _affine_map(here[near] - place_px, there[near], whole, (_PLACE_PX / _LOCAL) ** 2)
+        scales = np.linalg.svd(local[:, :2], compute_uv=False)
+        return local if 1 / _STRETCH < scales[1] <= scales[0] < _STRETCH else None
+
+
+def _affine_map(here: Array, there: Array, usual: Array, weight: float) -> Array:
+    """(2, 3) from places (n, 2) to places, a few of which may be false; with a weight on what its linear part is
+    usually."""
+    middle = here.mean(axis=0)
+    design = np.column_stack([np.ones(len(here)), here - middle])
+    prior, of_usual = weight * np.diag([0.0, 1.0, 1.0]), np.vstack([np.zeros(2), usual.T])
+    target, *linear = least_distances(design, there, _PLACE_PX, _REWEIGHTINGS, prior, of_usual)
+    matrix = np.transpose(linear)
+    return np.column_stack([matrix, target - matrix @ middle])
+
+
+# Which natural points are worth measuring: features that three scans or more share, and how the ground about them maps
+# from scan to scan.
+#
+# Features of all scans are compared in pairs; what one epipolar geometry explains is joined to tracks, and the tracks
+# are ordered so that the first of them, however many, spread evenly over the frames.
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +99,9 @@ class TieCandidate:
     radius_px: int = RADIUS_PX
 
 
-def found_features(frames: Sequence[TieFrame], wanted: int, workers: Executor | None) -> Iterator[Features | Reason]:
+def find_all_features(frames: Sequence[TieFrame], wanted: int, workers: Executor | None) -> Iterator[Features | Reason]:
     """The features of every scan from which so many natural points are to come; or why it has none."""
-    return mapped_or_lost(workers, partial(_features, wanted), frames, lambda _, why: out_of_reach(why))
+    return mapped_or_lost(workers, partial(_features, wanted), frames, lambda _, why: unreachable(why))
 
 
 def _features(wanted: int, frame: TieFrame) -> Features | Reason:
@@ -58,15 +111,15 @@ def _features(wanted: int, frame: TieFrame) -> Features | Reason:
             size = (scan.width_px, scan.height_px)
             return find_features(scan, lambda places: frame.usable(places, size), frame.mirrored, count)
     except MeasurementError as error:
-        return out_of_reach(str(error))
+        return unreachable(str(error))
 
 
-def out_of_reach(why: str) -> Reason:
+def unreachable(why: str) -> Reason:
     """Of a scan that could not be looked at once more."""
     return Reason(f"No natural points are sought here: {why}", Code.UNREACHABLE)
 
 
-def verified(
+def verify_pairs(
     frames: Sequence[TieFrame], features: Sequence[Features], workers: Executor | None
 ) -> dict[tuple[int, int], Indices]:
     """By pair of frames the features that they share, as far as one epipolar geometry explains them; none of a pair
@@ -78,7 +131,7 @@ def verified(
     for (i, j), pairs in zip(both, found, strict=True):
         first = frames[i].camera_px(features[i].places_px[pairs[:, 0]])
         second = frames[j].camera_px(features[j].places_px[pairs[:, 1]])
-        shared[i, j] = pairs[agreeing(first, second, _AGREE_PX * features[i].reduction)]
+        shared[i, j] = pairs[epipolar_inliers(first, second, _AGREE_PX * features[i].reduction)]
     return shared
 
 
@@ -86,7 +139,7 @@ def _shared(pair: tuple[Features, Features]) -> Indices:
     return shared_features(*pair)
 
 
-def candidates(
+def find_candidates(
     frames: Sequence[TieFrame], features: Sequence[Features], shared: Shared, fewest: int
 ) -> list[TieCandidate]:
     """The tracks that at least `fewest` frames may show, the best textured of every part of a frame before its others.
@@ -96,7 +149,7 @@ def candidates(
     """
     maps = LocalMaps(features, shared)
     found, cells, textures = [], [], []
-    for track in join_tracks(shared):
+    for track in tracks_of_pairs(shared):
         reference = _most_central(frames, features, track)
         reached = _maps(frames, features, maps, track, reference)
         candidate = TieCandidate(reference, _one_an_exposure(frames, features, reached, reference))
@@ -110,7 +163,7 @@ def candidates(
     return [found[k] for k in in_turn(np.array(cells, np.intp), np.array(textures))] if found else []
 
 
-def widened(
+def candidates_with_radius(
     candidates: Sequence[TieCandidate],
     radius_px: int,
     frames: Sequence[TieFrame],
@@ -177,7 +230,7 @@ def _most_central(frames: Sequence[TieFrame], features: Sequence[Features], trac
     return min(off, key=lambda i: (off[i], i))
 
 
-def join_tracks(shared: Mapping[tuple[int, int], NDArray[np.intp]]) -> list[Track]:
+def tracks_of_pairs(shared: Mapping[tuple[int, int], NDArray[np.intp]]) -> list[Track]:
     """Tracks in the order of their features.
 
     shared: by pair of frames, (n, 2) features that they share. A track that has two features in a frame is none; and a

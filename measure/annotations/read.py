@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.annotations.detect_text import HEIGHT_PX, WAYS, Networks, Picture, Place, find_writing, read_ways
+from measure.annotations.line import Line, of_one_face
 from measure.marks.shapes import Side
 from measure.scans.scan import Scan
-from measure.writing.line import Line, of_one_face
-from measure.writing.networks import HEIGHT_PX, WAYS, Networks, Picture, Place, find_writing, read_ways
 
 Array = NDArray[np.float64]
 

@@ -1,1 +1,0 @@
-"""What is written on the film: found, read, and told which way it lies."""
