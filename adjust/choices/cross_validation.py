@@ -13,6 +13,7 @@ from adjust.initial_values.intersection import intersect
 from adjust.problem.images import approximate_image, lifted
 from adjust.problem.network import Approximations, Network
 from adjust.problem.problem import number
+from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, with_datum
 from adjust.solution.runs import run
@@ -131,15 +132,18 @@ def _fitted_without(
     )
     if reduced.unoriented - network.unoriented:
         return None
+    reduction = Reduction.of(reduced)
+    start = reduction.approximations(approximations_of(adjustment))
     try:
         validate(reduced)
-        problem = number(reduced, approximations_of(adjustment), options.method == "elements")
+        problem = number(reduction.network(reduced), start, options.method == "elements")
         last = run(with_datum(problem, options), options)
     except AdjustmentError:
         return None
     if not last.converged:
         return None
-    values = _by_owner(problem.unknowns.names, last.end.state.values)
+    whole = reduction.unreduced_values(problem.unknowns, last.end.state.values, reduced)
+    values = _by_owner(problem.unknowns.names, whole)
     fitted = _as_approximations(reduced, values, adjustment.mirrored)
     oriented = [image for image in reduced.images if image.name not in reduced.unoriented]
     return {

@@ -15,6 +15,7 @@ from adjust.problem.functions import blind_mark, computed_observations
 from adjust.problem.further_observations import at_computed
 from adjust.problem.network import Approximations, Network
 from adjust.problem.problem import Problem, number
+from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment, NullDirection
 from adjust.quality.cofactor import free_cofactor
 from adjust.solution.adjustment import Options, adjust_problem, with_datum
@@ -67,14 +68,17 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     """
     options = options or Options()
     validate(network)
-    problem = _at_computed_observations(number(network, values))
+    reduction = Reduction.of(network)
+    problem = _at_computed_observations(number(reduction.network(network), reduction.approximations(values)))
     result = adjust_problem(problem, options)
     singular = result.singular
     null = np.zeros((len(problem.unknowns), 0))
     if singular:
         held, null = _held(with_datum(problem, options))
         result = adjust_problem(problem, options, held)
-    expected = replace(result, vpv=sigma0**2 * result.redundancy)
+    own = reduction.inverse.network(result.network)
+    adjusted = reduction.unreduced_values(problem.unknowns, result.values, own)
+    expected = replace(result, network=own, values=adjusted, vpv=sigma0**2 * result.redundancy)
     return Plan(expected, sigma0, singular, null)
 
 

@@ -1,6 +1,6 @@
 """Object points into images and back: rays, camera points, comparator points, with the adjustment's own functions."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,13 @@ class ImageModel:
     line_of_sight: LineOfSight = STRAIGHT
     bend: Bend = NO_BEND
     bend_parameters: Array = field(default_factory=lambda: np.empty(0))
+
+    def reduced_to(self, xyz: Array) -> tuple["ImageModel", Array]:
+        """The same image and object points (n, 3), counted from its station: differences of large numbers are formed
+        once. Heights stay as they are where the line of sight depends on them.
+        """
+        origin = self.station * [1.0, 1.0, float(self.line_of_sight.is_straight)]
+        return replace(self, station=self.station - origin), xyz - origin
 
     def camera_from_object(self, xyz: Array) -> tuple[Array, Mask]:
         """Observed, that is distorted, camera coordinates (n, 2) in mm of object points (n, 3); which have an image."""

@@ -20,6 +20,7 @@ from adjust.initial_values.resection import Pose
 from adjust.initial_values.wide_angle import find_wide_distance
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Image, Network
+from adjust.problem.reduction import Reduction
 from adjust.validation import validate
 
 Array = NDArray[np.float64]
@@ -43,6 +44,11 @@ def approximate(network: Network) -> Approximations:
 
 def initial_values(network: Network) -> Approximations:
     """As `approximate`, of a network that was validated."""
+    reduction = Reduction.of(network)
+    return reduction.inverse.approximations(_initial_values(reduction.network(network)))
+
+
+def _initial_values(network: Network) -> Approximations:
     if network.has_parts:
         return _of_parts(network)
     films = _film_transformations(network)
@@ -70,7 +76,7 @@ def _of_parts(network: Network) -> Approximations:
         joins |= {(frame.name, point): xy for point, xy in frame.joins.items()}
     films |= _film_transformations(network)
     whole = whole_frames(network, films)
-    found = initial_values(whole) if whole.images else Approximations({}, {}, {}, {})
+    found = _initial_values(whole) if whole.images else Approximations({}, {}, {}, {})
     return replace(
         found,
         exterior={image.name: found.exterior[image.frame] for image in network.images if image.frame in found.exterior},

@@ -13,6 +13,7 @@ from adjust.initial_values.far_points import far_points
 from adjust.least_squares.kept_memory import keep_freed_memory
 from adjust.problem.network import STRAIGHT, Approximations, Network
 from adjust.problem.problem import Problem, number
+from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment, Cofactor
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.solution.assessment import RunAssessment
@@ -38,11 +39,12 @@ def adjust(
     """Adjust a network by least squares, all unknowns together.
 
     The combined model A v + B dx = w is relinearised at the adjusted observations and unknowns until both stand still
-    (Torlegård, equations F1 to F9). The cofactor matrix is that of all unknowns, nothing held fixed but what a standard
-    deviation of 0 fixes. A singular network is a result with its null directions, not an error: its values are the
-    approximations, its cofactor matrix is zero and means nothing. Where no approximations are given, or the iteration
-    does not come to rest from them, it begins with those found from the network itself. Given points that are far off
-    are named where the observations do not agree for them; robust estimation and data snooping begin without them.
+    (Torlegård, equations F1 to F9); object coordinates count from the middle of the field. The cofactor matrix is that
+    of all unknowns, nothing held fixed but what a standard deviation of 0 fixes. A singular network is a result with
+    its null directions, not an error: its values are the approximations, its cofactor matrix is zero and means nothing.
+    Where no approximations are given, or the iteration does not come to rest from them, it begins with those found from
+    the network itself. Given points that are far off are named where the observations do not agree for them; robust
+    estimation and data snooping begin without them.
 
     Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
     has no image, where the chosen datum does not hold the object space, or where a slip that concerns the whole network
@@ -97,7 +99,7 @@ def _plainly(network: Network, start: Approximations | None, options: Options) -
         return None
     plain = replace(options.plain, iteration_limit=min(options.iteration_limit, TRIAL_STEPS))
     try:
-        return adjust_problem(_numbered(network, start, plain), plain)
+        return _solved(network, start, plain)
     except AdjustmentError:
         return None
 
@@ -108,7 +110,7 @@ def _adjusted(network: Network, approximations: Approximations, options: Options
     if begun is not None and begun.converged:
         return begun if _agrees(begun, options) else _with_slips(begun, network, approximations, options)
     try:
-        result = adjust_problem(_numbered(network, approximations, options), options)
+        result = _solved(network, approximations, options)
     except NoImageError as error:
         if found := _slips(network, approximations, options):
             raise AdjustmentError(" ".join(slip.sentence for slip in found)) from error
@@ -125,6 +127,20 @@ def _with_slips(result: Adjustment, network: Network, approximations: Approximat
     if found := _slips(network, approximations, options):
         return replace(result, slips=tuple(slip.sentence for slip in found))
     return result if result.converged else replace(result, remarks=(*result.remarks, *few_points(network)))
+
+
+def _solved(
+    network: Network, approximations: Approximations, options: Options, doubted_points: Iterable[str] = ()
+) -> Adjustment:
+    """A network adjusted about its centroid, in its own coordinates; without the given places of some points to begin
+    with.
+    """
+    reduction = Reduction.of(network)
+    problem = _numbered(reduction.network(network), reduction.approximations(approximations), options)
+    unknowns = problem.unknowns
+    doubted = [int(position) for name in doubted_points for position in unknowns.point[name]]
+    result = adjust_problem(problem, options, doubted=doubted)
+    return replace(result, network=network, values=reduction.unreduced_values(unknowns, result.values, network))
 
 
 def _numbered(network: Network, approximations: Approximations, options: Options) -> Problem:
@@ -146,10 +162,8 @@ def _without_slips(network: Network, approximations: Approximations, options: Op
     if not found:
         return None
     _, start = freed(network, approximations, [slip.far for slip in found])
-    problem = _numbered(network, start, options)
-    doubted = [int(position) for slip in found for position in problem.unknowns.point[slip.far.name]]
     try:
-        return adjust_problem(problem, options, doubted=doubted)
+        return _solved(network, start, options, [slip.far.name for slip in found])
     except NoImageError:
         return None
 
@@ -162,7 +176,7 @@ def _slips(network: Network, approximations: Approximations, options: Options) -
     without, start = freed(network, approximations, far)
     plain = options.plain
     try:
-        return slips(network, far, adjust_problem(_numbered(without, start, plain), plain), options)
+        return slips(network, far, _solved(without, start, plain), options)
     except AdjustmentError:  # without these points it cannot even begin
         return []
 
@@ -176,7 +190,7 @@ def _begun_anew(network: Network, approximations: Approximations, options: Optio
             continue
         if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):
             continue
-        result = adjust_problem(_numbered(network, own, options), options)
+        result = _solved(network, own, options)
         if result.converged:
             warning = (
                 f"From the given approximations the iteration did not come to rest ({stopped.termination} after "

@@ -24,6 +24,7 @@ def eccentricity_mm(model: ImageModel, centers: Array, normals: Array, radius: f
     the dual conic of its circle. The lens bends this ellipse; its centre of gravity, which a fitted ellipse finds, is
     that of its outline as distortion and film image it.
     """
+    model, centers = model.reduced_to(centers)
     forward = np.array([1.0, 1.0, -1.0])
     c = ((centers - model.station) @ model.rotation.T) * forward
     n = (normals @ model.rotation.T) * forward

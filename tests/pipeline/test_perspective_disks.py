@@ -1,6 +1,7 @@
 """Disks in perspective, against the truth of rendered frames, whose projection is another program's."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -156,3 +157,16 @@ def test_the_ellipse_of_a_near_disk_is_that_of_its_outline() -> None:
         middle = np.array([((x + np.roll(x, -1)) * cross).sum(), ((y + np.roll(y, -1)) * cross).sum()])
         middle /= 3.0 * cross.sum()
         np.testing.assert_allclose(off, middle + c * center[:2] / center[2], atol=1e-3)
+
+
+def test_the_eccentricity_of_disks_at_seven_digits_is_that_at_the_origin() -> None:
+    """To a picometre and less: what coordinates of seven digits lose by rounding would be 10 pm here."""
+    centers, normals = (
+        np.array([[0.75, -0.5, -3.0], [-1.0, 0.625, -2.75]]),
+        np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]]),
+    )
+    film = Film("none", np.empty(0), np.zeros(2), False)
+    model = ImageModel(Distortion("none", {}), np.array([100.0, 0.0, 0.0]), np.empty(0), np.eye(3), np.zeros(3), film)
+    far = np.array([500_000.0, 5_400_000.0, 300.0])
+    there = eccentricity_mm(replace(model, station=far), centers + far, normals, 0.013)
+    np.testing.assert_allclose(there, eccentricity_mm(model, centers, normals, 0.013), rtol=0.0, atol=1e-12)

@@ -1,0 +1,113 @@
+"""Reduction to the centroid: object coordinates counted from the middle of the network.
+
+A coordinate of seven digits leaves a difference of two of them a nanometre or so of rounding, which keeps an iteration
+from standing still. All that is computed is therefore computed about the middle of the field.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.problem.camera import Prior
+from adjust.problem.network import Approximations, Board, Image, Network, ObjectPoint
+from adjust.problem.unknowns import Unknowns
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """origin (3,): what is taken off all object coordinates, stations' and points'."""
+
+    origin: Array
+
+    @classmethod
+    def of(cls, network: Network) -> "Reduction":
+        """To a round place near the middle of what is given; none where the middle is nearer to 0 than the field is
+        wide.
+
+        The origin is a multiple of a power of two near the field's extent, so that no digit of a coordinate is lost.
+        Heights are left as they are where the line of sight depends on them.
+        """
+        xyz = _given_places(network)
+        count = (~np.isnan(xyz)).sum(axis=0)
+        middle = np.array([np.nanmedian(axis) if some else 0.0 for axis, some in zip(xyz.T, count, strict=True)])
+        off = np.abs(xyz - middle)
+        extent = max((float(np.nanmedian(axis)) for axis, some in zip(off.T, count, strict=True) if some), default=0.0)
+        step = 2.0 ** np.ceil(np.log2(4.0 * extent)) if extent > 0.0 else 1.0
+        origin = step * np.round(middle / step)
+        if not network.line_of_sight.is_straight:
+            origin[2] = 0.0
+        return cls(origin if np.isfinite(origin).all() else np.zeros(3))
+
+    @property
+    def is_none(self) -> bool:
+        return not self.origin.any()
+
+    @property
+    def inverse(self) -> "Reduction":
+        """Back to the network's own coordinates."""
+        return Reduction(-self.origin)
+
+    def network(self, network: Network) -> Network:
+        """A network in reduced coordinates."""
+        if self.is_none:
+            return network
+        return replace(
+            network,
+            images=tuple(self._image(image) for image in network.images),
+            points=tuple(self._point(point) for point in network.points),
+            boards=tuple(self._board(board) for board in network.boards),
+        )
+
+    def approximations(self, start: Approximations) -> Approximations:
+        """Approximations in reduced coordinates."""
+        if self.is_none:
+            return start
+        return replace(
+            start,
+            exterior={image: values - self._of_elements for image, values in start.exterior.items()},
+            points={point: xyz - self.origin for point, xyz in start.points.items()},
+        )
+
+    def unreduced_values(self, unknowns: Unknowns, values: Array, network: Network) -> Array:
+        """The values (n,) of reduced unknowns in the network's own coordinates; fixed ones exactly as given."""
+        if self.is_none:
+            return values
+        whole = values.copy()
+        for at in [*unknowns.point.values(), *{at[0]: at[:3] for at in unknowns.exterior.values()}.values()]:
+            whole[at] += self.origin
+        for point in (each for each in network.points if each.id in unknowns.point):
+            for at, prior in zip(unknowns.point[point.id], (point.X, point.Y, point.Z), strict=True):
+                if prior is not None and prior.sigma == 0.0 and unknowns.sigma[at] == 0.0:
+                    whole[at] = prior.value
+        return whole
+
+    @property
+    def _of_elements(self) -> Array:
+        """(6,) what is taken off an exterior orientation."""
+        return np.append(self.origin, np.zeros(3))
+
+    def _image(self, image: Image) -> Image:
+        if image.exterior is None:
+            return image
+        values = image.exterior.values - self._of_elements
+        return replace(image, exterior=replace(image.exterior, values=values))
+
+    def _point(self, point: ObjectPoint) -> ObjectPoint:
+        priors = zip((point.X, point.Y, point.Z), self.origin.tolist(), strict=True)
+        return ObjectPoint(point.id, *(prior and Prior(prior.value - off, prior.sigma) for prior, off in priors))
+
+    def _board(self, board: Board) -> Board:
+        return replace(board, places={id_: xyz - self.origin for id_, xyz in board.places.items()})
+
+
+def _given_places(network: Network) -> Array:
+    """(n, 3) what is given of the points, else of the stations; nan where nothing is."""
+    priors = [(point.X, point.Y, point.Z) for point in network.points]
+    rows = [[np.nan if prior is None else prior.value for prior in three] for three in priors]
+    places = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    if not np.isnan(places).all():
+        return places
+    return np.array([image.exterior.center for image in network.images if image.exterior is not None]).reshape(-1, 3)
