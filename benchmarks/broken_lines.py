@@ -44,26 +44,26 @@ LINES = (
         "measure/test_frame_settling.py",
     ),
     Broken(
-        "measure/fitting/linear_fit.py",
+        "measure/matching/covariance.py",
         " * (2 * np.pi * _ALIKE_PX**2)",
         "",
         "measure/test_unlike_drawing.py",
     ),
-    Broken("measure/noise/noise.py", " - unknowns, 1)", ", 1)", "measure/test_noise.py"),
+    Broken("measure/noise/noise_model.py", " - unknowns, 1)", ", 1)", "measure/test_noise.py"),
     Broken(
-        "measure/noise/least_squares.py",
+        "measure/noise/robust_estimation.py",
         ", 0.0, 1.0) ** 2) ** 2)",
         ", 0.0, 1.0) ** 2))",
         "measure/test_least_squares.py",
     ),
     Broken("measure/noise/grain.py", "-squared / (4.0 *", "-squared / (2.0 *", "measure/test_grain.py"),
-    Broken("measure/fitting/linear_fit.py", " @ turning) / 2", " @ turning)", "measure/test_second_order.py"),
-    Broken("measure/fitting/clipping.py", "sides * sigma_dn * size", "sides * size", "measure/test_clipping.py"),
+    Broken("measure/matching/covariance.py", " @ turning) / 2", " @ turning)", "measure/test_second_order.py"),
+    Broken("measure/matching/saturation.py", "sides * sigma_dn * size", "sides * size", "measure/test_clipping.py"),
     Broken(
-        "measure/fitting/rounding.py", "- 0.5) / sigma\n    log", "- 0.4) / sigma\n    log", "measure/test_rounding.py"
+        "measure/matching/rounding.py", "- 0.5) / sigma\n    log", "- 0.4) / sigma\n    log", "measure/test_rounding.py"
     ),
     Broken(
-        "measure/fitting/second_place.py",
+        "measure/matching/covariance.py",
         "2 * slopes[0] * slopes[1]",
         "slopes[0] * slopes[1]",
         "measure/test_second_place.py",

@@ -51,7 +51,7 @@ from mark_drawings import (
     WINGS,
 )
 
-from measure.noise.noise import SIGMA_OF_DEVIATION
+from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
 
 # Numbered as in the reports of the US Geological Survey, x' to the right and y' up. Their form, as in OSL/1785, has the
 # data strip to the left; what forms of other makers and of before 1960 have is not known.

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from true_marks import KIND, Kind, TrueMark, some_mark
 
 from measure.fiducial_options import FiducialOptions
-from measure.fitting.matching import match
-from measure.fitting.scan_window import ScanWindow
 from measure.frames.frame_measurement import measure_frame
 from measure.frames.refinement import options_for
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.matching.match import match
+from measure.matching.window import ScanWindow
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan

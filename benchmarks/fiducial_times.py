@@ -38,12 +38,12 @@ from large_scans import FRAME_MM, Storage, rendered
 
 import measure.attempts
 import measure.fiducials
-import measure.fitting.matching
 import measure.frames.refinement
+import measure.matching.match
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.fitting.picture_fit import PictureFit
 from measure.marks.shapes import FiducialLayout
+from measure.matching.fit import PictureFit
 from measure.scans.scan import open_scan
 from measure.scans.tiff_segments import TiffSegments
 from measure.scans.tone import LINEAR, Tone
@@ -55,10 +55,10 @@ STAGES: dict[str, list[tuple[Any, str]]] = {
     "search: correlations": [(FrameSearch, "_about_middle")],
     "search: constellation": [(FrameSearch, "_placements")],
     "first looks": [(measure.frames.refinement, "seen")],
-    "picture fits": [(measure.fitting.matching, "_fitted")],
-    "borders of the ground": [(measure.fitting.matching, "_with_border")],
+    "picture fits": [(measure.matching.match, "_fitted")],
+    "borders of the ground": [(measure.matching.match, "_with_border")],
     "weights of grain": [(PictureFit, "weigh")],
-    "other causes, second places, checks of a mark": [(measure.fitting.matching, "_result")],
+    "other causes, second places, checks of a mark": [(measure.matching.match, "_result")],
     "pose": [(measure.attempts, "named"), (measure.fiducials, "named")],
 }
 _COMMAND = "from pipeline.main import main; main()"

@@ -20,12 +20,12 @@ from measured_marks import CONTRAST, GROUND, measured, start_off
 from numpy.typing import NDArray
 from true_marks import KIND, Border, over_border, some_mark
 
-import measure.fitting.matching as matching
 import measure.frames.frame_measurement as frame_measurement
+import measure.matching.match as matching
 import measure.single_targets.targets as targets
 from adjust.linear_algebra import fronts
 from adjust.solution.adjustment import adjust
-from measure.fitting.picture_fit import PictureFit
+from measure.matching.fit import PictureFit
 from measure.reason import NO_REASON
 
 Array = NDArray[np.float64]

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fiducials import measure_fiducials
-from measure.fitting.matching import Match, MatchOptions, match, window_about
-from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, MarkTemplate, ring_cross
+from measure.matching.match import Match, MatchOptions, match, window_about
+from measure.matching.window import ScanWindow
 from measure.scans.scan import Scan, open_scan
 
 Array = NDArray[np.float64]

@@ -1,10 +1,6 @@
 from .errors import MeasurementError as MeasurementError
 from .fiducial_options import FiducialOptions as FiducialOptions
 from .fiducials import measure_fiducials as measure_fiducials
-from .fitting.matching import Match as Match
-from .fitting.matching import match as match
-from .fitting.scan_window import ScanWindow as ScanWindow
-from .fitting.scan_window import read_window as read_window
 from .marks.shapes import FiducialLayout as FiducialLayout
 from .marks.shapes import FrameCorner as FrameCorner
 from .marks.shapes import LayoutMark as LayoutMark
@@ -17,6 +13,10 @@ from .marks.shapes import polygon as polygon
 from .marks.shapes import ring_cross as ring_cross
 from .marks.shapes import ring_dot as ring_dot
 from .match_options import MatchOptions as MatchOptions
+from .matching.match import Match as Match
+from .matching.match import match as match
+from .matching.window import ScanWindow as ScanWindow
+from .matching.window import read_window as read_window
 from .reason import Code as Code
 from .reason import Reason as Reason
 from .results import FrameMeasurement as FrameMeasurement

@@ -10,7 +10,7 @@ from scipy.special import chdtrc, chdtri, fdtrc
 from measure.checks.doubts import TOLD
 from measure.checks.misfits import Misfit, Pattern, log_densities_wider
 from measure.film import SCATTER_DEGREES
-from measure.noise.least_squares import MEDIAN_EFFICIENCY
+from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
 from measure.probabilities import FALSE_DOUBT
 
 Array = NDArray[np.float64]

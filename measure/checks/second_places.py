@@ -15,7 +15,7 @@ from scipy.special import chdtrc, chdtri, fdtrc
 from measure.checks.doubts import Doubt, observed
 from measure.covariance import Cause
 from measure.frames.frame import may_be_wrong
-from measure.noise.least_squares import MEDIAN_EFFICIENCY
+from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
 from measure.probabilities import FALSE_DOUBT
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement

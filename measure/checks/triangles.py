@@ -20,7 +20,7 @@ from measure.checks.doubts import TOLD, Doubt, observed
 from measure.covariance import Cause
 from measure.film import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_MM
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
-from measure.noise.least_squares import MEDIAN_EFFICIENCY
+from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
 from measure.probabilities import FALSE_DOUBT
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement

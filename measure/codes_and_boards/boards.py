@@ -19,7 +19,7 @@ from measure.codes_and_boards.board_specs import (
 from measure.codes_and_boards.circle_grids import measure_circle_grid
 from measure.codes_and_boards.corners import Corner, Surface, crossing, fit_corner, quarter
 from measure.covariance import Covariance
-from measure.fitting.scan_window import ScanWindow
+from measure.matching.window import ScanWindow
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan

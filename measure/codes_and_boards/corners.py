@@ -22,11 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf, ndtr, owens_t
 
-from measure.fitting.picture_model import PIXEL_VARIANCE_PX2
-from measure.fitting.scan_window import ScanWindow
-from measure.noise.least_squares import gauss_newton_step, tukey_weights
-from measure.noise.noise import correlated, noise_model, robust_scale
-from measure.noise.pixel_sums import products
+from measure.matching.models import PIXEL_VARIANCE_PX2
+from measure.matching.window import ScanWindow
+from measure.noise.noise_model import correlated, noise_model, products
+from measure.noise.robust_estimation import gauss_newton_step, robust_scale, tukey_weights
 from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.codes_and_boards.sheet_view import SheetView, fitted_view, homography_through
-from measure.noise.noise import robust_scale
+from measure.noise.robust_estimation import robust_scale
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from measure.noise.noise import robust_scale
+from measure.noise.robust_estimation import robust_scale
 
 Array = NDArray[np.float64]
 

@@ -8,13 +8,13 @@ import numpy as np
 from scipy.special import comb
 
 from measure.fiducial_options import FiducialOptions
-from measure.fitting.matching import Match
 from measure.frames.first_look import seen as sight_of_mark
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import look_at_frame
 from measure.frames.frame_sighter import FrameSighter
 from measure.marks.shapes import FiducialLayout
 from measure.match_options import MatchOptions
+from measure.matching.match import Match
 from measure.probabilities import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
 from measure.scans.scan import Scan
 from measure.search.candidates import Effort

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.matching import window_about
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
+from measure.matching.match import window_about
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

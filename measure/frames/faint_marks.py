@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause, Covariance
-from measure.fitting.matching import Match
-from measure.fitting.scan_window import Coding
 from measure.marks.rendering import extent_px, picture
+from measure.matching.match import Match
+from measure.matching.window import Coding
 from measure.reason import NO_REASON
 from measure.scans.scan import Scan, means
 from measure.search.candidates import FAINT, detail_px

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.matching import Match
 from measure.frames.faint_marks import FaintMark, find_faint
 from measure.frames.frame_sighter import FrameSighter
 from measure.frames.refinement import Sighting
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FrameCorner, Mark
+from measure.matching.match import Match
 from measure.probabilities import TEXTURE_LIKE_A_FAINT_MARK
 from measure.reason import NO_REASON, Code, Reason
 from measure.search.prediction import MarkPrediction

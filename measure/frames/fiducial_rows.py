@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from measure.film import AFFINITY_SIGMA
-from measure.fitting.second_place import SecondPlace
 from measure.frames.frame import Frame
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate
+from measure.matching.covariance import SecondPlace
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan

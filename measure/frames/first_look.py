@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import ndtr
 
-from measure.fitting.matching import window_about
 from measure.marks.rendering import extent_px, known_picture
+from measure.matching.match import window_about
 from measure.probabilities import NOISE_LIKE_A_MARK
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT, detail_px

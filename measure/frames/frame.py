@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from measure.film import SCATTER_MM
-from measure.fitting.matching import Match
 from measure.frames.refinement import Sighting
+from measure.matching.match import Match
 from measure.probabilities import LARGE_ERROR
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.told_tone import FrameTone

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause
-from measure.fitting.generators import is_round
-from measure.fitting.matching import Match
 from measure.frames.frame import CLEAR_LIKENESS, WRONG_PX
 from measure.frames.frame_edges import told_by_edges
 from measure.frames.frame_sighter import FrameSighter
@@ -26,7 +24,9 @@ from measure.frames.refinement import leans_on_frame, sight, strained_px
 from measure.marks.rendering import reach_px
 from measure.marks.shapes import Disk, Mark, MarkShape, Ring
 from measure.match_options import MatchOptions
-from measure.noise.noise import may_be_noise
+from measure.matching.match import Match
+from measure.matching.models import is_round
+from measure.noise.noise_model import may_be_noise
 from measure.probabilities import LARGE_ERROR
 from measure.reason import Code, Reason
 from measure.scans.told_tone import FrameTone, ToldTone

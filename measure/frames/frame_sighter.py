@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from measure.covariance import Cause
 from measure.fiducial_options import CLICK_SIGMA_PX, FiducialOptions
-from measure.fitting.matching import Match
 from measure.frames.channels import best_weights
 from measure.frames.first_look import strongest
 from measure.frames.frame import CLEAR_LIKENESS, Frame
@@ -16,6 +15,7 @@ from measure.frames.frame_fit import fit_frame, outliers
 from measure.frames.refinement import Sighting, nothing_within, sight
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
+from measure.matching.match import Match
 from measure.probabilities import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
 from measure.reason import Reason
 from measure.scans.parallel import side_by_side

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from measure.fitting.matching import Match
-from measure.fitting.own_shape import OwnShape
-from measure.fitting.picture_model import PIXEL_VARIANCE_PX2
+from measure.matching.covariance import OwnShape
+from measure.matching.match import Match
+from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.probabilities import MARK_UNLIKE_THE_OTHERS
 
 Array = NDArray[np.float64]

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause
-from measure.fitting.matching import Match, MatchOptions, match, window_about
-from measure.fitting.scan_window import beyond_edge, read_window
 from measure.frames.first_look import seen
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
+from measure.matching.match import Match, MatchOptions, match, window_about
+from measure.matching.window import beyond_edge, read_window
 from measure.noise.grain import BESIDE_PX
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.compression import covariance_of_compression, tone_variance

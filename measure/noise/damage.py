@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise.noise import robust_scale
+from measure.noise.robust_estimation import robust_scale
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

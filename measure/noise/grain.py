@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import nnls
 
-from measure.noise.noise import NoiseModel, padded
-from measure.noise.pixel_sums import to_orthonormal
+from measure.noise.noise_model import NoiseModel, padded, to_orthonormal
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from measure.annotations.line import Line
 from measure.fiducial_options import FiducialOptions
 from measure.film import SCATTER_DEGREES
-from measure.fitting.matching import Match
 from measure.frames.frame import Frame
 from measure.frames.frame_fit import FrameFit, fit_frame
 from measure.frames.frame_sighter import first_search_px
 from measure.marks.poses import pose_in_camera, up_from_camera
 from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
+from measure.matching.match import Match
 from measure.pose.pose_pictures import Drawings, Shown, Site
 from measure.pose.written_pose import line_score, main_pose, writing_likelihoods
 from measure.results import Pose

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.fitting.matching import Match
 from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
 from measure.marks.shapes import Mark, MarkTemplate
-from measure.noise.least_squares import TukeyFit, tukey_fit
-from measure.noise.noise import robust_scale
+from measure.matching.match import Match
+from measure.noise.robust_estimation import TukeyFit, robust_scale, tukey_fit
 from measure.scans.scan import Scan, means
 from measure.search.candidates import detail_px, quarter_turned
 

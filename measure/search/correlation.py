@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise.noise import SIGMA_OF_DEVIATION
+from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from measure.noise.noise import robust_scale
+from measure.noise.robust_estimation import robust_scale
 from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]

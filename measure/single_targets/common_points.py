@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise.least_squares import STUDENT_FREEDOM, student_weights
+from measure.noise.robust_estimation import STUDENT_FREEDOM, student_weights
 from measure.single_targets.shared_offsets import Comparison, TargetPlaces, compared
 
 Array = NDArray[np.float64]

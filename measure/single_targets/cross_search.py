@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise.noise import robust_scale
+from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
 from measure.single_targets.block_search import search_blocks
 from measure.single_targets.disk_patches import Candidate, DiskSearch, Patches

@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise.least_squares import gauss_newton_step, tukey_weights
-from measure.noise.noise import SIGMA_OF_DEVIATION
+from measure.noise.robust_estimation import SIGMA_OF_DEVIATION, gauss_newton_step, tukey_weights
 from measure.single_targets.block import Block, joined
 from measure.single_targets.disk_model import DAMPING, GREYS, UNKNOWNS, DiskModel, DiskStates, each
 from measure.single_targets.disk_patches import Patches

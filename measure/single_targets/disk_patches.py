@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise.noise import robust_scales
+from measure.noise.robust_estimation import robust_scales
 from measure.single_targets.block import joined
 from measure.single_targets.disk_outlines import REACH, Blobs, Outlines, outlines_about
 

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause, Covariance
-from measure.fitting.matching import Match, MatchOptions, match, window_about
-from measure.fitting.picture_model import GREY
-from measure.fitting.scan_window import read_window
-from measure.fitting.second_place import SecondPlace
 from measure.marks.shapes import Disk, MarkShape
+from measure.matching.covariance import SecondPlace
+from measure.matching.match import Match, MatchOptions, match, window_about
+from measure.matching.models import GREY
+from measure.matching.window import read_window
 from measure.noise.grain import BESIDE_PX
-from measure.noise.noise import may_be_noise
+from measure.noise.noise_model import may_be_noise
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan

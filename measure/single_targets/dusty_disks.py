@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from measure.noise.noise import SIGMA_OF_DEVIATION
+from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
 from measure.probabilities import LARGE_ERROR, MUCH_DUST
 from measure.reason import NO_REASON, Code, Reason
 from measure.single_targets.disks import FittedDisk

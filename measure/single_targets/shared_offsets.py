@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import fdtrc
 
-from measure.noise.least_squares import MEDIAN_EFFICIENCY, student_weights
+from measure.noise.robust_estimation import MEDIAN_EFFICIENCY, student_weights
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Covariance
-from measure.fitting.matching import Match
 from measure.marks.shapes import FrameCorner
+from measure.matching.match import Match
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.scans.told_tone import ToldTone

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
-from measure.noise.least_squares import gauss_newton_step, tukey_fit
+from measure.noise.robust_estimation import gauss_newton_step, tukey_fit
 from measure.scans.scan import Scan
 from measure.scans.tone import SaidOfTone, Tone
 from measure.search.candidates import FAINT

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from measure.covariance import Covariance
-from measure.fitting.matching import Match
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
-from measure.noise.noise import robust_scale
+from measure.matching.match import Match
+from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
 from measure.special_marks.shared_picture import NOISE_FLOOR, SMOOTHED_PX2, SharedPicture, adjusted, first_picture
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 from scipy.sparse.linalg import LinearOperator, lsmr
 
-from measure.noise.least_squares import tukey_weights
-from measure.noise.noise import robust_scale
+from measure.noise.robust_estimation import robust_scale, tukey_weights
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

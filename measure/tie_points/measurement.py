@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from measure.errors import MeasurementError
-from measure.noise.noise import robust_scale
+from measure.noise.robust_estimation import robust_scale
 from measure.probabilities import POINT_REFUSED
 from measure.reason import Code, Reason
 from measure.scans.parallel import mapped_or_lost

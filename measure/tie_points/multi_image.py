@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import chdtrc
 
-from measure.noise.noise import NoiseModel, correlated, noise_model
+from measure.noise.noise_model import NoiseModel, correlated, noise_model
 from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]

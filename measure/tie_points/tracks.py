@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.errors import MeasurementError
-from measure.noise.least_squares import least_distances
+from measure.noise.robust_estimation import least_distances
 from measure.reason import Code, Reason
 from measure.scans.parallel import mapped_or_lost
 from measure.tie_points.features import Features, TieFrame, find_features, in_turn, shared_features

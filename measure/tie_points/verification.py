@@ -6,8 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
-from measure.noise.least_squares import least_distances
-from measure.noise.noise import robust_scale
+from measure.noise.robust_estimation import least_distances, robust_scale
 from measure.probabilities import POINT_OFF_ITS_NEIGHBOURS, POINT_OFF_ITS_RAY
 
 Array = NDArray[np.float64]

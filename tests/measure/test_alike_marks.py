@@ -5,11 +5,11 @@ import pytest
 from brute_marks import brute_picture
 from drawn_frames import numbered
 
-from measure.fitting.alike_marks import taken_out_of
-from measure.fitting.picture_fit import PictureFit
-from measure.fitting.picture_model import PictureModel
-from measure.fitting.scan_window import Coding
 from measure.match_options import MatchOptions
+from measure.matching.alike_marks import taken_out_of
+from measure.matching.fit import PictureFit
+from measure.matching.models import PictureModel
+from measure.matching.window import Coding
 from measure.noise.grain import taken_out
 
 SIZE, BLUR_PX = 61, 0.77

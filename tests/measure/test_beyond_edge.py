@@ -8,10 +8,10 @@ from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.fitting.scan_window import beyond_edge
 from measure.frames.refinement import sight
 from measure.marks.shapes import MarkShape, cross, polygon
 from measure.match_options import MatchOptions
+from measure.matching.window import beyond_edge
 from measure.search.correlation import CLOSE
 from measure.search.prediction import MarkPrediction
 

@@ -6,12 +6,12 @@ from drawn import scan_of
 from true_marks import KIND, Border, TrueMark, grainy, over_border, some_mark, whitened_rms
 
 from measure.fiducial_options import FiducialOptions
-from measure.fitting.border_search import likely_border
-from measure.fitting.bordered_model import BorderedModel
-from measure.fitting.matching import Match
-from measure.fitting.picture_model import PictureModel
 from measure.frames.refinement import sight
 from measure.match_options import MatchOptions
+from measure.matching.border_search import likely_border
+from measure.matching.bordered_model import BorderedModel
+from measure.matching.match import Match
+from measure.matching.models import PictureModel
 from measure.search.prediction import MarkPrediction
 
 Array = np.ndarray

@@ -6,9 +6,9 @@ from drawn import scan_of
 from true_marks import KIND, TrueMark, some_mark, whitened_rms
 
 from measure.fiducial_options import FiducialOptions
-from measure.fitting.clipping import censored, clipped_sides, noise_scale
-from measure.fitting.matching import Match
 from measure.frames.refinement import sight
+from measure.matching.match import Match
+from measure.matching.saturation import censored, clipped_sides, noise_scale
 from measure.search.prediction import MarkPrediction
 
 FULL, CONTRAST = 65535.0, 20000.0

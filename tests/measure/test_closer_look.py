@@ -11,11 +11,11 @@ from drawn_frames import layout_of, paint
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.fitting.matching import Match
 from measure.frames import frame_sighter
 from measure.frames.frame_sighter import FrameSighter
 from measure.frames.refinement import Sighting
 from measure.marks.shapes import MarkShape, polygon, turned_part
+from measure.matching.match import Match
 from measure.search.constellation import Placement
 from measure.search.correlation import CLOSE, WIDE, Surroundings
 from measure.status import Status

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
 from measure.codes_and_boards.corners import Corner, Surface, crossing, fit_corner, quarter
-from measure.fitting.scan_window import ScanWindow
+from measure.matching.window import ScanWindow
 
 Array = NDArray[np.float64]
 SIZE, NOISE, CONTRAST = 25, 4.0, 100.0

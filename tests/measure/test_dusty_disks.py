@@ -5,7 +5,7 @@ import pytest
 from drawn import drawn, ellipse, scan_of, whitened
 
 from measure.covariance import Covariance
-from measure.fitting.second_place import SecondPlace
+from measure.matching.covariance import SecondPlace
 from measure.single_targets.disks import FittedDisk
 from measure.single_targets.dusty_disks import doubts
 from measure.single_targets.targets import TargetPrediction, measure_disks

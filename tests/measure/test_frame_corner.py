@@ -11,9 +11,9 @@ from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.fitting.matching import Match
 from measure.frames.frame_edges import told_by_edges
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, frame_corner, polygon
+from measure.matching.match import Match
 from measure.scans.tone import Tone, power
 from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_corner import corner_of_edges

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from measure.noise.grain import PATCH_PX, PLANE, grain_model, taken_out
-from measure.noise.noise import noise_model
+from measure.noise.noise_model import noise_model
 
 
 @pytest.mark.parametrize("grain_px", [0.6, 0.8, 1.1])

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
-from measure.fitting.matching import MatchOptions, match
-from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkShape, polygon
+from measure.matching.match import MatchOptions, match
+from measure.matching.window import ScanWindow
 from measure.special_marks.learned import Chip, honest_covariance, template_of
 from measure.special_marks.recurring import recurrence
 

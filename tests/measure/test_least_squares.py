@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise.least_squares import (
+from measure.noise.robust_estimation import (
     gauss_newton_step,
     least_distances,
     solution,

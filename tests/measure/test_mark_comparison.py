@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from measure.fitting.own_shape import OwnShape
 from measure.frames.mark_comparison import (
     SharedBlur,
     SharedShape,
@@ -16,6 +15,7 @@ from measure.frames.mark_comparison import (
     shared_sizes,
     touch_of_round,
 )
+from measure.matching.covariance import OwnShape
 
 PIXEL = 1 / 12
 

@@ -8,9 +8,9 @@ import pytest
 from brute_marks import Array, brute_picture, placed
 from scipy.ndimage import gaussian_filter
 
-from measure.fitting.matching import Match, MatchOptions, match
-from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
+from measure.matching.match import Match, MatchOptions, match
+from measure.matching.window import ScanWindow
 
 SIZE, SCALE, CONTRAST, GROUND = 41, 10.0, 500.0, 1000.0
 MARKS = {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from measure.noise.noise import noise_model
+from measure.noise.noise_model import noise_model
 
 
 def test_the_variance_of_noise_is_that_before_the_fit_took_its_share() -> None:

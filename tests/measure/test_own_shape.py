@@ -4,10 +4,10 @@ the wedge is another."""
 import numpy as np
 from drawn import Array, drawn, transformed
 
-from measure.fitting.matching import Match, match
-from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkShape, Polygon
 from measure.match_options import MatchOptions
+from measure.matching.match import Match, match
+from measure.matching.window import ScanWindow
 
 SIZE, CONTRAST = 41, 500.0
 PLACE = np.array([6.3, 20.2])

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.matching import MatchOptions, match
-from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkTemplate
+from measure.matching.match import MatchOptions, match
+from measure.matching.window import ScanWindow
 from measure.pose.pose_pictures import Drawings, Shown, Site
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS

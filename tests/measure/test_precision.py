@@ -20,9 +20,9 @@ from true_marks import (
 from measure.covariance import Cause
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.fitting.matching import Match
 from measure.frames.refinement import sight
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
+from measure.matching.match import Match
 from measure.scans.tone import Tone
 from measure.search.prediction import MarkPrediction
 from measure.single_targets.disks import fit_disk

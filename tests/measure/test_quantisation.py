@@ -9,9 +9,9 @@ import tifffile
 from brute_marks import brute_picture, placed
 from numpy.typing import NDArray
 
-from measure.fitting.matching import match
-from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkShape, ring_cross
+from measure.matching.match import match
+from measure.matching.window import ScanWindow
 from measure.scans.compression import UNKNOWN_DN, covariance_of_compression, rounding_step_dn
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS

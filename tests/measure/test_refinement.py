@@ -7,10 +7,10 @@ import pytest
 from brute_marks import brute_picture
 from drawn import scan_of
 
-from measure.fitting.matching import MatchOptions, match
-from measure.fitting.scan_window import ScanWindow
 from measure.frames.refinement import options_for, sight, strained_px
 from measure.marks.shapes import MarkShape, cross, polygon
+from measure.matching.match import MatchOptions, match
+from measure.matching.window import ScanWindow
 from measure.search.prediction import MarkPrediction
 
 WING = MarkShape(polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35))))

@@ -5,7 +5,7 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, some_mark, whitened_rms
 
-from measure.fitting.rounding import likely_sigma, rounding_step, unrounded, unrounded_variance
+from measure.matching.rounding import likely_sigma, rounding_step, unrounded, unrounded_variance
 from measure.single_targets.disks import fit_disk
 
 

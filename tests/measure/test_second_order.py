@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from measure.fitting.linear_fit import second_order
+from measure.matching.covariance import second_order
 
 
 @pytest.mark.parametrize("noise_dn", [1.0, 10.0])

@@ -8,11 +8,11 @@ import pytest
 from brute_marks import Array, brute_picture, placed
 from drawn import drawn, ellipse
 
-from measure.fitting.matching import Match, match
-from measure.fitting.scan_window import ScanWindow
-from measure.fitting.second_place import SecondPlace, across_edges
 from measure.marks.shapes import Mark, MarkShape, polygon, ring_cross
 from measure.match_options import MatchOptions
+from measure.matching.covariance import SecondPlace, across_edges
+from measure.matching.match import Match, match
+from measure.matching.window import ScanWindow
 from measure.single_targets.disks import UNIT_DISK
 
 SIZE, CONTRAST = 41, 500.0

@@ -5,10 +5,10 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, some_mark, whitened_rms
 
-from measure.fitting.matching import match
-from measure.fitting.scan_window import read_window
 from measure.match_options import MatchOptions
-from measure.noise.weighting import steadiness
+from measure.matching.match import match
+from measure.matching.window import read_window
+from measure.noise.noise_model import steadiness
 from measure.scans.tone import Tone, power
 
 FULL = 65535.0

@@ -7,15 +7,14 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 
-from measure.fitting.hidden_causes import Landscape
-from measure.fitting.linear_fit import LinearFit
-from measure.fitting.matching import Match, match
-from measure.fitting.scan_window import read_window
-from measure.fitting.tone_estimate import told_tone
 from measure.frames.refinement import options_for, sight
 from measure.marks.shapes import MarkShape, polygon
 from measure.match_options import MatchOptions
-from measure.noise.noise import NoiseModel
+from measure.matching.covariance import Landscape, LinearFit
+from measure.matching.match import Match, match
+from measure.matching.tone_information import told_tone
+from measure.matching.window import read_window
+from measure.noise.noise_model import NoiseModel
 from measure.scans.told_tone import FrameTone, ToldTone
 from measure.scans.tone import LINEAR, SaidOfTone, Tone, power, sampled, srgb
 from measure.search.prediction import MarkPrediction

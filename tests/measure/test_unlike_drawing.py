@@ -6,13 +6,11 @@ from numpy.typing import NDArray
 from true_marks import KIND, Kind, some_mark, whitened_rms
 
 from measure.covariance import Cause
-from measure.fitting.linear_fit import LinearFit
-from measure.fitting.matching import MatchOptions, match
-from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross
-from measure.noise.noise import NoiseModel, coloured
-from measure.noise.pixel_sums import combined, products
-from measure.noise.weighting import weighted
+from measure.matching.covariance import LinearFit
+from measure.matching.match import MatchOptions, match
+from measure.matching.window import ScanWindow
+from measure.noise.noise_model import NoiseModel, coloured, combined, products, weighted
 
 CROSS = MarkShape(cross(1.5, 0.15))
 FOLD, SPARE_PX = 4, 6

@@ -11,9 +11,9 @@ from brute_marks import brute_picture, placed
 
 from measure.codes_and_boards.board_specs import ChessboardSpec
 from measure.codes_and_boards.boards import measure_board
-from measure.fitting.matching import match
-from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkShape, ring_cross
+from measure.matching.match import match
+from measure.matching.window import ScanWindow
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan

@@ -12,9 +12,16 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.special import chdtri, fdtrc
 
-from measure.fitting.picture_model import GREY, PictureModel
-from measure.noise.noise import REACH_PX, NoiseModel, autocovariance, correlated
-from measure.noise.pixel_sums import combined, products, to_orthonormal
+from measure.matching.models import GREY, PictureModel
+from measure.noise.noise_model import (
+    REACH_PX,
+    NoiseModel,
+    autocovariance,
+    combined,
+    correlated,
+    products,
+    to_orthonormal,
+)
 from measure.probabilities import BORDER_FEIGNED
 
 Array = NDArray[np.float64]

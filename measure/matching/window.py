@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.clipping import Sides, clipped_sides
-from measure.fitting.rounding import rounding_step
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
+from measure.matching.rounding import rounding_step
+from measure.matching.saturation import Sides, clipped_sides
 from measure.scans.scan import Scan
 from measure.scans.tone import LINEAR, Tone
 

@@ -6,23 +6,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.clipping import noise_scale
-from measure.fitting.picture_model import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel
-from measure.fitting.rounding import (
+from measure.marks.rendering import chip_mask, picture, true
+from measure.marks.shapes import MarkTemplate
+from measure.matching.models import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel
+from measure.matching.rounding import (
     COARSEST_VARIANCE,
     ROUNDING_VARIANCE,
     likely_sigma,
     unrounded,
     unrounded_variance,
 )
-from measure.fitting.scan_window import Coding
-from measure.marks.rendering import chip_mask, picture, true
-from measure.marks.shapes import MarkTemplate
+from measure.matching.saturation import noise_scale
+from measure.matching.window import Coding
 from measure.noise.damage import damage, damage_where_lossy, grown
-from measure.noise.least_squares import solution, tukey_loss, tukey_weights
-from measure.noise.noise import NoiseModel, correlated, may_be_noise, robust_scale
-from measure.noise.pixel_sums import combined, products
-from measure.noise.weighting import steadiness, weighted
+from measure.noise.noise_model import NoiseModel, combined, correlated, may_be_noise, products, steadiness, weighted
+from measure.noise.robust_estimation import robust_scale, solution, tukey_loss, tukey_weights
 from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]

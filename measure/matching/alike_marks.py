@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.picture_fit import PictureFit
-from measure.fitting.picture_model import GREY, PictureModel, State
-from measure.fitting.scan_window import Coding
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import MarkShape
 from measure.match_options import Freedom, MatchOptions
+from measure.matching.fit import PictureFit
+from measure.matching.models import GREY, PictureModel, State
+from measure.matching.window import Coding
 from measure.noise.grain import taken_out
 
 Array = NDArray[np.float64]

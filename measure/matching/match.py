@@ -15,25 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause, Covariance
-from measure.fitting.alike_marks import taken_out_of
-from measure.fitting.border_search import is_overwhelming, likely_border
-from measure.fitting.bordered_model import BorderedModel
-from measure.fitting.clipping import Sides, clear_of_ends
-from measure.fitting.generators import is_round
-from measure.fitting.hidden_causes import Landscape, covariance_of_changed_tone
-from measure.fitting.linear_fit import LinearFit, second_order
-from measure.fitting.own_shape import OwnShape, own_shape
-from measure.fitting.picture_fit import EDGE_BLURS, PictureFit
-from measure.fitting.picture_model import GREY, PictureModel, State, background_px
-from measure.fitting.scan_window import Coding, ScanWindow
-from measure.fitting.second_place import SecondPlace, edge_place, sloping_place
-from measure.fitting.tone_estimate import told_tone, untold_tone
 from measure.marks.rendering import extent_px, frame_beside, known
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Polygon
 from measure.match_options import MatchOptions
+from measure.matching.alike_marks import taken_out_of
+from measure.matching.border_search import is_overwhelming, likely_border
+from measure.matching.bordered_model import BorderedModel
+from measure.matching.covariance import (
+    Landscape,
+    LinearFit,
+    OwnShape,
+    SecondPlace,
+    covariance_of_changed_tone,
+    edge_place,
+    own_shape,
+    second_order,
+    sloping_place,
+)
+from measure.matching.fit import EDGE_BLURS, PictureFit
+from measure.matching.models import GREY, PictureModel, State, background_px, is_round
+from measure.matching.saturation import Sides, clear_of_ends
+from measure.matching.tone_information import told_tone, untold_tone
+from measure.matching.window import Coding, ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured
-from measure.noise.noise import NoiseModel, as_if_white, is_textured, noise_model
-from measure.noise.pixel_sums import combined, factors, products
+from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, noise_model, products
 from measure.reason import Reason
 from measure.scans.told_tone import ToldTone
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from measure.fitting.picture_model import GREY, PIXEL_VARIANCE_PX2, PictureModel
 from measure.marks.rendering import Rendering
-from measure.noise.pixel_sums import factors
+from measure.matching.models import GREY, PIXEL_VARIANCE_PX2, PictureModel
+from measure.noise.noise_model import factors
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

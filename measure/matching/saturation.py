@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, log_ndtr
 
-from measure.noise.noise import robust_scale
+from measure.noise.robust_estimation import robust_scale
 from measure.probabilities import NATURAL_END
 from measure.scans.scan import Scan
 

@@ -1,12 +1,10 @@
-"""Least squares that hold against outliers: Gauss and Newton's step, and weights by Tukey's and Student's functions."""
+"""Robust estimation: weights and losses against outliers, robust scales, and Gauss-Newton steps."""
 
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-
-from measure.noise.noise import robust_scale
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -16,6 +14,9 @@ MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the 
 STUDENT_FREEDOM = 4.0  # of Student's t: a fifth of false observations moves little
 _TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 _WORST_CONDITION = 1e10  # of normal equations that determine their unknowns
+
+
+SIGMA_OF_DEVIATION = 1.4826  # the standard deviation of normal values over their median absolute deviation
 
 
 def tukey_weights(residuals: NDArray[Real], scale: float) -> NDArray[Real]:
@@ -103,3 +104,23 @@ def least_distances(
         off = places - design @ maps
         weights = least / np.maximum(np.hypot(off[..., 0], off[..., 1]), least)
     return np.asarray(maps)
+
+
+def robust_scale(values: Array) -> float:
+    """The standard deviation of normal values, from their median absolute deviation."""
+    if values.size == 0:
+        return 0.0
+    return SIGMA_OF_DEVIATION * _median(np.abs(values - _median(values)))
+
+
+def robust_scales(values: NDArray[np.floating]) -> Array:
+    """(n,) that of each row of many values (n, many), at once."""
+    middle = values.shape[1] // 2
+    off = np.abs(values - np.partition(values, middle, axis=1)[:, middle, None])
+    return np.asarray(SIGMA_OF_DEVIATION * np.partition(off, middle, axis=1)[:, middle], float)
+
+
+def _median(values: Array) -> float:
+    middle = values.size // 2  # numpy's own takes many times as long for a small window
+    parted = np.partition(values, middle, axis=None)
+    return float(parted[middle] if values.size % 2 else (parted[:middle].max() + parted[middle]) / 2)

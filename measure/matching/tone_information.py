@@ -10,10 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.hidden_causes import Landscape
-from measure.fitting.linear_fit import LinearFit
-from measure.fitting.picture_model import GREY
-from measure.noise.pixel_sums import combined, products
+from measure.matching.covariance import Landscape, LinearFit
+from measure.matching.models import GREY
+from measure.noise.noise_model import combined, products
 from measure.scans.told_tone import ToldTone
 from measure.scans.tone import SaidOfTone, Tone
 

@@ -6,14 +6,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.clipping import Sides, censored, tells
-from measure.fitting.generators import are_strains, generators
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
-from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
-from measure.match_options import MatchOptions
-from measure.noise.pixel_sums import combined, factors
+from measure.marks.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
+from measure.match_options import Freedom, MatchOptions
+from measure.matching.saturation import Sides, censored, tells
+from measure.noise.noise_model import combined, factors
 from measure.reason import NO_REASON, Code, Reason
 
+# Changes of the mark's linear part: (I + e G) times it, G a generator.
+_TURN, _SCALE = ((0.0, -1.0), (1.0, 0.0)), ((1.0, 0.0), (0.0, 1.0))
+_STRETCH, _SHEAR = ((1.0, 0.0), (0.0, -1.0)), ((0.0, 1.0), (1.0, 0.0))
+_OF_FREEDOM: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]], ...]] = {
+    "shift": (),
+    "similarity": (_SCALE, _TURN),
+    "affine": (_SCALE, _TURN, _STRETCH, _SHEAR),
+    "ellipse": (_SCALE, _STRETCH, _SHEAR),
+}
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -29,6 +37,26 @@ _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linear
 _MOST_BLURRED = 2.0  # times the blur, likewise
 _LINEAR = 0.015  # times the blur: within it a linearisation is as good as a new one, to 1e-4 of the blur
 _CHIP_SMOOTHED_PX = 0.7  # and of what it is compared with: as sharp as pixels, edges are sampled falsely in both
+
+
+def generators(freedom: Freedom, mark: Mark) -> NDArray[np.float64]:
+    """(n, 2, 2) of the changes that a fit estimates, scale and rotation first; a round mark has no rotation."""
+    shown = [each for each in _OF_FREEDOM[freedom] if not (each is _TURN and is_round(mark))]
+    return np.array(shown).reshape(-1, 2, 2)
+
+
+def are_strains(generators: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(n,) which of the changes (n, 2, 2) are of stretch or shear: symmetric, and the area stays."""
+    symmetric = np.all(generators == generators.swapaxes(1, 2), axis=(1, 2))
+    return np.asarray(symmetric & (np.trace(generators, axis1=1, axis2=2) == 0))
+
+
+def is_round(mark: Mark) -> bool:
+    """Whether every rotation leaves the mark as it is."""
+    if isinstance(mark, MarkTemplate):
+        return False
+    centred = all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in mark.parts)
+    return centred and not any(mark.perspective)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,1 +1,0 @@
-"""One mark measured to the noise of the film, by least-squares matching."""

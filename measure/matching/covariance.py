@@ -1,0 +1,280 @@
+"""The covariance of a matched place by its causes, from the fit linearised at its solution."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+from scipy.ndimage import gaussian_filter
+from scipy.special import chdtrc
+
+from measure.matching.models import GREY
+from measure.noise.noise_model import NoiseModel, autocovariance, coloured, combined, correlated, products
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_ALIKE_PX = 1.5  # standard deviation of the weights by distance of what neighbours leave alike
+_LEAST_SLOPE = 1e-3  # of a clipped grey value: what tells less tells nothing
+_LEAST_PX = 400  # of the frame beside the notch: fewer do not tell how uneven it is
+# Of the contrast and the logarithm of its change, how much half tones are off: anything between nothing and what a glow
+# makes that stays as it is while the light changes, which is a half.
+_BENT = 0.5 / np.sqrt(3)
+_MOST = 1.0  # of that logarithm: more is another scanner's scale
+_SMOOTHING = 1.5  # times the scan's blur: noise of about 1.3 times the match's, while a line's two edges stay apart
+_LEAST_SMOOTHING_PX = 1.0  # below it pixels sample the derivative too coarsely
+_WORST_CONDITION = 1e6  # of a normal matrix: beyond it double precision leaves no figure of a place in small windows
+_OWN = 0.9  # of what is known of rotation and scale: where the picture gives so much, little is the frame's
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """residuals (height, width), where used; design (unknowns, height, width): derivatives of the model by the
+    unknowns, the first two the place by column and row, the last four gain, offset and slopes of the ground; by_grey,
+    alike: derivatives of the fitted unknowns by the grey values; noise: of these. All images are
+    multiplied by steadiness (height, width), so that their noise is alike everywhere."""
+
+    residuals: Array
+    used: Mask
+    design: Array
+    by_grey: Array
+    noise: NoiseModel
+    steadiness: Array
+
+    def covariance(self, by_grey: Array) -> Array:
+        """(n, n) that the noise gives to n figures, whose derivatives by the grey values are (n, height, width)."""
+        white = self.noise.variance_dn2 * by_grey
+        covariance = products(by_grey, white if self.noise.is_white else correlated(by_grey, self.noise))
+        return np.asarray((covariance + covariance.T) / 2)
+
+    def unlike_drawing_px2(self, by_noise: Array) -> Array:
+        """(2, 2) by which the place is known less well than by_noise, (2, 2) px2, says: by what is left at the mark's
+        edges, and alike in neighbours, beyond the noise."""
+        place, left = self.by_grey[:2], np.where(self.used, self.residuals, 0.0)[None]
+        expected = self.covariance(place)
+        if self.noise.is_grain:  # that weighed the fit: as if it were white, so that neighbours share none
+            place, left = coloured(place, self.noise, 0.5), coloured(left, self.noise, -0.5)
+            expected = products(place, place)
+        shares = place * left
+        about = gaussian_filter(shares, (0.0, _ALIKE_PX, _ALIKE_PX), mode="constant") * (2 * np.pi * _ALIKE_PX**2)
+        more = products(about, shares) - expected
+        sizes, axes = eigh((more + more.T) / 2, by_noise)
+        axes = by_noise @ axes
+        return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
+
+
+def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, priors_dn2: Array) -> float:
+    """By what share of itself the variance of a place is larger than a linearised adjustment has it.
+
+    design (unknowns, height, width): derivatives of the model, the first two by column and row, the last four by the
+    greys; slopes (height, width): their part in what clipped grey values tell, 1 elsewhere; used (height, width): the
+    pixels that count; covariance (unknowns, unknowns); priors_dn2 (unknowns,): weights of the priors, that of a pixel
+    being 1. The bends are compared pixel by pixel, with grain in the covariance only: its weights amplify them as no
+    noise does."""
+    moving = len(design) - GREY + 1  # all but the ground's
+    among, seen = covariance[:moving, :moving], design * used
+    # All that moves with the mark changes by its slope, against the move.
+    whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
+    changes = np.concatenate(np.gradient(whole, axis=(2, 1))) * (-slopes * used)
+    normal, shared = products(seen, seen), products(seen, changes)
+    inverse: Array = np.asarray(np.linalg.inv(normal + np.diag(priors_dn2)), float)
+    taken_up = np.asarray(inverse @ shared, float)
+    by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # of the variance's logarithm, negative
+    both = taken_up.T @ shared
+    left = products(changes, changes) - both - both.T + taken_up.T @ normal @ taken_up
+    turning = np.einsum("jl,ijml->im", among, left.reshape(2, moving, 2, moving))
+    by_noise = np.asarray(inverse @ normal @ inverse, float)
+    curvature = np.trace(by_noise[:2, :2] @ turning) / 2
+    # Lags that are noise themselves may leave the covariance of the other unknowns indefinite.
+    return max(float(curvature + by_unknown @ among @ by_unknown / 2), 0.0)
+
+
+# What a place is uncertain by that its residuals do not show: light that is uneven in the mark, tones that changed.
+#
+# A notch is cut into the frame's border and exposed as the frame is: its light is no more even than the terrain. A
+# slope of that light is a shift of the edges where it ends, and leaves little else in a small notch. How uneven it may
+# be, the frame beside the notch shows.
+#
+# An edge between dark and light is a slope of grey values. Light that is stronger than in the pictures that a chip was
+# learned from climbs that slope elsewhere: the film saturates, or what glows beside it does not grow as it does. Its
+# half tones then are lighter or darker between the same ends, and where all edges face one side that is a shift and
+# leaves next to nothing else.
+
+
+def covariance_of_landscape(light: Array, beside: Mask, moved: Array) -> Array:
+    """(n, n) of figures, column and row of a place for example, for a landscape in the mark that varies as beside it.
+
+    light (height, width): grey values, and beside, alike, which of them show the frame; moved (n, height, width) of the
+    mark's window: derivatives of the figures by the grey values, as much of them as its light has part in.
+    """
+    if beside.sum() < _LEAST_PX:
+        return np.zeros((len(moved),) * 2)
+    reach = max(moved.shape[1:])
+    lags = autocovariance(np.where(beside, light - light[beside].mean(), 0.0), beside, reach)
+    # The noise of single pixels counts already; what neighbours have in common is the landscape.
+    lags[reach, reach] = max(lags[reach, reach + 1], 0.0)
+    landscape = NoiseModel(float(lags[reach, reach]), lags, 1.0)
+    covariance = products(moved, correlated(moved, landscape))
+    sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
+    return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)  # far lags are chance, and may leave less than nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Landscape:
+    """Where a mark shows one. light, beside: as `covariance_of_landscape` takes them; share (height, width): of it in
+    the light of the mark's window."""
+
+    light: Array
+    beside: Mask
+    share: Array
+
+    def covariance(self, by_grey: Array) -> Array:
+        """(n, n) of figures whose derivatives by the grey values are by_grey (n, height, width)."""
+        return covariance_of_landscape(self.light, self.beside, by_grey * self.share)
+
+
+def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_change: float) -> Array:
+    """(2, 2) px2 of a place, for what the tones may have changed.
+
+    half_tones (height, width): grey values, the picture's contrast in the middle between dark and light, none at both
+    ends; by_grey (unknowns, height, width): the unknowns' derivatives by the grey values, column and row first.
+    contrast_change: the contrast over that of the pictures that the chip was learned from.
+    """
+    bent = _BENT * min(abs(float(np.log(contrast_change))), _MOST)
+    moved = bent * products(by_grey[:2], half_tones[None])
+    return np.asarray(moved @ moved.T)
+
+
+# A second place of a mark, by another method, beside the matched one: by its edges, or with paint that slopes.
+#
+# Both are linear in the residuals of the match, so that the covariance of their difference to the matched place is
+# known: noise moves both places, in part together. What it cannot explain is damage or a mark unlike its drawing.
+
+
+@dataclass(frozen=True, eq=False)
+class SecondPlace:
+    """offset_px (2,): the second place less the matched one; covariance_px2 (2, 2): of that difference."""
+
+    offset_px: Array
+    covariance_px2: Array
+
+    @property
+    def sigmas(self) -> float:
+        """The length of the difference in its own standard deviations."""
+        return float(np.sqrt(self.offset_px @ np.linalg.solve(self.covariance_px2, self.offset_px)))
+
+    @property
+    def chance(self) -> float:
+        """The probability that noise alone makes the difference as long."""
+        return float(chdtrc(2, self.sigmas**2))
+
+
+def edge_place(fit: LinearFit, blur_px: float) -> SecondPlace | None:
+    """The place by the mark's edges, None where they do not give one.
+
+    Least-squares matching weighs grey values by how fast the mark's picture changes. An edge detector (Haralick, 1984,
+    Digital step edges from zero crossing of second directional derivatives) asks instead where the second derivative
+    across an edge, under a Gaussian, passes through nothing. Summed round the mark that gives a place of its own: gain,
+    offset and whatever is smooth have no part in it, and a mark whose opposite edges are alike needs no drawing for it.
+    """
+    weights = across_edges(fit.design[:2] * fit.used, max(_SMOOTHING * blur_px, _LEAST_SMOOTHING_PX)) * fit.used
+    response = products(weights, fit.design)
+    by_place = response[:, :2]
+    if not np.linalg.cond(by_place) < _WORST_CONDITION:
+        return None
+    # What noise the match has taken up already has left the residuals.
+    left = weights - combined(response, fit.by_grey)
+    offset = np.asarray(np.linalg.solve(by_place, products(weights, fit.residuals[None])[:, 0]), float)
+    return _second_place(offset, fit.covariance(combined(np.asarray(np.linalg.inv(by_place)), left)))
+
+
+def sloping_place(fit: LinearFit) -> SecondPlace | None:
+    """The place with two more unknowns, slopes of the contrast, in one step from the fit; None where they are not told
+    from the others.
+
+    Dust on one side of a small disk, soft at its edge, moves the disk as it moves an edge, and leaves of itself only
+    that the disk is darker on that side. A disk whose paint may grow lighter or darker across takes that up.
+    """
+    sloping = fit.design[-GREY] * fit.design[-2:] * fit.used
+    left = (sloping - combined(products(sloping, fit.design), fit.by_grey)) * fit.used  # by what the match has taken up
+    normal = products(left, sloping)
+    if not np.linalg.cond(normal) < _WORST_CONDITION:
+        return None
+    by_noise = combined(-products(fit.by_grey[:2], sloping) @ np.linalg.inv(normal), left)
+    return _second_place(products(by_noise, fit.residuals[None])[:, 0], fit.covariance(by_noise))
+
+
+def _second_place(offset_px: Array, covariance_px2: Array) -> SecondPlace | None:
+    """None where the noise's lags, which are noise themselves, make no covariance."""
+    if not np.all(np.linalg.eigvalsh(covariance_px2) > 0):
+        return None
+    return SecondPlace(offset_px, covariance_px2)
+
+
+def across_edges(slopes: Array, smoothing_px: float) -> Array:
+    """(2, height, width): what each grey value counts in the sums, along columns and rows, of the second derivatives
+    across the edges; slopes (2, height, width): of the mark's picture."""
+    square = np.maximum((slopes**2).sum(axis=0), 1e-300)
+    across = (slopes[0] ** 2 / square, 2 * slopes[0] * slopes[1] / square, slopes[1] ** 2 / square)
+    smooth, slope, bend = _kernels(smoothing_px)
+    along = ((bend, smooth), (slope, slope), (smooth, bend))
+    return np.stack(
+        [
+            np.sum([_filtered(part * each, *pair) for each, pair in zip(across, along, strict=True)], axis=0)
+            for part in slopes
+        ]
+    )
+
+
+def _filtered(image: Array, along_cols: Array, along_rows: Array) -> Array:
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_64F, along_cols, along_rows, borderType=cv2.BORDER_CONSTANT))
+
+
+def _kernels(sigma_px: float) -> tuple[Array, Array, Array]:
+    """A Gaussian and its first two derivatives; the second sums to nothing, so that an even ground has none."""
+    reach = int(np.ceil(4 * sigma_px))
+    place = np.arange(-reach, reach + 1.0)
+    smooth = np.exp(-(place**2) / (2 * sigma_px**2))
+    smooth /= smooth.sum()
+    bend = (place**2 / sigma_px**2 - 1) * smooth / sigma_px**2
+    return smooth, -place * smooth / sigma_px**2, bend - bend.mean()
+
+
+# The rotation and scale that a mark's own picture gives, where it was matched with those of the frame.
+#
+# A wedge's or a notch's edges hardly tell its scale from its place, so the frame gives it. But what touches an edge
+# moves the place as it changes that scale, and leaves no other trace: both are in the picture, and may be compared.
+
+
+@dataclass(frozen=True, eq=False)
+class OwnShape:
+    """change (2,): scale and rotation (rad) by the picture alone, less those of the frame, and sigma (2,), their
+    standard deviations; on_place (2, 2): px by which the place would follow, did the match not keep to the frame's."""
+
+    change: Array
+    sigma: Array
+    on_place: Array
+
+
+def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) -> OwnShape | None:
+    """What the picture says of the two unknowns of a shape, None where they were its own anyway, or it says nothing.
+
+    shape: which unknowns of the fit these are; strain: those of stretch and shear, which stay held by the frame;
+    departures (unknowns,): of the match from what the frame gave.
+    """
+    told = products(fit.by_grey, fit.design)
+    if np.diag(told)[shape].min() > _OWN:
+        return None
+    let_go = told.copy()  # as if no other unknown were held: each column is how far that unknown itself decides
+    let_go[:, strain] = np.eye(len(told))[:, strain]
+    try:
+        freed = np.asarray(np.linalg.inv(let_go), float)[shape]
+    except np.linalg.LinAlgError:
+        return None
+    by_noise = combined(freed, fit.by_grey)
+    variance = np.diag(fit.covariance(by_noise))
+    if not np.all(variance > 0):
+        return None
+    change = products(by_noise, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
+    return OwnShape(change + freed @ told @ departures, np.sqrt(variance), -told[:2, shape])

@@ -1,0 +1,270 @@
+"""The noise of film and scanner behind the residuals of a fit: variance, autocovariance, and weights that follow."""
+
+from dataclasses import dataclass, replace
+from math import prod
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from measure.noise.robust_estimation import robust_scale
+
+Array = NDArray[np.float64]
+
+_ALIKE = 1e-10  # of the largest eigenvalue: what images differ by in less is no direction of its own
+Mask = NDArray[np.bool_]
+
+_ODDS = 13.8  # chi-square of two coordinates: one in a thousand
+_TEXTURE = 0.25  # correlation at REACH_PX that grain never has
+
+WHITE = 0.02  # of the variance at least is taken as white: no film's grain is known better at the finest frequencies
+REACH_PX = 5  # the coarsest grain that matters at scanning pitch: correlated over 1.5 px, gone beyond 5
+Single = NDArray[np.float32]
+
+_POWER, _POWER_SIGMA, _MOST = 0.4, 0.25, 1 - 1 / 2.2  # of light: what is believed of any scan
+_OTHER, _SAME = 0.5, 0.15  # of light's greatest change: from where noise differs, up to where it does not
+_GREATEST = 0.98  # of the pixels change less than what is called the greatest change
+_FEWEST = 12  # pixels that tell how noisy they are
+_SCALE_VARIANCE = 1.36  # of the logarithm of a robust scale, times the number of values it is of
+_LEAST = 0.1  # of light's logarithm: noise hardly changes with less
+_DARKEST = 5e-4  # of full scale: nearer to black no scanner's noise is less
+
+_ROUNDS = 8  # of conjugate gradients, at most
+_CLOSE = 0.03  # of a derivative: so little left costs a thousandth of the standard deviation
+_MISFIT = 0.003  # of the contrast: what the drawing itself gets wrong from pixel to pixel
+
+
+def combined(factors: Array, images: Array) -> Array:
+    """Images (n, height, width) times factors (n,), summed to one image, or (m, n), to m images."""
+    sums = factors @ images.reshape(len(images), prod(images.shape[1:]))
+    return np.asarray(sums.reshape(*factors.shape[:-1], *images.shape[1:]))
+
+
+def products(first: Array, second: Array) -> Array:
+    """(n, m) the sums over all pixels of the products of images (n, height, width) and (m, height, width)."""
+    return np.asarray(first.reshape(len(first), -1) @ second.reshape(len(second), -1).T)
+
+
+def to_orthonormal(normal: Array) -> Array:
+    """(k, n) the factors by which images become an orthonormal base of the space they span, of k dimensions; normal
+    (n, n): the sums of their products."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, vectors = np.linalg.eigh(normal / np.outer(size, size))
+    told = values > _ALIKE * values[-1]
+    return np.asarray((vectors[:, told] / np.sqrt(values[told])).T / size)
+
+
+def factors(images: Array, image: Array) -> Array:
+    """(n,) the factors by which images (n, height, width), 0 where they do not count, come closest to an image in least
+    squares."""
+    inverse = np.linalg.pinv(products(images, images), hermitian=True)
+    return np.asarray(inverse @ products(images, image[None])[:, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """variance_dn2 of one pixel, and the (2 * reach + 1) square of autocovariances about it, a lone value for white
+    noise. neighbour_correlation: the mean correlation of pixels that touch along an edge. is_grain: whether blank film
+    shows it, and not a fit's residuals alone, which may be a landscape's."""
+
+    variance_dn2: float
+    autocovariance_dn2: Array
+    neighbour_correlation: float
+    is_grain: bool = False
+
+    @property
+    def is_white(self) -> bool:
+        return self.autocovariance_dn2.size == 1
+
+    def at_least(self, variance_dn2: float) -> "NoiseModel":
+        """The same, of a variance that is not smaller."""
+        if not self.variance_dn2:  # a picture without any noise: there is nothing to enlarge
+            return NoiseModel(variance_dn2, np.full((1, 1), variance_dn2), 0.0, self.is_grain)
+        larger = max(variance_dn2 / self.variance_dn2, 1.0)
+        return replace(
+            self, variance_dn2=self.variance_dn2 * larger, autocovariance_dn2=self.autocovariance_dn2 * larger
+        )
+
+
+def noise_model(residuals: Array, used: Mask, unknowns: int, told: float | None = None) -> NoiseModel:
+    """The noise model of residuals (height, width), where used, after a fit of so many unknowns. told: of how many
+    ordinary pixels they have the information, where some are clipped and residuals are their scores.
+
+    Noise counts as white where the correlation of neighbours is within three standard errors of nothing.
+    """
+    noise, is_white = as_if_white(residuals, used, unknowns, told)
+    if is_white:
+        return noise
+    lags = autocovariance(np.where(used, residuals, 0.0), used, REACH_PX) * _taper(REACH_PX)
+    return replace(noise, autocovariance_dn2=lags * (noise.variance_dn2 / lags[REACH_PX, REACH_PX]))
+
+
+def as_if_white(residuals: Array, used: Mask, unknowns: int, told: float | None = None) -> tuple[NoiseModel, bool]:
+    """The same without correlations, and whether it has none."""
+    count = max(int(used.sum()), 1)
+    kept = np.where(used, residuals, 0.0)
+    squares = float((kept**2).sum())
+    variance = squares / max((count if told is None else told) - unknowns, 1)
+    correlation = _covariance_along(kept, used, 1) / (squares / count) if squares else 0.0
+    return NoiseModel(variance, np.array([[variance]]), correlation), abs(correlation) < 3 / np.sqrt(2 * count)
+
+
+def is_textured(residuals: Array, used: Mask, floor_dn: float) -> bool:
+    """Whether what a fit leaves is a landscape rather than grain: still alike beyond the reach of any grain. Residuals
+    below floor_dn are the drawing's own."""
+    kept = np.where(used, residuals, 0.0)
+    if not kept.any():
+        return False
+    return bool(_covariance_along(kept, used, REACH_PX) > _TEXTURE * max((kept**2).sum() / used.sum(), floor_dn**2))
+
+
+def may_be_noise(off: Array, covariance: Array) -> bool:
+    """Whether noise of that covariance (2, 2) may have moved a place by off (2,)."""
+    return bool(off @ np.linalg.solve(covariance, off) < _ODDS)
+
+
+def correlated(columns: Array, noise: NoiseModel) -> Array:
+    """The noise's covariance matrix times images (n, height, width), without ever forming it."""
+    return coloured(columns, noise, 1.0)
+
+
+def coloured(columns: Array, noise: NoiseModel, power: float) -> Array:
+    """A power of the noise's covariance matrix, as if the picture had no border, times images (n, height, width)."""
+    height, width = columns.shape[1:]
+    reach = len(noise.autocovariance_dn2) // 2
+    shape = padded((height, width), reach)
+    kernel, index = np.zeros(shape), np.arange(-reach, reach + 1)
+    kernel[np.ix_(index, index)] = noise.autocovariance_dn2
+    spectrum = fft.rfft2(kernel).real
+    if power != 1.0:
+        spectrum = np.maximum(spectrum, WHITE * noise.variance_dn2) ** power
+    smeared = fft.irfft2(fft.rfft2(columns, s=shape) * spectrum, s=shape)
+    return np.asarray(smeared[:, :height, :width])
+
+
+def autocovariance(kept: Array, used: Mask, reach: int) -> Array:
+    """Mean products at all lags up to reach, averaged over opposite and mirrored lags: grain has no direction."""
+    shape = padded(kept.shape, reach)
+    spectra = np.abs(fft.rfft2(np.stack([kept, used]), s=shape)) ** 2
+    products, pairs = fft.irfft2(spectra, s=shape)
+    index = np.arange(-reach, reach + 1)
+    lags = (products / np.maximum(pairs, 1.0))[np.ix_(index, index)]
+    lags = (lags + lags[:, ::-1]) / 2
+    return np.asarray((lags + lags.T) / 2)
+
+
+def padded(shape: tuple[int, ...], reach: int) -> list[int]:
+    """The size of a transform in which lags up to the reach do not run into one another."""
+    return [fft.next_fast_len(size + reach, real=True) for size in shape]
+
+
+def _covariance_along(kept: Array, used: Mask, lag: int) -> float:
+    """The mean product at a lag along a row or a column."""
+    products = (kept[:, lag:] * kept[:, :-lag]).sum(), (kept[lag:] * kept[:-lag]).sum()
+    pairs = (used[:, lag:] & used[:, :-lag]).sum(), (used[lag:] & used[:-lag]).sum()
+    return float(sum(product / max(count, 1) for product, count in zip(products, pairs, strict=True)) / 2)
+
+
+def _taper(reach: int) -> Array:
+    """Fades out the far lags, which are noise themselves."""
+    index = np.arange(-reach, reach + 1)
+    distance = np.hypot(index[:, None], index[None, :])
+    return np.asarray(np.clip(reach + 1 - distance, 0.0, 1.0))
+
+
+# Weights of pixels: by noise that grows with light, and for grain by what the inverse of the noise's covariance matrix
+# makes of a fit's derivatives.
+#
+# A sensor's own noise is alike in light. What is added to grey values that are a power of light, or rounded or
+# compressed away of them, is alike in these, and in light the larger the more light there is; grain lies between. So
+# the standard deviation of noise is taken to grow as a power of light, from 0, alike in light, to that of noise alike
+# in grey values of a gamma of 2.2: the same however a file codes light. What seems to grow faster is no noise: it is a
+# mark that is not as drawn, and to weigh it down would fit less and less of it.
+#
+# Generalised least squares solves `B r = 0`, B being the derivatives times that inverse. Conjugate gradients give B to
+# some per cent in a few rounds without forming a matrix. B need not be exact: the estimate is unbiased with any, and
+# its covariance follows from the very B that was used.
+
+
+def steadiness(residuals: Array, light: Array, ground: Mask, used: Mask) -> Array:
+    """(height, width): the standard deviation of the ground's noise over that of each pixel.
+
+    residuals (height, width): light that a fit left; light, alike: what it draws, of full scale; ground, used,
+    alike: the ordinary pixels, and those that count. Damage hardly does: scales are medians.
+    """
+    at_ground = ground & used
+    if not at_ground.any():
+        return np.ones_like(residuals)
+    light = np.maximum(light, _DARKEST)
+    change = np.log(light / np.median(light[at_ground]))
+    size = np.abs(change)
+    greatest = float(np.quantile(size[used], _GREATEST))
+    if greatest < _LEAST:
+        return np.ones_like(residuals)
+    same, other = at_ground & (size < _SAME * greatest), used & (size > _OTHER * greatest)
+    power, weight = _POWER, _POWER_SIGMA**-2
+    if same.sum() >= _FEWEST and other.sum() >= _FEWEST:
+        scales = [max(robust_scale(residuals[group]), 1e-9) for group in (other, same)]
+        apart = float(np.mean(change[other]) - np.mean(change[same]))
+        told = apart**2 / (_SCALE_VARIANCE * (1 / same.sum() + 1 / other.sum()))
+        power = (weight * power + told * float(np.log(scales[0] / scales[1])) / apart) / (weight + told)
+    return np.asarray(np.exp(-np.clip(power, 0.0, _MOST) * change))
+
+
+def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -> tuple[Array, Array]:
+    """B and C B', each (unknowns, height, width) and 0 where not used: weighted derivatives, and the covariance matrix
+    of the noise times them."""
+    covariance = _Covariance(noise, used, max(WHITE * noise.variance_dn2, (_MISFIT * contrast_dn) ** 2))
+    # The columns are scaled for single precision, and all are solved at once.
+    right = (design * used).astype(np.float32)
+    size = np.sqrt(_dots(right, right))
+    right /= size
+    # Columns that are close leave the rounds: those of a mark's edges are so at once, the ground's later.
+    solution, left, rests = np.zeros_like(right), np.arange(len(right)), right.copy()
+    direction = ahead = covariance.roughly_inverse(right)
+    strength = _dots(right, ahead)
+    for _ in range(_ROUNDS):
+        seen = covariance.times(direction)
+        length = strength / np.maximum(_dots(direction, seen), 1e-30)
+        solution[left] += length * direction
+        rests[left] -= np.multiply(length, seen, out=seen)
+        rest = rests[left]
+        far = _dots(rest, rest)[:, 0, 0] >= _CLOSE**2  # of columns of unit length
+        if not far.any():
+            break
+        left, rest, direction, before = left[far], rest[far], direction[far], strength[far]
+        ahead = covariance.roughly_inverse(rest)
+        strength = _dots(rest, ahead)
+        direction *= strength / np.maximum(before, 1e-30)
+        direction += ahead
+    return solution * (size / covariance.scale_dn2).astype(float), (right - rests) * size.astype(float)
+
+
+class _Covariance:
+    """The noise's covariance among the pixels used, in units of scale_dn2, applied by Fourier transforms."""
+
+    def __init__(self, noise: NoiseModel, used: Mask, white_dn2: float) -> None:
+        reach = noise.autocovariance_dn2.shape[0] // 2
+        self.used = used.astype(np.float32)
+        self.scale_dn2 = noise.variance_dn2
+        self.shape = padded(used.shape, reach)
+        kernel, index = np.zeros(self.shape, np.float32), np.arange(-reach, reach + 1)
+        kernel[np.ix_(index, index)] = noise.autocovariance_dn2 / self.scale_dn2
+        spectrum = np.asarray(fft.rfft2(kernel).real, np.float32)
+        self.spectrum: Single = np.asarray(np.maximum(spectrum, white_dn2 / self.scale_dn2), np.float32)
+
+    def times(self, images: Single) -> Single:
+        return self._filtered(images, self.spectrum)
+
+    def roughly_inverse(self, images: Single) -> Single:
+        """As if the pixels used had no border."""
+        return self._filtered(images, np.asarray(1 / self.spectrum, np.float32))
+
+    def _filtered(self, images: Single, spectrum: Single) -> Single:
+        height, width = self.used.shape
+        smeared = fft.irfft2(fft.rfft2(images, s=self.shape) * spectrum, s=self.shape)
+        return np.asarray(smeared[:, :height, :width] * self.used, np.float32)
+
+
+def _dots(first: Single, second: Single) -> Single:
+    return np.asarray(np.einsum("nij,nij->n", first, second)[:, None, None], np.float32)
