@@ -94,9 +94,7 @@ LINES = (
         "prior[0, 4] = prior[1, 5] = 0.1 / AFFINITY_SIGMA",
         "measure/test_frame_fit.py",
     ),
-    Broken(
-        "measure/single_targets/shared_offsets.py", "own + best.predicted_px2", "own", "measure/test_shared_offsets.py"
-    ),
+    Broken("measure/targets/consistency.py", "own + best.predicted_px2", "own", "measure/test_shared_offsets.py"),
     Broken(
         "pipeline/measuring/perspective_disks.py",
         "c[:, 2] ** 2 - radius**2 * tilt",

@@ -23,9 +23,9 @@ from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
-from measure.single_targets.disks import PLAIN_MARGIN_PX
-from measure.single_targets.targets import TargetPrediction, measure_disks
 from measure.status import Status
+from measure.targets.disks import PLAIN_MARGIN_PX
+from measure.targets.measure_targets import TargetPrediction, measure_disks
 from synthetic_images.optics import reach_px, seen_coverage
 
 Array = NDArray[np.float64]

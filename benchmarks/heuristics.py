@@ -22,7 +22,7 @@ from true_marks import KIND, Border, over_border, some_mark
 
 import measure.frames.frame_measurement as frame_measurement
 import measure.matching.match as matching
-import measure.single_targets.targets as targets
+import measure.targets.measure_targets as targets
 from adjust.linear_algebra import fronts
 from adjust.solution.adjustment import adjust
 from measure.matching.fit import PictureFit

@@ -27,9 +27,8 @@ from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout
 from measure.scans.parallel import side_by_side
 from measure.scans.scan import open_scan
-from measure.single_targets.disk_patches import DiskSearch
-from measure.single_targets.disk_search import disk_candidates
-from measure.single_targets.disks import fit_disk
+from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.disks import fit_disk
 from pipeline.files.project_file import read_project
 from pipeline.rendered.scene_file import render_project
 

@@ -12,7 +12,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.frames.frame import CLEAR_DAMAGE
 from measure.frames.refinement import sight
 from measure.search.prediction import MarkPrediction
-from measure.single_targets.disks import fit_disk
+from measure.targets.disks import fit_disk
 
 Array = NDArray[np.float64]
 

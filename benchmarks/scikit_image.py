@@ -32,8 +32,7 @@ from measure.codes_and_boards.corners import junction
 from measure.frames.frame_fit import outliers
 from measure.noise.damage import _opened
 from measure.search.response_layers import peaks
-from measure.single_targets.disk_patches import DiskSearch
-from measure.single_targets.disk_search import disk_candidates
+from measure.targets.disk_detection import DiskSearch, disk_candidates
 
 Array = NDArray[np.float64]
 

@@ -24,8 +24,8 @@ from .results import MarkMeasurement as MarkMeasurement
 from .results import Pose as Pose
 from .scans.scan import Scan as Scan
 from .scans.scan import open_scan as open_scan
-from .single_targets.targets import TargetOptions as TargetOptions
-from .single_targets.targets import TargetPrediction as TargetPrediction
-from .single_targets.targets import measure_crosses as measure_crosses
-from .single_targets.targets import measure_disks as measure_disks
 from .status import Status as Status
+from .targets.measure_targets import TargetOptions as TargetOptions
+from .targets.measure_targets import TargetPrediction as TargetPrediction
+from .targets.measure_targets import measure_crosses as measure_crosses
+from .targets.measure_targets import measure_disks as measure_disks

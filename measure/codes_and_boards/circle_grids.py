@@ -11,10 +11,10 @@ from measure.codes_and_boards.lattices import Place, grid_places, is_whole, othe
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.single_targets.disk_patches import Candidate, DiskSearch
-from measure.single_targets.disk_search import disk_candidates
-from measure.single_targets.disks import FittedDisk, fit_disk
 from measure.status import Status
+from measure.targets.block_search import Candidate
+from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.disks import FittedDisk, fit_disk
 
 Array = NDArray[np.float64]
 

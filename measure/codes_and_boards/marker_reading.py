@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.sheet_view import SheetView, robust_view
 from measure.reason import Code, Reason
+from measure.targets.sheets import SheetView, robust_view
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

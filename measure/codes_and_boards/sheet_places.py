@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.sheet_view import SheetView, focal_length, robust_view
-from measure.single_targets.common_points import ImagePoints
-from measure.single_targets.shared_offsets import TargetPlaces
+from measure.targets.consistency import ImagePoints, TargetPlaces
+from measure.targets.sheets import SheetView, focal_length, robust_view
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from measure.reason import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.addresses import scan_path
 from measure.scans.scan import open_scan
-from measure.single_targets.targets import TargetPrediction
 from measure.status import Status
+from measure.targets.measure_targets import TargetPrediction
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.handed_out import results_of

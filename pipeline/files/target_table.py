@@ -9,7 +9,7 @@ from pipeline.text.tables import Table
 
 if TYPE_CHECKING:
     from measure.codes_and_boards.board_specs import BoardSpec
-    from measure.codes_and_boards.ring_codes import RingCode
+    from measure.targets.ring_codes import RingCode
 
 KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco", "squares")
 
@@ -64,7 +64,7 @@ def _crosses(table: Table) -> TargetSettings:
 
 
 def _coded(table: Table) -> TargetSettings:
-    from measure.codes_and_boards.ring_codes import RingCode
+    from measure.targets.ring_codes import RingCode
 
     default = RingCode()
     diameter = table.number("diameter_mm", above=0.0) if "diameter_mm" in table else None

@@ -8,9 +8,9 @@ import numpy as np
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.single_targets.disk_patches import Candidate
-from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_disks
 from measure.status import Status
+from measure.targets.block_search import Candidate
+from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_disks
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_model import camera_model
 from pipeline.measuring.coded_points import (

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.ring_codes import read_code
 from measure.codes_and_boards.sheet_places import along_plane, is_flat
 from measure.scans.scan import Scan
-from measure.single_targets.disk_patches import Candidate, DiskSearch
-from measure.single_targets.disk_search import disk_candidates
+from measure.targets.block_search import Candidate
+from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.ring_codes import read_code
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from measure.codes_and_boards.sheet_naming import Dots, Naming, name_dots
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.single_targets.disk_patches import Candidate
-from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_disks
 from measure.status import Status
+from measure.targets.block_search import Candidate
+from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_disks
+from measure.targets.sheets import Dots, Naming, name_dots
 from pipeline.measuring.coded_points import (
     CodedPoints,
     coded_candidates,

@@ -11,8 +11,8 @@ from measure.codes_and_boards.sheet_places import FLAT, SeenSheet, along_plane, 
 from measure.probabilities import SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
-from measure.single_targets.common_points import ImagePoints, compared_together
 from measure.status import Status
+from measure.targets.consistency import ImagePoints, compared_together
 from pipeline.files.project_file import Project
 from pipeline.measuring.coded_points import CodedPoints
 from pipeline.results.measured_scan import MeasuredScan

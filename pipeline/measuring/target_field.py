@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from adjust.functional_model.projection import ImageModel
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.single_targets.cross_search import CrossSearch, cross_candidates
-from measure.single_targets.disk_patches import Candidate, DiskSearch
-from measure.single_targets.disk_search import disk_candidates
-from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
+from measure.targets.block_search import Candidate
+from measure.targets.crosses import CrossSearch, cross_candidates
+from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.perspective_disks import disk_images, disk_normals, plane_normal

@@ -11,8 +11,8 @@ from adjust.functional_model.rotation import rotation_from_vector
 from measure.probabilities import TARGET_ELSEWHERE, TARGET_OFF_PLACE
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
-from measure.single_targets.shared_offsets import TargetPlaces, compared
 from measure.status import Status
+from measure.targets.consistency import TargetPlaces, compared
 from pipeline.measuring.target_field import Field
 from pipeline.results.comparator_file import pixel_from_comparator
 from pipeline.results.measured_scan import MeasuredScan

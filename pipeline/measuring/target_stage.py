@@ -13,8 +13,8 @@ from measure.codes_and_boards.boards import measure_board
 from measure.reason import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan
-from measure.single_targets.targets import TargetPrediction
 from measure.status import Status
+from measure.targets.measure_targets import TargetPrediction
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.camera_model import camera_model
 from pipeline.measuring.coded_field import measure_coded_field

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 
 from adjust.functional_model.projection import ImageModel
 from adjust.target_names.naming import Names, name_coded, name_marks
-from measure.single_targets.disk_patches import Candidate
-from measure.single_targets.targets import TargetPrediction
+from measure.targets.block_search import Candidate
+from measure.targets.measure_targets import TargetPrediction
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_model import frame_mm
 from pipeline.measuring.target_field import Field

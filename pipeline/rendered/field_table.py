@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.ring_codes import RingCode
+from measure.targets.ring_codes import RingCode
 from pipeline.files.project_file import UNITS_MM
 from pipeline.text.tables import Table
 from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarget, RingFigure

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from measure.scans.scan import Scan
-from measure.single_targets.block_search import search_blocks
-from measure.single_targets.disk_patches import DiskSearch
-from measure.single_targets.disk_search import disk_candidates, octaves_of
-from measure.single_targets.disks import FittedDisk, fit_disk
+from measure.targets.block_search import search_blocks
+from measure.targets.disk_detection import DiskSearch, disk_candidates, octaves_of
+from measure.targets.disks import FittedDisk, fit_disk
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 600.0, 12000.0

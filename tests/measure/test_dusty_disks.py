@@ -6,10 +6,10 @@ from drawn import drawn, ellipse, scan_of, whitened
 
 from measure.covariance import Covariance
 from measure.matching.covariance import SecondPlace
-from measure.single_targets.disks import FittedDisk
-from measure.single_targets.dusty_disks import doubts
-from measure.single_targets.targets import TargetPrediction, measure_disks
 from measure.status import Status
+from measure.targets.disks import FittedDisk
+from measure.targets.dust import doubts
+from measure.targets.measure_targets import TargetPrediction, measure_disks
 
 CONTRAST, GROUND = 15000.0, 25000.0
 

@@ -14,8 +14,7 @@ from measure.scans.parallel import mapped_or_lost, side_by_side
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from measure.single_targets.disk_patches import DiskSearch
-from measure.single_targets.disk_search import disk_candidates
+from measure.targets.disk_detection import DiskSearch, disk_candidates
 
 
 @pytest.fixture(autouse=True)

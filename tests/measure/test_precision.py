@@ -25,7 +25,7 @@ from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cr
 from measure.matching.match import Match
 from measure.scans.tone import Tone
 from measure.search.prediction import MarkPrediction
-from measure.single_targets.disks import fit_disk
+from measure.targets.disks import fit_disk
 
 GROUND, CONTRAST, SNR = 25000.0, 15000.0, 20.0
 

@@ -19,7 +19,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.marks.shapes import MarkShape, polygon, turned_part
 from measure.results import MarkMeasurement
 from measure.revision import MEASURE_REVISION
-from measure.single_targets.targets import TargetPrediction, measure_disks
+from measure.targets.measure_targets import TargetPrediction, measure_disks
 
 TABLE = Path(__file__).with_name("revision.json")
 PLACE_PX, SIGMA = 1e-4, 0.01  # which processors may make of rounding; SIGMA is a share

@@ -7,11 +7,11 @@ import pytest
 from drawn import drawn, scan_of, transformed
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.ring_codes import RingCode, read_code
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from measure.single_targets.disk_patches import Candidate
+from measure.targets.block_search import Candidate
+from measure.targets.ring_codes import RingCode, read_code
 
 Array = NDArray[np.float64]
 SIZE = 121

@@ -6,7 +6,7 @@ from drawn import scan_of
 from true_marks import KIND, some_mark, whitened_rms
 
 from measure.matching.rounding import likely_sigma, rounding_step, unrounded, unrounded_variance
-from measure.single_targets.disks import fit_disk
+from measure.targets.disks import fit_disk
 
 
 def test_disks_on_an_even_ground_are_measured_by_the_intervals_that_grey_values_stand_for() -> None:

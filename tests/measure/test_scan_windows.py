@@ -14,9 +14,7 @@ from stored_picture import HEIGHT, WIDTH, picture
 from measure.scans.parallel import side_by_side
 from measure.scans.scan import open_scan
 from measure.scans.segments import SegmentCache
-from measure.single_targets.block import Block
-from measure.single_targets.block_search import search_blocks
-from measure.single_targets.disk_patches import Patches
+from measure.targets.block_search import Block, Patches, search_blocks
 
 
 def test_parts_outside_of_the_scan_repeat_its_edge(tmp_path: Path) -> None:
@@ -140,8 +138,8 @@ class Watched:
 def test_a_search_by_blocks_decodes_each_segment_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: dict[str, Any]
 ) -> None:
-    monkeypatch.setattr("measure.single_targets.block_search.BLOCK_BYTES", 40 * 100)
-    monkeypatch.setattr("measure.single_targets.block_search.ROW_BYTES", 100)
+    monkeypatch.setattr("measure.targets.block_search.BLOCK_BYTES", 40 * 100)
+    monkeypatch.setattr("measure.targets.block_search.ROW_BYTES", 100)
     tifffile.imwrite(tmp_path / "s.tif", picture(), photometric="minisblack", compression="lzw", **layout)
     with open_scan(tmp_path / "s.tif") as scan:
         reads: list[tuple[Any, ...]] = []

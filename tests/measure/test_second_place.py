@@ -13,7 +13,7 @@ from measure.match_options import MatchOptions
 from measure.matching.covariance import SecondPlace, across_edges
 from measure.matching.match import Match, match
 from measure.matching.window import ScanWindow
-from measure.single_targets.disks import UNIT_DISK
+from measure.targets.disks import UNIT_DISK
 
 SIZE, CONTRAST = 41, 500.0
 RING_CROSS = MarkShape(ring_cross(1.0, 0.2, 1.6, 0.15))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.single_targets.shared_offsets import TargetPlaces, compared
+from measure.targets.consistency import TargetPlaces, compared
 
 Array = NDArray[np.float64]
 SIZE_PX, NOISE_PX = (4000, 3000), 0.05

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.sheet_naming import Dots, Naming, name_dots
+from measure.targets.sheets import Dots, Naming, name_dots
 
 Array = NDArray[np.float64]
 SIZE = (2200, 1700)

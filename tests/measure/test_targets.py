@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.single_targets.cross_search import CrossSearch, cross_candidates
-from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 from measure.status import Status
+from measure.targets.crosses import CrossSearch, cross_candidates
+from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 500.0, 12000.0

@@ -10,11 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from real_data import DATA, needs
 
-from measure.codes_and_boards.ring_codes import RingCode, read_code
-from measure.codes_and_boards.sheet_naming import Dots, Naming, name_dots
 from measure.scans.scan import open_scan
-from measure.single_targets.disk_patches import DiskSearch
-from measure.single_targets.disk_search import disk_candidates
+from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.ring_codes import RingCode, read_code
+from measure.targets.sheets import Dots, Naming, name_dots
 from pipeline.cli import run
 
 Array = NDArray[np.float64]

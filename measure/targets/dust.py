@@ -17,7 +17,7 @@ from scipy.special import chdtrc
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
 from measure.probabilities import LARGE_ERROR, MUCH_DUST
 from measure.reason import NO_REASON, Code, Reason
-from measure.single_targets.disks import FittedDisk
+from measure.targets.disks import FittedDisk
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
-from measure.single_targets.block_search import search_blocks
-from measure.single_targets.disk_patches import Candidate, DiskSearch, Patches
+from measure.targets.block_search import Candidate, Patches, search_blocks
+from measure.targets.disk_detection import DiskSearch
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

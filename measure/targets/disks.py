@@ -17,8 +17,8 @@ from measure.noise.noise_model import may_be_noise
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
-from measure.single_targets.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
-from measure.single_targets.disk_patches import LEAST_SNR
+from measure.targets.disk_detection import LEAST_SNR
+from measure.targets.disk_fit_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.scans.scan import Scan
-from measure.single_targets.disk_patches import Candidate
+from measure.targets.block_search import Candidate
 
 Array = NDArray[np.float64]
 

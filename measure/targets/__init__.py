@@ -1,0 +1,1 @@
+"""Targets: disks, crosses, coded rings and sheets of dots, detected, identified and measured."""
