@@ -28,6 +28,8 @@ POOR_GAIN = 0.25  # of the promised decrease of v'Pv, below which the next step 
 LARGEST_EASING = 0.1  # of the damping after a good step
 PROBE = 0.1  # part of a step over which its curvature is taken
 LARGEST_TURN = 0.75  # of a step's length that its second-order part may have
+SLOW = 0.5  # of the step before, above which a step shrinks slowly
+LARGEST_STRETCH = 10.0  # times as long as a step that an accelerated one may be
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,10 @@ def linearise(numbering: Numbering, covariance_mm2: Array, state: State) -> Line
 
 
 def _square_sum(problem: Problem, state: State, rows: WhitenedRows) -> float:
-    """v'Pv of the observations, of the priors and of further observations."""
-    prior = problem.unknowns.has_prior
-    normalised = prior_differences(problem, state)[prior] / problem.unknowns.sigma[prior]
+    """v'Pv of the observations, of the priors and of further observations; of pseudo-observations too."""
+    sigma = problem.prior_sigma
+    prior = (sigma > 0.0) & np.isfinite(sigma)
+    normalised = prior_differences(problem, state)[prior] / sigma[prior]
     return float((rows.right**2).sum() + (normalised**2).sum()) + square_sum(problem.further, state.values)
 
 
@@ -96,13 +99,15 @@ def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limi
     A step is taken when it makes v'Pv smaller; if not, or where a point would have no image after it, the damping
     grows. How much of the promised decrease came about, the gain, decides on the next damping (Nielsen 1999, Damping
     parameter in Marquardt's method). Damped steps are bent along the curve on which the linear residuals stay
-    (`_bent`): that follows the valleys in which the principal distance changes with heights and scale.
+    (`_bent`): that follows the valleys in which the principal distance changes with heights and scale. Undamped steps
+    that shrink slowly are accelerated (`_accelerated`).
     """
     at = start
     damping, lately = 0.0, FIRST_DAMPING
     history: list[Iteration] = []
+    moved: _Moved | None = None
     while len(history) < limit:
-        moved = _step(numbering, covariance_mm2, at, damping, lately)
+        moved = _step(numbering, covariance_mm2, at, damping, lately, moved)
         if moved is None:
             return Solution(at, None, "diverged", tuple(history))
         at = moved.end
@@ -134,22 +139,33 @@ def _eased(damping: float, gain: float) -> float:
 
 @dataclass(frozen=True)
 class _Moved:
-    """A step that was taken: where it leads, its length in standard deviations, and how it came about."""
+    """A step that was taken: where it leads, its length in standard deviations, and how it came about.
+
+    solution (n,): that of the linear equations; taken (n,): what was made of it.
+    """
 
     end: Linearised
     sigmas: float
     damping: float
     gain: float
     attempts: int
+    solution: Array
+    taken: Array
 
 
-def _step(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, lately: float) -> _Moved | None:
+def _step(
+    numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, lately: float, before: _Moved | None
+) -> _Moved | None:
     """The first step from a state that makes v'Pv smaller, with more and more damping; None: there is none.
 
-    lately: the damping that helped lately, to be tried where it takes some.
+    lately: the damping that helped lately, to be tried where it takes some. before: the step before.
     """
     problem = numbering.problem
     attempts = 0
+    if damping == 0.0 and before is not None and before.damping == 0.0:
+        accelerated = _accelerated(numbering, covariance_mm2, at, before)
+        if accelerated is not None:
+            return accelerated
     while damping < LARGEST_DAMPING:
         attempts += 1
         try:
@@ -164,11 +180,36 @@ def _step(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: 
             promised = factor.length() ** 2 + damping * float(((factor.scale * solution) ** 2).sum())
             bent = step if damping == 0.0 else _bent(numbering, at, damping, step)
             moved = None if bent is None else linearise(numbering, covariance_mm2, problem.moved(at.state, bent))
-            if moved is not None and moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
+            if bent is not None and moved is not None and moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
                 gain = (at.vpv - moved.vpv) / promised if promised > VPV_ROUNDING * (1.0 + at.vpv) else 1.0
-                return _Moved(moved, factor.length(), damping, gain, attempts)
+                return _Moved(moved, factor.length(), damping, gain, attempts, step, bent)
         damping = 10.0 * damping or lately
     return None
+
+
+def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, before: _Moved) -> _Moved | None:
+    """An undamped step with what the one before tells of its error; None where steps shrink quickly, or it is no better.
+
+    Where observations hardly determine a direction, the second derivatives of large residuals make Gauss-Newton's steps
+    shrink slowly, or overshoot. The combination of the last two steps of least length takes their place (Anderson 1965,
+    Iterative procedures for nonlinear integral equations; of depth one).
+    """
+    problem, factor = numbering.problem, at.factor
+    step = np.zeros(len(problem.unknowns))
+    step[numbering.free] = factor.solution()
+    length = factor.length()
+    if not SLOW * before.sigmas < length < 1.0:
+        return None
+    change = (step - before.solution)[numbering.free] * factor.scale
+    part = float(change @ (step[numbering.free] * factor.scale)) / float(change @ change)
+    taken = step - part * (before.taken + step - before.solution)
+    sizes = [float(np.linalg.norm(each[numbering.free] * factor.scale)) for each in (step, taken)]
+    if not sizes[1] <= LARGEST_STRETCH * sizes[0]:
+        return None
+    moved = linearise(numbering, covariance_mm2, problem.moved(at.state, taken))
+    if moved is None or moved.vpv > at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
+        return None
+    return _Moved(moved, length, 0.0, 1.0, 1, step, taken)
 
 
 def _bent(numbering: Numbering, at: Linearised, damping: float, step: Array) -> Array | None:

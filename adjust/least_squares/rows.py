@@ -125,8 +125,8 @@ def _further_block(numbering: Numbering, further: FurtherObservation, values: Ar
 
 
 def prior_root_weights(numbering: Numbering) -> Array:
-    """One over the standard deviation of every free unknown's prior (f,), 0 where it has none."""
-    return np.asarray(1.0 / numbering.problem.unknowns.sigma[numbering.free])
+    """One over the standard deviation of every free unknown's prior or pseudo-observation (f,), 0 where it has none."""
+    return np.asarray(1.0 / numbering.problem.prior_sigma[numbering.free])
 
 
 def of_cameras(numbering: Numbering) -> NDArray[np.bool_]:

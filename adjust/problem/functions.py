@@ -79,7 +79,7 @@ def compute(problem: Problem, state: State) -> Computed | None:
 def _computed_in_camera(problem: Problem, state: State, targets: Iterable[SeenTargets]) -> Array | None:
     """The camera coordinates (n, 2) of all marks; None where some point has no image."""
     camera_xy = state.values[problem.places.T[:2]].T  # fiducials stay, targets follow
-    observed = _observed_in_camera(problem, state) if problem.by_elements else camera_xy
+    observed = observed_in_camera(problem, state) if problem.by_elements else camera_xy
     for seen in targets:
         interior, parameters, distortion = _camera(problem, state, seen.camera)
         if interior[0] <= 0.0:
@@ -118,7 +118,7 @@ def _camera(problem: Problem, state: State, name: str) -> tuple[Array, Array, Di
     return interior, parameters, problem.network.camera_by_name[name].distortion
 
 
-def _observed_in_camera(problem: Problem, state: State) -> Array:
+def observed_in_camera(problem: Problem, state: State) -> Array:
     """The camera coordinates (n, 2) of the observations as they were made."""
     camera_xy = np.empty_like(problem.network.observations.xy_mm)
     straight_mm = _straight(problem, state, problem.network.observations.xy_mm)

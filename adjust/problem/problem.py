@@ -1,7 +1,7 @@
 """A network whose quantities are numbered, observation by observation, and the state of its unknowns."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple, TypeVar
 
@@ -114,12 +114,23 @@ class Problem:
 
     by_elements: distortion is that of the observed camera point and not of the adjusted one, so that every observation
     is an explicit function of the unknowns (adjustment by elements, of indirect observations).
+    pseudo_observed: positions of free unknowns that are held near their given values, and by which standard deviations
+    (see `undetermined.flat_valleys`): no observations, and none of what the result tells of these.
     """
 
     network: Network
     unknowns: Unknowns
     mirrored: frozenset[str]
     by_elements: bool = False
+    pseudo_observed: Mapping[int, float] = field(default_factory=dict)
+
+    @cached_property
+    def prior_sigma(self) -> Array:
+        """(n,) the standard deviations of priors and pseudo-observations: 0 fixed, inf for what has neither."""
+        sigma = self.unknowns.sigma.copy()
+        for position, own in self.pseudo_observed.items():
+            sigma[position] = min(sigma[position], own)
+        return sigma
 
     def start(self) -> State:
         values = self.unknowns.start

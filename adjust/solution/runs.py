@@ -9,19 +9,21 @@ from numpy.typing import NDArray
 
 from adjust.errors import NoImageError
 from adjust.functional_model.families import family
-from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
+from adjust.least_squares.iteration import Linearised, Solution, factorise, iterate, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.functions import blind_mark
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import NullDirection, Termination
 from adjust.problem.tested import TestedUnits
+from adjust.quality.cofactor import free_cofactor
 from adjust.quality.reliability import Misfits, misfits, statistics
 from adjust.quality.reweighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
 from adjust.quality.snooping import Contradiction, contradictions, limits, search
 from adjust.quality.variance_components import refined_factors
 from adjust.solution.options import Options
 from adjust.undetermined.diagnosis import singular_directions
+from adjust.undetermined.flat_valleys import possible_pseudo_observations, unresolved
 
 ROUNDS = 30  # of robust estimation, of variance components or of data snooping at most
 ITERATIONS_A_ROUND = 8  # of the adjustments whose weights robust estimation is to change anyway
@@ -181,9 +183,27 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
         if held and last.singular and not last.solution.history:
             begun = _run(replace(problem, unknowns=problem.unknowns.fixed(held)), weighting, state, limit)
             if begun.converged:
-                freed = _adjusted(problem, weighting, _apart(problem, begun.end.state), limit)
+                freed = _freed(problem, weighting, begun, limit)
                 last = last if freed.singular else freed
     return last
+
+
+def _freed(problem: Problem, weighting: Weighting, begun: Run, limit: int) -> Run:
+    """The run with all parameters free, from where one ended that held some; where the observations do not separate
+    distortion parameters, with pseudo-observations of these.
+    """
+    state = _apart(problem, begun.end.state)
+    weighted, covariance = weighting.applied(problem)
+    numbering = Numbering(replace(weighted, pseudo_observed={}))
+    at = linearise(numbering, covariance, state)
+    possible = possible_pseudo_observations(problem, at) if at is not None else {}
+    if at is not None and possible:
+        held = replace(problem, pseudo_observed=possible)
+        factor = factorise(Numbering(replace(weighted, pseudo_observed=possible)), at)
+        variances = free_cofactor(numbering, state, factor).variances
+        if unresolved(possible, variances):
+            return _adjusted(held, weighting, begun.end.state, limit)
+    return _adjusted(problem, weighting, state, limit)
 
 
 def _alike_at_zero(problem: Problem, state: State) -> dict[str, list[int]]:

@@ -11,6 +11,7 @@ from adjust.linear_algebra.factor import Factor
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import NullDirection
 from adjust.undetermined.datum import free_coordinates, object_datum
+from adjust.undetermined.flat_valleys import UNRESOLVED
 from adjust.undetermined.directions import camera_leads, datum_sentence, field_of, following
 from adjust.undetermined.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
 from adjust.undetermined.own_directions import many_sentence, own_sentence, unnamed_sentence
@@ -58,7 +59,7 @@ def weak_directions(
     marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
     sigma = np.where(
         np.isin(np.char.partition(np.array(problem.unknowns.names)[free], ".")[:, 0], ("IO", "SC")),
-        problem.unknowns.sigma[free],
+        np.where(np.isin(free, list(problem.pseudo_observed)), UNRESOLVED / SETTLED, 1.0) * problem.prior_sigma[free],
         np.inf,
     )
     calibrated = [each.positions for each in problem.further if each.group == "calibration"]
