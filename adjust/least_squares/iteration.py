@@ -188,7 +188,7 @@ def _step(
 
 
 def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, before: _Moved) -> _Moved | None:
-    """An undamped step with what the one before tells of its error; None where steps shrink quickly, or it is no better.
+    """An undamped step with what the one before tells of its error; None where that is no better.
 
     Where observations hardly determine a direction, the second derivatives of large residuals make Gauss-Newton's steps
     shrink slowly, or overshoot. The combination of the last two steps of least length takes their place (Anderson 1965,

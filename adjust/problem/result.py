@@ -233,6 +233,9 @@ class Assessment(Protocol):
     @property
     def warnings(self) -> tuple[str, ...]: ...
 
+    @property
+    def notes(self) -> tuple[str, ...]: ...
+
 
 @dataclass(frozen=True, repr=False)
 class Adjustment:
@@ -308,6 +311,11 @@ class Adjustment:
         """What the user should look at; where slips kept it from a solution, all else there seems to be is theirs."""
         spoilt = self.slips and not self.converged
         return (*self.slips, *self.remarks, *(() if spoilt else self.assessment.warnings))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is worth knowing and needs no action."""
+        return self.assessment.notes
 
     @property
     def converged(self) -> bool:

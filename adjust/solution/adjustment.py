@@ -294,7 +294,7 @@ def _result(last: Run, cofactor: Cofactor, options: Options) -> Adjustment:
         conditions=assessment.conditions,
         unknowns=len(last.numbering.free),
         redundancy=assessment.redundancy,
-        vpv=last.end.vpv,
+        vpv=last.vpv,
         names=problem.unknowns.names,
         values=np.where(_meaningless(problem), np.nan, state.values),
         cofactor=cofactor,

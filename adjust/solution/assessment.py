@@ -21,6 +21,7 @@ from adjust.quality.suspicions import is_gross, swapped_numbers, unchecked_orien
 from adjust.quality.variance_components import factor_sigmas
 from adjust.solution.runs import ROUNDS, Run
 from adjust.undetermined.diagnosis import undetermined, weak_directions
+from adjust.undetermined.flat_valleys import held_directions, inseparable
 from adjust.undetermined.scanner_directions import hardly_told
 
 
@@ -34,10 +35,11 @@ class RunAssessment:
 
     @cached_property
     def conditions(self) -> int:
-        """Equations, without what the adjustment does without."""
+        """Equations, without what the adjustment does without; with what pseudo-observations determine."""
         problem = self.run.problem
         further = sum(len(each.observed) for each in problem.further)
-        return int(TestedUnits(problem).sizes[self.run.weighting.used].sum()) + further
+        held = held_directions(problem, self.cofactor.variances)
+        return int(TestedUnits(problem).sizes[self.run.weighting.used].sum()) + further + held
 
     @property
     def redundancy(self) -> int:
@@ -59,7 +61,7 @@ class RunAssessment:
         if not run.has_solution or not run.problem.further:
             return ()
         of_state = run.problem, run.end.state, run.end.rows.further
-        found = contradictions_of_groups(*of_state, run.factor, run.end.vpv, self.redundancy)
+        found = contradictions_of_groups(*of_state, run.factor, run.vpv, self.redundancy)
         return tuple(each for each in found if each.group == "calibration")
 
     @cached_property
@@ -80,7 +82,7 @@ class RunAssessment:
         if found is None:
             return None
         at, weights = (run.numbering, run.end, run.factor, found), run.weighting.weights
-        sigma0 = float(np.sqrt(run.end.vpv / self.redundancy)) if self.redundancy > 0 else 1.0
+        sigma0 = float(np.sqrt(run.vpv / self.redundancy)) if self.redundancy > 0 else 1.0
         return reliability(*at, weights, sigma0, self.redundancy, self.probabilities)
 
     @cached_property
@@ -97,6 +99,11 @@ class RunAssessment:
         observations = self.run.problem.network.observations
         unchecked = unchecked_orientations(observations, self.residuals) if self.run.converged else []
         return (*_warnings(self.run, self.cofactor), *self._swapped, *unchecked)
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        problem = self.run.problem
+        return tuple(inseparable(problem, self.run.end.state, self.cofactor.variances)) if self.run.converged else ()
 
     @property
     def _swapped(self) -> list[str]:

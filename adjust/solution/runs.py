@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from adjust.errors import NoImageError
 from adjust.functional_model.families import family
-from adjust.least_squares.iteration import Linearised, Solution, factorise, iterate, linearise
+from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.functions import blind_mark
@@ -23,7 +23,13 @@ from adjust.quality.snooping import Contradiction, contradictions, limits, searc
 from adjust.quality.variance_components import refined_factors
 from adjust.solution.options import Options
 from adjust.undetermined.diagnosis import singular_directions
-from adjust.undetermined.flat_valleys import possible_pseudo_observations, unresolved
+from adjust.undetermined.flat_valleys import (
+    REACHES,
+    edge_motions,
+    is_contradicted,
+    pseudo_square_sum,
+    unresolved,
+)
 
 ROUNDS = 30  # of robust estimation, of variance components or of data snooping at most
 ITERATIONS_A_ROUND = 8  # of the adjustments whose weights robust estimation is to change anyway
@@ -65,6 +71,11 @@ class Run:
     @property
     def end(self) -> Linearised:
         return self.solution.end
+
+    @property
+    def vpv(self) -> float:
+        """v'Pv of all that is observed or given."""
+        return self.end.vpv - pseudo_square_sum(self.problem, self.end.state)
 
     @property
     def converged(self) -> bool:
@@ -190,20 +201,34 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
 
 def _freed(problem: Problem, weighting: Weighting, begun: Run, limit: int) -> Run:
     """The run with all parameters free, from where one ended that held some; where the observations do not separate
-    distortion parameters, with pseudo-observations of these.
+    distortion parameters, with pseudo-observations of these, as weak as they have to be.
     """
-    state = _apart(problem, begun.end.state)
+    state, start = begun.end.state, _apart(problem, begun.end.state)
+    at = _linearised(problem, weighting, state)
+    motions = edge_motions(problem, at) if at is not None else {}
+    for reach in REACHES if motions else ():
+        held = replace(problem, pseudo_observed={i: reach * motion for i, motion in motions.items()})
+        if not unresolved(held.pseudo_observed, _variances(held, weighting, start)):
+            break
+        last = _adjusted(held, weighting, state, limit)
+        if last.converged and not is_contradicted(held, last.end.state):
+            return last
+        if last.converged:
+            state = start = last.end.state
+    return _adjusted(problem, weighting, start, limit)
+
+
+def _linearised(problem: Problem, weighting: Weighting, state: State) -> Linearised | None:
     weighted, covariance = weighting.applied(problem)
-    numbering = Numbering(replace(weighted, pseudo_observed={}))
-    at = linearise(numbering, covariance, state)
-    possible = possible_pseudo_observations(problem, at) if at is not None else {}
-    if at is not None and possible:
-        held = replace(problem, pseudo_observed=possible)
-        factor = factorise(Numbering(replace(weighted, pseudo_observed=possible)), at)
-        variances = free_cofactor(numbering, state, factor).variances
-        if unresolved(possible, variances):
-            return _adjusted(held, weighting, begun.end.state, limit)
-    return _adjusted(problem, weighting, state, limit)
+    return linearise(Numbering(weighted), covariance, state)
+
+
+def _variances(problem: Problem, weighting: Weighting, state: State) -> NDArray[np.float64]:
+    """A-priori variances (n,) of all quantities at a state; 0 where some point has no image there."""
+    at = _linearised(problem, weighting, state)
+    if at is None:
+        return np.zeros(len(problem.unknowns))
+    return free_cofactor(at.rows.numbering, state, at.factor).variances
 
 
 def _alike_at_zero(problem: Problem, state: State) -> dict[str, list[int]]:

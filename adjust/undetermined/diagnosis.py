@@ -11,8 +11,8 @@ from adjust.linear_algebra.factor import Factor
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import NullDirection
 from adjust.undetermined.datum import free_coordinates, object_datum
-from adjust.undetermined.flat_valleys import UNRESOLVED
 from adjust.undetermined.directions import camera_leads, datum_sentence, field_of, following
+from adjust.undetermined.flat_valleys import trading_off
 from adjust.undetermined.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
 from adjust.undetermined.own_directions import many_sentence, own_sentence, unnamed_sentence
 from adjust.undetermined.scanner_directions import scanner_leads
@@ -48,7 +48,8 @@ def weak_directions(
 
     The factor is to be that without the priors of cameras and scanners. Of all directions below WEAK those are told in
     which these priors weigh less than SETTLED times what the observations do. Directions that move fiducials with
-    priors are no cause for alarm: their priors are meant to place them. singular: the null directions, which are not
+    priors are no cause for alarm: their priors are meant to place them; nor are those of lenses whose parameters trade
+    off, of which notes tell. singular: the null directions, which are not
     told again. Many directions without a name are told as one: the longer a strip is, the more ways there are in which
     it can bend.
     """
@@ -59,11 +60,12 @@ def weak_directions(
     marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
     sigma = np.where(
         np.isin(np.char.partition(np.array(problem.unknowns.names)[free], ".")[:, 0], ("IO", "SC")),
-        np.where(np.isin(free, list(problem.pseudo_observed)), UNRESOLVED / SETTLED, 1.0) * problem.prior_sigma[free],
+        problem.unknowns.sigma[free],
         np.inf,
     )
     calibrated = [each.positions for each in problem.further if each.group == "calibration"]
     placed = marks & (np.isfinite(problem.unknowns.sigma[free]) | np.isin(free, np.concatenate([[], *calibrated])))
+    placed |= np.isin(free, np.concatenate([[], *trading_off(problem).values()]))
     kept = _unseen_by(hardly[placed], MIXED)
     of_unit_weight = hardly @ kept @ np.linalg.inv(np.linalg.qr(np.maximum(told, SINGULAR)[:, None] * kept, mode="r"))
     _, weight, right = np.linalg.svd(of_unit_weight / (factor.scale * sigma)[:, None], full_matrices=False)

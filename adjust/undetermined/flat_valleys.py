@@ -1,18 +1,19 @@
 """Distortion parameters that do the same within the observed field: a flat valley of v'Pv, which the iteration must not
 wander along.
 
-The numerator and the denominator of a rational lens trade off where targets stand in the middle of the picture: the
-distortion is known there, its parameters are not. No observation of the object would change that, so this is no datum
-defect. Each parameter of such a lens is held by a pseudo-observation: alone, it moves the edge of the observed field by
-REACH of its radius at most. That is what no lens does, a thousand times what marks are measured to, and nothing beside
-what determines a parameter that can be determined; along the valley it leads to the parameters that are smallest
-(Tikhonov's regularisation).
+Numerator and denominator of a rational lens trade off where targets stand in the middle of the picture: the distortion
+is known there, its parameters are not. No datum would change that. Each free parameter of such a lens is held by a
+pseudo-observation: at one standard deviation it moves the edge of the observed field, alone, by a part of its radius
+(REACHES). That is hundreds of times what marks are measured to: beside what the observations determine it is nothing,
+along the valley it leads to the smallest parameters (Tikhonov's regularisation). Where the observations contradict it,
+a weaker one takes its place (Morozov's discrepancy principle), and none where they separate the parameters.
 """
 
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from adjust.functional_model.families import family
 from adjust.least_squares.iteration import Linearised
@@ -22,22 +23,38 @@ from adjust.problem.problem import Problem, State
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-REACH = 0.1  # of the radius of the outermost target, by which a parameter alone may move it
+REACHES = (0.3, 1.0, 3.0, 10.0)  # parts of the radius, the first that the observations do not contradict
+CONTRADICTED = 0.01  # probability of so large parameters, below which a pseudo-observation is contradicted
 UNRESOLVED = 0.3  # standard deviation, over that of its pseudo-observation, above which a parameter is not separable
 
 
-def possible_pseudo_observations(problem: Problem, at: Linearised) -> dict[int, float]:
-    """By position, the standard deviations of pseudo-observations of the free distortion parameters of cameras whose
-    family has a numerator and a denominator that are both free.
+def trading_off(problem: Problem) -> dict[str, list[int]]:
+    """By camera the positions of its free distortion parameters, where numerator and denominator are both free."""
+    unknowns, found = problem.unknowns, {}
+    for name, positions in unknowns.camera.items():
+        of = family(problem.network.camera_by_name[name].distortion.family)
+        free = {
+            each: int(i) for each, i in zip(of.parameters, positions[3:], strict=True) if np.isinf(unknowns.sigma[i])
+        }
+        if not free.keys().isdisjoint(of.alike_at_zero) and len(problem.targets_by_camera[name]):
+            found[name] = list(free.values())
+    return found
+
+
+def edge_motions(problem: Problem, at: Linearised) -> dict[int, float]:
+    """By position, of the parameters that trade off: the change that alone moves the edge of the observed field by its
+    radius.
     """
     found: dict[int, float] = {}
-    for name, positions in problem.unknowns.camera.items():
-        free = [int(i) for i in positions[3:] if np.isinf(problem.unknowns.sigma[i])]
-        rows = problem.targets_by_camera[name]
-        if len(rows) and not _denominator(problem, name).isdisjoint(free):
-            radius_mm = observed_radius_mm(problem, at.state, name)
-            found |= {i: REACH * radius_mm / moved for i in free if (moved := _largest_motion_mm(problem, at, rows, i))}
+    for name, free in trading_off(problem).items():
+        rows, radius_mm = problem.targets_by_camera[name], observed_radius_mm(problem, at.state, name)
+        found |= {i: radius_mm / moved for i in free if (moved := _largest_motion_mm(problem, at, rows, i))}
     return found
+
+
+def is_contradicted(problem: Problem, state: State) -> bool:
+    """Whether the observations want larger parameters than the pseudo-observations allow."""
+    return bool(chdtrc(len(problem.pseudo_observed), pseudo_square_sum(problem, state)) < CONTRADICTED)
 
 
 def observed_radius_mm(problem: Problem, state: State, camera: str) -> float:
@@ -55,10 +72,38 @@ def unresolved(pseudo_observed: Mapping[int, float], variances: Array) -> list[i
     return [i for i, sigma in pseudo_observed.items() if np.sqrt(variances[i]) > UNRESOLVED * sigma]
 
 
-def _denominator(problem: Problem, camera: str) -> set[int]:
-    of = family(problem.network.camera_by_name[camera].distortion.family)
-    positions = problem.unknowns.camera[camera][3:]
-    return {int(positions[of.parameters.index(each)]) for each in of.alike_at_zero}
+def pseudo_square_sum(problem: Problem, state: State) -> float:
+    """The part of the pseudo-observations in v'Pv."""
+    unknowns = problem.unknowns
+    return sum(
+        float((state.values[i] - unknowns.given[i]) / sigma) ** 2 for i, sigma in problem.pseudo_observed.items()
+    )
+
+
+def held_directions(problem: Problem, variances: Array) -> int:
+    """How many directions pseudo-observations determine in place of the observations: the sum of 1 - r of them."""
+    return round(sum(float(variances[i]) / sigma**2 for i, sigma in problem.pseudo_observed.items()))
+
+
+def inseparable(problem: Problem, state: State, variances: Array) -> list[str]:
+    """A sentence on every camera of which parameters are not separable."""
+    told = set(unresolved(problem.pseudo_observed, variances))
+    sentences = []
+    for name, positions in problem.unknowns.camera.items():
+        of = family(problem.network.camera_by_name[name].distortion.family)
+        names = [each for each, i in zip(of.parameters, positions[3:], strict=True) if int(i) in told]
+        if names:
+            radius_mm = observed_radius_mm(problem, state, name)
+            sentences.append(
+                f"{_listed(names)} of camera {name} cannot be separated: up to {radius_mm:.3g} mm from the "
+                "principal point, as far as targets were observed, they do the same. The distortion itself is known "
+                "there. Use its parameters together, not one by one, or estimate fewer of them."
+            )
+    return sentences
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _largest_motion_mm(problem: Problem, at: Linearised, rows: Indices, position: int) -> float:

@@ -269,6 +269,7 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     elif data.check["verdict"] == "not possible" and not is_film_alone(data):
         yield f"OpenCV cannot check this calibration. {data.check['reason']}"
     if data.adjustment:
+        yield from data.adjustment.get("notes", ())
         yield from _weight_notes(data.adjustment)
         if _is_solved(data) and data.adjustment["redundancy"] > 0:
             yield from _too_small(data.adjustment)

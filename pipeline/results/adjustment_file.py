@@ -92,6 +92,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
             for each in correlations(adjustment)
         ],
         "warnings": list(adjustment.warnings),
+        "notes": list(adjustment.notes),
         "variance_factors": dict(adjustment.variance_factors),
         "variance_sigmas": dict(adjustment.variance_sigmas),
         "suspects": [suspect_json(suspect) for suspect in adjustment.suspects],

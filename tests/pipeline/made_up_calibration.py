@@ -97,6 +97,7 @@ class Told:
     reliability: Reliability | None = None
     suspects: tuple[Suspect, ...] = ()
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 @cache
