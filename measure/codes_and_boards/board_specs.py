@@ -159,7 +159,9 @@ class SquareGridSpec:
 class CharucoSpec:
     """A chessboard of columns x rows SQUARES with ArUco markers in its white ones, as OpenCV prints it.
 
-    A point's id is c{number} of the inner corner, row by row from the upper left one.
+    A point's id is c{number} of the inner corner, row by row from the upper left one. legacy: whether the board has the
+    layout of OpenCV before 4.6, a marker in the upper left square where the rows are even; None: the markers tell it.
+    first_id: the number of the first marker.
     """
 
     dictionary: str
@@ -167,6 +169,8 @@ class CharucoSpec:
     rows: int
     square_mm: float
     marker_mm: float
+    legacy: bool | None = None
+    first_id: int = 0
 
     def __post_init__(self) -> None:
         _check_count(self, "columns", 2)
@@ -175,7 +179,7 @@ class CharucoSpec:
         _check_length(self, "marker_mm")
         if self.marker_mm >= self.square_mm:
             raise ValueError(f"marker_mm is {self.marker_mm}; less than the square's {self.square_mm} is right")
-        _check_markers(self.dictionary, 0, self.columns * self.rows // 2)
+        _check_markers(self.dictionary, self.first_id, self.columns * self.rows // 2)
 
     def object_points(self) -> dict[str, Point3]:
         """Id to (X, Y, 0) in mm."""

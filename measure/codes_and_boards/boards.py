@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.board_finding import FoundBoard, FoundCorner, find_board
+from measure.codes_and_boards.board_finding import find_board
 from measure.codes_and_boards.board_specs import (
     ArucoSpec,
     BoardSpec,
@@ -18,6 +18,7 @@ from measure.codes_and_boards.board_specs import (
 )
 from measure.codes_and_boards.circle_grids import measure_circle_grid
 from measure.codes_and_boards.corners import Corner, Surface, crossing, fit_corner, quarter
+from measure.codes_and_boards.found_board import FoundBoard, FoundCorner
 from measure.covariance import Covariance
 from measure.matching.window import ScanWindow
 from measure.reason import NO_REASON, Code, Reason
@@ -87,8 +88,10 @@ def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Arr
 
 
 def _refused(name: str, board: FoundBoard, spec: BoardSpec) -> Reason:
-    """Why the marker of a corner is not used, though it was read."""
-    return board.refused.get(int(name.split(".")[0]), NO_REASON) if isinstance(spec, ArucoSpec) else NO_REASON
+    """Why a corner, or the marker that it belongs to, is not used, though it was seen."""
+    if isinstance(spec, ArucoSpec):
+        return board.refused.get(int(name.split(".")[0]), NO_REASON)
+    return board.off_corners.get(name, NO_REASON)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """The markers of a board read in a picture, each at one place: where one is read at several, its board says which."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -12,31 +13,50 @@ from measure.targets.sheets import SheetView, robust_view
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
+Markers = Mapping[int, Array]  # the corners (4, 2) of each on its board, by number
+Key = TypeVar("Key")
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerReadings:
+    """All markers of a dictionary that a picture shows: outlines_px (4, 2) by number; module: the share of their sides
+    that one of their cells has."""
+
+    outlines_px: Mapping[int, list[Array]]
+    size_px: tuple[int, int]
+    module: float
 
 
 @dataclass(frozen=True, eq=False)
 class ReadMarkers:
     """corners_px: (4, 2) of each marker, by number; refused: those that were read, but not where the board has them or
-    at places that nothing tells apart, and why."""
+    at places that nothing tells apart, and why; agreeing: how many lie where the board has them."""
 
     corners_px: Mapping[int, Array]
     refused: Mapping[int, Reason]
+    agreeing: int
 
 
-def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary, board: Mapping[int, Array]) -> ReadMarkers:
-    """The markers of a board, its corners (4, 2) on it by number, in the order in which they are read."""
+def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary) -> MarkerReadings:
+    """Read all markers of a dictionary, of whatever board."""
     outlines, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
     readings: dict[int, list[Array]] = {}
     for outline, number in zip(outlines, _integers(numbers), strict=True):
-        if number in board:
-            readings.setdefault(number, []).append(np.asarray(outline, float).reshape(4, 2))
-    half_module = 0.5 / (dictionary.markerSize + 2)
-    view = _view(readings, board, (picture.shape[1], picture.shape[0]), half_module)
+        readings.setdefault(number, []).append(np.asarray(outline, float).reshape(4, 2))
+    return MarkerReadings(readings, (picture.shape[1], picture.shape[0]), 1 / (dictionary.markerSize + 2))
+
+
+def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
+    """The markers of a board, in the order in which they are read."""
+    readings = {number: places for number, places in read.outlines_px.items() if number in board}
+    view = _view(readings, board, read.size_px, read.module / 2)
     corners: dict[int, Array] = {}
     refused: dict[int, Reason] = {}
+    agreeing = 0
     for number, places in readings.items():
         off = [_off(view, board[number], place) for place in places]
         best = int(np.argmin(np.nan_to_num(off, nan=np.inf)))
+        agreeing += off[best] < 1.0
         if off[best] < 1.0 or (len(readings) == len(places) == 1):
             corners[number] = places[best]
         elif len(places) > 1:
@@ -54,7 +74,29 @@ def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary, board: Mappin
         else:
             told = f"marker {number} was read where the board's other markers do not have it"
             refused[number] = Reason(told, Code.OFF_PLACE)
-    return ReadMarkers(corners, refused)
+    return ReadMarkers(corners, refused, agreeing)
+
+
+def better_layout(
+    read: MarkerReadings, given: ReadMarkers, others: Iterable[tuple[Key, Markers]]
+) -> tuple[Key, ReadMarkers] | None:
+    """The layout under which more of the markers that were read lie where their board has them than under the given
+    one; None where none is better."""
+    best: tuple[Key, ReadMarkers] | None = None
+    most = given.agreeing
+    for key, board in others if given.agreeing < len(read.outlines_px) else ():
+        placed = placed_markers(read, board)
+        if placed.agreeing > most:
+            best, most = (key, placed), placed.agreeing
+    return best
+
+
+def other_first_numbers(read: MarkerReadings, first: int, count: int) -> list[int]:
+    """The numbers that a board of so many markers may begin at to have all that were read, where it has not."""
+    numbers = sorted(read.outlines_px)
+    if not numbers or (first <= numbers[0] and numbers[-1] < first + count):
+        return []
+    return list(range(max(numbers[-1] - count + 1, 0), numbers[0] + 1))
 
 
 def _integers(numbers: object) -> list[int]:

@@ -115,6 +115,8 @@ def _board(kind: str, table: Table) -> "BoardSpec":
         return SquareGridSpec(columns, rows, table.number("square_mm", above=0.0), table.number("gap_mm", above=0.0))
     dictionary, marker = table.text("dictionary"), table.number("marker_mm", above=0.0)
     if kind == "charuco":
-        return CharucoSpec(dictionary, columns, rows, table.number("square_mm", above=0.0), marker)
+        square = table.number("square_mm", above=0.0)
+        legacy = table.flag("legacy", False) if "legacy" in table else None
+        return CharucoSpec(dictionary, columns, rows, square, marker, legacy, table.whole("first_id", 0))
     first = table.whole("first_marker", 0)
     return ArucoSpec(dictionary, columns, rows, marker, table.number("gap_mm", above=0.0), first)

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -23,7 +24,11 @@ from measure.codes_and_boards.board_specs import (
     aruco_dictionary,
 )
 from measure.codes_and_boards.boards import BoardMeasurement, measure_board
+from measure.codes_and_boards.chessboard_lines import is_even, whole_pattern
 from measure.codes_and_boards.coma import one_definition
+from measure.codes_and_boards.found_board import FoundCorner
+from measure.codes_and_boards.marker_boards import off_corners
+from measure.codes_and_boards.marker_reading import ReadMarkers
 from measure.covariance import Covariance
 from measure.results import MarkMeasurement
 from measure.scans.scan import open_scan
@@ -175,6 +180,115 @@ def test_trap_charuco_corners_shifted_by_half_a_pixel(turn_deg: float) -> None:
     assert len(errors) >= 16
     assert np.abs(errors).max() < 0.06
     assert np.abs(errors.mean(axis=0)).max() < 0.01
+
+
+def charuco_picture(spec: CharucoSpec, homography: Array) -> Array:
+    """OpenCV's own drawing of a board, photographed."""
+    count = spec.columns * spec.rows // 2
+    numbers = np.arange(spec.first_id, spec.first_id + count)
+    size, dictionary = (spec.columns, spec.rows), aruco_dictionary(spec.dictionary)
+    drawing = cv2.aruco.CharucoBoard(size, spec.square_mm, spec.marker_mm, dictionary, numbers)
+    drawing.setLegacyPattern(bool(spec.legacy))
+    width, height = spec.columns * spec.square_mm, spec.rows * spec.square_mm
+    corner = np.array([-spec.square_mm, height - spec.square_mm])
+    return picture_of(spec, homography, printed(drawing, spec, (width, height), corner))
+
+
+OLDER = CharucoSpec("4X4_50", 6, 6, 32.0, 24.0, legacy=True)
+
+
+def test_trap_charuco_corners_of_the_older_layout_have_their_neighbours_names() -> None:
+    """The markers tell the layout; one that is set against them is refused."""
+    homography = board_from_pixel(5.0, 2e-4) * np.array([[1.2], [1.2], [1.0]])
+    picture = charuco_picture(OLDER, homography)
+    board = measure_board(scan_of(picture), replace(OLDER, legacy=None))
+    errors = errors_px(board, truth_of(OLDER, homography))
+    assert len(errors) >= 20
+    assert np.abs(errors).max() < 0.06
+    refused = measure_board(scan_of(picture), replace(OLDER, legacy=False))
+    assert "but as with legacy = true" in refused.reason
+    assert {mark.status for mark in refused.marks} == {Status.ABSENT}
+    present = charuco_picture(replace(OLDER, legacy=False), homography)
+    assert "but as with legacy = false" in measure_board(scan_of(present), OLDER).reason
+
+
+def test_charuco_numbers_that_begin_later() -> None:
+    """Shifted by two rows of markers, all would lie as on a board that begins at 0."""
+    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0, first_id=6)
+    homography = board_from_pixel(4.0, 2e-4)
+    picture = charuco_picture(spec, homography)
+    board = measure_board(scan_of(picture), spec)
+    errors = errors_px(board, truth_of(spec, homography))
+    assert len(errors) >= 16
+    assert np.abs(errors).max() < 0.06
+    assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=0)).reason
+    assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=30)).reason
+
+
+def test_a_charuco_corner_is_held_against_the_markers_beside_it() -> None:
+    """One a square off, as another crossing would be, is named; where no marker beside it was read, nothing tells."""
+    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
+    homography = board_from_pixel(3.0, 1e-4)
+    points, truth = spec.object_points(), truth_of(spec, homography)
+    outline = np.array([(-12.0, 12.0), (12.0, 12.0), (12.0, -12.0), (-12.0, -12.0)])
+    middle = np.mean([point[:2] for point in points.values()], axis=0)
+    marker = outline + np.array(points["c2"][:2]) - middle + 16.0 * np.array([-1.0, 1.0])  # in the square before c2
+    read = ReadMarkers({1: mapped(np.linalg.inv(homography), marker)}, {}, 1)
+    found = {name: FoundCorner(truth[name], 32 * np.eye(2)) for name in ("c2", "c3", "c19")}
+    assert off_corners(found, spec, read) == {}
+    found["c2"] = FoundCorner(truth["c7"], 32 * np.eye(2))
+    assert "1.0 squares off where the markers beside it put it" in off_corners(found, spec, read)["c2"]
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "words"),
+    [
+        (5, 5, "one of 6 x 5 is. Set columns and rows"),
+        (6, 4, "one of 6 x 5 is. Set columns and rows"),
+        (4, 3, "one of 6 x 5 is. Set columns and rows"),
+        (7, 5, "one of 6 x 5 is. Set columns and rows"),
+        (7, 6, "one of 6 x 5 is: squares may have been counted"),
+    ],
+)
+def test_a_chessboard_of_another_count_is_refused_with_its_own(columns: int, rows: int, words: str) -> None:
+    spec = ChessboardSpec(6, 5, 24.0)
+    picture = picture_of(spec, board_from_pixel(8.0, 6e-4), chessboard_dark(spec))
+    board = measure_board(scan_of(picture), ChessboardSpec(columns, rows, 24.0))
+    assert words in board.reason
+    assert {mark.status for mark in board.marks} == {Status.ABSENT}
+
+
+@pytest.mark.parametrize("left_out", [None, 0, 1, 3])
+def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int | None) -> None:
+    """Of a lens with 6 % of distortion at the corner, seen at an angle; one line left out shows, wherever it is."""
+    column, row = np.meshgrid(np.arange(9.0), np.arange(7.0))
+    x, y = mapped(
+        np.array([[60.0, 4, 60], [-3, 58, 50], [2e-2, 3e-2, 1]]), np.stack([column, row], axis=-1).reshape(-1, 2)
+    ).T
+    about = np.stack([x - 320, y - 240], axis=-1)
+    grid = np.array([320, 240]) + about * (1 - 0.06 * (about**2).sum(axis=1, keepdims=True) / 400**2)
+    grid = grid.reshape(7, 9, 2)
+    if left_out is not None:
+        grid = np.delete(grid, 1 + left_out, axis=0)
+    assert is_even(grid, (640, 480)) == (left_out is None)
+
+
+def test_a_pattern_grows_to_where_it_ends() -> None:
+    """From a part of its lines; a line along its border is none of it, and one that the picture cuts is no end."""
+    spec = ChessboardSpec(6, 5, 24.0)
+    homography = board_from_pixel(5.0, 4e-4)
+    picture = (picture_of(spec, homography, chessboard_dark(spec)) / 256).astype(np.uint8)
+    grid = np.array(list(truth_of(spec, homography).values())).reshape(5, 6, 2)
+    part = whole_pattern(picture, grid[1:4, :4])
+    assert part is not None
+    assert part.grid.shape == grid.shape
+    assert part.is_bounded
+    assert np.abs(part.grid - grid).max() < 0.5
+    border = np.concatenate([3 * grid[:1] - 3 * grid[1:2] + grid[2:3], grid])
+    assert whole_pattern(picture, border) is None
+    cut = whole_pattern(picture[: int(grid[3, :, 1].min())], grid[:3])
+    assert cut is not None
+    assert not cut.is_bounded
 
 
 @pytest.mark.parametrize("dictionary", ["5X5_100", "APRILTAG_36h11"])
