@@ -85,7 +85,8 @@ def _crossing_contrast(picture: Bytes, grid: Array) -> Array:
     right, down = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
     corners = [grid + _INTO_SQUARE * (x * right + y * down) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     columns_rows = np.concatenate(corners).astype(np.float32)
-    grey = cv2.remap(picture, columns_rows, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    columns, rows = columns_rows[..., 0], columns_rows[..., 1]
+    grey = cv2.remap(picture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
     a, b, c, d = np.split(grey, 4)
     between = np.stack([a - b, c - b, c - d, a - d])
     alternating = np.maximum(between.min(axis=0), 0.0) + np.minimum(between.max(axis=0), 0.0)
@@ -94,4 +95,5 @@ def _crossing_contrast(picture: Bytes, grid: Array) -> Array:
 
 def _shorter_steps(grid: Array) -> Array:
     """(rows, columns) the shorter of the steps to the next column and the next row, px."""
-    return np.minimum(*(np.hypot(*np.moveaxis(np.gradient(grid, axis=axis), 2, 0)) for axis in (0, 1)))
+    across, down = (np.hypot(*np.moveaxis(np.gradient(grid, axis=axis), 2, 0)) for axis in (1, 0))
+    return np.asarray(np.minimum(across, down))

@@ -10,6 +10,7 @@ the model of this program, whose correction k3 r^3 + k5 r^5 + k7 r^7 has no line
 which is linear in c - C, k3, k5, k7.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +44,7 @@ class Certificate:
 
     name: str
     principal_distance_mm: float
-    principal_point_mm: tuple[float, float]
+    principal_point_mm: tuple[float, float] | None
     radius_mm: Array
     tangent: Array
     radial_um: Array
@@ -99,7 +100,7 @@ def read_certificate(path: Path) -> Certificate:
     certificate = Certificate(
         table.text("name", path.stem),
         distance,
-        table.pair("principal_point_mm") if "principal_point_mm" in table else (0.0, 0.0),
+        table.pair("principal_point_mm") if "principal_point_mm" in table else None,
         radius_mm,
         tangent,
         radial_um,
@@ -153,6 +154,7 @@ def _curve(coefficients: Array, radius_mm: Array) -> Array:
 
 def _camera(certificate: Certificate, fitted: FittedTable) -> CameraFile:
     names = [f"k{power}" for power in POWERS]
+    point_sigma = math.inf if certificate.principal_point_mm is None else DEFAULT_SIGMA_MM
     given = zip(names, fitted.coefficients.tolist(), fitted.sigmas[1:].tolist(), strict=True)
     return CameraFile(
         path=Path(certificate.name),
@@ -161,7 +163,7 @@ def _camera(certificate: Certificate, fitted: FittedTable) -> CameraFile:
         principal_distance_mm=fitted.equivalent_mm,
         principal_point_mm=certificate.principal_point_mm,
         principal_distance_sigma_mm=float(fitted.sigmas[0]),
-        principal_point_sigma_mm=(DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM),
+        principal_point_sigma_mm=(point_sigma, point_sigma),
         distortion=Distortion("torlegard", {name: Prior(k, sigma) for name, k, sigma in given if sigma > 0.0}),
         fiducials=(),
     )
@@ -171,6 +173,11 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
     largest = float(np.abs(fitted.residuals_um).max())
     rms = float(np.sqrt((fitted.residuals_um**2).mean()))
     k3, k5, k7 = fitted.coefficients
+    point = (
+        "gives no principal point: it is left to the points"
+        if certificate.principal_point_mm is None
+        else f"gives no standard deviation of the principal point: {DEFAULT_SIGMA_MM:g} mm is assumed"
+    )
     over = len(certificate.radial_um) - int((fitted.sigmas > 0.0).sum())
     return [
         f"{certificate.name}: equivalent principal distance {fitted.equivalent_mm:.4f} mm, its standard deviation "
@@ -178,6 +185,7 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
         f"table refers to {certificate.principal_distance_mm:.4f} mm. The camera file has the equivalent one.",
         f"{certificate.name}: k3 {k3:.4g}, k5 {k5:.4g}, k7 {k7:.4g}; residuals of the table {rms:.2f} um rms, "
         f"{largest:.2f} um at most, {over} values more than unknowns.",
+        f"{certificate.name}: the certificate {point}.",
     ]
 
 

@@ -58,7 +58,10 @@ def opencv_camera(
 
 
 def fiducial_camera(name: str, places: Mapping[str, Array]) -> CameraFile:
-    """A camera of which only fiducial marks are known, mm."""
+    """A camera of which only fiducial marks are known, mm: they may count from a frame's corner, so the principal point
+    is sought from the middle of the marks."""
+    xy = np.array(list(places.values()))
+    middle = (xy.min(axis=0) + xy.max(axis=0)) / 2
     sigma = (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM)
     fiducials = [GivenFiducial(id, (float(x), float(y)), sigma, None, True) for id, (x, y) in places.items()]
     return CameraFile(
@@ -66,9 +69,9 @@ def fiducial_camera(name: str, places: Mapping[str, Array]) -> CameraFile:
         name=name,
         frame_mm=None,
         principal_distance_mm=None,
-        principal_point_mm=(0.0, 0.0),
+        principal_point_mm=(float(middle[0]), float(middle[1])),
         principal_distance_sigma_mm=math.inf,
-        principal_point_sigma_mm=sigma,
+        principal_point_sigma_mm=(math.inf, math.inf),
         distortion=Distortion(),
         fiducials=tuple(fiducials),
     )

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.metadata import version
@@ -15,7 +15,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.convention import IMPORTED
 from pipeline.exchange.export_stage import README, check_folder, publish
 from pipeline.exchange.incoming import ForeignMark, ForeignPose, ImportOptions, Incoming
-from pipeline.files.camera_file import CameraFile
+from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import ELEMENTS
 from pipeline.results.comparator_file import COLUMNS, comparator_from_pixel
@@ -49,9 +49,27 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
     files |= _cameras(incoming.cameras)
     if not files:
         raise InputError(f"{', '.join(map(str, paths))}: there is nothing to import in it.")
+    incoming = replace(incoming, notes=(*incoming.notes, *_unknown_notes(incoming.cameras)))
     told = _readme(format, paths, files, incoming)
     publish(folder, {**files, README: told})
     return Imported(tuple(files), told)
+
+
+def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:
+    """What a camera file says that the other program's files do not."""
+    for camera in cameras:
+        if camera.principal_distance_sigma_mm == 0.0:
+            yield (
+                f"{camera.name}: the files give no standard deviations. The calibration is held fixed; give [sigma] in "
+                "the camera file if it is to be adjusted."
+            )
+        if camera.fiducials and camera.principal_point_mm is not None:
+            x, y = camera.principal_point_mm
+            yield (
+                f"{camera.name}: the files give no principal point. Adjusting starts at the middle of the fiducials, "
+                f"({x:.4g}, {y:.4g}) mm; it is free. The standard deviation of the fiducials, {DEFAULT_SIGMA_MM:g} mm, "
+                "is no figure of the files either. Set in the camera file what a certificate says."
+            )
 
 
 def _readme(format: str, paths: Sequence[Path], files: dict[str, str | bytes], incoming: Incoming) -> str:

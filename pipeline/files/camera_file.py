@@ -2,10 +2,12 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast, get_args
+
+import numpy as np
 
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
 from adjust.problem.camera import Camera, Decentering, Distortion, Fiducial, Prior
@@ -21,6 +23,8 @@ from pipeline.text.tables import Table, read_toml
 NO_MARK = "none"  # a fiducial that is not to be looked for in scans
 CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
+_FEWEST_ABOUT_ORIGIN = 3  # fiducials that show where their middle is...
+_OFF_MIDDLE = 0.25  # ...and how far the origin lies from it, in their extent, where it is none of their middle
 
 
 @dataclass(frozen=True)
@@ -156,9 +160,12 @@ def parse_camera(table: Table) -> CameraFile:
     """The camera that stands in a table: a whole camera file, or a part of another file in the same words."""
     fiducials = _fiducials(table)
     default_sigma = DEFAULT_SIGMA_MM if fiducials else math.inf
+    default_point, point_sigma = _default_principal_point(fiducials)
     sigma = table.table("sigma")
     distance = table.number("principal_distance_mm", above=0.0) if "principal_distance_mm" in table else None
-    point = table.pair("principal_point_mm") if "principal_point_mm" in table else (0.0, 0.0) if fiducials else None
+    point = default_point
+    if "principal_point_mm" in table:
+        point, point_sigma = table.pair("principal_point_mm"), default_sigma
     frame = table.pair("frame_mm") if "frame_mm" in table else None
     if frame is not None and min(frame) <= 0.0:
         raise table.error("frame_mm", f"must be two positive lengths, [width, height], not {list(frame)}.")
@@ -173,7 +180,7 @@ def parse_camera(table: Table) -> CameraFile:
         principal_distance_mm=distance,
         principal_point_mm=point,
         principal_distance_sigma_mm=sigma.sigma("principal_distance_mm", default_sigma),
-        principal_point_sigma_mm=sigma.sigma_pair("principal_point_mm", (default_sigma, default_sigma)),
+        principal_point_sigma_mm=sigma.sigma_pair("principal_point_mm", (point_sigma, point_sigma)),
         distortion=_distortion(table.table("distortion"), frame),
         fiducials=fiducials,
         number=_number(table),
@@ -273,6 +280,18 @@ def _placed(
         reach = mark.reach_mm or max(min(abs(xy_mm[0]), abs(xy_mm[1])) * CORNER_REACH, 2 * mark.radius_mm)
         return shapes.frame_corner(xy_mm, reach, mark.radius_mm, mark.polarity)
     return shapes.turned(mark, math.degrees(math.atan2(xy_mm[1], xy_mm[0]))) if radial else mark
+
+
+def _default_principal_point(fiducials: Sequence[GivenFiducial]) -> tuple[tuple[float, float] | None, float]:
+    """Where a file that gives none has it, and its standard deviation: the origin, where the fiducials lie about it;
+    else, where they count from a corner of the frame, near their middle, and nothing is known of it."""
+    if not fiducials:
+        return None, math.inf
+    xy = np.array([fiducial.xy_mm for fiducial in fiducials])
+    middle, extent = (xy.min(axis=0) + xy.max(axis=0)) / 2, np.ptp(xy, axis=0).max()
+    if len(fiducials) < _FEWEST_ABOUT_ORIGIN or np.abs(middle).max() < _OFF_MIDDLE * extent:
+        return (0.0, 0.0), DEFAULT_SIGMA_MM
+    return (float(middle[0]), float(middle[1])), math.inf
 
 
 def _distortion(table: Table, frame_mm: tuple[float, float] | None) -> Distortion:

@@ -232,8 +232,8 @@ def test_a_charuco_corner_is_held_against_the_markers_beside_it() -> None:
     points, truth = spec.object_points(), truth_of(spec, homography)
     outline = np.array([(-12.0, 12.0), (12.0, 12.0), (12.0, -12.0), (-12.0, -12.0)])
     middle = np.mean([point[:2] for point in points.values()], axis=0)
-    marker = outline + np.array(points["c2"][:2]) - middle + 16.0 * np.array([-1.0, 1.0])  # in the square before c2
-    read = ReadMarkers({1: mapped(np.linalg.inv(homography), marker)}, {}, 1)
+    marker = outline + np.array(points["c2"][:2]) - middle + 16.0  # in the square between c2 and c3
+    read = ReadMarkers({1: mapped(np.asarray(np.linalg.inv(homography)), marker)}, {}, 1)
     found = {name: FoundCorner(truth[name], 32 * np.eye(2)) for name in ("c2", "c3", "c19")}
     assert off_corners(found, spec, read) == {}
     found["c2"] = FoundCorner(truth["c7"], 32 * np.eye(2))

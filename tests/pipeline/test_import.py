@@ -66,6 +66,32 @@ def test_marks_come_back_as_they_went(format: str, project: Path, tmp_path: Path
             assert given[id] == pytest.approx(xy, abs=1e-6)
 
 
+def test_fiducials_that_count_from_a_corner_give_no_principal_point_at_the_origin(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As published for a T-11, y down: the principal point lies near the middle of the marks, and is free."""
+    places = {"P5": "0.000 117.521", "P6": "237.846 117.521", "P7": "120.428 0.000", "P8": "120.421 235.000"}
+    marks = "".join(
+        f"<OneMesureAF1I><NamePt>{id}</NamePt><PtIm>{xy}</PtIm></OneMesureAF1I>" for id, xy in places.items()
+    )
+    file = tmp_path / "T-11" / "Ori-InterneScan" / "MeasuresCamera.xml"
+    file.parent.mkdir(parents=True)
+    file.write_text(f"<MesureAppuiFlottant1Im><NameIm>Glob</NameIm>{marks}</MesureAppuiFlottant1Im>")
+    folder = imported("micmac", [file], tmp_path)
+    camera = read_camera(folder / "camera.toml")
+    assert camera.principal_point_mm == pytest.approx((118.923, -117.5))
+    assert camera.principal_point_sigma_mm == (np.inf, np.inf)
+    told = " ".join(capsys.readouterr().out.split())
+    assert (
+        "the files give no principal point. Adjusting starts at the middle of the fiducials, (118.9, -117.5) mm" in told
+    )
+    written = (tmp_path / "in" / "camera.toml").read_text()
+    bare = tmp_path / "bare.toml"
+    bare.write_text("\n".join(line for line in written.splitlines() if not line.startswith("principal_point_mm")))
+    assert read_camera(bare).principal_point_mm == pytest.approx((118.923, -117.5))
+    assert read_camera(bare).principal_point_sigma_mm == (np.inf, np.inf)
+
+
 def test_points_of_a_set_of_marks_are_targets(project: Path, tmp_path: Path) -> None:
     marks = exported(project, "micmac", tmp_path) / "Measures-S2D.xml"
     folder = imported("micmac", [marks], tmp_path, *PITCH)
@@ -224,6 +250,23 @@ def test_a_certificate_gives_back_the_lens_that_it_was_made_of(tmp_path: Path) -
     assert fitted.equivalent_mm == pytest.approx(equivalent, abs=1e-8)
     np.testing.assert_allclose(fitted.coefficients, k, rtol=1e-6)
     np.testing.assert_allclose(fitted.residuals_um, 0.0, atol=1e-6)
+
+
+def test_what_a_calibration_does_not_say_is_no_knowledge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A certificate without a principal point leaves it to the points; a calibration without standard deviations is
+    held fixed, and says so."""
+    table = printed(tmp_path / "c.toml", 153.0, [1.0, 2.0, 1.0, -1.0, -2.0, 3.0])
+    camera = read_camera(imported("certificate", [table], tmp_path) / "camera.toml")
+    assert camera.principal_point_mm is None
+    assert camera.principal_point_sigma_mm == (np.inf, np.inf)
+    assert "gives no principal point: it is left to the points" in " ".join(capsys.readouterr().out.split())
+    printed(table, 153.0, [1.0, 2.0, 1.0, -1.0, -2.0, 3.0], principal_point_mm="[0.01, 0.02]")
+    assert read_camera(imported("certificate", [table], tmp_path) / "camera.toml").principal_point_mm == (0.01, 0.02)
+    assert "no standard deviation of the principal point: 1 mm is assumed" in " ".join(capsys.readouterr().out.split())
+    calibration = tmp_path / "m.xml"
+    calibration.write_text("<calibration><width>600</width><height>400</height><f>500</f></calibration>")
+    imported("metashape", [calibration], tmp_path, *PITCH)
+    assert "no standard deviations. The calibration is held fixed" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_calibrated_distance_balances_the_distortion(tmp_path: Path) -> None:
