@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.sheet_view import robust_view
+from measure.targets.sheets import robust_view
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
