@@ -13,6 +13,7 @@ from adjust.functional_model.transformation import fewest_marks, marks_needed
 from adjust.problem.camera import Camera, Prior
 from adjust.problem.network import Image, Network
 from adjust.problem.observations import Observations
+from adjust.problem.parameter import Parameter, description
 
 TARGETS_NEEDED = 3
 SHOWN_AS = {"fiducial": 1, "join": 2}  # all others are object points
@@ -141,21 +142,22 @@ def _check_antennas(network: Network) -> None:
 
 
 def _check_calibrations(network: Network) -> None:
-    sigmas = {name: sigma for camera in network.cameras for name, sigma in _camera_sigmas(camera)}
-    given: set[str] = set()
+    sigmas = {parameter: sigma for camera in network.cameras for parameter, sigma in _camera_sigmas(camera)}
+    given: set[Parameter] = set()
     for each in network.calibrations:
-        for name in each.names:
-            if name not in sigmas:
-                raise AdjustmentError(f"an earlier calibration gives {name}, which no camera has. Leave it out.")
-            if name in given or np.isfinite(sigmas[name]):
-                other = (
-                    "another calibration" if name in given else f"a standard deviation of its own ({sigmas[name]:g})"
-                )
+        for key in each.parameters:
+            if key not in sigmas:
                 raise AdjustmentError(
-                    f"{name} has an earlier calibration and {other}: the same knowledge would count twice. Keep one."
+                    f"an earlier calibration gives {key.label}, but no camera has that quantity. Leave it out."
                 )
-            given.add(name)
-        count = len(each.names)
+            if key in given or np.isfinite(sigmas[key]):
+                other = "another calibration" if key in given else f"a standard deviation of its own ({sigmas[key]:g})"
+                raise AdjustmentError(
+                    f"{key.label} has an earlier calibration and {other}: the same knowledge would count twice. "
+                    f"Keep one."
+                )
+            given.add(key)
+        count = len(each.parameters)
         if each.values.shape != (count,) or each.covariance.shape != (count, count):
             raise AdjustmentError(
                 f"an earlier calibration of {count} quantities has {each.values.shape} values and a covariance of the "
@@ -164,20 +166,21 @@ def _check_calibrations(network: Network) -> None:
         scale = np.sqrt(np.diag(each.covariance).clip(1e-300))
         if not np.linalg.eigvalsh(each.covariance / np.outer(scale, scale)).min(initial=1.0) > DEFINITE:
             raise AdjustmentError(
-                f"the covariance of an earlier calibration of {', '.join(each.names[:3])} and more is not positive "
-                f"definite: some of these quantities were fixed, or no observation told them apart. Fix them here too."
+                f"the covariance of an earlier calibration of {description(each.parameters[:3])} and more is not "
+                f"positive definite: some of these quantities were fixed, or no observation told them apart. Fix them "
+                f"here too."
             )
 
 
-def _camera_sigmas(camera: Camera) -> Iterator[tuple[str, float]]:
-    """The camera's quantities by their names, and the standard deviations that they have of their own."""
+def _camera_sigmas(camera: Camera) -> Iterator[tuple[Parameter, float]]:
+    """The camera's quantities, and the standard deviations that they have of their own."""
     interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
-    priors: dict[str, Prior | None] = {f"IO.{camera.name}.{name}": prior for name, prior in interior.items()}
-    priors |= {f"IO.{camera.name}.{name}": prior for name, prior in camera.distortion.parameters.items()}
+    named: dict[str, Prior | None] = {**interior, **camera.distortion.parameters}
+    priors = {Parameter.interior(camera.name, name): prior for name, prior in named.items()}
     for id_, mark in camera.fiducials.items():
-        priors |= {f"FID.{camera.name}.{id_}.x": mark.x_mm, f"FID.{camera.name}.{id_}.y": mark.y_mm}
-    for name, prior in priors.items():
-        yield name, np.inf if prior is None else prior.sigma
+        priors |= {Parameter.fiducial(camera.name, id_, axis): getattr(mark, f"{axis}_mm") for axis in "xy"}
+    for parameter, prior in priors.items():
+        yield parameter, np.inf if prior is None else prior.sigma
 
 
 def _check_shapes(observations: Observations) -> None:

@@ -19,6 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import synthetic_images
+from adjust.problem.parameter import Parameter
 from pipeline.design.alone import alone
 from pipeline.design.alternatives import gains
 from pipeline.design.expected import INTERIOR, UM_PER_MM, expect, rms
@@ -163,8 +164,8 @@ def row(plan: Plan) -> tuple[list[float], int]:
     for layout in range(plan.layouts):
         expected = expect(scene.setup(layout))
         sigmas = alone(expected)
-        marks = [sigma for name, sigma in sigmas.items() if name.startswith("FID.")]
-        c, x0, y0 = (sigmas[f"IO.{expected.camera}.{name}"] for name in INTERIOR)
+        marks = [sigma for parameter, sigma in sigmas.items() if parameter.kind == "fiducial"]
+        c, x0, y0 = (sigmas[Parameter.interior(expected.camera, name)] for name in INTERIOR)
         at = expected.curve[0]
         found.append([UM_PER_MM * rms(marks), UM_PER_MM * c, UM_PER_MM * rms([x0, y0]), at.radial_um, at.tangential_um])
         defect = sum(sigma == math.inf for sigma in sigmas.values())

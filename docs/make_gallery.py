@@ -5,6 +5,7 @@ words are the program's.
 """
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -19,6 +20,7 @@ from null_directions import AXES, CATALOGUE, Failure
 
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.network import Network
+from adjust.problem.parameter import Parameter, description
 from adjust.problem.result import NullDirection
 from adjust.solution.adjustment import adjust
 
@@ -39,8 +41,8 @@ direction, a change of the network ends those that it is advised for.
 
 Every network is simulated without errors. There are four images (or as many as are said) from 1500 m by a camera of
 c = 153 mm with five fiducial marks, film transformations are affine, and nothing is given of fiducials, c, x0', y0'
-(F5 to F9 are dropped). A minimal datum holds the object space where too little of it is known. `EO.*.Z0` is the Z0 of
-many images, `T.*` their film transformations. [The theory](theory.md) says why the directions are there.
+(F5 to F9 are dropped). A minimal datum holds the object space where too little of it is known. What moves
+together stands in parentheses. [The theory](theory.md) says why the directions are there.
 
 ![The networks](failure-gallery.png)
 
@@ -84,13 +86,13 @@ def _failure(number: int, failure: Failure) -> str:
 
 
 def _direction(each: NullDirection) -> str:
-    return f"\n- {each.cause} *{each.remedy}* (`{'`, `'.join(_short(each.parameters))}`)\n"
+    return f"\n- {each.cause} *{each.remedy}* ({_moving(each.parameters)})\n"
 
 
-def _short(parameters: tuple[str, ...]) -> list[str]:
-    """The parameters, the film's as one."""
-    names = ["T.*" if name.startswith("T.") else name for name in parameters]
-    return list(dict.fromkeys(names))
+def _moving(parameters: Sequence[Parameter]) -> str:
+    """What moves, the films as one: which of their parameters lead, rounding decides."""
+    films = ["film transformations"] if any(each.kind == "film" for each in parameters) else []
+    return "; ".join([*filter(None, [description(each for each in parameters if each.kind != "film")]), *films])
 
 
 def _mishap(mishap: Mishap) -> str:

@@ -12,6 +12,7 @@ from adjust.functional_model.projection import ImageModel
 from adjust.initial_values.intersection import intersect
 from adjust.problem.images import approximate_image, lifted
 from adjust.problem.network import Approximations, Network
+from adjust.problem.parameter import Kind, Parameter, object_coordinate
 from adjust.problem.problem import number
 from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment
@@ -22,6 +23,7 @@ from adjust.validation import validate
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+Owner = tuple[Kind, str, str]  # of a parameter: its kind, owner and id
 
 FOLDS = 5
 FEWEST_KNOWN = 10  # known points below this number stay in every fold: they carry the datum
@@ -52,7 +54,7 @@ def folds(network: Network, options: Options) -> tuple[frozenset[str], ...]:
         if not on_film
     )
     held = {name for distance in network.distances for name in (distance.start, distance.end)}
-    held |= {name.rsplit(".", 1)[0] for name in options.datum_coordinates} | set(options.datum_points)
+    held |= {object_coordinate(text).id for text in options.datum_coordinates} | set(options.datum_points)
     known = {point.id for point in network.points if point.id in shown and _given(network, point.id).any()}
     if len(known) < FEWEST_KNOWN:
         held |= known
@@ -87,30 +89,27 @@ def cross_validate(
 
 def approximations_of(adjustment: Adjustment) -> Approximations:
     """The values of an adjustment as a start of another one."""
-    values = _by_owner(adjustment.names, adjustment.values)
+    values = _by_owner(adjustment.parameters, adjustment.values)
     return _as_approximations(adjustment.network, values, adjustment.mirrored)
 
 
-def _by_owner(names: Sequence[str], values: Array) -> dict[str, Array]:
-    """The values of every camera, image and point: by "IO.<camera>", "EO.<image>" and the like."""
-    collected: dict[str, list[float]] = {}
-    for name, value in zip(names, values.tolist(), strict=True):
-        collected.setdefault(name.rsplit(".", 1)[0], []).append(value)
+def _by_owner(parameters: Sequence[Parameter], values: Array) -> dict[Owner, Array]:
+    """The values of every camera, image, point and so on."""
+    collected: dict[Owner, list[float]] = {}
+    for each, value in zip(parameters, values.tolist(), strict=True):
+        collected.setdefault((each.kind, each.owner, each.id), []).append(value)
     return {owner: np.array(each) for owner, each in collected.items()}
 
 
-def _as_approximations(network: Network, values: dict[str, Array], mirrored: frozenset[str]) -> Approximations:
-    def of(kind: str) -> dict[str, Array]:
-        return {owner[len(kind) :]: each for owner, each in values.items() if owner.startswith(kind)}
-
-    transformation, exterior, join = of("T."), of("EO."), of("JOIN.")
+def _as_approximations(network: Network, values: dict[Owner, Array], mirrored: frozenset[str]) -> Approximations:
+    interior = {camera: each[:3] for (kind, camera, _), each in values.items() if kind == "interior"}
     return Approximations(
-        interior={camera: each[:3] for camera, each in of("IO.").items()},
-        exterior={image.name: exterior[image.frame] for image in network.images},
-        transformation={image.name: transformation.get(image.name, np.empty(0)) for image in network.images},
-        points=of("PT."),
+        interior=interior,
+        exterior={image.name: values["exterior", image.frame, ""] for image in network.images},
+        transformation={image.name: values.get(("film", image.name, ""), np.empty(0)) for image in network.images},
+        points={id: each for (kind, _, id), each in values.items() if kind == "point"},
         mirrored=mirrored,
-        joins={(frame, point): join[f"{frame}.{point}"] for frame, point in network.joins},
+        joins={(frame, point): values["join", frame, point] for frame, point in network.joins},
     )
 
 
@@ -143,14 +142,14 @@ def _fitted_without(
     if not last.converged:
         return None
     whole = reduction.unreduced_values(problem.unknowns, last.end.state.values, reduced)
-    values = _by_owner(problem.unknowns.names, whole)
+    values = _by_owner(problem.unknowns.parameters, whole)
     fitted = _as_approximations(reduced, values, adjustment.mirrored)
     oriented = [image for image in reduced.images if image.name not in reduced.unoriented]
     return {
         image.name: replace(
             approximate_image(reduced, fitted, image.name),
-            parameters=values[f"IO.{image.camera}"][3:],
-            bend_parameters=values.get(f"SC.{image.scanner}", np.empty(0)),
+            parameters=values["interior", image.camera, ""][3:],
+            bend_parameters=values.get(("scanner", image.scanner, ""), np.empty(0)),
         )
         for image in oriented
     }

@@ -20,6 +20,7 @@ from adjust.choices.scanner_choice import choose_bends
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
 from adjust.problem.network import Network
+from adjust.problem.parameter import description
 from adjust.problem.result import Adjustment
 from adjust.quality.reweighting import NO_WEIGHT
 from adjust.solution.adjustment import Options, adjust
@@ -147,7 +148,7 @@ class _Fits:
         except AdjustmentError as error:
             return Candidate(model, str(error))
         if result.singular:
-            causes = " ".join(f"{', '.join(each.parameters)}: {each.cause}" for each in result.singular)
+            causes = " ".join(f"{description(each.parameters)}: {each.cause}" for each in result.singular)
             return Candidate(model, f"singular. {causes}")
         if not result.converged:
             return Candidate(model, f"no solution: {result.termination}")
@@ -180,7 +181,7 @@ class _Fits:
     def _network(self, model: Model, near: Adjustment | None) -> Network:
         """The network with a model, parameters that the near one has too starting at its values."""
         same = near is not None and near.network.cameras[0].distortion.family == model.family
-        values = dict(zip(near.names, near.values.tolist(), strict=True)) if near is not None and same else {}
+        values = dict(zip(near.parameters, near.values.tolist(), strict=True)) if near is not None and same else {}
         return model.of(self.network, values, self.half_mm)
 
 
@@ -188,13 +189,13 @@ def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:
     """Pairs of interior parameters of a camera that are highly correlated, the highest first."""
     pairs = []
     for camera in result.network.cameras:
-        owner = f"IO.{camera.name}."
-        names = [name for name in result.names if name.startswith(owner)]
-        cofactor = result.cofactor_of(names)
+        own = [each for each in result.parameters if each.kind == "interior" and each.owner == camera.name]
+        cofactor = result.cofactor_of(own)
         free = np.flatnonzero(np.diag(cofactor) > 0.0)
         scale = np.sqrt(np.diag(cofactor)[free])
         correlation = cofactor[np.ix_(free, free)] / np.outer(scale, scale)
-        shown = [names[i].removeprefix("IO." if len(result.network.cameras) > 1 else owner) for i in free]
+        several = len(result.network.cameras) > 1
+        shown = [own[i].label if several else own[i].quantity for i in free]
         pairs += [
             (shown[i], shown[j], float(correlation[i, j]))
             for i, j in zip(*np.triu_indices(len(free), 1), strict=True)

@@ -13,6 +13,7 @@ from adjust.functional_model.transformation import marks_needed
 from adjust.problem.camera import Prior
 from adjust.problem.network import Network, Transformation
 from adjust.problem.observations import Calibration
+from adjust.problem.parameter import Parameter
 
 # A transformation and the simpler ones that it contains, simplest first.
 TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {
@@ -57,12 +58,14 @@ class Model:
         same = same and all(set(terms) <= set(bends.get(scanner, ())) for scanner, terms in other.bends)
         return other != self and other.transformation in films and same
 
-    def of(self, network: Network, values: Mapping[str, float], half_mm: Mapping[str, tuple[float, float]]) -> Network:
-        """The network with this model, its parameters free. values: where they start, by their names in a result."""
+    def of(
+        self, network: Network, values: Mapping[Parameter, float], half_mm: Mapping[str, tuple[float, float]]
+    ) -> Network:
+        """The network with this model, its parameters free. values: where they start."""
         cameras = []
         for camera in network.cameras:
             given = camera.distortion
-            start = {name: values.get(f"IO.{camera.name}.{name}", 0.0) for name in self.parameters}
+            start = {name: values.get(Parameter.interior(camera.name, name), 0.0) for name in self.parameters}
             distortion = replace(
                 given,
                 family=self.family,
@@ -81,10 +84,13 @@ class Model:
 
 def _without_distortion(calibration: Calibration, network: Network) -> Calibration:
     """What an earlier calibration says of everything but distortion, which is another in every candidate."""
-    distortion = {f"IO.{camera.name}.{name}" for camera in network.cameras for name in camera.distortion.parameters}
-    kept = [i for i, name in enumerate(calibration.names) if name not in distortion]
+    cameras = network.cameras
+    distortion = {Parameter.interior(camera.name, name) for camera in cameras for name in camera.distortion.parameters}
+    kept = [i for i, parameter in enumerate(calibration.parameters) if parameter not in distortion]
     return Calibration(
-        tuple(calibration.names[i] for i in kept), calibration.values[kept], calibration.covariance[np.ix_(kept, kept)]
+        tuple(calibration.parameters[i] for i in kept),
+        calibration.values[kept],
+        calibration.covariance[np.ix_(kept, kept)],
     )
 
 

@@ -14,6 +14,7 @@ from adjust.linear_algebra.factor import Factor
 from adjust.problem.functions import blind_mark, computed_observations
 from adjust.problem.further_observations import at_computed
 from adjust.problem.network import Approximations, Network
+from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment, NullDirection
@@ -42,15 +43,15 @@ class Plan:
     singular: tuple[NullDirection, ...]
     null: Array
 
-    def sigma(self, name: str) -> float:
+    def sigma(self, parameter: Parameter | str) -> float:
         """The expected standard deviation of an unknown: 0 where it is fixed, inf where it is not determined."""
-        i = self.adjustment.index(name)
+        i = self.adjustment.index(parameter)
         return np.inf if self.null[i].any() else self.sigma0 * float(np.sqrt(self.adjustment.cofactor.variances[i]))
 
-    def sigmas(self, names: Sequence[str], functions: Array) -> Array:
+    def sigmas(self, parameters: Sequence[Parameter | str], functions: Array) -> Array:
         """The expected standard deviations (m,) of linear functions (m, k) of k unknowns; inf where not determined."""
-        rows = [self.adjustment.index(name) for name in names]
-        variances = ((functions @ self.adjustment.cofactor_of(names)) * functions).sum(axis=1)
+        rows = [self.adjustment.index(each) for each in parameters]
+        variances = ((functions @ self.adjustment.cofactor_of(parameters)) * functions).sum(axis=1)
         moved = np.abs(functions @ self.null[rows])
         could_move = np.abs(functions) @ np.abs(self.null[rows])
         determined = (moved <= STILL * could_move).all(axis=1)

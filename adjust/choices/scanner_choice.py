@@ -18,6 +18,7 @@ from adjust.functional_model.scanner import carriage_terms, smooth_terms
 from adjust.problem.camera import Prior
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network, Scanner
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 from adjust.quality.significance import LEVEL
 from adjust.undetermined.scanner_directions import HARDLY, poses_of, untold_sentences
@@ -142,18 +143,19 @@ class _Equations:
         return float(self.right[at] @ np.linalg.solve(self.normal[np.ix_(at, at)], self.right[at]))
 
 
-def _free_distortion(trial: Adjustment) -> list[str]:
+def _free_distortion(trial: Adjustment) -> list[Parameter]:
     """The distortion parameters of all cameras that are not fixed."""
-    names = [f"IO.{camera.name}.{name}" for camera in trial.network.cameras for name in camera.distortion.parameters]
-    return [name for name in names if name in trial.names and trial.sigma(name) > 0.0]
+    cameras = trial.network.cameras
+    keys = [Parameter.interior(camera.name, name) for camera in cameras for name in camera.distortion.parameters]
+    return [key for key in keys if trial.has(key) and trial.sigma(key) > 0.0]
 
 
-def _equations(trial: Adjustment, scanner: Scanner, held: Sequence[str] = ()) -> _Equations:
+def _equations(trial: Adjustment, scanner: Scanner, held: Sequence[Parameter] = ()) -> _Equations:
     """Of one scanner's terms, those of others being free beside them; held: other unknowns, taken as known."""
     terms = tuple(scanner.terms)
-    names = [f"SC.{scanner.name}.{term}" for term in terms]
-    values = np.array([trial.value(name) for name in names])
-    cofactor, count = trial.cofactor_of([*names, *held]), len(names)
+    keys = [Parameter.scanner(scanner.name, term) for term in terms]
+    values = trial.values_of(keys)
+    cofactor, count = trial.cofactor_of([*keys, *held]), len(keys)
     by_held = cofactor[:count, count:]
     taken = by_held @ np.linalg.solve(cofactor[count:, count:], by_held.T) if held else 0.0
     normal = np.linalg.inv(cofactor[:count, :count] - taken)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import cross_matrix, rotation_from_angles, vector_by_angles
 from adjust.problem.network import Exterior, Network
+from adjust.problem.parameter import Parameter
 from adjust.problem.unknowns import Unknowns
 
 Array = NDArray[np.float64]
@@ -22,14 +23,17 @@ Indices = NDArray[np.intp]
 class FurtherObservation(Protocol):
     """Correlated observations (m,) of functions of some unknowns.
 
-    group: what they are called in the result's groups. names (m,): what each is called. positions (k,) of the unknowns
-    that take part. observed (m,) and covariance (m, m) in the units of the unknowns.
+    group: what they are called in the result's groups. names (m,): what each is called in files, labels (m,): in
+    messages. positions (k,) of the unknowns that take part. observed (m,) and covariance (m, m) in the units of the
+    unknowns.
     """
 
     @property
     def group(self) -> str: ...
     @property
     def names(self) -> tuple[str, ...]: ...
+    @property
+    def labels(self) -> tuple[str, ...]: ...
     @property
     def positions(self) -> Indices: ...
     @property
@@ -65,6 +69,10 @@ class ObservedDistance:
     covariance: Array
     group: str = "distance"
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return self.names
+
     def computed(self, values: Array) -> Array:
         return np.array([np.linalg.norm(self._difference(values))])
 
@@ -91,13 +99,21 @@ def _distances(network: Network, unknowns: Unknowns) -> Iterator[ObservedDistanc
 
 @dataclass(frozen=True)
 class ObservedCalibration:
-    """An earlier calibration; positions (m,): the quantities that it gives."""
+    """An earlier calibration; parameters, positions (m,): the quantities that it gives."""
 
-    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
     positions: Indices
     observed: Array
     covariance: Array
     group: str = "calibration"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(each.text for each in self.parameters)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(each.label for each in self.parameters)
 
     def computed(self, values: Array) -> Array:
         return np.asarray(values[self.positions])
@@ -108,13 +124,13 @@ class ObservedCalibration:
 
 def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCalibration]:
     """Those of the quantities that are free: a fiducial that no image shows is held, and has no part here."""
-    number = {name: i for i, name in enumerate(unknowns.names)}
+    number = {parameter: i for i, parameter in enumerate(unknowns.parameters)}
     for each in network.calibrations:
-        free = [i for i, name in enumerate(each.names) if name in number and unknowns.sigma[number[name]] > 0.0]
+        free = [i for i, key in enumerate(each.parameters) if key in number and unknowns.sigma[number[key]] > 0.0]
         if free:
             yield ObservedCalibration(
-                names=tuple(each.names[i] for i in free),
-                positions=np.array([number[each.names[i]] for i in free], dtype=np.intp),
+                parameters=tuple(each.parameters[i] for i in free),
+                positions=np.array([number[each.parameters[i]] for i in free], dtype=np.intp),
                 observed=each.values[free],
                 covariance=each.covariance[np.ix_(free, free)],
             )
@@ -122,13 +138,13 @@ def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCali
 
 @dataclass(frozen=True)
 class ObservedAntenna:
-    """Coordinates of a point that is fixed to the camera; positions (6,): the image's exterior orientation.
+    """Coordinates of a point that is fixed to the camera; positions (6,): the exterior orientation of the frame.
 
     axes (m,): which coordinates are observed; offset (3,) from the projection centre along the camera's axes;
     keeps_angles: whether the attitude moves by its angles and not by a rotation vector.
     """
 
-    names: tuple[str, ...]
+    frame: str
     positions: Indices
     observed: Array
     covariance: Array
@@ -136,6 +152,14 @@ class ObservedAntenna:
     offset: Array
     keeps_angles: bool
     group: str = "antenna"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"{self.frame} {'XYZ'[axis]}" for axis in self.axes)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return self.names
 
     def computed(self, values: Array) -> Array:
         rotation = rotation_from_angles(values[self.positions[3:]])
@@ -158,7 +182,7 @@ def _antennas(network: Network, unknowns: Unknowns) -> Iterator[ObservedAntenna]
         axes = np.flatnonzero(np.isfinite(exterior.sigmas[:3]))
         if len(axes):
             yield ObservedAntenna(
-                names=tuple(f"{image.frame} {'XYZ'[axis]}" for axis in axes),
+                frame=image.frame,
                 positions=unknowns.exterior[image.name],
                 observed=exterior.values[axes],
                 covariance=np.diag(exterior.sigmas[axes] ** 2),
@@ -174,11 +198,12 @@ def at_computed(network: Network, unknowns: Unknowns, values: Array) -> Network:
         replace(each, value=float(observed.computed(values)[0]))
         for each, observed in zip(network.distances, _distances(network, unknowns), strict=True)
     )
-    number = {name: i for i, name in enumerate(unknowns.names)}
+    number = {parameter: i for i, parameter in enumerate(unknowns.parameters)}
     calibrations = tuple(
-        replace(each, values=np.array([values[number[name]] for name in each.names])) for each in network.calibrations
+        replace(each, values=np.array([values[number[key]] for key in each.parameters]))
+        for each in network.calibrations
     )
-    seen = {each.names[0].rpartition(" ")[0]: each for each in _antennas(network, unknowns)}
+    seen = {each.frame: each for each in _antennas(network, unknowns)}
     images = tuple(
         replace(image, exterior=_with_antenna_at(image.exterior, seen[image.frame], values))
         if image.exterior is not None and image.frame in seen

@@ -12,6 +12,7 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network
+from adjust.problem.parameter import Kind, Parameter
 from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -23,28 +24,28 @@ def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
     image = network.image_by_name[name]
     camera = network.camera_by_name[image.camera]
 
-    def values(owner: str, names: tuple[str, ...]) -> Array:
-        return np.array([adjustment.value(f"{owner}.{each}") for each in names])
+    def values(kind: Kind, owner: str, quantities: tuple[str, ...]) -> Array:
+        return adjustment.values_of(Parameter(kind, owner, "", each) for each in quantities)
 
-    exterior = values(f"EO.{image.frame}", EXTERIOR_NAMES)
-    parameters = values(f"T.{name}", film_parameter_names(image.transformation))
+    exterior = values("exterior", image.frame, EXTERIOR_NAMES)
+    parameters = values("film", name, film_parameter_names(image.transformation))
     bend = bend_of(network, image)
     return ImageModel(
         distortion=camera.distortion,
-        interior=values(f"IO.{camera.name}", ("c", "x0", "y0")),
-        parameters=values(f"IO.{camera.name}", parameter_names(camera.distortion.family)),
+        interior=values("interior", camera.name, ("c", "x0", "y0")),
+        parameters=values("interior", camera.name, parameter_names(camera.distortion.family)),
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
         film=_film(network, image, parameters, name in adjustment.mirrored),
         line_of_sight=network.line_of_sight,
         bend=bend,
-        bend_parameters=values(f"SC.{image.scanner}", bend.terms),
+        bend_parameters=values("scanner", image.scanner, bend.terms),
     )
 
 
 def adjusted_places(adjustment: Adjustment, points: Sequence[str]) -> Array:
     """(n, 3) where object points are, with the values of an adjustment: those of a bent board off its plane."""
-    places = np.array([[adjustment.value(f"PT.{point}.{axis}") for axis in "XYZ"] for point in points]).reshape(-1, 3)
+    places = adjustment.values_of(Parameter.point(point, axis) for point in points for axis in "XYZ").reshape(-1, 3)
     return places + lifted(adjustment, points)
 
 
@@ -52,7 +53,7 @@ def lifted(adjustment: Adjustment, points: Sequence[str]) -> Array:
     """(n, 3) how far the bends of boards put object points beside their flat places."""
     offsets = np.zeros((len(points), 3))
     for board in adjustment.network.boards:
-        bends = np.array([adjustment.value(f"BD.{board.name}.{name}") for name in BOARD_NAMES])
+        bends = adjustment.values_of(Parameter.board(board.name, name) for name in BOARD_NAMES)
         for row, point in enumerate(points):
             if point in board.places:
                 offsets[row] = bends @ board.lifted_by[point]

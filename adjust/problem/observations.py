@@ -7,6 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.problem.parameter import Parameter
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
@@ -74,10 +76,10 @@ class Distance:
 class Calibration:
     """What an earlier adjustment found of a camera, "equal to image observations" (Juhl).
 
-    names (m,) as in `Adjustment.names`: `IO.<camera>.c`, `FID.<camera>.<id>.x`; values (m,), covariance (m, m). What
-    was given beforehand in that adjustment is in it already: these quantities must be free of priors here.
+    parameters (m,): the keys of the camera's quantities; values (m,), covariance (m, m). What was given beforehand in
+    that adjustment is in it already: these quantities must be free of priors here.
     """
 
-    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
     values: Array
     covariance: Array

@@ -1,6 +1,6 @@
 """What an adjustment hands on."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem.network import Network
+from adjust.problem.parameter import Parameter, parameter_of
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.tested import Tested
 
@@ -36,7 +37,7 @@ class Iteration(NamedTuple):
 class NullDirection:
     """A change of the unknowns that the observations cannot see: what moves together, why, and what would remove it."""
 
-    parameters: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
     cause: str
     remedy: str
 
@@ -115,7 +116,7 @@ class OuterEffect:
     parameter's a-priori standard deviation.
     """
 
-    parameter: str
+    parameter: Parameter
     effect: float
     in_sigmas: float
     cause: str
@@ -186,13 +187,13 @@ class Suspect:
 class Contradiction:
     """What the images say against observations that are correlated, as an earlier calibration's quantities are.
 
-    names (m,); difference (m,): where the images put each less where it was observed, with the a-posteriori sigma (m,)
-    of that; nan and inf where the images do not tell it. statistic: of all together, F with freedom and the other
+    parameters (m,); difference (m,): where the images put each less where it was observed, with the a-posteriori sigma
+    (m,) of that; nan and inf where the images do not tell it. statistic: of all together, F with freedom and the other
     observations' redundancy; probability: of as much where they do not contradict each other.
     """
 
     group: str
-    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
     difference: Array
     sigma: Array
     statistic: float
@@ -241,10 +242,10 @@ class Assessment(Protocol):
 class Adjustment:
     """The result: values, covariance, residuals, and how it came about.
 
-    names: the unknowns, in the order of values and covariance: `T.<image>.a1`, `EO.<image>.X0` (omega, phi, kappa in
-    rad), `IO.<camera>.c` / `.x0` / `.y0` / `.k3`, `FID.<camera>.<id>.x`, `PT.<id>.X`; fixed quantities included, with
-    zero rows. cofactor: a-priori covariance (sigma0 = 1), computed where it is asked for; covariance is sigma0² times
-    that. Without a solution (termination "singular", "diverged") it is zero and means nothing.
+    parameters: the keys of all quantities, in the order of values and covariance (omega, phi, kappa in rad); fixed ones
+    included, with zero rows. `value`, `sigma` and the like take a key, or its text in the files. cofactor: a-priori
+    covariance (sigma0 = 1), computed where it is asked for; covariance is sigma0² times that. Without a solution
+    (termination "singular", "diverged") it is zero and means nothing.
     assessment: what is told of the observations, computed where it is asked for: `residuals`, `groups`, `reliability`,
     `suspects`, `warnings` and more.
     mirrored: the images whose scan is mirrored, as in `Approximations`.
@@ -261,7 +262,7 @@ class Adjustment:
     unknowns: int
     redundancy: int
     vpv: float
-    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
     values: Array
     cofactor: Cofactor
     assessment: Assessment
@@ -326,23 +327,35 @@ class Adjustment:
         """Square root of the a-posteriori variance of unit weight; 1 where there is no redundancy."""
         return float(np.sqrt(self.vpv / self.redundancy)) if self.redundancy > 0 else 1.0
 
-    def index(self, name: str) -> int:
-        return self._positions[name]
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The quantities' texts in the files: `IO.<camera>.k3`, `FID.<camera>.<id>.x`, `EO.<image>.X0`, `PT.<id>.X`."""
+        return tuple(each.text for each in self.parameters)
+
+    def has(self, parameter: Parameter | str) -> bool:
+        return parameter_of(parameter) in self._positions
+
+    def index(self, parameter: Parameter | str) -> int:
+        return self._positions[parameter_of(parameter)]
 
     @cached_property
-    def _positions(self) -> dict[str, int]:
-        return {name: i for i, name in enumerate(self.names)}
+    def _positions(self) -> dict[Parameter, int]:
+        return {each: i for i, each in enumerate(self.parameters)}
 
-    def value(self, name: str) -> float:
-        return float(self.values[self.index(name)])
+    def value(self, parameter: Parameter | str) -> float:
+        return float(self.values[self.index(parameter)])
 
-    def cofactor_of(self, names: Sequence[str]) -> Array:
-        """The cofactor matrix (k, k) of some unknowns."""
-        return self.cofactor.of(np.array([self.index(name) for name in names], dtype=np.intp))
+    def values_of(self, parameters: Iterable[Parameter | str]) -> Array:
+        """(k,) the values of some quantities."""
+        return self.values[[self.index(each) for each in parameters]]
 
-    def sigma(self, name: str) -> float:
+    def cofactor_of(self, parameters: Sequence[Parameter | str]) -> Array:
+        """The cofactor matrix (k, k) of some quantities."""
+        return self.cofactor.of(np.array([self.index(each) for each in parameters], dtype=np.intp))
+
+    def sigma(self, parameter: Parameter | str) -> float:
         """A-posteriori standard deviation."""
-        return self.sigma0 * float(np.sqrt(self.cofactor.variances[self.index(name)]))
+        return self.sigma0 * float(np.sqrt(self.cofactor.variances[self.index(parameter)]))
 
     def __repr__(self) -> str:
         return (
@@ -352,11 +365,10 @@ class Adjustment:
 
     def _repr_html_(self) -> str:
         """The cameras' parameters, as a notebook shows them."""
-        names = [name for name in self.names if name.startswith("IO.")]
         rows = "".join(
-            f"<tr><td>{escape(name.removeprefix('IO.'))}</td><td>{self.value(name):.7g}</td>"
-            f"<td>{self.sigma(name):.2g}</td></tr>"
-            for name in names
+            f"<tr><td>{escape(each.label)}</td><td>{self.value(each):.7g}</td><td>{self.sigma(each):.2g}</td></tr>"
+            for each in self.parameters
+            if each.kind == "interior"
         )
         head = "<tr><th>parameter</th><th>value</th><th>sigma</th></tr>"
         return f"<p>{escape(repr(self))}</p><table>{head}{rows}</table>"

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.problem.parameter import Parameter
 from adjust.problem.problem import ABSENT, Problem
 
 Indices = NDArray[np.intp]
@@ -86,9 +87,8 @@ class TestedUnits:
     @cached_property
     def groups(self) -> NDArray[np.str_]:
         """(N,) the group of each."""
-        kinds = {"FID": "datum", "PT": "control", "IO": "interior", "SC": "scanner", "BD": "board", "EO": "exterior"}
-        names = self.problem.unknowns.names
-        given = [kinds[names[position].split(".", 1)[0]] for position in self.positions[:, 0]]
+        parameters = self.problem.unknowns.parameters
+        given = [_group(parameters[position]) for position in self.positions[:, 0]]
         return np.array([*self.problem.network.observations.kind, *given], dtype=np.str_)
 
     def named(self) -> tuple[Tested, ...]:
@@ -99,15 +99,14 @@ class TestedUnits:
         return (*observed, *self._named_priors())
 
     def _named_priors(self) -> Sequence[Tested]:
-        unknowns = self.problem.unknowns
-        owner_of = {int(i): ("datum", *key) for key, pair in unknowns.fiducial.items() for i in pair}
-        owner_of |= {int(i): ("control", "", id_) for id_, three in unknowns.point.items() for i in three}
-        owner_of |= {int(i): ("interior", name, "") for name, some in unknowns.camera.items() for i in some}
-        owner_of |= {int(i): ("scanner", name, "") for name, some in unknowns.scanner.items() for i in some}
-        owner_of |= {int(i): ("board", name, "") for name, two in unknowns.board.items() for i in two}
-        owner_of |= {int(i): ("exterior", name, "") for name, six in unknowns.exterior.items() for i in six}
+        parameters = self.problem.unknowns.parameters
         named = []
         for pair in self.positions:
-            coordinates = tuple(unknowns.names[i].rsplit(".", 1)[1] for i in pair if i != ABSENT)
-            named.append(Tested(*owner_of[int(pair[0])], coordinates))
+            first, *others = (parameters[i] for i in pair if i != ABSENT)
+            coordinates = tuple(each.quantity for each in (first, *others))
+            named.append(Tested(_group(first), first.owner, first.id, coordinates))
         return named
+
+
+def _group(parameter: Parameter) -> str:
+    return {"fiducial": "datum", "point": "control"}.get(parameter.kind, parameter.kind)

@@ -12,6 +12,7 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.camera import Camera, Prior
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
+from adjust.problem.parameter import Kind, Parameter
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -21,7 +22,7 @@ Quantity = tuple[str, Prior | None, float | None]  # name, what is given, approx
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Every quantity of a network by its name in the result: its given value, how well that is known, where it starts.
+    """Every quantity of a network by its key: its given value, how well that is known, where it starts.
 
     given (n,): nan where nothing is given. sigma (n,): 0 fixed, inf free. start (n,): where the iteration starts.
     Positions in these: camera by name (c, x0', y0', then the distortion parameters), fiducial by (camera, id),
@@ -29,7 +30,7 @@ class Unknowns:
     scanners, boards and points stand before the images. Parts of one frame have the same exterior orientation.
     """
 
-    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
     given: Array
     sigma: Array
     start: Array
@@ -43,7 +44,7 @@ class Unknowns:
     board: dict[str, Indices]
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.parameters)
 
     @property
     def has_prior(self) -> NDArray[np.bool_]:
@@ -90,25 +91,23 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
             continue
         idle = each.name in network.idle_cameras
         quantities = _camera_quantities(each, approximations)
-        camera[each.name] = listing.add(f"IO.{each.name}", _stopped(quantities) if idle else quantities)
+        camera[each.name] = listing.add("interior", each.name, "", _stopped(quantities) if idle else quantities)
         for id_, mark in each.fiducials.items():
             priors = (mark.x_mm, mark.y_mm)
             if (each.name, id_) not in observed:
                 priors = (_held(mark.x_mm), _held(mark.y_mm))
             pair: list[Quantity] = [("x", priors[0], None), ("y", priors[1], None)]
-            fiducial[each.name, id_] = listing.add(f"FID.{each.name}.{id_}", pair)
+            fiducial[each.name, id_] = listing.add("fiducial", each.name, id_, pair)
     scanner = {
-        each.name: listing.add(f"SC.{each.name}", [(name, prior, None) for name, prior in each.terms.items()])
+        each.name: listing.add("scanner", each.name, "", [(name, prior, None) for name, prior in each.terms.items()])
         for each in network.scanners
     }
     board = {
-        each.name: listing.add(
-            f"BD.{each.name}", [(name, prior, None) for name, prior in zip(BOARD_NAMES, each.bends, strict=True)]
-        )
+        each.name: listing.add("board", each.name, "", list(zip(BOARD_NAMES, each.bends, (None, None), strict=True)))
         for each in network.boards
     }
     point = {
-        each.id: listing.add(f"PT.{each.id}", _point_quantities(each, approximations))
+        each.id: listing.add("point", "", each.id, _point_quantities(each, approximations))
         for each in network.points
         if ("", each.id) in observed
     }
@@ -119,30 +118,33 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
         if image.frame not in of_frame:
             quantities = _exterior_quantities(image, approximations)
             stopped = image.name in network.unoriented
-            of_frame[image.frame] = listing.add(f"EO.{image.frame}", _stopped(quantities) if stopped else quantities)
+            of_frame[image.frame] = listing.add(
+                "exterior", image.frame, "", _stopped(quantities) if stopped else quantities
+            )
         exterior[image.name] = of_frame[image.frame]
-        transformation[image.name] = listing.add(f"T.{image.name}", _transformation_quantities(image, approximations))
+        film = _transformation_quantities(image, approximations)
+        transformation[image.name] = listing.add("film", image.name, "", film)
     join = {}
     for (frame, id_), (x_mm, y_mm) in approximations.joins.items():
         place: list[Quantity] = [("x", None, float(x_mm)), ("y", None, float(y_mm))]
-        join[frame, id_] = listing.add(f"JOIN.{frame}.{id_}", place)
+        join[frame, id_] = listing.add("join", frame, id_, place)
     given, sigma, start = listing.values()
     owned = camera, fiducial, scanner, point, transformation, exterior, join, board
-    return Unknowns(tuple(listing.names), given, sigma, start, *owned)
+    return Unknowns(tuple(listing.parameters), given, sigma, start, *owned)
 
 
 class _Listing:
     """Takes the quantities down one after the other."""
 
     def __init__(self) -> None:
-        self.names: list[str] = []
+        self.parameters: list[Parameter] = []
         self.quantities: list[Quantity] = []
 
-    def add(self, owner: str, quantities: Sequence[Quantity]) -> Indices:
-        first = len(self.names)
-        self.names += [f"{owner}.{quantity[0]}" for quantity in quantities]
+    def add(self, kind: Kind, owner: str, id: str, quantities: Sequence[Quantity]) -> Indices:
+        first = len(self.parameters)
+        self.parameters += [Parameter(kind, owner, id, quantity[0]) for quantity in quantities]
         self.quantities += quantities
-        return np.arange(first, len(self.names))
+        return np.arange(first, len(self.parameters))
 
     def values(self) -> tuple[Array, Array, Array]:
         """What is given, its standard deviation, and where to start (n,): what is fixed stays at its value."""
@@ -154,8 +156,8 @@ class _Listing:
         missing = np.flatnonzero(np.isnan(start))
         if len(missing):
             raise AdjustmentError(
-                f"{self.names[missing[0]]} has neither a value nor an approximation. Give one of them, or observe "
-                f"it in images whose orientation can be found."
+                f"{self.parameters[missing[0]].label} has neither a value nor an approximation. Give one of them, or "
+                f"observe it in images whose orientation can be found."
             )
         return given, sigma, start
 

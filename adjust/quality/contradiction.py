@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
 from adjust.linear_algebra.factor import Blocks, Factor
+from adjust.problem.further_observations import ObservedCalibration
+from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import Contradiction
 from adjust.quality.residuals import surplus
@@ -25,10 +27,10 @@ UNSEEN = 1e-6  # part of a direction's variance: where the others say so little,
 def contradictions_of_groups(
     problem: Problem, state: State, rows: Sequence[Blocks], factor: Factor, vpv: float, redundancy: int
 ) -> Iterator[Contradiction]:
-    """Of every further observation of several quantities; rows, factor: as of the residuals, vpv and redundancy of the
+    """Of every earlier calibration of several quantities; rows, factor: as of the residuals, vpv and redundancy of the
     whole adjustment, whose other part tells sigma0."""
     for each, block in zip(problem.further, rows, strict=True):
-        if len(each.observed) < 2:
+        if not isinstance(each, ObservedCalibration) or len(each.observed) < 2:
             continue
         root = np.linalg.cholesky(each.covariance)
         free, directions = np.linalg.eigh(surplus(block, factor))
@@ -40,14 +42,14 @@ def contradictions_of_groups(
         chi_square = float((u[seen] ** 2 / free[seen]).sum())
         left = redundancy - freedom
         variance = (vpv - chi_square) / left if left > 0 and vpv > chi_square else 1.0
-        along = _as_marks_show(root @ directions, ~seen, each.names)
+        along = _as_marks_show(root @ directions, ~seen, each.parameters)
         difference = along[:, seen] @ (u[seen] / free[seen])
         sigma = np.sqrt(variance * (along[:, seen] ** 2 / free[seen]).sum(axis=1))
         hidden = (along[:, ~seen] ** 2).sum(axis=1) > UNSEEN * np.diag(each.covariance)
         test = chi_square / freedom / variance
         yield Contradiction(
             group=each.group,
-            names=each.names,
+            parameters=each.parameters,
             difference=np.where(hidden, np.nan, difference),
             sigma=np.where(hidden, np.inf, sigma),
             statistic=test,
@@ -56,12 +58,12 @@ def contradictions_of_groups(
         )
 
 
-def _as_marks_show(along: Array, unseen: NDArray[np.bool_], names: Sequence[str]) -> Array:
+def _as_marks_show(along: Array, unseen: NDArray[np.bool_], parameters: Sequence[Parameter]) -> Array:
     """Changes (n, m) of the quantities, each with so much of the unseen ones that the fiducial marks move least.
 
     The frame of the marks can shift, turn and grow, and the camera with it: as where two calibrations are compared,
     what is told of c is then what changes beside the marks. What marks do not show of the unseen changes stays.
     """
-    is_mark = np.array([name.startswith("FID.") for name in names])
+    is_mark = np.array([each.kind == "fiducial" for each in parameters])
     by_marks = np.linalg.pinv(along[:, unseen] * is_mark[:, None], rcond=UNSEEN)
     return np.asarray(along - along[:, unseen] @ (by_marks @ along))

@@ -16,6 +16,7 @@ from adjust.functional_model.families import family
 from adjust.functional_model.rotation import rotation_from_angles, vector_by_angles
 from adjust.problem.camera import Camera
 from adjust.problem.network import EXTERIOR_NAMES, Network
+from adjust.problem.parameter import MANY, Parameter
 from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -38,9 +39,9 @@ DIRECTIONS = (
 
 @dataclass(frozen=True)
 class Correlation:
-    """What trades off, by names of unknowns (EO.*.Z0: of many images), the largest correlation, cause and remedy."""
+    """What trades off (owner MANY: in many images), the largest correlation, cause and remedy."""
 
-    parameters: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
     rho: float
     cause: str
     remedy: str
@@ -69,10 +70,10 @@ class _Kind:
 
 
 def _of_camera(adjustment: Adjustment, camera: Camera, above: float) -> Iterator[Correlation]:
-    kinds = [kind for kind in _kinds(camera) if _is_free(adjustment, f"IO.{camera.name}.{kind.name}")]
+    kinds = [kind for kind in _kinds(camera) if _is_free(adjustment, Parameter.interior(camera.name, kind.name))]
     if not kinds:
         return
-    own = [f"IO.{camera.name}.{kind.name}" for kind in kinds]
+    own = [Parameter.interior(camera.name, kind.name) for kind in kinds]
     marks = _free_marks(adjustment, camera)
     of_camera = _correlation(_held(adjustment.cofactor_of([*own, *marks]), len(own), _figure(adjustment, marks)))
     known = _field_is_known(adjustment.network)
@@ -104,19 +105,19 @@ def _kinds(camera: Camera) -> list[_Kind]:
     return interior + [_Kind(name, groups.get(name, "other")) for name in of.parameters]
 
 
-def _is_free(adjustment: Adjustment, name: str) -> bool:
-    return name in adjustment.names and adjustment.sigma(name) > 0.0
+def _is_free(adjustment: Adjustment, parameter: Parameter) -> bool:
+    return adjustment.has(parameter) and adjustment.sigma(parameter) > 0.0
 
 
-def _free_marks(adjustment: Adjustment, camera: Camera) -> list[str]:
+def _free_marks(adjustment: Adjustment, camera: Camera) -> list[Parameter]:
     """x and y of every fiducial that was estimated, x before y."""
-    pairs = [[f"FID.{camera.name}.{id_}.{axis}" for axis in "xy"] for id_ in camera.fiducials]
-    return [name for pair in pairs if all(_is_free(adjustment, name) for name in pair) for name in pair]
+    pairs = [[Parameter.fiducial(camera.name, id_, axis) for axis in "xy"] for id_ in camera.fiducials]
+    return [each for pair in pairs if all(_is_free(adjustment, one) for one in pair) for each in pair]
 
 
-def _figure(adjustment: Adjustment, marks: Sequence[str]) -> Array:
+def _figure(adjustment: Adjustment, marks: Sequence[Parameter]) -> Array:
     """Shift, rotation and scale (k, m) of fiducial coordinates (m,)."""
-    xy = np.array([adjustment.value(name) for name in marks]).reshape(-1, 2)
+    xy = adjustment.values_of(marks).reshape(-1, 2)
     if len(xy) < 2:
         return np.zeros((0, len(marks)))
     x, y = (xy - xy.mean(axis=0)).T
@@ -144,10 +145,10 @@ def _correlation(cofactor: Array) -> Array:
     return np.asarray(cofactor / np.outer(scale, scale))
 
 
-def _with_exteriors(adjustment: Adjustment, own: list[str], marks: list[str], images: list[str]) -> Array:
+def _with_exteriors(adjustment: Adjustment, own: list[Parameter], marks: list[Parameter], images: list[str]) -> Array:
     """Correlations (images, k, 6) of k parameters with the six directions of every exterior orientation."""
-    names = [f"EO.{image}.{element}" for image in images for element in EXTERIOR_NAMES]
-    cofactor = _held(adjustment.cofactor_of([*own, *marks, *names]), len(own), _figure(adjustment, marks))
+    exterior = [Parameter.exterior(image, element) for image in images for element in EXTERIOR_NAMES]
+    cofactor = _held(adjustment.cofactor_of([*own, *marks, *exterior]), len(own), _figure(adjustment, marks))
     turn = np.eye(len(cofactor))
     for i, image in enumerate(images):
         at = slice(len(own) + 6 * i, len(own) + 6 * i + 6)
@@ -158,7 +159,7 @@ def _with_exteriors(adjustment: Adjustment, own: list[str], marks: list[str], im
 
 def _in_camera_axes(adjustment: Adjustment, image: str) -> Array:
     """The derivative (6, 6) of the six directions by the elements of an exterior orientation."""
-    angles = np.array([adjustment.value(f"EO.{image}.{element}") for element in EXTERIOR_NAMES[3:]])
+    angles = adjustment.values_of(Parameter.exterior(image, element) for element in EXTERIOR_NAMES[3:])
     turn = np.zeros((6, 6))
     turn[:3, :3] = rotation_from_angles(angles)
     turn[3:, 3:] = vector_by_angles(angles)
@@ -175,7 +176,8 @@ def _field_is_known(network: Network) -> bool:
 def _of_pair(camera: str, first: _Kind, second: _Kind, rho: float, known: bool) -> Correlation:
     why, remedy = _why(first.group, second.group, known)
     cause = f"{first} and {second} of camera {camera} are correlated by {rho:.3f}: {why}."
-    return Correlation((f"IO.{camera}.{first.name}", f"IO.{camera}.{second.name}"), rho, cause, remedy)
+    pair = Parameter.interior(camera, first.name), Parameter.interior(camera, second.name)
+    return Correlation(pair, rho, cause, remedy)
 
 
 def _of_images(
@@ -200,10 +202,9 @@ def _of_images(
     )
     why, remedy = _why(kind.group, other, known)
     cause = f"{kind} of camera {camera} and {what} of {of} are correlated by {rho:.3f}: {why}."
-    owner = "*" if len(images) > 1 else images[0]
-    return Correlation(
-        (f"IO.{camera}.{kind.name}", *(f"EO.{owner}.{element}" for element in elements)), rho, cause, remedy
-    )
+    owner = MANY if len(images) > 1 else images[0]
+    exterior = (Parameter.exterior(owner, element) for element in elements)
+    return Correlation((Parameter.interior(camera, kind.name), *exterior), rho, cause, remedy)
 
 
 def _elements(adjustment: Adjustment, images: list[str], direction: int) -> list[str]:

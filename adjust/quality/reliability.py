@@ -267,7 +267,9 @@ def _outer(
             largest[i], causes[i] = values[i], name_of(int(worst[i]))
     sigma = np.sqrt((of_cameras * by_shared).sum(axis=0))
     return tuple(
-        OuterEffect(unknowns.names[free[members[i]]], float(largest[i]), float(abs(largest[i]) / sigma[i]), causes[i])
+        OuterEffect(
+            unknowns.parameters[free[members[i]]], float(largest[i]), float(abs(largest[i]) / sigma[i]), causes[i]
+        )
         for i in np.argsort(free[members])
     )
 
@@ -310,4 +312,4 @@ def _further_effects(
 
 
 def _further_name(each: FurtherObservation, row: int) -> str:
-    return f"{each.group} {each.names[row]}"
+    return f"{each.group} {each.labels[row]}"

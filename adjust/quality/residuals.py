@@ -105,10 +105,10 @@ def _rms_um(problem: Problem, state: State, v_mm: Array, group: str, members: ND
         return 0.0, 0.0
     given = TestedUnits(problem).positions[members[count:]].ravel()
     given = given[given != ABSENT]
-    names = np.array(problem.unknowns.names)[given]
+    quantities = np.array([problem.unknowns.parameters[i].quantity for i in given], dtype=np.str_)
     v = (1e6 if group == "control" else UM_PER_MM) * prior_differences(problem, state)[given]
-    x, y = (".X", ".Y") if group == "control" else (".x", ".y")
-    return _rms(v[np.char.endswith(names, x)]), _rms(v[np.char.endswith(names, y)])
+    x, y = ("X", "Y") if group == "control" else ("x", "y")
+    return _rms(v[quantities == x]), _rms(v[quantities == y])
 
 
 def _rms(v: Array) -> float:

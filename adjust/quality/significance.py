@@ -21,6 +21,7 @@ from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family
 from adjust.problem.camera import Camera, Prior
 from adjust.problem.network import Board, Scanner
+from adjust.problem.parameter import Kind, Parameter
 from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ def parameter_tests(adjustment: Adjustment, camera: Camera) -> tuple[Significanc
     interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
     tests = [_against_given(adjustment, camera.name, name, prior) for name, prior in interior.items()]
     found = [test for test in tests if test is not None]
-    return (*found, *(_against_zero(adjustment, f"IO.{camera.name}", name, (name,)) for name in _estimated(camera)))
+    return (*found, *(_against_zero(adjustment, "interior", camera.name, name, (name,)) for name in _estimated(camera)))
 
 
 def group_tests(adjustment: Adjustment, camera: Camera) -> tuple[SignificanceTest, ...]:
@@ -66,26 +67,28 @@ def group_tests(adjustment: Adjustment, camera: Camera) -> tuple[SignificanceTes
     several = {name: members for name, members in present.items() if len(members) > 1}
     if len(several) == 2 and len(set(several.values())) == 1:
         del several["all"]
-    return tuple(_against_zero(adjustment, f"IO.{camera.name}", name, members) for name, members in several.items())
+    return tuple(_against_zero(adjustment, "interior", camera.name, name, members) for name, members in several.items())
 
 
 def scanner_tests(adjustment: Adjustment, scanner: Scanner) -> tuple[SignificanceTest, ...]:
     """Of every term of a scanner's bend that was estimated, and of all of them together."""
-    return _of_terms(adjustment, f"SC.{scanner.name}", scanner.terms)
+    return _of_terms(adjustment, "scanner", scanner.name, scanner.terms)
 
 
 def board_tests(adjustment: Adjustment, board: Board) -> tuple[SignificanceTest, ...]:
     """Of the bends of a board along each axis that were estimated, and of both together."""
-    return _of_terms(adjustment, f"BD.{board.name}", dict(zip(BOARD_NAMES, board.bends, strict=True)))
+    return _of_terms(adjustment, "board", board.name, dict(zip(BOARD_NAMES, board.bends, strict=True)))
 
 
-def _of_terms(adjustment: Adjustment, owner: str, terms: Mapping[str, Prior]) -> tuple[SignificanceTest, ...]:
+def _of_terms(
+    adjustment: Adjustment, kind: Kind, owner: str, terms: Mapping[str, Prior]
+) -> tuple[SignificanceTest, ...]:
     estimated = tuple(name for name, prior in terms.items() if prior.sigma > 0.0)
     if not adjustment.converged or not estimated:
         return ()
     several = {"all": estimated} if len(estimated) > 1 else {}
     tested = {name: (name,) for name in estimated} | several
-    return tuple(_against_zero(adjustment, owner, name, members) for name, members in tested.items())
+    return tuple(_against_zero(adjustment, kind, owner, name, members) for name, members in tested.items())
 
 
 def _has_tests(adjustment: Adjustment, camera: Camera) -> bool:
@@ -99,7 +102,7 @@ def _estimated(camera: Camera) -> tuple[str, ...]:
 
 
 def _against_given(adjustment: Adjustment, camera: str, name: str, prior: Prior | None) -> SignificanceTest | None:
-    full = f"IO.{camera}.{name}"
+    full = Parameter.interior(camera, name)
     if prior is None or prior.sigma == 0.0:
         return None
     cofactor = float(adjustment.cofactor_of([full])[0, 0])
@@ -111,10 +114,11 @@ def _against_given(adjustment: Adjustment, camera: str, name: str, prior: Prior 
     return _tested(adjustment, name, (name,), np.array([adjustment.value(full) - prior.value]), np.array([[cofactor]]))
 
 
-def _against_zero(adjustment: Adjustment, owner: str, name: str, parameters: Sequence[str]) -> SignificanceTest:
-    full = [f"{owner}.{each}" for each in parameters]
-    values = np.array([adjustment.value(each) for each in full])
-    return _tested(adjustment, name, tuple(parameters), values, adjustment.cofactor_of(full))
+def _against_zero(
+    adjustment: Adjustment, kind: Kind, owner: str, name: str, quantities: Sequence[str]
+) -> SignificanceTest:
+    tested = [Parameter(kind, owner, "", each) for each in quantities]
+    return _tested(adjustment, name, tuple(quantities), adjustment.values_of(tested), adjustment.cofactor_of(tested))
 
 
 def _tested(

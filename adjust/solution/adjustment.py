@@ -295,7 +295,7 @@ def _result(last: Run, cofactor: Cofactor, options: Options) -> Adjustment:
         unknowns=len(last.numbering.free),
         redundancy=assessment.redundancy,
         vpv=last.vpv,
-        names=problem.unknowns.names,
+        parameters=problem.unknowns.parameters,
         values=np.where(_meaningless(problem), np.nan, state.values),
         cofactor=cofactor,
         assessment=assessment,

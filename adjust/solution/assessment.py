@@ -9,6 +9,7 @@ import numpy as np
 from adjust.functional_model.transformation import marks_needed
 from adjust.least_squares.iteration import factorise
 from adjust.problem.functions import computed_observations
+from adjust.problem.parameter import description
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.problem import Problem
 from adjust.problem.result import Cofactor, Contradiction, FurtherResidual, Group, Reliability, Residuals, Suspect
@@ -61,8 +62,7 @@ class RunAssessment:
         if not run.has_solution or not run.problem.further:
             return ()
         of_state = run.problem, run.end.state, run.end.rows.further
-        found = contradictions_of_groups(*of_state, run.factor, run.vpv, self.redundancy)
-        return tuple(each for each in found if each.group == "calibration")
+        return tuple(contradictions_of_groups(*of_state, run.factor, run.vpv, self.redundancy))
 
     @cached_property
     def groups(self) -> Mapping[str, Group]:
@@ -145,7 +145,7 @@ def _warnings(last: Run, cofactor: Cofactor) -> list[str]:
     without_priors = factorise(last.numbering, last.end, camera_priors=False)
     weak = weak_directions(problem, last.end.state, last.numbering.free, without_priors, last.singular)
     warnings += [
-        f"Practically singular without priors: {', '.join(each.parameters)}. {each.cause} {each.remedy}"
+        f"Practically singular without priors: {description(each.parameters)}. {each.cause} {each.remedy}"
         for each in weak
     ]
     if last.converged:

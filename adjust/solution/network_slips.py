@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from adjust.problem.camera import Camera, Fiducial, Prior
-from adjust.problem.network import Exterior, Network, ObjectPoint
+from adjust.problem.network import EXTERIOR_NAMES, Exterior, Network, ObjectPoint
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -172,10 +173,10 @@ def _opposite(prior: Prior) -> Prior:
 
 
 def _other_principal_distance(network: Network) -> Iterator[Hypothesis]:
-    calibrated = {name for each in network.calibrations for name in each.names}
+    calibrated = {parameter for each in network.calibrations for parameter in each.parameters}
     for camera in network.cameras:
         given = camera.principal_distance_mm
-        if given is not None and np.isfinite(given.sigma) and f"IO.{camera.name}.c" not in calibrated:
+        if given is not None and np.isfinite(given.sigma) and Parameter.interior(camera.name, "c") not in calibrated:
             others = tuple(replace(each, principal_distance_mm=None) if each is camera else each
                            for each in network.cameras)  # fmt: skip
             yield Hypothesis(
@@ -238,13 +239,14 @@ def _given_stations(network: Network) -> dict[str, Array]:
 def _stations(result: Adjustment, of: dict[str, Array]) -> tuple[Array, Array]:
     """Adjusted stations (n, 3) of some images, and their distances (n,) from the middle of the points."""
     frames = [result.network.image_by_name[name].frame for name in of]
-    stations = np.array([[result.value(f"EO.{frame}.{axis}0") for axis in "XYZ"] for frame in frames])
+    exterior = (Parameter.exterior(frame, element) for frame in frames for element in EXTERIOR_NAMES[:3])
+    stations = result.values_of(exterior).reshape(-1, 3)
     return stations, np.linalg.norm(stations - _points(result).mean(axis=0), axis=1)
 
 
 def _points(result: Adjustment) -> Array:
     seen = [point.id for point in result.network.points if point.id in result.network.observed_points]
-    return np.array([[result.value(f"PT.{id}.{axis}") for axis in "XYZ"] for id in seen])
+    return result.values_of(Parameter.point(id, axis) for id in seen for axis in "XYZ").reshape(-1, 3)
 
 
 def _near(stations: Array, given: Array, depths: Array) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from adjust.initial_values.far_points import FarPoint
 from adjust.problem.camera import Prior
 from adjust.problem.network import Approximations, Network, ObjectPoint
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 from adjust.solution.options import Options
 
@@ -72,9 +73,8 @@ def slips(network: Network, far: Sequence[FarPoint], without: Adjustment, option
     critical = float(options.probabilities.critical(np.array([3]), len(given))[0]) * max(without.sigma0, 1.0) ** 2
     found = []
     for each in far:
-        names = [f"PT.{each.name}.{axis}" for axis in "XYZ"]
-        place = np.array([without.value(name) for name in names])
-        cofactor = without.cofactor_of(names)
+        coordinates = [Parameter.point(each.name, axis) for axis in "XYZ"]
+        place, cofactor = without.values_of(coordinates), without.cofactor_of(coordinates)
         covariance = cofactor + _given_covariance(network.point_by_id[each.name])
         test = _Test(place, np.asarray(np.linalg.inv(covariance), dtype=np.float64), critical)
         if not test.passes(given[each.name]):

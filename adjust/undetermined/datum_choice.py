@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from adjust.errors import DatumError
 from adjust.problem.camera import Prior
 from adjust.problem.network import Network, ObjectPoint
+from adjust.problem.parameter import Parameter, object_coordinate
 from adjust.problem.problem import Problem
 from adjust.undetermined.datum import FLAT, ObjectDatum, free_coordinates, object_datum
 from adjust.undetermined.directions import DATUM_LEADS
@@ -21,13 +22,13 @@ DEPENDENT = 1e-6  # part of a coordinate's motion that those before it must leav
 
 def with_held(network: Network, coordinates: Sequence[str]) -> Network:
     """The network for approximations: coordinates that are to be held, and have a value, count as known."""
-    held = set(coordinates)
+    held = {object_coordinate(text) for text in coordinates}
     return replace(network, points=tuple(_with_held(point, held) for point in network.points))
 
 
-def _with_held(point: ObjectPoint, held: set[str]) -> ObjectPoint:
+def _with_held(point: ObjectPoint, held: set[Parameter]) -> ObjectPoint:
     priors = [
-        Prior(prior.value) if prior is not None and f"{point.id}.{axis}" in held else prior
+        Prior(prior.value) if prior is not None and Parameter.point(point.id, axis) in held else prior
         for axis, prior in zip("XYZ", (point.X, point.Y, point.Z), strict=True)
     ]
     return ObjectPoint(point.id, *priors)
@@ -63,13 +64,9 @@ def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
 
 
 def _position(problem: Problem, coordinate: str) -> int:
-    point, _, axis = coordinate.rpartition(".")
-    if axis not in ("X", "Y", "Z"):
-        raise DatumError(
-            f"The datum coordinate {coordinate} is none: write the point, a dot and X, Y or Z, such as 12.X."
-        )
-    _check_points(problem, [point])
-    position = int(problem.unknowns.point[point]["XYZ".index(axis)])
+    parameter = object_coordinate(coordinate)
+    _check_points(problem, [parameter.id])
+    position = int(problem.unknowns.point[parameter.id]["XYZ".index(parameter.quantity)])
     if np.isfinite(problem.unknowns.sigma[position]):
         raise DatumError(
             f"The datum coordinate {coordinate} is given with the standard deviation "

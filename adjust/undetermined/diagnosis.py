@@ -1,6 +1,5 @@
 """What the observations do not determine: null directions of the equations, named with cause and remedy."""
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -8,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.linear_algebra.factor import Factor
+from adjust.problem.parameter import Parameter, description
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import NullDirection
 from adjust.undetermined.datum import free_coordinates, object_datum
@@ -58,11 +58,10 @@ def weak_directions(
     if singular and (told <= SINGULAR).all():
         return ()
     marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
-    sigma = np.where(
-        np.isin(np.char.partition(np.array(problem.unknowns.names)[free], ".")[:, 0], ("IO", "SC")),
-        problem.unknowns.sigma[free],
-        np.inf,
+    cameras_and_scanners = np.isin(
+        free, [i for some in (problem.unknowns.camera, problem.unknowns.scanner) for own in some.values() for i in own]
     )
+    sigma = np.where(cameras_and_scanners, problem.unknowns.sigma[free], np.inf)
     calibrated = [each.positions for each in problem.further if each.group == "calibration"]
     placed = marks & (np.isfinite(problem.unknowns.sigma[free]) | np.isin(free, np.concatenate([[], *calibrated])))
     placed |= np.isin(free, np.concatenate([[], *trading_off(problem).values()]))
@@ -78,8 +77,8 @@ def weak_directions(
 
 def _together(directions: Sequence[NullDirection]) -> NullDirection:
     """Many directions that have no name, as one."""
-    moved = tuple(dict.fromkeys(name for each in directions for name in each.parameters))
-    return NullDirection(_collapsed(list(moved)), *many_sentence(len(directions), following(set(moved))))
+    moved = tuple(dict.fromkeys(moved for each in directions for moved in each.parameters))
+    return NullDirection(_collapsed(moved), *many_sentence(len(directions), following(set(moved))))
 
 
 def _motion(direction: NullDirection) -> str:
@@ -98,23 +97,23 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
     told[np.unique(problem.columns[problem.columns >= 0])] = True
     told[[i for point in unknowns.point.values() for i in point]] = False
     prior = np.where(unknowns.has_prior & told, unknowns.sigma, np.inf)
-    names = [unknowns.names[i] for i in np.flatnonzero(np.sqrt(variances) > UNDETERMINED * prior)]
-    if not names:
+    untold = np.flatnonzero(np.sqrt(variances) > UNDETERMINED * prior)
+    if not len(untold):
         return ""
-    said = f"The observations say nothing about {', '.join(_collapsed(names))}: their standard deviations stay as given"
-    cameras = [name for name in unknowns.camera if any(f"IO.{name}.{each}" in names for each in ("c", "x0", "y0"))]
+    shown = description(_collapsed([unknowns.parameters[i] for i in untold]))
+    said = f"The observations say nothing about {shown}: their standard deviations stay as given"
+    cameras = [name for name, positions in unknowns.camera.items() if np.isin(positions[:3], untold).any()]
     if not cameras:
         return f"{said}. What is given is all that places them: give it well, or fix what you do not need."
     field = field_of(problem, state, cameras[0])
     return f"{said}, for {field.because}. To determine them, {field.remedy}."
 
 
-def _collapsed(names: list[str]) -> tuple[str, ...]:
-    """Names of unknowns, those of one kind shown as one with a star where they are many."""
-    kinds: dict[str, list[str]] = {}
-    for name in names:
-        kind = name if name.startswith(("IO.", "SC.")) else re.sub(r"^(FID\.[^.]*|[A-Z]+)\..*\.", r"\1.*.", name)
-        kinds.setdefault(kind, []).append(name)
+def _collapsed(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """Unknowns, those of one kind shown as one where they are many."""
+    kinds: dict[Parameter, list[Parameter]] = {}
+    for each in parameters:
+        kinds.setdefault(each.any_owner, []).append(each)
     shown = []
     for kind, members in kinds.items():
         shown += [kind] if len(members) > NAMES_SHOWN or kind in members else members
@@ -135,8 +134,8 @@ def _within_blocks(
     """Null directions of an image's or a point's own unknowns, which the shared ones have no part in."""
     for block in blind:
         for vector in block.right.T:
-            names = [problem.unknowns.names[free[block.own[i]]] for i in _largest(vector)]
-            yield NullDirection(tuple(names), *own_sentence(problem, state, names[0]))
+            moved = tuple(problem.unknowns.parameters[free[block.own[i]]] for i in _largest(vector))
+            yield NullDirection(moved, *own_sentence(problem, state, moved[0]))
 
 
 def _named(
@@ -151,7 +150,7 @@ def _named(
     """Sentences for the vectors (n, d) of a null space: the object datum first, then the camera, then what is left."""
     if null.shape[1] == 0:
         return _Directions((), ())
-    names = [problem.unknowns.names[i] for i in free]
+    parameters = [problem.unknowns.parameters[i] for i in free]
     datum, sentences, rest = _datum_part(problem, state, free, factor, blind, null)
     still = _with_points_still(problem, free, datum, rest)
     leads = [*scanner_leads(problem, state), *camera_leads(problem, state)]
@@ -161,23 +160,23 @@ def _named(
     ranks = np.array([lead.rank for lead in leads], dtype=np.intp)
     axes = (functionals[ranks == 0] * factor.scale**2).T  # as motions of the scaled unknowns
     chosen = _independent_rows(seen, part, ranks, _made_of(axes, rest, part))
-    vectors = _with_object_still(names, still @ np.linalg.pinv(seen[chosen]), ranks[chosen])
+    vectors = _with_object_still(parameters, still @ np.linalg.pinv(seen[chosen]), ranks[chosen])
     left = still @ _unseen_by(seen[chosen], PURE)
-    moved = [[names[i] for i in _largest(vector)] for vector in np.hstack([datum, vectors, left]).T]
+    moved = [[parameters[i] for i in _largest(vector)] for vector in np.hstack([datum, vectors, left]).T]
     of_leads = moved[datum.shape[1] : len(moved) - left.shape[1]]
     for own, i in zip(of_leads, chosen, strict=True):  # small as they may be, what it is named after moves
-        own += [names[k] for k in np.flatnonzero(functionals[i]) if names[k] not in own]
+        own += [parameters[k] for k in np.flatnonzero(functionals[i]) if parameters[k] not in own]
     sentences += [leads[i].sentence(own) for i, own in zip(chosen, of_leads, strict=True)]
     for vector, own in zip(left.T, moved[len(moved) - left.shape[1] :], strict=True):
-        sentences.append(_left_sentence(problem, state, names[int(np.argmax(np.abs(vector)))], own))
+        sentences.append(_left_sentence(problem, state, parameters[int(np.argmax(np.abs(vector)))], own))
     told = tuple(NullDirection(_collapsed(own), *sentence) for own, sentence in zip(moved, sentences, strict=True))
     return _Directions(told[: len(told) - left.shape[1]], told[len(told) - left.shape[1] :])
 
 
-def _left_sentence(problem: Problem, state: State, most: str, moved: Sequence[str]) -> tuple[str, str]:
+def _left_sentence(problem: Problem, state: State, most: Parameter, moved: Sequence[Parameter]) -> tuple[str, str]:
     """Cause and remedy of a direction without a lead, of what moves most in it: of one point or image, or of many."""
-    owners = {name.rsplit(".", 1)[0].split(".", 1)[1] for name in moved}
-    if len(owners) == 1 and most.startswith(("PT.", "EO.", "T.")):
+    owners = {(each.owner, each.id) for each in moved}
+    if len(owners) == 1 and most.kind in ("point", "exterior", "film"):
         return own_sentence(problem, state, most)
     return unnamed_sentence(most, following(set(moved) - {most}))
 
@@ -210,12 +209,12 @@ def _with_points_still(problem: Problem, free: Indices, datum: Array, vectors: A
     return np.asarray(vectors - datum @ amounts)
 
 
-def _with_object_still(names: list[str], vectors: Array, ranks: Indices) -> Array:
+def _with_object_still(parameters: Sequence[Parameter], vectors: Array, ranks: Indices) -> Array:
     """Vectors (n, d) with as much of the others added to those of rank 0 as leaves stations and points where they are.
 
     A common shift of fiducials and principal point, which no object takes part in, is then told as just that.
     """
-    placed = np.array([name.rsplit(".", 1)[1] in OBJECT_AXES for name in names], dtype=bool)
+    placed = np.array([each.quantity in OBJECT_AXES for each in parameters], dtype=bool)
     first, others = vectors[:, ranks == 0], vectors[:, ranks > 0]
     result = vectors.copy()
     result[:, ranks == 0] -= others @ np.linalg.lstsq(others[placed], first[placed])[0]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import family
 from adjust.functional_model.transformation import follows_tilts
+from adjust.problem.parameter import Kind, Parameter
 from adjust.problem.problem import Problem, State
 
 Array = NDArray[np.float64]
@@ -25,7 +26,7 @@ class Lead:
 
     rank: of several leads that would do, that of the lowest rank gives the name. motion: what moves; because: why
     nothing hinders it, where that is more than what follows it. given: what a prior would end it, partner: another
-    unknown (its name, and in words) that would, where it moves too; otherwise: what else to do.
+    unknown (its key, and in words) that would, where it moves too; otherwise: what else to do.
     """
 
     rank: int
@@ -33,10 +34,10 @@ class Lead:
     motion: str
     given: str
     because: str = ""
-    partner: tuple[str, str] | None = None
+    partner: tuple[Parameter, str] | None = None
     otherwise: str = ""
 
-    def sentence(self, moved: Iterable[str]) -> tuple[str, str]:
+    def sentence(self, moved: Iterable[Parameter]) -> tuple[str, str]:
         """Cause and remedy of a direction that moves some unknowns."""
         moved = set(moved)
         cause = f"{self.motion}{following(moved, self.motion)}{self.because and f': {self.because}'}."
@@ -45,27 +46,29 @@ class Lead:
         return cause, remedy
 
 
-FOLLOWERS = (  # what follows a motion: the unknowns' kind, quantities (all where empty), words, a word that told it
-    ("FID", (), "the fiducial marks", "fiducial mark"),
-    ("T", (), "the film transformations", ""),
-    ("JOIN", (), "what joins scans of a frame", ""),
-    ("IO", ("x0", "y0"), "the principal point", "principal point's"),
-    ("IO", ("c",), "the principal distance", "principal distance"),
-    ("EO", ("X0", "Y0", "Z0"), "the stations", ""),
-    ("EO", ("omega", "phi"), "the tilts", ""),
-    ("EO", ("kappa",), "kappa", ""),
-    ("PT", ("X", "Y"), "the object points in plan", ""),
-    ("PT", ("Z",), "the heights", ""),
+FOLLOWERS: tuple[
+    tuple[Kind, tuple[str, ...], str, str], ...
+] = (  # what follows a motion: the unknowns' kind, quantities (all where empty), words, a word that told it
+    ("fiducial", (), "the fiducial marks", "fiducial mark"),
+    ("film", (), "the film transformations", ""),
+    ("join", (), "what joins scans of a frame", ""),
+    ("interior", ("x0", "y0"), "the principal point", "principal point's"),
+    ("interior", ("c",), "the principal distance", "principal distance"),
+    ("exterior", ("X0", "Y0", "Z0"), "the stations", ""),
+    ("exterior", ("omega", "phi"), "the tilts", ""),
+    ("exterior", ("kappa",), "kappa", ""),
+    ("point", ("X", "Y"), "the object points in plan", ""),
+    ("point", ("Z",), "the heights", ""),
 )
 
 
-def following(moved: Iterable[str], motion: str = "") -> str:
+def following(moved: Iterable[Parameter], motion: str = "") -> str:
     """What moves along, in words."""
-    kinds = {(name.split(".", 1)[0], name.rsplit(".", 1)[1]) for name in moved}
+    kinds = {(each.kind, each.quantity) for each in moved}
     words = [
         word
-        for owner, quantities, word, told in FOLLOWERS
-        if not (told and told in motion) and any(o == owner and (not quantities or q in quantities) for o, q in kinds)
+        for kind, quantities, word, told in FOLLOWERS
+        if not (told and told in motion) and any(k == kind and (not quantities or q in quantities) for k, q in kinds)
     ]
     if not words:
         return ""
@@ -120,8 +123,9 @@ def _fiducial_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
     one, zero = np.ones_like(x), np.zeros_like(x)
     marks = f"all fiducial marks of camera {camera} can"
     turned = "add images turned by 90 degrees about their axes or tilted in other directions"
-    x0, y0 = (f"IO.{camera}.x0", "x0' (F7)"), (f"IO.{camera}.y0", "y0' (F8)")
-    c = (f"IO.{camera}.c", "the principal distance (F9)")
+    x0 = (Parameter.interior(camera, "x0"), "x0' (F7)")
+    y0 = (Parameter.interior(camera, "y0"), "y0' (F8)")
+    c = (Parameter.interior(camera, "c"), "the principal distance (F9)")
     lever = "one coordinate of a fiducial mark that has a lever arm (F5, F6)"
     two, three = (f"x' and y' of {number} fiducial marks (F5, F6)" for number in ("two", "three"))
     leads = (  # rank, dx', dy', motion, given, partner, otherwise

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem.network import Image
+from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
 
 Array = NDArray[np.float64]
@@ -14,20 +15,16 @@ IN_LINE = 1e-3  # width over length of marks in an image, and base over distance
 SHOWN = 3  # names that are told one by one
 
 
-def own_sentence(problem: Problem, state: State, name: str) -> tuple[str, str]:
+def own_sentence(problem: Problem, state: State, parameter: Parameter) -> tuple[str, str]:
     """Cause and remedy where the observations do not determine the image or the point that an unknown is of."""
-    kind, owner = name.rsplit(".", 1)[0].split(".", 1)
-    if kind == "PT":
-        return _of_point(problem, state, owner)
-    parts = _parts(problem, kind, owner)
-    return _of_parts(problem, parts) if parts else _of_image(problem, owner)
+    if parameter.kind == "point":
+        return _of_point(problem, state, parameter.id)
+    parts = _parts(problem, parameter.owner)
+    return _of_parts(problem, parts) if parts else _of_image(problem, parameter.owner)
 
 
-def _parts(problem: Problem, kind: str, owner: str) -> list[Image]:
-    """The scans of the frame, of several, that an orientation, a transformation or a join is of."""
-    frame = next(
-        (frame for frame, point in problem.unknowns.join if kind == "JOIN" and f"{frame}.{point}" == owner), owner
-    )
+def _parts(problem: Problem, frame: str) -> list[Image]:
+    """The scans of a frame of several; frame: its name, or that of one of its scans."""
     image = problem.network.image_by_name.get(frame)
     frame = image.part_of if image is not None else frame
     return [image for image in problem.network.images if image.part_of and image.part_of == frame]
@@ -89,45 +86,43 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
-def unnamed_sentence(name: str, followers: str) -> tuple[str, str]:
+def unnamed_sentence(most: Parameter, followers: str) -> tuple[str, str]:
     """Cause and remedy of a direction that no lead names, after the unknown that moves most in it."""
-    owner, quantity = name.rsplit(".", 1)
-    kind, owner = owner.split(".", 1)
+    kind, owner, id, quantity = most
     match kind:
-        case "EO":
+        case "exterior":
             return (
                 f"The exterior orientation of image {owner} can change ({quantity} most){followers}: too few known "
                 "points, or rays from other stations, hold it.",
                 "Measure known points in this image, take images from other stations that share its points, or give "
                 "its orientation with standard deviations in images.csv.",
             )
-        case "PT":
+        case "point":
             return (
-                f"The object point {owner} can move ({quantity} most){followers}.",
+                f"The object point {id} can move ({quantity} most){followers}.",
                 "Measure it in more images, give its coordinates with standard deviations, or leave it out.",
             )
-        case "FID":
-            camera, mark = owner.rsplit(".", 1)
+        case "fiducial":
             return (
-                f"The fiducial mark {mark} of camera {camera} can move ({quantity} most){followers}.",
+                f"The fiducial mark {id} of camera {owner} can move ({quantity} most){followers}.",
                 "Give it a standard deviation (F5, F6), or measure it in more images.",
             )
-        case "T":
+        case "film":
             return (
                 f"The film transformation of image {owner} can change ({quantity} most){followers}.",
                 "Measure more fiducial marks in this image, or choose a transformation with fewer parameters.",
             )
-        case "JOIN":
+        case "join":
             return (
-                f"What joins the scans of a frame, {owner}, can move ({quantity} most){followers}.",
+                f"Point {id}, which joins the scans of frame {owner}, can move ({quantity} most){followers}.",
                 "Measure more points that both scans show, spread over their overlap.",
             )
-        case "SC":
+        case "scanner":
             return (
                 f"The term {quantity} of the bend of scanner {owner} can change{followers}.",
                 f"Give {quantity} a standard deviation, or leave it out.",
             )
-        case "BD":
+        case "board":
             return (
                 f"The {quantity} of board {owner} can change{followers}: no image sees the board at a slant.",
                 "Take images that are tilted against the board, or give its bend a standard deviation.",

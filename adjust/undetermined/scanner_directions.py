@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.scanner import degree_of, is_left
 from adjust.linear_algebra.factor import Factor
+from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import Cofactor
 from adjust.undetermined.directions import Lead
@@ -34,18 +35,18 @@ class ScannerLead(Lead):
     poses: Sequence[Pose] = ()
     taken_by_film: str = ""
 
-    def sentence(self, moved: Iterable[str]) -> tuple[str, str]:
+    def sentence(self, moved: Iterable[Parameter]) -> tuple[str, str]:
         """Cause and remedy by what moves along: the lens, the fiducial marks, or nothing that could."""
         moved = list(moved)
         if self.taken_by_film:
             because = f"the {self.taken_by_film} transformation of its films does the same"
             return replace(self, because=because, given="the term itself", otherwise="leave it out")._told(moved)
-        by_lens = any(name.startswith("IO.") and name.rsplit(".", 1)[1] not in INTERIOR for name in moved)
-        seen = by_lens or any(name.startswith("FID.") for name in moved)
+        by_lens = any(each.kind == "interior" and each.quantity not in INTERIOR for each in moved)
+        seen = by_lens or any(each.kind == "fiducial" for each in moved)
         why = _Why(self.motion.split()[2], self.poses, "lens" if by_lens else "marks" if seen else "")
         return replace(self, because=why.cause, given=why.given, otherwise=why.otherwise)._told(moved)
 
-    def _told(self, moved: Iterable[str]) -> tuple[str, str]:
+    def _told(self, moved: Iterable[Parameter]) -> tuple[str, str]:
         return super().sentence(moved)
 
 
@@ -107,7 +108,7 @@ def hardly_told(problem: Problem, state: State, free: Indices, factor: Factor, c
         lens = [int(i) for camera in unknowns.camera.values() for i in camera[3:] if int(i) in places]
         held = held_variances(cofactor.of(np.array([*hardly, *lens])), len(hardly))
         scale = factor.scale[[places[position] for position in hardly]]
-        names = [unknowns.names[position].rsplit(".", 1)[1] for position in hardly]
+        names = [unknowns.parameters[position].quantity for position in hardly]
         by_lens = [term for term, ratio in zip(names, np.sqrt(held) * scale, strict=True) if ratio <= HARDLY]
         yield from untold_sentences(name, names, by_lens, _poses(problem, state, name))
 
@@ -151,7 +152,7 @@ def scanner_leads(problem: Problem, state: State) -> list[Lead]:
 
 
 def _lead(problem: Problem, scanner: str, position: int, poses: Sequence[Pose]) -> Lead:
-    term = problem.unknowns.names[position].rsplit(".", 1)[1]
+    term = problem.unknowns.parameters[position].quantity
     functional = np.zeros(len(problem.unknowns))
     functional[position] = 1.0
     motion = f"The term {term} of the bend of scanner {scanner} can change"

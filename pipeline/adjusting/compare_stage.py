@@ -15,6 +15,7 @@ from rich.text import Text
 
 from adjust.choices.comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
 from adjust.functional_model.families import parameter_names
+from adjust.problem.parameter import Parameter
 from pipeline.adjusting.compare_picture import draw_comparison
 from pipeline.errors import InputError
 from pipeline.results.adjustment_reader import calibrated_lens, read_adjustment, read_own_covariance
@@ -88,8 +89,8 @@ def _calibration(path: Path, content: Json, name: str, label: str) -> CameraCali
     if not np.isfinite([*interior, *parameters]).all():
         raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
     marks = {id: np.array([mark["x_mm"]["value"], mark["y_mm"]["value"]]) for id, mark in camera["fiducials"].items()}
-    unknowns = [f"IO.{name}.{each}" for each in ("c", "x0", "y0", *parameter_names(distortion.family))]
-    unknowns += [f"FID.{name}.{id}.{axis}" for id in marks for axis in "xy"]
+    unknowns = [Parameter.interior(name, each) for each in ("c", "x0", "y0", *parameter_names(distortion.family))]
+    unknowns += [Parameter.fiducial(name, id, axis) for id in marks for axis in "xy"]
     covariance = read_own_covariance(path).of(unknowns)
     return CameraCalibration(label, distortion, interior, parameters, marks, covariance, content["redundancy"])
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from adjust.choices.planning import plan
 from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import Options
 from pipeline.design.expected import INTERIOR, Expected
 from pipeline.design.setup import planned_network
@@ -18,8 +19,8 @@ from pipeline.design.setup import planned_network
 ROUNDING = 1e-9  # part of the largest motion that is none
 
 
-def alone(expected: Expected) -> Mapping[str, float]:
-    """Standard deviations of the camera's quantities by their names in the adjustment, with F5 to F9 dropped.
+def alone(expected: Expected) -> Mapping[Parameter, float]:
+    """Standard deviations of the camera's quantities, with F5 to F9 dropped.
 
     mm, and the parameters' own units; inf: not determined. With N how everything moves in the null directions, and N_f
     its rows of the fiducials: those of d - N N_f^+ d_f (Baarda's S-transformation to inner constraints over the marks).
@@ -29,12 +30,12 @@ def alone(expected: Expected) -> Mapping[str, float]:
     without = replace(network, cameras=(_without_priors(camera),))
     options = Options(expected.setup.settings.datum)
     free = plan(without, planned_network(expected.setup)[1], options, expected.plan.sigma0)
-    names = [f"IO.{camera.name}.{name}" for name in (*INTERIOR, *expected.family_parameters)]
-    marks = [f"FID.{camera.name}.{id}.{axis}" for id in camera.fiducials for axis in "xy"]
-    moved = free.null[[free.adjustment.index(name) for name in (*names, *marks)]]
-    functions = np.eye(len(names) + len(marks))
-    functions[:, len(names) :] -= moved @ np.linalg.pinv(moved[len(names) :], rcond=ROUNDING)
-    return dict(zip((*names, *marks), free.sigmas((*names, *marks), functions).tolist(), strict=True))
+    interior = [Parameter.interior(camera.name, name) for name in (*INTERIOR, *expected.family_parameters)]
+    marks = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
+    moved = free.null[[free.adjustment.index(each) for each in (*interior, *marks)]]
+    functions = np.eye(len(interior) + len(marks))
+    functions[:, len(interior) :] -= moved @ np.linalg.pinv(moved[len(interior) :], rcond=ROUNDING)
+    return dict(zip((*interior, *marks), free.sigmas((*interior, *marks), functions).tolist(), strict=True))
 
 
 def _without_priors(camera: Camera) -> Camera:

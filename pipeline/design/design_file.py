@@ -10,6 +10,7 @@ import numpy as np
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Image
+from adjust.problem.parameter import Parameter
 from pipeline.design.alternatives import Alternative
 from pipeline.design.expected import Expected, rms
 from pipeline.design.reliability import error_unit
@@ -24,14 +25,14 @@ Json = dict[str, Any]
 def design_json(
     scene: Variations,
     expected: Expected,
-    alone: Mapping[str, float],
+    alone: Mapping[Parameter, float],
     layouts: Layouts,
     helpful: tuple[Alternative, ...],
     swept: tuple[tuple[Swept, str], ...],
 ) -> Json:
     """The contents of design.json; a standard deviation of null: the observations do not determine the quantity.
 
-    alone: the standard deviations without given fiducials and interior orientation, by their names in the adjustment.
+    alone: the standard deviations without given fiducials and interior orientation.
     swept: every sweep with the name of its picture.
     """
     adjustment = expected.plan.adjustment
@@ -47,16 +48,16 @@ def design_json(
         "unknowns": adjustment.unknowns,
         "redundancy": adjustment.redundancy,
         "singular": [
-            {"parameters": list(null.parameters), "cause": null.cause, "remedy": null.remedy}
+            {"parameters": [each.text for each in null.parameters], "cause": null.cause, "remedy": null.remedy}
             for null in expected.plan.singular
         ],
         "warnings": list(adjustment.warnings),
         "cameras": {expected.camera: _camera(expected)},
         "scanners": {
-            scanner.name: {term: _quantity(expected, f"SC.{scanner.name}.{term}") for term in scanner.terms}
+            scanner.name: {term: _quantity(expected, Parameter.scanner(scanner.name, term)) for term in scanner.terms}
             for scanner in expected.network.scanners
         },
-        "photographs_alone": dict(alone),
+        "photographs_alone": {parameter.text: sigma for parameter, sigma in alone.items()},
         "images": {image.name: _image(expected, image) for image in expected.network.images},
         "points": _points(expected),
         "point_summary": _point_summary(expected),
@@ -83,16 +84,15 @@ def design_json(
 
 def _camera(expected: Expected) -> Json:
     camera = expected.network.cameras[0]
-    interior = f"IO.{camera.name}."
     distortion: Json = {"family": camera.distortion.family, "r0_mm": camera.distortion.r0_mm}
     for parameter in parameter_names(camera.distortion.family):
-        distortion[parameter] = _quantity(expected, interior + parameter)
+        distortion[parameter] = _quantity(expected, Parameter.interior(camera.name, parameter))
     return {
-        "principal_distance_mm": _quantity(expected, interior + "c"),
-        "principal_point_mm": {axis: _quantity(expected, f"{interior}{axis}0") for axis in "xy"},
+        "principal_distance_mm": _quantity(expected, Parameter.interior(camera.name, "c")),
+        "principal_point_mm": {axis: _quantity(expected, Parameter.interior(camera.name, f"{axis}0")) for axis in "xy"},
         "distortion": distortion,
         "fiducials": {
-            id: {f"{axis}_mm": _quantity(expected, f"FID.{camera.name}.{id}.{axis}") for axis in "xy"}
+            id: {f"{axis}_mm": _quantity(expected, Parameter.fiducial(camera.name, id, axis)) for axis in "xy"}
             for id in camera.fiducials
         },
         "precision_at_radii": [
@@ -114,11 +114,11 @@ def _image(expected: Expected, image: Image) -> Json:
     transformation: Json = {"kind": image.transformation}
     for parameter in film_parameter_names(image.transformation):
         key, scale = (f"{parameter}_deg", DEG_PER_RAD) if parameter in ANGLES else (parameter, 1.0)
-        transformation[key] = _quantity(expected, f"T.{image.name}.{parameter}", scale)
+        transformation[key] = _quantity(expected, Parameter.film(image.name, parameter), scale)
     exterior = {}
     for element in EXTERIOR_NAMES:
         key, scale = (f"{element}_deg", DEG_PER_RAD) if element in ANGLES else (element, 1.0)
-        exterior[key] = _quantity(expected, f"EO.{image.name}.{element}", scale)
+        exterior[key] = _quantity(expected, Parameter.exterior(image.name, element), scale)
     return {
         "targets": kinds.count("target"),
         "fiducials": kinds.count("fiducial"),
@@ -134,7 +134,7 @@ def _points(expected: Expected) -> Json:
         if kind == "target"
     ]
     return {
-        point.id: {axis: _quantity(expected, f"PT.{point.id}.{axis}") for axis in "XYZ"}
+        point.id: {axis: _quantity(expected, Parameter.point(point.id, axis)) for axis in "XYZ"}
         | {"images": seen.count(point.id)}
         for point in expected.network.points
     }
@@ -167,14 +167,14 @@ def _reliability(expected: Expected) -> Json:
             for one in expected.reliability.groups
         },
         "camera": [
-            {"parameter": one.parameter, "effect_in_sigmas": one.in_sigmas, "error_in": one.cause}
+            {"parameter": one.parameter.text, "effect_in_sigmas": one.in_sigmas, "error_in": one.cause}
             for one in expected.reliability.camera
         ],
     }
 
 
-def _quantity(expected: Expected, name: str, scale: float = 1.0) -> Json:
-    return {"value": scale * expected.plan.adjustment.value(name), "sigma": scale * expected.plan.sigma(name)}
+def _quantity(expected: Expected, parameter: Parameter, scale: float = 1.0) -> Json:
+    return {"value": scale * expected.plan.adjustment.value(parameter), "sigma": scale * expected.plan.sigma(parameter)}
 
 
 def _layouts(layouts: Layouts) -> Json:

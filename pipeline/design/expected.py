@@ -12,6 +12,7 @@ from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import ideal_from_observed
 from adjust.problem.network import Network
+from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import Options
 from pipeline.design.reliability import PlannedReliability, planned_reliability
 from pipeline.design.setup import Setup, planned_network
@@ -79,10 +80,11 @@ class Expected:
         return {name: sigma for name, sigma in sigmas.items() if sigma > 0.0}
 
     @cached_property
-    def scanner_sigmas(self) -> Mapping[str, float]:
-        """Of the terms of the scanner's bend, mm, by their names in the adjustment; empty where none is to be found."""
-        names = [f"SC.{scanner.name}.{term}" for scanner in self.network.scanners for term in scanner.terms]
-        return {name: self.plan.sigma(name) for name in names}
+    def scanner_sigmas(self) -> Mapping[Parameter, float]:
+        """Of the terms of the scanner's bend, mm; empty where none is to be found."""
+        scanners = self.network.scanners
+        terms = [Parameter.scanner(scanner.name, term) for scanner in scanners for term in scanner.terms]
+        return {term: self.plan.sigma(term) for term in terms}
 
     @cached_property
     def curve(self) -> tuple[AtRadius, ...]:
@@ -109,8 +111,8 @@ class Expected:
     @cached_property
     def point_sigmas(self) -> Array:
         """(n, 3) of the network's points, object units."""
-        names = [f"PT.{point.id}.{axis}" for point in self.network.points for axis in "XYZ"]
-        return np.array([self.plan.sigma(name) for name in names]).reshape(-1, 3)
+        coordinates = [Parameter.point(point.id, axis) for point in self.network.points for axis in "XYZ"]
+        return np.array([self.plan.sigma(each) for each in coordinates]).reshape(-1, 3)
 
     @property
     def _parameters(self) -> tuple[str, ...]:
@@ -134,8 +136,8 @@ class Expected:
         outward = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         across = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
         adjustment = self.plan.adjustment
-        interior = np.array([adjustment.value(f"IO.{self.camera}.{name}") for name in INTERIOR])
-        values = np.array([adjustment.value(f"IO.{self.camera}.{name}") for name in self._parameters])
+        interior = adjustment.values_of(Parameter.interior(self.camera, name) for name in INTERIOR)
+        values = adjustment.values_of(Parameter.interior(self.camera, name) for name in self._parameters)
         lens = Lens(self.camera, self.network.cameras[0].distortion, interior, values)
         by_c_and_parameters = displacement(lens, radius_mm * outward).by_unknowns_um
         by_c_and_parameters[np.abs(by_c_and_parameters) < ROUNDING_UM] = 0.0  # most families do not depend on c

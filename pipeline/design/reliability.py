@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.choices.planning import Plan
+from adjust.problem.parameter import Parameter
 
 UM_PER_MM = 1000.0
 IN_MM = ("target", "tie", "fiducial", "datum", "scanner")
@@ -30,7 +31,7 @@ class GroupReliability:
 class CameraEffect:
     """What the worst error that is not found does to a camera parameter: in sigmas of it; cause: where the error is."""
 
-    parameter: str
+    parameter: Parameter
     in_sigmas: float
     cause: str
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from adjust.problem.parameter import Parameter
 from pipeline.design.alone import alone
 from pipeline.design.alternatives import Alternative, alternatives
 from pipeline.design.design_file import Json, design_json
@@ -24,7 +25,7 @@ class Design:
     """A plan that was carried out. files: what was written, by a word for it; content: that of design.json."""
 
     expected: Expected
-    alone: Mapping[str, float]
+    alone: Mapping[Parameter, float]
     layouts: Layouts
     helpful: tuple[Alternative, ...]
     swept: tuple[Swept, ...]

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from adjust.problem.parameter import Parameter, description
 from pipeline.design.alternatives import FOUND, Alternative
 from pipeline.design.expected import Expected, rms
 from pipeline.design.reliability import error_unit
@@ -30,7 +31,7 @@ UNITS = {"c": "µm", "x0": "µm", "y0": "µm", "fiducials": "µm", "ray": "µm",
 
 def print_design(
     expected: Expected,
-    alone: Mapping[str, float],
+    alone: Mapping[Parameter, float],
     layouts: Layouts,
     helpful: tuple[Alternative, ...],
     swept: Iterable[Swept],
@@ -45,7 +46,7 @@ def print_design(
         highlight=False,
     )
     for null in expected.plan.singular:
-        console.print(Text(f"- {', '.join(null.parameters)}: {null.cause}", style="bold yellow"))
+        console.print(Text(f"- {description(null.parameters)}: {null.cause}", style="bold yellow"))
         console.print(Text(f"  {null.remedy}", style="dim"))
     for warning in adjustment.warnings:
         console.print(Text(f"- {warning}"))
@@ -67,7 +68,7 @@ def print_design(
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _camera_table(expected: Expected, alone: Mapping[str, float], layouts: Layouts) -> Table:
+def _camera_table(expected: Expected, alone: Mapping[Parameter, float], layouts: Layouts) -> Table:
     """With fiducials beside it: what the photographs alone tell, in the frame that the fiducials make."""
     several = layouts.count > 1
     title = f"Expected precision of camera {expected.camera}"
@@ -77,14 +78,15 @@ def _camera_table(expected: Expected, alone: Mapping[str, float], layouts: Layou
     if several:
         table.add_column(f"mean of {layouts.count} layouts")
         table.add_column("spread")
-    plan, interior = expected.plan, f"IO.{expected.camera}."
+    plan = expected.plan
     rows = {"c": "principal distance, mm", "x0": "principal point x', mm", "y0": "principal point y', mm"}
     rows |= {name: name for name in expected.family_parameters}
     for name, label in rows.items():
-        sigma = plan.sigma(interior + name)
-        cells = [label, *_told(plan.adjustment.value(interior + name), sigma)]
+        parameter = Parameter.interior(expected.camera, name)
+        sigma = plan.sigma(parameter)
+        cells = [label, *_told(plan.adjustment.value(parameter), sigma)]
         if expected.fiducials:
-            cells.append(_sigma(alone[interior + name]) if sigma > 0.0 else "")
+            cells.append(_sigma(alone[parameter]) if sigma > 0.0 else "")
         if several and name in layouts.mean:
             scale = UM_PER_MM if name in UNITS else 1.0
             cells += [_sigma(layouts.mean[name] / scale), _sigma(layouts.spread[name] / scale)]
@@ -101,20 +103,20 @@ def _curve_table(expected: Expected) -> Table:
     return table
 
 
-def _fiducial_table(expected: Expected, alone: Mapping[str, float]) -> Table:
+def _fiducial_table(expected: Expected, alone: Mapping[Parameter, float]) -> Table:
     heads = ("x', µm", "y', µm", "photographs alone: x', µm", "y', µm")
     table = Table("fiducial", *heads, title="Fiducial marks, sigma", title_justify="left")
     for id in expected.fiducials:
-        names = [f"FID.{expected.camera}.{id}.{axis}" for axis in "xy"]
-        sigmas = (*(expected.plan.sigma(name) for name in names), *(alone[name] for name in names))
+        place = [Parameter.fiducial(expected.camera, id, axis) for axis in "xy"]
+        sigmas = (*(expected.plan.sigma(each) for each in place), *(alone[each] for each in place))
         table.add_row(Text(id), *(_sigma(UM_PER_MM * sigma) for sigma in sigmas))
     return table
 
 
 def _scanner_table(expected: Expected) -> Table:
     table = Table("term", "sigma, µm", title="Bend of the scanner", title_justify="left")
-    for name, sigma in expected.scanner_sigmas.items():
-        table.add_row(name.rsplit(".", 1)[1], _sigma(UM_PER_MM * sigma))
+    for parameter, sigma in expected.scanner_sigmas.items():
+        table.add_row(parameter.quantity, _sigma(UM_PER_MM * sigma))
     return table
 
 
@@ -146,10 +148,10 @@ def _outer_table(expected: Expected) -> Table:
     title = "What errors that are not found may do to the camera"
     table = Table("parameter", "in its sigmas", "error in", title=title, title_justify="left")
     effects = expected.reliability.camera
-    marks = [one for one in effects if one.parameter.startswith("FID.")]
+    marks = [one for one in effects if one.parameter.kind == "fiducial"]
     shown = [one for one in effects if one not in marks] + sorted(marks, key=lambda one: -one.in_sigmas)[:1]
     for one in shown:
-        table.add_row(Text(one.parameter), f"{one.in_sigmas:.1f}", Text(one.cause))
+        table.add_row(Text(one.parameter.label), f"{one.in_sigmas:.1f}", Text(one.cause))
     return table
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from adjust.choices.lens_conversion import ConvertedLens, convert_lens
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
 from adjust.problem.camera import Distortion, Prior
+from adjust.problem.parameter import Parameter
 from pipeline.errors import InputError
 from pipeline.exchange.export_stage import README, check_folder, publish
 from pipeline.files.camera_file import read_camera
@@ -118,19 +119,23 @@ def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion
     given = calibrated_lens(camera)
     if not np.isfinite([*given[1], *given[2]]).all():
         raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
-    known = np.sqrt(np.diag(covariance.of(_names(name, given[0])[3:])))
+    known = np.sqrt(np.diag(covariance.of(_parameters(name, given[0])[3:])))
     lens, told = _converted(given, known, _observed_corners_mm(path, content, name), options)
     moved = _moved_covariance(covariance, name, given[0], lens)
-    sigmas = np.sqrt(np.diag(moved.of(_names(name, lens.distortion))))
+    sigmas = np.sqrt(np.diag(moved.of(_parameters(name, lens.distortion))))
     entry = _camera_entry(camera, given[0], lens, sigmas)
-    gone = {f"IO.{name}.{each}" for each in parameter_names(given[0].family)}
+    gone = {Parameter.interior(name, each).text for each in parameter_names(given[0].family)}
     correlations = [row for row in content["correlations"] if not gone & set(row["parameters"])]
     content |= {"cameras": content["cameras"] | {name: entry}, "correlations": correlations}
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
     arrays = io.BytesIO()
     with np.load(io.BytesIO(read_bytes(covariance_path(path))), allow_pickle=False) as stored:
         kept = {key: stored[key] for key in stored.files}
-    kept |= {"names": np.array(moved.names), "values": moved.values, "matrix": moved.matrix}
+    kept |= {
+        "names": np.array([each.text for each in moved.parameters]),
+        "values": moved.values,
+        "matrix": moved.matrix,
+    }
     kept["fingerprint"] = np.array(of_content(text.encode("utf-8")))
     np.savez_compressed(arrays, allow_pickle=False, **kept)
     files: dict[str, str | bytes] = {"adjustment.json": text, "adjustment.npz": arrays.getvalue()}
@@ -149,20 +154,20 @@ def _observed_corners_mm(path: Path, content: Json, name: str) -> Array:
     return np.array([np.min(seen, axis=0), np.max(seen, axis=0)])
 
 
-def _names(camera: str, distortion: Distortion) -> tuple[str, ...]:
-    return tuple(f"IO.{camera}.{each}" for each in (*INTERIOR, *parameter_names(distortion.family)))
+def _parameters(camera: str, distortion: Distortion) -> tuple[Parameter, ...]:
+    return tuple(Parameter.interior(camera, each) for each in (*INTERIOR, *parameter_names(distortion.family)))
 
 
 def _moved_covariance(covariance: Covariance, camera: str, source: Distortion, lens: ConvertedLens) -> Covariance:
     """That of all quantities, the camera's own in the other family: with all others, too."""
-    old, new = _names(camera, source), _names(camera, lens.distortion)
-    others = tuple(name for name in covariance.names if name not in old)
+    old, new = _parameters(camera, source), _parameters(camera, lens.distortion)
+    others = tuple(each for each in covariance.parameters if each not in old)
     by_old = np.zeros((len(new) + len(others), len(old) + len(others)))
     by_old[: len(new), : len(old)] = lens.by_source
     by_old[len(new) :, len(old) :] = np.eye(len(others))
     matrix = by_old @ covariance.of((*old, *others)) @ by_old.T
-    value = dict(zip(covariance.names, covariance.values, strict=True))
-    values = np.concatenate([lens.interior, lens.parameters, [value[name] for name in others]])
+    value = dict(zip(covariance.parameters, covariance.values, strict=True))
+    values = np.concatenate([lens.interior, lens.parameters, [value[each] for each in others]])
     return Covariance((*new, *others), values, (matrix + matrix.T) / 2.0)
 
 

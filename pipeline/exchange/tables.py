@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
+from adjust.problem.parameter import Parameter
 from pipeline.exchange.block import ELEMENTS, Block, OutFrame
 from pipeline.exchange.convention import Convention
 from pipeline.results.comparator_file import ComparatorPoint
@@ -92,16 +91,18 @@ def _transformations(block: Block) -> Table:
 
 def _covariances(block: Block) -> Table:
     """Of each image's orientation and film transformation: the lower triangle, mm, object units and rad."""
-    known = set(block.covariance.names)
+    of_image: dict[str, list[Parameter]] = {}
+    for each in block.covariance.parameters:
+        if each.kind in ("exterior", "film"):
+            of_image.setdefault(each.owner, []).append(each)
     rows = []
     for frame in block.frames:
-        prefixes = (f"EO.{frame.image}.", f"T.{frame.image}.")
-        names = [name for name in block.covariance.names if name.startswith(prefixes) and name in known]
-        matrix = block.covariance.of(names) if names else np.zeros((0, 0))
+        own = of_image.get(frame.image, [])
+        matrix = block.covariance.of(own)
         rows += [
-            {"image": frame.image, "first": first, "second": second, "covariance": float(matrix[i, j])}
-            for i, first in enumerate(names)
-            for j, second in enumerate(names[: i + 1])
+            {"image": frame.image, "first": first.text, "second": second.text, "covariance": float(matrix[i, j])}
+            for i, first in enumerate(own)
+            for j, second in enumerate(own[: i + 1])
         ]
     return _table(rows)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.families import parameter_names
 from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
 from adjust.problem.observations import Calibration
+from adjust.problem.parameter import Parameter
 from pipeline.results.adjustment_reader import Covariance, covariance_path, read_adjustment, read_covariance
 from pipeline.text.tables import Table
 
@@ -27,48 +28,51 @@ _TOGETHER = "Take both files as one adjustment wrote them."
 class EarlierCalibration:
     """What an earlier adjustment found of a camera, with the a-posteriori covariance.
 
-    names: "IO.c", "IO.k3", "FID.1.x" and so on, as in `adjustment.npz` less the camera; values and covariance are
-    theirs. held: the values of what that adjustment held fixed.
+    parameters: its camera's, which may have another name than the present one; values and covariance are theirs. held:
+    the values of what that adjustment held fixed.
     """
 
     path: Path
     distortion: Mapping[str, Any]
-    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
     values: Array
     covariance: Array
-    held: Mapping[str, float]
+    held: Mapping[Parameter, float]
 
     @property
     def tells_fiducials(self) -> bool:
-        return any(name.startswith("FID.") for name in (*self.names, *self.held))
+        return any(each.kind == "fiducial" for each in (*self.parameters, *self.held))
 
     def applied(self, camera: Camera) -> tuple[Camera, Calibration]:
         """The camera without priors where the calibration takes their place, and the calibration for the network."""
-        given = dict(zip(self.names, self.values.tolist(), strict=True))
+        here = tuple(each._replace(owner=camera.name) for each in self.parameters)
+        given = dict(zip(here, self.values.tolist(), strict=True))
 
-        def prior(name: str, otherwise: Prior | None) -> Prior | None:
-            return Prior(given[name], np.inf) if name in given else otherwise
+        def prior(parameter: Parameter, otherwise: Prior | None) -> Prior | None:
+            return Prior(given[parameter], np.inf) if parameter in given else otherwise
 
-        def sure(name: str, otherwise: Prior) -> Prior:
-            return prior(name, otherwise) or otherwise
+        def interior(name: str, otherwise: Prior | None) -> Prior | None:
+            return prior(Parameter.interior(camera.name, name), otherwise)
 
-        parameters = {
-            name: sure(f"IO.{name}", camera.distortion.parameters.get(name, Prior(0.0, 0.0)))
-            for name in parameter_names(camera.distortion.family)
-        }
+        def place(id: str, axis: str, otherwise: Prior) -> Prior:
+            return prior(Parameter.fiducial(camera.name, id, axis), otherwise) or otherwise
+
+        distortion = {}
+        for name in parameter_names(camera.distortion.family):
+            otherwise = camera.distortion.parameters.get(name, Prior(0.0, 0.0))
+            distortion[name] = interior(name, otherwise) or otherwise
         free = replace(
             camera,
-            principal_distance_mm=prior("IO.c", camera.principal_distance_mm),
-            x0_mm=prior("IO.x0", camera.x0_mm),
-            y0_mm=prior("IO.y0", camera.y0_mm),
-            distortion=replace(camera.distortion, parameters=parameters),
+            principal_distance_mm=interior("c", camera.principal_distance_mm),
+            x0_mm=interior("x0", camera.x0_mm),
+            y0_mm=interior("y0", camera.y0_mm),
+            distortion=replace(camera.distortion, parameters=distortion),
             fiducials={
-                id: Fiducial(sure(f"FID.{id}.x", mark.x_mm), sure(f"FID.{id}.y", mark.y_mm))
+                id: Fiducial(place(id, "x", mark.x_mm), place(id, "y", mark.y_mm))
                 for id, mark in camera.fiducials.items()
             },
         )
-        names = tuple(_of_camera(name, camera.name) for name in self.names)
-        return free, Calibration(names, self.values, self.covariance)
+        return free, Calibration(here, self.values, self.covariance)
 
 
 def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
@@ -97,13 +101,14 @@ def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
 def _check_agreement(sigma: Table, path: Path, name: str, camera: Mapping[str, Any], covariance: Covariance) -> None:
     """Both files are to say the same of the camera: what the network takes is the covariance's."""
     told = _told(name, camera)
-    listed = {each for each in covariance.names if each.startswith((f"IO.{name}.", f"FID.{name}."))}
+    listed = {each for each in covariance.parameters if each.kind in ("interior", "fiducial") and each.owner == name}
     for each in sorted(told.keys() ^ listed):
         has, lacks = (path, covariance_path(path)) if each in told else (covariance_path(path), path)
-        raise sigma.error("calibration", f"{has} holds {each}, and {lacks.name} does not. {_TOGETHER}")
-    names = tuple(told)
-    values, matrix = dict(zip(covariance.names, covariance.values.tolist(), strict=True)), covariance.of(names)
-    for each, variance in zip(names, np.diag(matrix).tolist(), strict=True):
+        raise sigma.error("calibration", f"{has} holds {each.label}, and {lacks.name} does not. {_TOGETHER}")
+    parameters = tuple(told)
+    values = dict(zip(covariance.parameters, covariance.values.tolist(), strict=True))
+    matrix = covariance.of(parameters)
+    for each, variance in zip(parameters, np.diag(matrix).tolist(), strict=True):
         here = told[each]
         for what, in_json, in_npz in (
             ("value", here["value"], values[each]),
@@ -112,21 +117,21 @@ def _check_agreement(sigma: Table, path: Path, name: str, camera: Mapping[str, A
             if in_json is not None and not math.isclose(in_json, in_npz, rel_tol=_ALIKE):
                 raise sigma.error(
                     "calibration",
-                    f"{path} gives {each} the {what} {in_json:.10g}, and {covariance_path(path).name} {in_npz:.10g}. "
-                    f"{_TOGETHER}",
+                    f"{path} gives {each.label} the {what} {in_json:.10g}, and {covariance_path(path).name} "
+                    f"{in_npz:.10g}. {_TOGETHER}",
                 )
-    if wrong := _no_covariance(names, matrix):
+    if wrong := _no_covariance(parameters, matrix):
         raise sigma.error("calibration", f"{covariance_path(path)}: {wrong}. {_TOGETHER}")
 
 
-def _told(name: str, camera: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What adjustment.json says of a camera, by the names of adjustment.npz."""
+def _told(name: str, camera: Mapping[str, Any]) -> dict[Parameter, Mapping[str, Any]]:
+    """What adjustment.json says of a camera."""
     point = camera["principal_point_mm"]
     interior = {"c": camera["principal_distance_mm"], "x0": point["x"], "y0": point["y"]}
     interior |= {key: value for key, value in camera["distortion"].items() if isinstance(value, dict)}
-    told = {f"IO.{name}.{key}": quantity for key, quantity in interior.items()}
+    told = {Parameter.interior(name, key): quantity for key, quantity in interior.items()}
     for id, mark in camera["fiducials"].items():
-        told |= {f"FID.{name}.{id}.{axis}": mark[f"{axis}_mm"] for axis in "xy"}
+        told |= {Parameter.fiducial(name, id, axis): mark[f"{axis}_mm"] for axis in "xy"}
     return {each: quantity for each, quantity in told.items() if _is_quantity(quantity)}
 
 
@@ -134,7 +139,7 @@ def _is_quantity(entry: Mapping[str, Any]) -> bool:
     return all(isinstance(entry.get(key, ""), float | int | None) for key in ("value", "sigma"))
 
 
-def _no_covariance(names: Sequence[str], matrix: Array) -> str:
+def _no_covariance(parameters: Sequence[Parameter], matrix: Array) -> str:
     """Why a matrix is none of covariances, and where; "" where it is one."""
     finite = np.isfinite(matrix)
     known = np.where(finite, matrix, 0.0)
@@ -147,16 +152,11 @@ def _no_covariance(names: Sequence[str], matrix: Array) -> str:
     ):
         if where.any():
             i, j = np.argwhere(where)[0]
-            return f"the covariance of {names[i]} and {names[j]} {wrong}"
+            return f"the covariance of {parameters[i].label} and {parameters[j].label} {wrong}"
     free = variance > 0.0
     if np.linalg.eigvalsh(matrix[np.ix_(free, free)] / scale[np.ix_(free, free)]).min(initial=0.0) < -_ALIKE:
         return "the matrix gives some combinations of the camera's quantities a negative variance"
     return ""
-
-
-def _of_camera(name: str, camera: str) -> str:
-    kind, quantity = name.split(".", 1)
-    return f"{kind}.{camera}.{quantity}"
 
 
 def _camera_in(sigma: Table, path: Path, content: Mapping[str, Any], name: str) -> str:
@@ -189,39 +189,39 @@ def _check_family(sigma: Table, path: Path, earlier: Mapping[str, Any], distorti
 def _taken(
     path: Path, distortion: Mapping[str, Any], covariance: Covariance, there: str, camera: Camera, fiducials: bool
 ) -> EarlierCalibration:
-    names = [f"IO.{name}" for name in (*INTERIOR, *parameter_names(camera.distortion.family))]
+    parameters = [Parameter.interior(there, name) for name in (*INTERIOR, *parameter_names(camera.distortion.family))]
     if fiducials:
-        names += [f"FID.{id}.{axis}" for id in camera.fiducials for axis in "xy"]
-    value = dict(zip(covariance.names, covariance.values.tolist(), strict=True))
-    names = [name for name in names if _of_camera(name, there) in value]
-    matrix = covariance.of(_of_camera(name, there) for name in names)
-    values = np.array([value[_of_camera(name, there)] for name in names])
+        parameters += [Parameter.fiducial(there, id, axis) for id in camera.fiducials for axis in "xy"]
+    value = dict(zip(covariance.parameters, covariance.values.tolist(), strict=True))
+    parameters = [each for each in parameters if each in value]
+    matrix = covariance.of(parameters)
+    values = np.array([value[each] for each in parameters])
     free = np.diag(matrix) > 0.0
     return EarlierCalibration(
         path=path,
         distortion=distortion,
-        names=tuple(name for name, is_free in zip(names, free, strict=True) if is_free),
+        parameters=tuple(each for each, is_free in zip(parameters, free, strict=True) if is_free),
         values=values[free],
         covariance=matrix[np.ix_(free, free)],
-        held={name: value for name, value, is_free in zip(names, values.tolist(), free, strict=True) if not is_free},
+        held={key: value for key, value, is_free in zip(parameters, values.tolist(), free, strict=True) if not is_free},
     )
 
 
 def _check_held(sigma: Table, earlier: EarlierCalibration, camera: Camera) -> None:
     """What the earlier adjustment held fixed must be fixed at the same value: the rest is right for that one only."""
-    given: dict[str, Prior | None] = {
-        "IO.c": camera.principal_distance_mm,
-        "IO.x0": camera.x0_mm,
-        "IO.y0": camera.y0_mm,
-        **{f"IO.{name}": prior for name, prior in camera.distortion.parameters.items()},
+    given: dict[tuple[str, str], Prior | None] = {  # by the id of a fiducial, and the quantity
+        ("", "c"): camera.principal_distance_mm,
+        ("", "x0"): camera.x0_mm,
+        ("", "y0"): camera.y0_mm,
+        **{("", name): prior for name, prior in camera.distortion.parameters.items()},
     }
     for id, mark in camera.fiducials.items():
-        given |= {f"FID.{id}.x": mark.x_mm, f"FID.{id}.y": mark.y_mm}
-    for name, value in earlier.held.items():
-        here = given.get(name, Prior(0.0, 0.0))
+        given |= {(id, "x"): mark.x_mm, (id, "y"): mark.y_mm}
+    for parameter, value in earlier.held.items():
+        here = given.get((parameter.id, parameter.quantity), Prior(0.0, 0.0))
         if here is None or here.sigma > 0.0 or not np.isclose(here.value, value, rtol=1e-9, atol=0.0):
             raise sigma.error(
                 "calibration",
-                f"{earlier.path} held {name.split('.', 1)[1]} fixed at {value:.10g}, and the rest of it is right for "
+                f"{earlier.path} held {parameter.label} fixed at {value:.10g}, and the rest of it is right for "
                 "that value alone. Fix it there in this file, with a standard deviation of 0.",
             )

@@ -11,6 +11,7 @@ from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 from pipeline.opencv_check.opencv_calibration import ImagePoints, can_begin
 from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, Freedom
@@ -66,7 +67,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
     points = sorted({point for name in usable for point in shown[name][2]})
     free = free_parameters(camera)
     values = {
-        name: adjustment.value(f"IO.{camera_name}.{name}")
+        name: adjustment.value(Parameter.interior(camera_name, name))
         for name in ("c", "x0", "y0", *parameter_names(camera.distortion.family))
     }
     return BareProblem(
@@ -79,7 +80,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
         approximations=Approximations(
             interior={camera_name: np.array([values["c"], values["x0"], values["y0"]])},
             exterior={
-                name: np.array([adjustment.value(f"EO.{frame}.{each}") for each in EXTERIOR_NAMES])
+                name: adjustment.values_of(Parameter.exterior(frame, each) for each in EXTERIOR_NAMES)
                 for name in usable
                 for frame in [adjustment.network.image_by_name[name].frame]
             },

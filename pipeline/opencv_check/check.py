@@ -15,6 +15,7 @@ import numpy as np
 
 from adjust.errors import AdjustmentError
 from adjust.problem.camera import Camera
+from adjust.problem.parameter import Parameter, description
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model
@@ -92,11 +93,12 @@ def _hindrance(camera: Camera) -> str:
 def _undetermined(solved: Adjustment, name: str) -> str:
     """Why the observations without priors give no camera; empty where they do."""
     if solved.singular:
-        causes = " ".join(f"{', '.join(direction.parameters)}: {direction.cause}" for direction in solved.singular)
+        causes = " ".join(f"{description(direction.parameters)}: {direction.cause}" for direction in solved.singular)
         return f"Priors carried the solution; the observations of the points alone do not determine it. {causes}"
     if not solved.converged:
         return f"Without priors the adjustment finds no solution: {_without_stop(solved)}."
-    c, sigma = solved.value(f"IO.{name}.c"), solved.sigma(f"IO.{name}.c")
+    distance = Parameter.interior(name, "c")
+    c, sigma = solved.value(distance), solved.sigma(distance)
     if sigma > UNDETERMINED * c:
         return (
             f"Priors carried the solution: from the observations of the points alone the principal distance has a "
@@ -211,11 +213,10 @@ def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: Open
 
 def _departures(adjustment: Adjustment, solved: Adjustment, camera: Camera) -> dict[str, float]:
     """How far, in the sigmas of the bare problem, the adjustment's own values lie from the bare problem's."""
-    names = {name: f"IO.{camera.name}.{name}" for name in sorted(free_parameters(camera))}
     return {
-        name: abs(adjustment.value(full) - solved.value(full)) / solved.sigma(full)
-        for name, full in names.items()
-        if solved.sigma(full) > 0
+        each.quantity: abs(adjustment.value(each) - solved.value(each)) / solved.sigma(each)
+        for each in (Parameter.interior(camera.name, name) for name in sorted(free_parameters(camera)))
+        if solved.sigma(each) > 0
     }
 
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from adjust.choices.lens_conversion import convert_lens
 from adjust.functional_model.families import parameter_names
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem
 from pipeline.opencv_check.opencv_model import FISHEYE, fixed, opencv_values, to_opencv_model
@@ -28,8 +29,8 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     """Raises AdjustmentError where the lens cannot be brought to OpenCV's model."""
     camera = problem.network.cameras[0]
     family = camera.distortion.family
-    names = [f"IO.{camera.name}.{each}" for each in ("c", "x0", "y0", *parameter_names(family))]
-    values = np.array([solved.value(name) for name in names])
+    own = [Parameter.interior(camera.name, each) for each in ("c", "x0", "y0", *parameter_names(family))]
+    values = solved.values_of(own)
     observed = problem.network.observations.xy_mm
     of_lens = camera.distortion, values[:3], values[3:]
     corners_mm = np.array([observed.min(axis=0), observed.max(axis=0)])
@@ -40,7 +41,7 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     free = convert_lens(*of_lens, model, corners_mm, problem.freedom.distortion, held=problem.freedom.held)
     parameters, _ = opencv_values(whole)
     _, by_lens = opencv_values(free)
-    covariance = by_lens @ free.covariance(solved.cofactor_of(names)) @ by_lens.T
+    covariance = by_lens @ free.covariance(solved.cofactor_of(own)) @ by_lens.T
     return Converted(parameters, np.sqrt(np.maximum(np.diag(covariance), 0.0)), whole.rms_mm)
 
 

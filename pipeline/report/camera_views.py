@@ -6,6 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from adjust.functional_model.families import parameter_names
+from adjust.problem.parameter import parameter_from_text
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.certificate import CertificateView, certificate_view
 from pipeline.report.data import Json, ReportData
@@ -139,10 +140,11 @@ def _observed_radius_mm(camera: Json, rows: list[Json]) -> float:
 
 def _trade_offs(name: str, stored: Json) -> list[str]:
     """What of a camera trades off, in words."""
+    firsts = (parameter_from_text(each["parameters"][0]) for each in stored["correlations"])
     return [
         f"{each['cause']} {each['remedy']}"
-        for each in stored["correlations"]
-        if each["parameters"][0].startswith(f"IO.{name}.")
+        for each, first in zip(stored["correlations"], firsts, strict=True)
+        if first.kind == "interior" and first.owner == name
     ]
 
 

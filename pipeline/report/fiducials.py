@@ -7,6 +7,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
 from pipeline.report.data import Json
 from pipeline.results.adjustment_reader import Covariance
@@ -82,9 +83,9 @@ def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
     point = camera["principal_point_mm"]
     c, x0, y0 = (q["value"] for q in (camera["principal_distance_mm"], point["x"], point["y"]))
     turn_and_scale, shift = _helmert(estimated, given)
-    interior = [f"IO.{name}.{each}" for each in ("c", "x0", "y0")]
+    interior = [Parameter.interior(name, each) for each in ("c", "x0", "y0")]
     s = _s_transformation(_similarities(estimated, c, (x0, y0)), 2 * len(ids))
-    reduced = s @ covariance.of([*_names(name, ids), *interior]) @ s.T
+    reduced = s @ covariance.of([*_places(name, ids), *interior]) @ s.T
     principal_point = turn_and_scale @ (x0, y0) + shift
     return Figure(
         ids=ids,
@@ -108,7 +109,7 @@ def figure_of_films(name: str, camera: Json, covariance: Covariance, kinds: Iter
         return None
     s = _s_transformation(motions, 2 * len(ids))
     change_mm = (s @ (estimated - given).ravel()).reshape(-1, 2)
-    covariance_mm2 = s @ covariance.of(_names(name, ids)) @ s.T
+    covariance_mm2 = s @ covariance.of(_places(name, ids)) @ s.T
     return Figure(ids, given, 1e3 * change_mm, 1e6 * covariance_mm2, np.empty(0), np.empty(0))
 
 
@@ -158,8 +159,8 @@ def _given(fiducial: Json) -> tuple[float, float] | None:
     return None if x is None or y is None else (x["value"], y["value"])
 
 
-def _names(camera: str, ids: Iterable[str]) -> list[str]:
-    return [f"FID.{camera}.{id}.{axis}" for id in ids for axis in "xy"]
+def _places(camera: str, ids: Iterable[str]) -> list[Parameter]:
+    return [Parameter.fiducial(camera, id, axis) for id in ids for axis in "xy"]
 
 
 def _helmert(source: Array, target: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.projection import ideal_from_observed
 from adjust.problem.camera import Distortion
+from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
 from pipeline.report.data import Json
 from pipeline.results.adjustment_reader import Covariance, calibrated_lens
@@ -37,9 +38,9 @@ class Lens:
         return family(self.distortion.family).needs == "half_mm"
 
     @property
-    def unknowns(self) -> tuple[str, ...]:
-        """The names of c and of the parameters, on which a displacement about the principal point depends."""
-        return tuple(f"IO.{self.name}.{name}" for name in ("c", *parameter_names(self.distortion.family)))
+    def unknowns(self) -> tuple[Parameter, ...]:
+        """c and the parameters, on which a displacement about the principal point depends."""
+        return tuple(Parameter.interior(self.name, name) for name in ("c", *parameter_names(self.distortion.family)))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 
 from adjust.functional_model.families import family as family_of
 from adjust.functional_model.families import parameter_names
+from adjust.problem.parameter import Parameter, parameter_from_text
 from adjust.quality.significance import LEVEL
 from pipeline.report.data import Json
 from pipeline.report.lens import largest_effects_um, lens
@@ -61,7 +62,7 @@ def _in_um(quantity: Json) -> Json:
 def high_correlations(name: str, camera: Json, covariance: Covariance) -> list[tuple[str, str, float]]:
     """Pairs of parameters that the observations hardly tell apart, the highest correlation first."""
     parameters = ["c", "x0", "y0", *parameter_names(camera["distortion"]["family"])]
-    block = covariance.of(f"IO.{name}.{parameter}" for parameter in parameters)
+    block = covariance.of(Parameter.interior(name, parameter) for parameter in parameters)
     sigma = np.sqrt(np.maximum(np.diag(block), 0.0))
     free = np.flatnonzero(sigma > 0.0)
     correlation = block[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
@@ -98,18 +99,16 @@ def _group(name: str) -> str:
     return name[0].upper() + name[1:]
 
 
-def spoken_name(name: str, cameras: Collection[str]) -> str:
-    """A quantity of a camera as this report calls it elsewhere: IO.RC 20.x0 is x₀′. With the camera's, where there are
-    several."""
-    for camera in sorted(cameras, key=len, reverse=True):
-        whose = f", {camera}" if len(cameras) > 1 else ""
-        if name.startswith(f"IO.{camera}."):
-            parameter = name.removeprefix(f"IO.{camera}.")
-            return _SYMBOLS.get(parameter, parameter) + whose
-        if name.startswith(f"FID.{camera}."):
-            id, _, axis = name.removeprefix(f"FID.{camera}.").rpartition(".")
-            return f"{axis}′ of fiducial {id}{whose}"
-    return name
+def spoken_name(text: str, cameras: Collection[str]) -> str:
+    """A quantity, by its text in adjustment.json, as this report calls it elsewhere: IO.RC 20.x0 is x₀′. With the
+    camera's name, where there are several."""
+    parameter = parameter_from_text(text, cameras)
+    whose = f", {parameter.owner}" if len(cameras) > 1 else ""
+    if parameter.kind == "interior":
+        return _SYMBOLS.get(parameter.quantity, parameter.quantity) + whose
+    if parameter.kind == "fiducial":
+        return f"{parameter.quantity}′ of fiducial {parameter.id}{whose}"
+    return parameter.label
 
 
 def _row(symbol: str, unit: str, quantity: Json, effect: str, meaning: str) -> ParameterRow:

@@ -8,6 +8,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from adjust.functional_model.scanner import Bend
+from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
 from pipeline.report.data import Json, ReportData
 from pipeline.report.numbers import value_and_sigma
@@ -73,7 +74,7 @@ def bend_field(name: str, scanner: Json, covariance: Covariance, xy_mm: Array) -
     bend = Bend(tuple(terms), tuple(scanner["center_mm"]), tuple(scanner["half_mm"]))
     values = np.array([scanner["terms"][term]["value"] for term in terms])
     at = bend.displacement(values, xy_mm)
-    of_terms = covariance.of(f"SC.{name}.{term}" for term in terms)
+    of_terms = covariance.of(Parameter.scanner(name, term) for term in terms)
     by_terms = UM_PER_MM * at.by_parameters
     return Field(xy_mm, UM_PER_MM * at.value, np.einsum("nik,kl,njl->nij", by_terms, of_terms, by_terms))
 

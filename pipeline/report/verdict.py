@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtri, ndtri
 
+from adjust.problem.parameter import description, parameter_from_text
 from measure.status import Status
 from pipeline.report.data import Json, Problem, ReportData
 from pipeline.report.fractions import places_px
@@ -94,7 +95,7 @@ def suspect_rows(adjustment: Json) -> list[Json]:
 
 def _no_solution(adjustment: Json) -> Iterator[Problem]:
     for null in adjustment["singular"]:
-        together = listed(null["parameters"])
+        together = description(parameter_from_text(text, adjustment["cameras"]) for text in null["parameters"])
         yield Problem(f"{null['cause']} The observations do not see it (together move {together}).", null["remedy"])
     if not adjustment["converged"] and not adjustment["singular"]:
         yield Problem(
@@ -144,7 +145,8 @@ def _further_problems(adjustment: Json) -> Iterator[Problem]:
         bad = _beyond_chance(adjustment, adjustment[group])
         if bad:
             heading = (one if len(bad) == 1 else many).format(len(bad))
-            yield Problem(f"{heading}: {listed([_with_residual(row) for row in bad])}.", remedy)
+            named = [_with_residual(row, _further_name(row, group, adjustment["cameras"])) for row in bad]
+            yield Problem(f"{heading}: {listed(named)}.", remedy)
 
 
 def contradiction(test: Json, cameras: Json) -> str:
@@ -159,8 +161,13 @@ def contradiction(test: Json, cameras: Json) -> str:
     )
 
 
-def _with_residual(row: Json) -> str:
-    name = row.get("name") or f"{row['from']} to {row['to']}"
+def _further_name(row: Json, group: str, cameras: Json) -> str:
+    if group == "distances":
+        return f"{row['from']} to {row['to']}"
+    return spoken_name(row["name"], cameras) if group == "calibrations" else str(row["name"])
+
+
+def _with_residual(row: Json, name: str) -> str:
     return f"{name} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})"
 
 

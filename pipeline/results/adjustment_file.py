@@ -17,6 +17,7 @@ from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import EXTERIOR_NAMES, Board, Image, ObjectPoint, Scanner
+from adjust.problem.parameter import Kind, Parameter
 from adjust.problem.result import Adjustment, Contradiction, FurtherResidual
 from adjust.quality.correlation import correlations
 from adjust.quality.significance import SignificanceTest, board_tests, group_tests, parameter_tests, scanner_tests
@@ -69,7 +70,6 @@ def adjustment_json(adjustment: Adjustment) -> Json:
     """The result as `adjustment.json` holds it; numbers that mean nothing are still NaN or infinite."""
     network = adjustment.network
     used = {image.camera for image in network.images}
-    names = frozenset(adjustment.names)
     return {
         "reseau": version("reseau"),
         "converged": adjustment.converged,
@@ -84,11 +84,16 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "sigma0": adjustment.sigma0,
         "covariance": covariance_note(adjustment),
         "singular": [
-            {"parameters": list(null.parameters), "cause": null.cause, "remedy": null.remedy}
+            {"parameters": _texts(null.parameters), "cause": null.cause, "remedy": null.remedy}
             for null in adjustment.singular
         ],
         "correlations": [
-            {"parameters": list(each.parameters), "rho": each.rho, "cause": each.cause, "remedy": each.remedy}
+            {
+                "parameters": _texts(each.parameters),
+                "rho": each.rho,
+                "cause": each.cause,
+                "remedy": each.remedy,
+            }
             for each in correlations(adjustment)
         ],
         "warnings": list(adjustment.warnings),
@@ -102,7 +107,11 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "boards": {board.name: _board(adjustment, board) for board in network.boards},
         "images": {image.name: _image(adjustment, image) for image in network.images},
         "frames": frames_json(adjustment),
-        "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
+        "points": {
+            point.id: _point(adjustment, point)
+            for point in network.points
+            if adjustment.has(Parameter.point(point.id, "X"))
+        },
         "residuals": _residuals(adjustment),
         "refraction": network.line_of_sight.refraction,
         "earth_curvature": network.line_of_sight.curvature,
@@ -123,12 +132,16 @@ def adjustment_json(adjustment: Adjustment) -> Json:
     }
 
 
+def _texts(parameters: Sequence[Parameter]) -> list[str]:
+    return [each.text for each in parameters]
+
+
 def _camera(adjustment: Adjustment, camera: Camera) -> Json:
     idle = camera.name in adjustment.network.idle_cameras
     tests = {test.name: {"t": test.statistic, "p": test.p} for test in parameter_tests(adjustment, camera)}
 
     def quantity(name: str, given: Prior | None) -> Json:
-        known = _quantity(adjustment, f"IO.{camera.name}.{name}", given)
+        known = _quantity(adjustment, Parameter.interior(camera.name, name), given)
         return known | {"sigma": math.nan} if idle else known | tests.get(name, {})
 
     distortion = distortion_settings(camera.distortion)
@@ -145,11 +158,12 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
         "significance": [_group_test(test) for test in group_tests(adjustment, camera)],
         "fiducials": {
             id: {
-                "x_mm": _quantity(adjustment, f"FID.{camera.name}.{id}.x", fiducial.x_mm),
-                "y_mm": _quantity(adjustment, f"FID.{camera.name}.{id}.y", fiducial.y_mm),
-                "rho": _correlation(adjustment, f"FID.{camera.name}.{id}.x", f"FID.{camera.name}.{id}.y"),
+                "x_mm": _quantity(adjustment, x, fiducial.x_mm),
+                "y_mm": _quantity(adjustment, y, fiducial.y_mm),
+                "rho": _correlation(adjustment, x, y),
             }
             for id, fiducial in camera.fiducials.items()
+            for x, y in [[Parameter.fiducial(camera.name, id, axis) for axis in "xy"]]
         },
     }
 
@@ -168,7 +182,7 @@ def distortion_settings(distortion: Distortion) -> Json:
 
 def _scanner(adjustment: Adjustment, scanner: Scanner) -> Json:
     """How far the scanner puts a point beside its place, in mm, as products of Legendre polynomials over an extent."""
-    terms, together = _terms(adjustment, f"SC.{scanner.name}", scanner.terms, scanner_tests(adjustment, scanner))
+    terms, together = _terms(adjustment, "scanner", scanner.name, scanner.terms, scanner_tests(adjustment, scanner))
     extent = {"center_mm": list(scanner.center_mm), "half_mm": list(scanner.half_mm)}
     return {**extent, "terms": terms, "significance": together}
 
@@ -176,18 +190,18 @@ def _scanner(adjustment: Adjustment, scanner: Scanner) -> Json:
 def _board(adjustment: Adjustment, board: Board) -> Json:
     """How far the board's middle stands off its plane, in object units, along each axis; points: how many it has."""
     bends = dict(zip(BOARD_NAMES, board.bends, strict=True))
-    terms, together = _terms(adjustment, f"BD.{board.name}", bends, board_tests(adjustment, board))
+    terms, together = _terms(adjustment, "board", board.name, bends, board_tests(adjustment, board))
     return {"points": len(board.places), **terms, "significance": together}
 
 
 def _terms(
-    adjustment: Adjustment, owner: str, terms: Mapping[str, Prior], of_terms: Sequence[SignificanceTest]
+    adjustment: Adjustment, kind: Kind, owner: str, terms: Mapping[str, Prior], of_terms: Sequence[SignificanceTest]
 ) -> tuple[Json, list[Json]]:
     """Every term with its test, and the test of all together."""
     tests = {test.name: test for test in of_terms}
     together = tests.pop("all", None)
     quantities = {
-        name: _quantity(adjustment, f"{owner}.{name}", prior)
+        name: _quantity(adjustment, Parameter(kind, owner, "", name), prior)
         | ({"t": tests[name].statistic, "p": tests[name].p} if name in tests else {})
         for name, prior in terms.items()
     }
@@ -202,17 +216,17 @@ def _image(adjustment: Adjustment, image: Image) -> Json:
     transformation: Json = {"kind": image.transformation, "mirrored": image.name in adjustment.mirrored}
     for parameter in film_parameter_names(image.transformation):
         key, scale = (f"{parameter}_deg", DEG_PER_RAD) if parameter in ANGLES else (parameter, 1.0)
-        transformation[key] = _quantity(adjustment, f"T.{image.name}.{parameter}", None, scale)
+        transformation[key] = _quantity(adjustment, Parameter.film(image.name, parameter), None, scale)
     exterior: Json = {}
     for i, element in enumerate(EXTERIOR_NAMES):
         known = image.exterior
         of_antenna = known is not None and known.has_antenna and i < 3
         given = None if known is None or of_antenna else Prior(float(known.values[i]), float(known.sigmas[i]))
-        name = f"EO.{image.frame}.{element}"
+        of_element = Parameter.exterior(image.frame, element)
         if element in ANGLES:
-            exterior[f"{element}_deg"] = _quantity(adjustment, name, given, DEG_PER_RAD)
+            exterior[f"{element}_deg"] = _quantity(adjustment, of_element, given, DEG_PER_RAD)
         else:
-            exterior[element] = _quantity(adjustment, name, given)
+            exterior[element] = _quantity(adjustment, of_element, given)
     if image.name in adjustment.network.unoriented:
         exterior = {key: quantity | {"sigma": math.nan} for key, quantity in exterior.items()}
     part = {"part_of": image.part_of} if image.part_of else {}
@@ -228,34 +242,35 @@ def _image(adjustment: Adjustment, image: Image) -> Json:
 def _point(adjustment: Adjustment, point: ObjectPoint) -> Json:
     """Where it is, and what was given of it; a point of a bent board is off the place that is given."""
     given = {"X": point.X, "Y": point.Y, "Z": point.Z}
-    place = {axis: _quantity(adjustment, f"PT.{point.id}.{axis}", prior) for axis, prior in given.items()}
+    place = {axis: _quantity(adjustment, Parameter.point(point.id, axis), prior) for axis, prior in given.items()}
     for board in adjustment.network.boards:
         if point.id in board.places:
-            names = [*(f"PT.{point.id}.{axis}" for axis in "XYZ"), *(f"BD.{board.name}.{each}" for each in BOARD_NAMES)]
-            by_names = np.hstack([np.eye(3), board.lifted_by[point.id].T])
-            values = by_names @ [adjustment.value(name) for name in names]
-            variances = np.diag(by_names @ adjustment.cofactor_of(names) @ by_names.T)
+            unknowns = [Parameter.point(point.id, axis) for axis in "XYZ"]
+            unknowns += [Parameter.board(board.name, each) for each in BOARD_NAMES]
+            by_unknowns = np.hstack([np.eye(3), board.lifted_by[point.id].T])
+            values = by_unknowns @ adjustment.values_of(unknowns)
+            variances = np.diag(by_unknowns @ adjustment.cofactor_of(unknowns) @ by_unknowns.T)
             for axis, value, variance in zip("XYZ", values, variances, strict=True):
                 sigma = adjustment.sigma0 * math.sqrt(variance) if _has_solution(adjustment) else math.nan
                 place[axis] |= {"value": float(value), "sigma": sigma}
     return place
 
 
-def _quantity(adjustment: Adjustment, name: str, given: Prior | None = None, scale: float = 1.0) -> Json:
+def _quantity(adjustment: Adjustment, parameter: Parameter, given: Prior | None = None, scale: float = 1.0) -> Json:
     """Value and a-posteriori sigma, and what was given: null where nothing was, its sigma null where it was free."""
-    quantity: Json = {"value": scale * adjustment.value(name), "sigma": scale * _sigma(adjustment, name)}
+    quantity: Json = {"value": scale * adjustment.value(parameter), "sigma": scale * _sigma(adjustment, parameter)}
     if given is not None:
         quantity["given"] = {"value": scale * given.value, "sigma": scale * given.sigma}
     return quantity
 
 
-def _sigma(adjustment: Adjustment, name: str) -> float:
+def _sigma(adjustment: Adjustment, parameter: Parameter) -> float:
     """NaN where there is no solution: a zero would say that the quantity was fixed."""
-    return adjustment.sigma(name) if _has_solution(adjustment) else math.nan
+    return adjustment.sigma(parameter) if _has_solution(adjustment) else math.nan
 
 
-def _correlation(adjustment: Adjustment, name_x: str, name_y: str) -> float:
-    q = adjustment.cofactor_of([name_x, name_y])
+def _correlation(adjustment: Adjustment, x: Parameter, y: Parameter) -> float:
+    q = adjustment.cofactor_of([x, y])
     product = q[0, 0] * q[1, 1]
     return float(q[0, 1] / math.sqrt(product)) if product > 0.0 and _has_solution(adjustment) else 0.0
 
@@ -324,7 +339,7 @@ def _contradiction(test: Contradiction) -> Json:
         "freedom": test.freedom,
         "p": test.probability,
         "direction": [
-            {"name": test.names[i], "difference": float(test.difference[i]), "sigma": float(test.sigma[i])}
+            {"name": test.parameters[i].text, "difference": float(test.difference[i]), "sigma": float(test.sigma[i])}
             for i in test.direction
         ],
     }

@@ -15,6 +15,12 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.problem.camera import Distortion
+from adjust.problem.parameter import (
+    Parameter,
+    parameter_from_text,
+    parameter_of,
+    parameters_from_texts,
+)
 from pipeline.errors import InputError
 from pipeline.results.fingerprints import of_file
 from pipeline.text.text_file import MOST_MB, read_bytes, read_json, shown
@@ -25,27 +31,28 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True)
 class Covariance:
-    """The a-posteriori covariance of all unknowns: names (n), values (n,), matrix (n, n); mm, object units, rad.
+    """The a-posteriori covariance of all unknowns: parameters (n), values (n,), matrix (n, n); mm, object units, rad.
 
     adjustment: the fingerprint of the adjustment.json that it belongs to; "" where the file does not say it.
     """
 
-    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
     values: Array
     matrix: Array
     adjustment: str = ""
 
-    def of(self, names: Iterable[str]) -> Array:
-        """The covariance (k, k) of some unknowns; one that is not listed was fixed, its row is zero."""
-        at = np.array([self._positions.get(name, -1) for name in names], dtype=int)
+    def of(self, parameters: Iterable[Parameter | str]) -> Array:
+        """The covariance (k, k) of some unknowns, by keys or by their texts in the file; one that is not listed was
+        fixed, its row is zero."""
+        at = np.array([self._positions.get(parameter_of(each), -1) for each in parameters], dtype=int)
         block: Array = self.matrix[np.ix_(at, at)]
         block[at < 0, :] = 0.0
         block[:, at < 0] = 0.0
         return block
 
     @cached_property
-    def _positions(self) -> dict[str, int]:
-        return {name: i for i, name in enumerate(self.names)}
+    def _positions(self) -> dict[Parameter, int]:
+        return {each: i for i, each in enumerate(self.parameters)}
 
 
 def covariance_path(path: Path) -> Path:
@@ -65,7 +72,22 @@ def read_adjustment(path: Path) -> Json:
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; an adjustment.json is needed here.") from None
     _check(content, _ADJUSTMENT, path, "")
+    _check_names(content, path)
     return dict(content)
+
+
+def _check_names(content: Json, path: Path) -> None:
+    """Refuse texts that name no quantity where readers take them apart."""
+    reliability = content["reliability"] or {}
+    texts = [text for each in (*content["singular"], *content["correlations"]) for text in each["parameters"]]
+    texts += [each["parameter"] for each in reliability.get("outer", ())]
+    texts += [each["name"] for each in content["calibrations"]]
+    texts += [each["name"] for test in content.get("calibration_tests", ()) for each in test["direction"]]
+    for text in texts:
+        try:
+            parameter_from_text(text)
+        except ValueError as error:
+            raise InputError(f"{path}: {error}. {_AGAIN}") from None
 
 
 def read_covariance(path: Path) -> Covariance:
@@ -86,7 +108,11 @@ def read_covariance(path: Path) -> Covariance:
     if twice is not None:
         raise InputError(f"{file}: {twice!r} is named twice. {_AGAIN}")
     adjustment = str(_array(data, "fingerprint", file)) if b"fingerprint.npy" in data else ""
-    return Covariance(texts, values.astype(np.float64), matrix.astype(np.float64), adjustment)
+    try:
+        parameters = parameters_from_texts(texts)
+    except ValueError as error:
+        raise InputError(f"{file}: {error}. {_AGAIN}") from None
+    return Covariance(parameters, values.astype(np.float64), matrix.astype(np.float64), adjustment)
 
 
 def read_own_covariance(path: Path) -> Covariance:

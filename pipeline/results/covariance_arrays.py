@@ -40,7 +40,7 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
 
 def covariance_note(adjustment: Adjustment) -> str:
     """What of the covariance is in the file, in words."""
-    count, alone = len(adjustment.names), " and every ".join(_parts(adjustment).groups)
+    count, alone = len(adjustment.parameters), " and every ".join(_parts(adjustment).groups)
     if not alone:
         return "adjustment.npz holds the covariance of all quantities."
     whole = "cameras" if "image" in alone else "cameras and images"
@@ -59,15 +59,16 @@ class _Parts:
 
 
 def _parts(adjustment: Adjustment) -> _Parts:
-    whole = np.arange(len(adjustment.names))
+    parameters = adjustment.parameters
+    whole = np.arange(len(parameters))
     groups: dict[str, list[Indices]] = {}
     # The quantities of a point or an image stand together, and begin with X or X0.
-    for kind, prefixes, first in (("point", ("PT.",), ".X"), ("image", ("EO.", "T."), ".X0")):
-        members = np.array([adjustment.names[i].startswith(prefixes) for i in whole], dtype=bool)
+    for kind, kinds, first in (("point", ("point",), "X"), ("image", ("exterior", "film"), "X0")):
+        members = np.array([parameters[i].kind in kinds for i in whole], dtype=bool)
         if len(whole) <= AFFORDABLE or not members.any():
             continue
         positions = whole[members]
-        begins = [j for j, i in enumerate(positions) if adjustment.names[i].endswith(first)]
+        begins = [j for j, i in enumerate(positions) if parameters[i].quantity == first]
         groups[kind] = np.split(positions, begins[1:])
         whole = whole[~members]
     return _Parts(whole, groups)

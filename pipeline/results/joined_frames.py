@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Image, Network
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -68,8 +69,8 @@ class _Part:
     def __init__(self, adjustment: Adjustment, image: Image) -> None:
         self.adjustment, self.image = adjustment, image
         self.model = adjusted_image(adjustment, image.name)
-        names = [f"T.{image.name}.{name}" for name in film_parameter_names(image.transformation)]
-        self.film_covariance = adjustment.sigma0**2 * adjustment.cofactor_of(names)
+        film = [Parameter.film(image.name, name) for name in film_parameter_names(image.transformation)]
+        self.film_covariance = adjustment.sigma0**2 * adjustment.cofactor_of(film)
 
     def camera_mm(self, rows: list[int] | Indices) -> Array:
         """(n, 2) where the film transformation puts observations."""
@@ -87,10 +88,9 @@ class _Part:
         found = []
         for k, row in enumerate(rows.tolist()):
             place, covariance = measured[k], self.adjustment.sigma0**2 * noise[k] + film[k]
-            if owner := _own_unknown(network, self.image, row):
-                names = [f"{owner}.x", f"{owner}.y"]
-                place = np.array([self.adjustment.value(name) for name in names])
-                covariance = self.adjustment.sigma0**2 * self.adjustment.cofactor_of(names)
+            if own := _own_unknowns(network, self.image, row):
+                place = self.adjustment.values_of(own)
+                covariance = self.adjustment.sigma0**2 * self.adjustment.cofactor_of(own)
             sx, sy = np.sqrt(np.diag(covariance))
             found.append(
                 {
@@ -125,9 +125,9 @@ class _Part:
         return np.asarray(by_parameters @ self.film_covariance @ by_parameters.swapaxes(1, 2))
 
 
-def _own_unknown(network: Network, image: Image, row: int) -> str:
-    """The name of the unknown that is the camera coordinates of an observation, "" where there is none."""
+def _own_unknowns(network: Network, image: Image, row: int) -> list[Parameter]:
+    """The unknowns that are the camera coordinates of an observation, none where it has none."""
     kind, point = network.observations.kind[row], network.observations.point[row]
     if kind == "join":
-        return f"JOIN.{image.frame}.{point}"
-    return f"FID.{image.camera}.{point}" if kind == "fiducial" else ""
+        return [Parameter.join(image.frame, point, axis) for axis in "xy"]
+    return [Parameter.fiducial(image.camera, point, axis) for axis in "xy"] if kind == "fiducial" else []

@@ -30,7 +30,7 @@ def reliability_json(adjustment: Adjustment) -> Json | None:
         "family": result.probabilities.family,
         "critical_tau": result.critical_tau,
         "outer": [
-            {"parameter": each.parameter, "effect": each.effect, "sigmas": each.in_sigmas, "cause": each.cause}
+            {"parameter": each.parameter.text, "effect": each.effect, "sigmas": each.in_sigmas, "cause": each.cause}
             for each in result.outer
         ],
         "unchecked": list(result.unchecked),

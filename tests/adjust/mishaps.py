@@ -157,7 +157,7 @@ MISHAPS: dict[str, Mishap] = {
     "single-flat": Mishap(
         "One vertical image of a flat field, priors of 1 mm",
         Setup(vertical(0.1), STATIONS[:1], relief=0.0, prior=1.0, noise=True).network,
-        ("The observations say nothing about IO.K.c, IO.K.x0, IO.K.y0", "", "", ""),
+        ("The observations say nothing about c, x0 and y0 of camera K", "", "", ""),
     ),
     "nearly-flat": Mishap(
         "Relief of 2 cm under 1500 m, vertical to 0.00001 rad, c and principal point without priors",

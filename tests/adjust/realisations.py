@@ -36,7 +36,9 @@ def exact(case: Case, fiducial_sigma_mm: float | None = None, control_sigma: flo
     network = replace(given, cameras=(_true_camera(given.cameras[0], truth, fiducial_sigma_mm),), points=points)
     problem = number(network, start)
     unknowns = problem.unknowns
-    values = np.array([truth.get(name, value) for name, value in zip(unknowns.names, unknowns.start, strict=True)])
+    values = np.array(
+        [truth.get(key.text, value) for key, value in zip(unknowns.parameters, unknowns.start, strict=True)]
+    )
     problem = replace(problem, unknowns=replace(unknowns, start=values))
     xy_mm = computed_observations(problem, problem.start())
     assert xy_mm is not None

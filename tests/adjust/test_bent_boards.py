@@ -17,6 +17,7 @@ from adjust.problem.functions import compute, computed_observations, derivatives
 from adjust.problem.images import adjusted_places
 from adjust.problem.network import Board, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
+from adjust.problem.parameter import Parameter
 from adjust.problem.problem import number
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
@@ -120,7 +121,7 @@ def test_derivatives_by_the_bends_are_differences_of_the_functions() -> None:
     state = problem.start()
     at = derivatives(problem, state, compute(problem, state))  # type: ignore[arg-type]
     for name in ("bend_x", "bend_y"):
-        position = problem.unknowns.names.index(f"BD.board.{name}")
+        position = problem.unknowns.parameters.index(Parameter.board("board", name))
         step = np.zeros(len(problem.unknowns))
         step[position] = 1e-3
         numeric = computed_observations(problem, problem.moved(state, step))

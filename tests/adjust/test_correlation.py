@@ -19,7 +19,7 @@ def test_flying_height_and_principal_distance_are_told() -> None:
     network, start = LOW_RELIEF.network()
     result = adjust(given(network, {"x": 0.0, "y": 0.0}), start)
     first = correlations(result)[0]
-    assert first.parameters == ("IO.K.c", "EO.*.Z0")
+    assert [each.text for each in first.parameters] == ["IO.K.c", "EO.*.Z0"]
     assert "c of camera K and Z0 of all images are correlated by" in first.cause
     assert "flying height and principal distance trade off" in first.cause
     assert "tilted in different directions" in first.remedy
@@ -47,7 +47,7 @@ def test_the_remedy_lowers_the_correlation() -> None:
     """Relief of 500 m, and images tilted by 20 degrees: c and Z0 are no longer told."""
     tilted = replace(LOW_RELIEF, attitudes=CONVERGENT, relief=500.0)
     for setup, told in ((LOW_RELIEF, True), (tilted, False)):
-        pairs = [each.parameters[0] for each in correlations(adjust(*setup.network()))]
+        pairs = [each.parameters[0].text for each in correlations(adjust(*setup.network()))]
         assert ("IO.K.c" in pairs) == told
 
 
@@ -67,14 +67,14 @@ def test_a_turn_of_the_camera_about_its_axis_changes_nothing() -> None:
         list(correlations(adjust(*Setup(vertical(k), STATIONS[:1], 20.0, prior=1.0).network())))
         for k in (0.0, np.pi / 2)
     )
-    by_x0 = [next(each for each in found if each.parameters[0] == "IO.K.x0") for found in (one, other)]
-    assert [each.parameters[1] for each in by_x0] == ["EO.f0.X0", "EO.f0.Y0"]
+    by_x0 = [next(each for each in found if each.parameters[0].text == "IO.K.x0") for found in (one, other)]
+    assert [each.parameters[1].text for each in by_x0] == ["EO.f0.X0", "EO.f0.Y0"]
 
 
 def test_powers_of_the_radius_and_decentering_are_told() -> None:
     setup = Setup(CONVERGENT, prior=1.0, distortion={"k3": FREE, "k5": FREE, "k7": FREE})
     found = correlations(adjust(*setup.network()))
-    powers = [each for each in found if each.parameters[0].startswith("IO.K.k")]
+    powers = [each for each in found if each.parameters[0].text.startswith("IO.K.k")]
     assert powers
     assert all("neighbouring powers of the radius" in each.cause for each in powers)
     assert all("Compare the curve" in each.remedy for each in powers)

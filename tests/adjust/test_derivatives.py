@@ -116,7 +116,7 @@ def test_functions_by_differences_of_computed_observations(kind: Transformation,
     assert computed is not None
     at = derivatives(problem, state, computed)
     by_unknowns = -np.linalg.solve(at.by_observation, at.by_unknowns)
-    names, columns = problem.unknowns.names, problem.columns
+    names, columns = [each.text for each in problem.unknowns.parameters], problem.columns
     for alike in apart(problem):
         sizes = np.array([step_of(names[position]) for position in alike])
         numeric = (moved(problem, alike, sizes) - moved(problem, alike, -sizes)) / (2 * sizes[0])
@@ -135,7 +135,7 @@ def test_functions_by_differences_of_computed_observations(kind: Transformation,
 def apart(problem: Problem) -> list[list[int]]:
     """The unknowns by what they are, of all images and points: no observation depends on two of one kind."""
     groups: dict[tuple[str, str], list[int]] = {}
-    for position, name in enumerate(problem.unknowns.names):
+    for position, name in enumerate(each.text for each in problem.unknowns.parameters):
         groups.setdefault((name.split(".")[0], name.rsplit(".", 1)[1]), []).append(position)
     return list(groups.values())
 

@@ -12,6 +12,7 @@ from adjust.errors import AdjustmentError
 from adjust.problem.camera import Fiducial, Prior
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.observations import Calibration, Observations
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment, Contradiction
 from adjust.solution.adjustment import adjust
 
@@ -56,14 +57,14 @@ def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, App
 
 
 def calibration_of(result: Adjustment, fiducials: bool) -> Calibration:
-    kinds = ("IO.", "FID.") if fiducials else ("IO.",)
-    names = [name for name in result.names if name.startswith(kinds) and result.cofactor_of([name])[0, 0] > 0.0]
-    return Calibration(tuple(names), np.array([result.value(n) for n in names]), result.cofactor_of(names))
+    kinds = ("interior", "fiducial") if fiducials else ("interior",)
+    taken = [each for each in result.parameters if each.kind in kinds and result.cofactor_of([each])[0, 0] > 0.0]
+    return Calibration(tuple(taken), result.values_of(taken), result.cofactor_of(taken))
 
 
 def with_calibration(network: Network, calibration: Calibration) -> Network:
     """The network with that calibration in the place of the camera's priors."""
-    value = dict(zip(calibration.names, calibration.values.tolist(), strict=True))
+    value = dict(zip((each.text for each in calibration.parameters), calibration.values.tolist(), strict=True))
 
     def freed(name: str, prior: Prior) -> Prior:
         return Prior(value[name], np.inf) if name in value else prior
@@ -128,18 +129,23 @@ def test_a_fiducial_that_no_image_shows_has_no_part_in_a_calibration() -> None:
     )
     result = adjust(with_calibration(replace(b, observations=rows), calibration), start_b)
     assert not any(".5." in row.name for row in result.further)
-    assert len(result.further) == len(calibration.names) - 2
+    assert len(result.further) == len(calibration.parameters) - 2
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda n, c: replace(n, calibrations=(replace(c, names=("IO.K.q", *c.names[1:])),)), ["IO.K.q", "no camera"]),
-        (lambda n, c: replace(n, calibrations=(c,)), ["IO.K.c", "standard deviation of its own (1)", "twice"]),
-        (lambda n, c: replace(with_calibration(n, c), calibrations=(c, c)), ["IO.K.c", "another calibration"]),
+        (
+            lambda n, c: replace(
+                n, calibrations=(replace(c, parameters=(Parameter.interior("K", "q"), *c.parameters[1:])),)
+            ),
+            ["q of camera K", "no camera has"],
+        ),
+        (lambda n, c: replace(n, calibrations=(c,)), ["c of camera K", "standard deviation of its own (1)", "twice"]),
+        (lambda n, c: replace(with_calibration(n, c), calibrations=(c, c)), ["c of camera K", "another calibration"]),
         (
             lambda n, c: with_calibration(n, replace(c, covariance=np.ones_like(c.covariance))),
-            ["not positive definite", "IO.K.c"],
+            ["not positive definite", "c, x0 and y0 of camera K"],
         ),
         (lambda n, c: with_calibration(n, replace(c, covariance=c.covariance[:2])), ["shape (2, 5)"]),
     ],
@@ -148,8 +154,8 @@ def test_a_calibration_that_cannot_be_is_refused(
     change: Callable[[Network, Calibration], Network], words: list[str]
 ) -> None:
     network, start = simulated(np.random.default_rng(5), kind="none", free={"k3": np.inf, "p1": np.inf})
-    names = tuple(f"IO.K.{name}" for name in ("c", "x0", "y0", "k3", "p1"))
-    calibration = Calibration(names, np.array([153.0, 0.0, 0.0, 1.5e-7, 0.0]), np.diag([1.0, 1.0, 1.0, 1e-18, 1e-16]))
+    own = tuple(Parameter.interior("K", name) for name in ("c", "x0", "y0", "k3", "p1"))
+    calibration = Calibration(own, np.array([153.0, 0.0, 0.0, 1.5e-7, 0.0]), np.diag([1.0, 1.0, 1.0, 1e-18, 1e-16]))
     with pytest.raises(AdjustmentError) as error:
         adjust(change(network, calibration), start)
     for word in words:
@@ -174,11 +180,11 @@ def test_an_earlier_calibration_is_tested_as_a_whole() -> None:
     network = with_calibration(b, changed)
     alone = adjust(replace(network, calibrations=()), start_b)
     (found,) = adjust(network, start_b).contradictions
-    names = list(calibration.names)
+    names = list(calibration.parameters)
     difference = np.array([alone.value(name) for name in names]) - changed.values
     joint = changed.covariance + alone.cofactor_of(names)
     chi_square = difference @ np.linalg.solve(joint, difference)
-    assert found.names == calibration.names
+    assert found.parameters == calibration.parameters
     assert found.freedom == len(names)
     assert found.statistic == pytest.approx(chi_square / len(names) / alone.sigma0**2, rel=0.02)
     sigma = alone.sigma0 * np.sqrt(np.diag(joint))
@@ -194,7 +200,7 @@ def contradicted(sigmas: float, draws: int, level: float = 0.05) -> float:
     told = []
     for _ in range(draws):
         calibration = calibration_of(adjust(noisy(a, rng, 1e6), start_a), False)
-        c = calibration.names.index("IO.K.c")
+        c = calibration.parameters.index(Parameter.interior("K", "c"))
         values = calibration.values.copy()
         values[c] += sigmas * np.sqrt(2.0 * calibration.covariance[c, c])
         network = with_calibration(noisy(b, rng, 1e6), replace(calibration, values=values))
@@ -214,8 +220,8 @@ def test_a_contradiction_is_told_beside_what_the_marks_show() -> None:
     what is left where the marks lie over one another."""
     (a, start_a), (b, start_b), _ = two_networks("affine", 1.0)
     calibration = calibration_of(adjust(a, start_a), True)
-    c, x0 = calibration.names.index("IO.K.c"), calibration.names.index("IO.K.x0")
-    along_x = np.array([name == "IO.K.x0" or name.endswith(".x") for name in calibration.names])
+    c, x0 = (calibration.parameters.index(Parameter.interior("K", name)) for name in ("c", "x0"))
+    along_x = np.array([each.quantity in ("x0", "x") for each in calibration.parameters])
 
     def found(change: NDArray[np.float64]) -> Contradiction:
         given = with_calibration(b, replace(calibration, values=calibration.values + change))
@@ -224,7 +230,7 @@ def test_a_contradiction_is_told_beside_what_the_marks_show() -> None:
 
     same, shifted = found(0.0 * along_x), found(0.05 * along_x)
     longer = found(0.3 * (np.arange(len(along_x)) == c))
-    assert same.freedom == len(same.names) - 4
+    assert same.freedom == len(same.parameters) - 4
     assert same.probability > 1e-3
     assert np.isfinite(same.difference).all()
     np.testing.assert_allclose(shifted.difference / same.sigma, same.difference / same.sigma, atol=0.05)

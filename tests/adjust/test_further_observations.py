@@ -191,7 +191,7 @@ def test_points_tied_by_a_distance_are_shared() -> None:
     own = np.concatenate([touched.own.ravel() for touched in numbering.touched])
     tied = {f"PT.{id}.{axis}" for id in "0123" for axis in "XYZ"}
     assert len(own) == 3 * 20
-    assert not tied & {problem.unknowns.names[numbering.free[i]] for i in own}
+    assert not tied & {problem.unknowns.parameters[numbering.free[i]].text for i in own}
 
 
 def test_approximations_of_a_model_have_the_size_of_the_distances() -> None:

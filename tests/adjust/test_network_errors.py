@@ -134,7 +134,7 @@ def test_an_image_turned_away() -> None:
 
 def test_a_missing_approximation() -> None:
     network, start = simulated(np.random.default_rng(1))
-    with pytest.raises(AdjustmentError, match=r"EO\.f1\.X0 has neither a value nor an approximation"):
+    with pytest.raises(AdjustmentError, match=r"X0 of image f1 has neither a value nor an approximation"):
         adjust(network, replace(start, exterior={k: v for k, v in start.exterior.items() if k != "f1"}))
     with pytest.raises(AdjustmentError, match=r"image f1: .*affine has 6 parameters .*but 4"):
         adjust(network, replace(start, transformation=dict(start.transformation) | {"f1": np.zeros(4)}))
@@ -143,7 +143,7 @@ def test_a_missing_approximation() -> None:
 def test_unknown_point_without_approximation() -> None:
     network, start = simulated(np.random.default_rng(1))
     points = (ObjectPoint("0", None, None, Prior(3.0, 0.1)), *network.points[1:])
-    with pytest.raises(AdjustmentError, match=r"PT\.0\.X has neither"):
+    with pytest.raises(AdjustmentError, match=r"X of point 0 has neither"):
         adjust(replace(network, points=points), replace(start, points={}))
 
 

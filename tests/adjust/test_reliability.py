@@ -12,6 +12,7 @@ from simulated import Truth, field_points, simulated
 from adjust.problem.camera import Camera, Prior
 from adjust.problem.network import Approximations, Exterior, Network
 from adjust.problem.observations import Calibration, ObservationKind
+from adjust.problem.parameter import Parameter
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.result import Adjustment, Reliability
 from adjust.solution.adjustment import Options, adjust
@@ -137,7 +138,7 @@ def test_the_cause_that_is_named_moves_the_parameter_by_what_is_told() -> None:
             assert shift == pytest.approx(outer.effect, rel=5e-3)
             checked += 1
     assert checked >= 2
-    assert {outer.parameter for outer in tests.outer} >= {"IO.K.c", "IO.K.x0", "IO.K.k3", "FID.K.1.x"}
+    assert {outer.parameter.text for outer in tests.outer} >= {"IO.K.c", "IO.K.x0", "IO.K.k3", "FID.K.1.x"}
 
 
 def test_an_error_in_the_least_favourable_direction_shifts_the_test_of_the_point() -> None:
@@ -160,18 +161,18 @@ def test_an_undetected_error_of_an_earlier_calibration_moves_the_camera_as_told(
     truth = Truth()
     network, start = simulated(np.random.default_rng(3), truth, noise=False, free={"k3": np.inf})
     camera = replace(network.cameras[0], principal_distance_mm=Prior(truth.c, np.inf))
-    names = ("IO.K.c", "IO.K.k3")
+    own = (Parameter.interior("K", "c"), Parameter.interior("K", "k3"))
     values = np.array([truth.c, truth.distortion["k3"]])
     sigmas = np.array([0.002, 1e-9])
     covariance = np.array([[1.0, -0.6], [-0.6, 1.0]]) * np.outer(sigmas, sigmas)
 
     def with_calibration(error: Array) -> Network:
-        return replace(network, cameras=(camera,), calibrations=(Calibration(names, values + error, covariance),))
+        return replace(network, cameras=(camera,), calibrations=(Calibration(own, values + error, covariance),))
 
     clean = adjust(with_calibration(np.zeros(2)), start)
     told = {outer.parameter: outer for outer in reliability_of(clean).outer}
-    for name in names:
-        i = [f"calibration {each}" for each in names].index(told[name].cause)
+    for name in own:
+        i = [f"calibration {each.label}" for each in own].index(told[name].cause)
         wrong = adjust(with_calibration(clean.further[i].detectable * np.eye(2)[i]), start)
         assert wrong.value(name) - clean.value(name) == pytest.approx(told[name].effect, rel=0.01)
 

@@ -32,7 +32,7 @@ def dense_sigmas(network: Network, start: Approximations, result: Adjustment) ->
     problem = number(network, start)
     factors = np.array([result.variance_factors[group] for group in GROUPS])
     kinds = np.where(problem.is_fiducial, factors[1], factors[0])
-    names = np.array(problem.unknowns.names)
+    names = np.array([each.text for each in problem.unknowns.parameters])
     sigma = problem.unknowns.sigma.copy()
     sigma[np.char.startswith(names, "PT.")] *= np.sqrt(factors[2])
     sigma[np.char.startswith(names, "FID.")] *= np.sqrt(factors[3])

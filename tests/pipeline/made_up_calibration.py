@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
 from adjust.problem.network import Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import (
     Adjustment,
     Contradiction,
@@ -105,14 +106,14 @@ def adjustment() -> Adjustment:
     """Converged, sigma0 within its bounds, no observation suspect; f2 is mirrored, its film sheared."""
     rng = np.random.default_rng(7)
     ids, targets_mm = tuple(str(i + 1) for i in range(POINTS)), rng.uniform(-100.0, 100.0, (POINTS, 2))
-    names, values, sigmas = _unknowns(ids, rng)
+    parameters, values, sigmas = _unknowns(ids, rng)
     network = _network(ids, targets_mm, rng)
     count = len(network.observations)
     redundancy = rng.uniform(0.4, 0.9, (count, 2))
     w = np.clip(rng.standard_normal((count, 2)), -3.0, 3.0)
     v = w * SIGMA_MM * np.sqrt(redundancy)
-    correlation = np.eye(len(names))
-    c, k3 = names.index(f"IO.{CAMERA}.c"), names.index(f"IO.{CAMERA}.k3")
+    correlation = np.eye(len(parameters))
+    c, k3 = (parameters.index(Parameter.interior(CAMERA, name)) for name in ("c", "k3"))
     correlation[c, k3] = correlation[k3, c] = -0.95
     return Adjustment(
         network=network,
@@ -122,7 +123,7 @@ def adjustment() -> Adjustment:
         unknowns=83,
         redundancy=257,
         vpv=262.1,
-        names=names,
+        parameters=parameters,
         values=values,
         cofactor=Dense(correlation * np.outer(sigmas, sigmas)),
         assessment=Told(
@@ -142,22 +143,22 @@ def adjustment() -> Adjustment:
     )
 
 
-def _unknowns(points: tuple[str, ...], rng: np.random.Generator) -> tuple[tuple[str, ...], Array, Array]:
-    """Names, values and a-priori sigmas of all quantities; points are fixed."""
-    quantities: dict[str, tuple[float, float]] = {}
-    quantities |= {f"IO.{CAMERA}.{name}": pair for name, pair in (INTERIOR | LENS).items()}
+def _unknowns(points: tuple[str, ...], rng: np.random.Generator) -> tuple[tuple[Parameter, ...], Array, Array]:
+    """Keys, values and a-priori sigmas of all quantities; points are fixed."""
+    quantities: dict[Parameter, tuple[float, float]] = {}
+    quantities |= {Parameter.interior(CAMERA, name): pair for name, pair in (INTERIOR | LENS).items()}
     for i, (x, y) in enumerate(MARKS, 1):
         for axis, given in (("x", x), ("y", y)):
-            quantities[f"FID.{CAMERA}.{i}.{axis}"] = (given + 0.01 * rng.standard_normal(), 0.0021)
+            quantities[Parameter.fiducial(CAMERA, str(i), axis)] = (given + 0.01 * rng.standard_normal(), 0.0021)
     for image in FRAMES:
         affine = (0.1, -1.0, 0.02, 0.2, 0.02, 1.0) if image == "f2" else (0.1, 1.0, 0.02, 0.2, -0.02, 1.0)
         station = (*rng.uniform(-500.0, 500.0, 2), 1500.0, *rng.uniform(-0.1, 0.1, 3))
         for name, value in zip(AFFINE, affine, strict=True):
-            quantities[f"T.{image}.{name}"] = (value, 1e-4)
+            quantities[Parameter.film(image, name)] = (value, 1e-4)
         for name, value, sigma in zip(EXTERIOR, station, EXTERIOR_SIGMAS, strict=True):
-            quantities[f"EO.{image}.{name}"] = (float(value), sigma)
+            quantities[Parameter.exterior(image, name)] = (float(value), sigma)
     for point in points:
-        quantities |= {f"PT.{point}.{axis}": (float(rng.uniform(-900.0, 900.0)), 0.0) for axis in "XYZ"}
+        quantities |= {Parameter.point(point, axis): (float(rng.uniform(-900.0, 900.0)), 0.0) for axis in "XYZ"}
     values, sigmas = np.array(list(quantities.values())).T
     return tuple(quantities), values, sigmas
 
@@ -198,9 +199,11 @@ def _network(points: tuple[str, ...], targets_mm: Array, rng: np.random.Generato
 def singular_adjustment() -> Adjustment:
     """The same without a solution."""
     null = NullDirection(
-        ("IO.RC 20.c", "EO.f1.Z0"), "c and the flying height move together over flat ground.", "Fix c."
+        (Parameter.interior(CAMERA, "c"), Parameter.exterior("f1", "Z0")),
+        "c and the flying height move together over flat ground.",
+        "Fix c.",
     )
-    count = len(adjustment().names)
+    count = len(adjustment().parameters)
     return replace(
         adjustment(), termination="singular", singular=(null,), cofactor=Dense(np.full((count, count), np.nan))
     )

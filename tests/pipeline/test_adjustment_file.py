@@ -1,7 +1,9 @@
 """adjustment.json and adjustment.npz: what is written is what was adjusted, and what is broken is said."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -9,9 +11,11 @@ import made_up_calibration
 import numpy as np
 import pytest
 from setups import Setup, vertical
+from two_cameras import two_cameras
 
 from adjust.problem.camera import Prior
 from adjust.problem.network import ObjectPoint
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment, Residuals
 from adjust.solution.adjustment import adjust
 from pipeline.errors import InputError
@@ -192,11 +196,41 @@ def test_of_a_large_network_points_and_images_stand_by_themselves(
         monkeypatch.setattr(covariance_arrays, "AFFORDABLE", affordable)
         write_adjustment(adjustment, path)
         covariance = read_covariance(path)
-        assert sorted(covariance.names) == sorted(together)
+        assert sorted(each.text for each in covariance.parameters) == sorted(together)
         np.testing.assert_array_equal(covariance.of(cameras), whole.of(cameras))
         assert f"every {' and every '.join(kinds)} by itself" in read_adjustment(path)["covariance"]
         with np.load(covariance_path(path)) as arrays:
             for kind in kinds:
                 for names, matrix in zip(arrays[f"{kind}_names"], arrays[f"{kind}_matrices"], strict=True):
-                    np.testing.assert_array_equal(matrix, whole.of(names))
+                    listed = [str(name) for name in names if name]
+                    np.testing.assert_array_equal(matrix[: len(listed), : len(listed)], whole.of(listed))
+                    assert not matrix[len(listed) :].any()
             assert arrays["point_names"].shape == (24, 3)
+
+
+def test_names_that_would_run_together_have_results_of_their_own(tmp_path: Path) -> None:
+    """Fiducial B.1 of camera A and fiducial 1 of camera A.B: each as under plain names."""
+    of: list[tuple[str, str, Callable[[str], str]]] = [("K", "A", "B.{}".format), ("W", "A.B", str)]
+    plain = adjust(*two_cameras(("K", "W"), (str, str), str, str))
+    other = adjust(*two_cameras(("A", "A.B"), ("B.{}".format, str), str, str))
+    write_adjustment(other, tmp_path / "adjustment.json")
+    cameras = read_adjustment(tmp_path / "adjustment.json")["cameras"]
+    covariance = read_covariance(tmp_path / "adjustment.json")
+    assert covariance.parameters == other.parameters
+    for plain_name, name, mark in of:
+        for id, axis in product("12345", "xy"):
+            own, alike = Parameter.fiducial(plain_name, id, axis), Parameter.fiducial(name, mark(id), axis)
+            stored = cameras[name]["fiducials"][mark(id)][f"{axis}_mm"]
+            assert stored["value"] == plain.value(own)
+            assert stored["sigma"] == plain.sigma(own) > 0.0
+            assert covariance.of([alike])[0, 0] == pytest.approx(plain.sigma(own) ** 2, rel=1e-12)
+
+
+def test_a_covariance_whose_names_say_nothing_is_refused(path: Path) -> None:
+    file = covariance_path(path)
+    with np.load(file) as arrays:
+        content = dict(arrays)
+    content["names"][0] = "c"
+    np.savez_compressed(file, **content)
+    with pytest.raises(InputError, match="'c' names no quantity of an adjustment"):
+        read_covariance(path)

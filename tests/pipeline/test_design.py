@@ -328,7 +328,7 @@ def test_fiducials_of_photographs_alone_are_the_mean_of_as_many(tmp_path: Path) 
             ('id = "a"\n', f'id = "a"\nsigma_mm = {given}\n'),
         )
         sigmas = alone(expect(Variations.read(scene).setup()))
-        marks = [sigma for name, sigma in sigmas.items() if name.startswith("FID.")]
+        marks = [sigma for parameter, sigma in sigmas.items() if parameter.kind == "fiducial"]
         assert rms(marks) == pytest.approx(0.003 / math.sqrt(2) * math.sqrt(1 - 4 / 8), rel=1e-4)
 
 

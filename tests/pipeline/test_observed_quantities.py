@@ -232,7 +232,7 @@ def test_the_fiducials_of_an_earlier_calibration_can_be_left_out(
         ("[distortion]", '[distortion]\nfamily = "brown"\n[unused]', ["family = 'torlegard'", "'brown'"]),
         ('decentering = "paper"', 'decentering = "reduced"', ["decentering = 'paper'"]),
         ("r0_mm = 0.0", "r0_mm = 50.0", ["r0_mm = 0.0"]),
-        ("\nk7 = 0.0\n", "\nk7 = 1e-20\n", ["held k7 fixed at 0", "standard deviation of 0"]),
+        ("\nk7 = 0.0\n", "\nk7 = 1e-20\n", ["held k7 of camera C fixed at 0", "standard deviation of 0"]),
     ],
 )
 def test_a_calibration_of_another_lens_is_refused(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from adjust.problem.parameter import Parameter
 from pipeline.report.fiducials import Figure, figure, figure_plot
 from pipeline.report.lens import curves, curves_plot, displacement, largest_effects_um, lens
 from pipeline.report.lens_map import lens_map
@@ -31,7 +32,7 @@ def camera(family: str, c_mm: float = 153.0, **parameters: float) -> Json:
 
 
 def covariance(name: str, parameters: tuple[str, ...], matrix: Array) -> Covariance:
-    return Covariance(tuple(f"IO.{name}.{each}" for each in parameters), np.zeros(len(parameters)), matrix)
+    return Covariance(tuple(Parameter.interior(name, each) for each in parameters), np.zeros(len(parameters)), matrix)
 
 
 def test_the_radial_curve_of_torlegard_is_its_polynomial_and_its_sigma_follows() -> None:
@@ -157,9 +158,9 @@ def fiducials(estimated: Array) -> Json:
 
 
 def changed(estimated: Array, matrix: Array) -> Figure:
-    names = tuple(f"FID.A.{i}.{axis}" for i in range(len(GIVEN)) for axis in "xy")
+    places = tuple(Parameter.fiducial("A", str(i), axis) for i in range(len(GIVEN)) for axis in "xy")
     form = figure(
-        "A", camera("none") | {"fiducials": fiducials(estimated)}, Covariance(names, estimated.ravel(), matrix)
+        "A", camera("none") | {"fiducials": fiducials(estimated)}, Covariance(places, estimated.ravel(), matrix)
     )
     assert form is not None
     return form

@@ -298,5 +298,5 @@ def test_a_lattice_that_lies_along_the_pixels_is_no_pixel_locking(measured: Repo
 
 def test_quantities_are_called_as_in_the_tables() -> None:
     names = ["IO.RC 20.c", "IO.RC 20.x0", "FID.RC 20.7.1.x", "EO.f1.Z0"]
-    assert [spoken_name(name, ["RC 20"]) for name in names] == ["c", "x₀′", "x′ of fiducial 7.1", "EO.f1.Z0"]
+    assert [spoken_name(name, ["RC 20"]) for name in names] == ["c", "x₀′", "x′ of fiducial 7.1", "Z0 of image f1"]
     assert spoken_name("IO.A.B.k3", ["A", "A.B"]) == "k3, A.B"
