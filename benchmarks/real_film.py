@@ -11,6 +11,7 @@ prints each mark whose status differs, or whose place differs by more than 0.005
 import argparse
 import json
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,7 +60,8 @@ def tasks(data: Path) -> Iterator[Task]:
     coarse = layout("library:fairchild-t12-152", Path())
     yield Task("coarse", film / "coarse" / "tma2161_0293.png", coarse, (313.0, 313.0))
     for folder in sorted((data / "film_rendered").iterdir()):
-        yield Task(folder.name, folder / "s.tif", layout("camera.toml", folder), None)
+        pitch_um = float(tomllib.loads((folder / "project.toml").read_text())["pitch_um"])
+        yield Task(folder.name, folder / "s.tif", layout("camera.toml", folder), (pitch_um, pitch_um))
 
 
 def layout(camera: str, folder: Path) -> FiducialLayout:
@@ -136,8 +138,8 @@ def main() -> None:
             print_row(task.name, results[task.name])
             if task.name in before:
                 print_changes(task.name, before[task.name], results[task.name])
-    if options.keep:
-        options.keep.write_text(json.dumps(results, indent=1))
+            if options.keep:
+                options.keep.write_text(json.dumps(results, indent=1))
 
 
 if __name__ == "__main__":
