@@ -1,5 +1,7 @@
 """What adjust raises."""
 
+from collections.abc import Mapping
+
 
 class AdjustmentError(Exception):
     """A network that cannot be adjusted: contradictory, incomplete or empty.
@@ -7,6 +9,14 @@ class AdjustmentError(Exception):
     The message says what is wrong, at which image, point or mark, what would be right and what to do. A singular
     network is no error: it is a result whose null directions are named.
     """
+
+
+class UnorientedError(AdjustmentError):
+    """Images for which no orientation is found, though it is for others; reasons: a sentence on each, by its name."""
+
+    def __init__(self, reasons: Mapping[str, str]) -> None:
+        super().__init__(next(iter(reasons.values())))
+        self.reasons = dict(reasons)
 
 
 class NoImageError(AdjustmentError):

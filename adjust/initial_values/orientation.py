@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.errors import AdjustmentError
+from adjust.errors import AdjustmentError, UnorientedError
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.block import Block, extend, intersected, known_field, resected
@@ -26,7 +26,7 @@ CLEARLY_WORSE = 5.0  # a given orientation whose residuals are this many times a
 def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pose], dict[str, Array]]:
     """Poses of all images and coordinates (3,) of all points that are seen or wholly known.
 
-    Raises AdjustmentError for the image or point that cannot be found.
+    Raises UnorientedError for images, AdjustmentError for a point that cannot be found.
     """
     block = Block(sights, _coordinates(network, firm=True), _coordinates(network, firm=False))
     for image in network.images:
@@ -40,7 +40,7 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
             _scale_by_distances(block, network.distances)
     missing = sorted(name for name in sights if name not in block.poses)
     if missing:
-        raise AdjustmentError(_why_not_oriented(block, missing[0]))
+        raise UnorientedError({name: _why_not_oriented(block, name) for name in missing})
     return block.poses, _all_points(block)
 
 

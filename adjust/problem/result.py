@@ -253,6 +253,7 @@ class Adjustment:
     variance_factors: the factors found for the variances of groups, where asked for.
     remarks: on how the adjustment came about, the first of the warnings.
     slips: sentences on given points so far off that the observations do not agree, or have no solution, for them.
+    left_out: by name, the images for which no orientation was found, and why; the network is that of the others.
     """
 
     network: Network
@@ -273,6 +274,7 @@ class Adjustment:
     variance_factors: Mapping[str, float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     slips: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def residuals(self) -> Residuals:
@@ -311,7 +313,8 @@ class Adjustment:
     def warnings(self) -> tuple[str, ...]:
         """What the user should look at; where slips kept it from a solution, all else there seems to be is theirs."""
         spoilt = self.slips and not self.converged
-        return (*self.slips, *self.remarks, *(() if spoilt else self.assessment.warnings))
+        left_out = (f"Left out of the adjustment: {reason}" for reason in self.left_out.values())
+        return (*self.slips, *left_out, *self.remarks, *(() if spoilt else self.assessment.warnings))
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from adjust.errors import AdjustmentError, DatumError, NoImageError
+from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.initial_values.approximations import initial_values
 from adjust.initial_values.far_points import far_points
 from adjust.least_squares.kept_memory import keep_freed_memory
@@ -17,6 +17,7 @@ from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment, Cofactor
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.solution.assessment import RunAssessment
+from adjust.solution.left_out_images import fitting, with_lens, without_images
 from adjust.solution.network_slips import network_slip, stations_elsewhere
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.runs import Run, again, run
@@ -44,7 +45,8 @@ def adjust(
     its null directions, not an error: its values are the approximations, its cofactor matrix is zero and means nothing.
     Where no approximations are given, or the iteration does not come to rest from them, it begins with those found from
     the network itself. Given points that are far off are named where the observations do not agree for them; robust
-    estimation and data snooping begin without them.
+    estimation and data snooping begin without them. Images for which no orientation is found are left out, and tried
+    again once the lens is known (`Adjustment.left_out`).
 
     Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
     has no image, where the chosen datum does not hold the object space, or where a slip that concerns the whole network
@@ -53,9 +55,54 @@ def adjust(
     keep_freed_memory()
     validate(network)
     options = options or Options()
-    weighs_anew, own = options.plain != options, None
+    if approximations is not None:
+        return _as_a_whole(network, approximations, None, options)
+    part, start, left_out = _orientable(network, options)
+    result = _as_a_whole(part, None, start, options)
+    return _tried_again(network, result, left_out, options) if left_out else result
+
+
+def _orientable(network: Network, options: Options) -> tuple[Network, Approximations | None, dict[str, str]]:
+    """The network without the images for which no orientation is found, its own approximations, and why these are left
+    out. The whole network without approximations where too little would be left, or something else is wrong.
+    """
+    try:
+        return network, initial_values(with_held(network, options.datum_coordinates)), {}
+    except UnorientedError as error:
+        part, reasons = without_images(network, error.reasons), error.reasons
+    except AdjustmentError:
+        return network, None, {}
+    start = None if part is None else _own_start(part, options)
+    return (network, None, {}) if part is None or start is None else (part, start, reasons)
+
+
+def _tried_again(network: Network, rest: Adjustment, left_out: dict[str, str], options: Options) -> Adjustment:
+    """The adjustment with those images that were left out and that fit once the lens is known."""
+    found = rest
+    if rest.converged:
+        _, start, reasons = _orientable(with_lens(network, rest), options)
+        came = left_out.keys() - reasons.keys()
+        while start is not None and came:
+            part = without_images(network, left_out.keys() - came)
+            if part is None:
+                break
+            tried = _adjusted(part, start, options)
+            fit = fitting(tried, came, rest.sigma0) if tried.converged else set()
+            if fit == came:
+                found = tried
+                break
+            came = fit
+    frames = {image.frame for image in found.network.images}
+    return replace(found, left_out={name: reason for name, reason in left_out.items() if name not in frames})
+
+
+def _as_a_whole(
+    network: Network, approximations: Approximations | None, own: Approximations | None, options: Options
+) -> Adjustment:
+    """The adjustment of a network; own: its own approximations, where these are known already."""
+    weighs_anew = options.plain != options
     if weighs_anew:  # what is wrong with all would be weighed away here and there
-        own = _own_start(network, options)
+        own = own or _own_start(network, options)
         _check_whole(network, _plainly(network, own, options), options)
     try:
         start = approximations or own or initial_values(with_held(network, options.datum_coordinates))

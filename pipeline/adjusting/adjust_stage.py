@@ -34,6 +34,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     options = adjustment_options(project)
     network, untold = with_scanners(project, network, partial(adjust, options=options))
     adjustment = adjust(network, options=options)
+    network = adjustment.network  # without images that are left out
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
@@ -71,7 +72,8 @@ def _without_eccentricity(
         if _in_sigmas(network, wanted - applied) < _SETTLED_SIGMAS:
             break
         applied = wanted
-        adjustment = adjust(_shifted(network, -applied), options=options)
+        corrected = adjust(_shifted(network, -applied), options=options)
+        adjustment = replace(corrected, left_out={**adjustment.left_out, **corrected.left_out})
     return adjustment, uncorrected
 
 

@@ -98,6 +98,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         ],
         "warnings": list(adjustment.warnings),
         "notes": list(adjustment.notes),
+        "left_out": dict(adjustment.left_out),
         "variance_factors": dict(adjustment.variance_factors),
         "variance_sigmas": dict(adjustment.variance_sigmas),
         "suspects": [suspect_json(suspect) for suspect in adjustment.suspects],

@@ -1,6 +1,7 @@
 """Data snooping, weight functions and variance components through files: keys, result, verdict, report."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,3 +93,27 @@ def test_wrong_keys_are_told(line: str, words: str, tmp_path: Path) -> None:
     project = spoilt_project(tmp_path, line)
     with pytest.raises(InputError, match=words):
         read_project(project)
+
+
+def test_an_image_without_orientation_is_left_out_and_named(tmp_path: Path) -> None:
+    """The targets of one of four frames have one another's numbers: the other three are adjusted."""
+    network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 15))
+    seen = network.observations
+    rows = [
+        i
+        for i, (image, kind) in enumerate(zip(seen.image, seen.kind, strict=True))
+        if (image, kind) == ("f2", "target")
+    ]
+    points = list(seen.point)
+    for row, other in zip(rows, np.random.default_rng(4).permutation(rows).tolist(), strict=True):
+        points[row] = seen.point[other]
+    project = write_network(replace(network, observations=replace(seen, point=tuple(points))), tmp_path)
+    assert run(["adjust", str(project)]) == 1
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    assert result["converged"]
+    assert sorted(result["images"]) == ["f0", "f1", "f3"]
+    assert result["left_out"]["f2"].startswith("image f2 sees 15 known points, but no orientation")
+    assert any(warning.startswith("Left out of the adjustment: image f2") for warning in result["warnings"])
+    assert run(["check", str(project)]) in (0, 1)
+    assert run(["report", str(project)]) == 1
+    assert "Left out of the adjustment: image f2" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

@@ -1,0 +1,88 @@
+"""Images for which no orientation is found: left out, so that they do not end the rest, and tried again afterwards."""
+
+from collections import defaultdict
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from adjust.functional_model.families import parameter_names
+from adjust.problem.camera import Camera, Prior
+from adjust.problem.network import Network
+from adjust.problem.result import Adjustment
+
+FITTING = 3.0  # times sigma0 of the others, up to which the standardised residuals of an image agree with them
+FEWEST_RAYS = 2  # of a point that is not known
+
+
+def without_images(network: Network, frames: Collection[str]) -> Network | None:
+    """The network without some frames and what they alone show; None where no more than half of it would be left."""
+    left = {image.frame for image in network.images if image.frame not in frames}
+    if len(left) <= len(frames):
+        return None
+    images = tuple(image for image in network.images if image.frame in left)
+    names = {image.name for image in images}
+    observations = network.observations
+    rows = zip(observations.image, observations.point, observations.is_fiducial, strict=True)
+    shown = [(image, point, on_film) for image, point, on_film in rows if image in names]
+    frames_of = defaultdict[str, set[str]](set)
+    for image, point, on_film in shown:
+        if not on_film:
+            frames_of[point].add(network.image_by_name[image].frame)
+    located = {
+        point.id
+        for point in network.points
+        if len(frames_of[point.id]) >= (FEWEST_RAYS if point.X is point.Y is point.Z is None else 1)
+    }
+    gone = network.observed_points - located
+    kept = [
+        row
+        for row, (image, point) in enumerate(zip(observations.image, observations.point, strict=True))
+        if image in names and (observations.is_fiducial[row] or point in located)
+    ]
+    ends = located | names
+    return replace(
+        network,
+        images=images,
+        points=tuple(point for point in network.points if point.id not in gone),
+        observations=observations.only(np.array(kept, dtype=np.intp)),
+        distances=tuple(each for each in network.distances if {each.start, each.end} <= ends),
+    )
+
+
+def with_lens(network: Network, result: Adjustment) -> Network:
+    """The network with its cameras as an adjustment of a part of it found them."""
+    used = {image.camera for image in result.network.images} - result.network.idle_cameras
+    return replace(
+        network,
+        cameras=tuple(_adjusted(camera, result) if camera.name in used else camera for camera in network.cameras),
+    )
+
+
+def fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[str]:
+    """Those of some frames whose residuals are as large as those of the others, of sigma0."""
+    squares, weights = defaultdict[str, float](float), defaultdict[str, float](float)
+    network = result.network
+    of_rows = zip(network.observations.image, result.residuals.w, result.weights, strict=True)
+    for image, w, weight in of_rows:
+        frame = network.image_by_name[image].frame
+        squares[frame] += float(weight * np.nan_to_num(w) @ np.nan_to_num(w))
+        weights[frame] += 2.0 * float(weight)
+    return {frame for frame in frames if squares[frame] <= (FITTING * sigma0) ** 2 * weights[frame]}
+
+
+def _adjusted(camera: Camera, result: Adjustment) -> Camera:
+    def known(name: str, given: Prior | None) -> Prior:
+        return Prior(result.value(f"IO.{camera.name}.{name}"), np.inf if given is None else given.sigma)
+
+    of = camera.distortion
+    parameters = {
+        name: known(name, of.parameters[name]) for name in parameter_names(of.family) if name in of.parameters
+    }
+    return replace(
+        camera,
+        principal_distance_mm=known("c", camera.principal_distance_mm),
+        x0_mm=known("x0", camera.x0_mm),
+        y0_mm=known("y0", camera.y0_mm),
+        distortion=replace(of, parameters=parameters),
+    )
