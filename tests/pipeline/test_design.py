@@ -187,7 +187,7 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixtu
     for words in (
         "principal distance, mm",
         "Smallest gross errors",
-        "IO.K.c",
+        "c of camera K",
         "Fiducial marks",
         "What would help",
         "Sigmas over design.transformation",
