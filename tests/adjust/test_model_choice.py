@@ -216,7 +216,7 @@ def test_what_is_singular_is_named_and_does_not_stop_the_choice() -> None:
     assert choice.chosen is None
     assert choice.verdict == "No model has a solution."
     assert all("singular" in each.problem for each in choice.candidates)
-    assert "IO.K.c, EO.*.Z0: The principal distance of camera K" in choice.reasons[0]
+    assert "c of camera K; Z0 of several images: The principal distance of camera K" in choice.reasons[0]
 
 
 def test_exact_images_are_predicted_exactly() -> None:
