@@ -6,7 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pipeline.archive.decision_check import inapplicable
 from pipeline.archive.measurement import made_from_of, measured_scans
+from pipeline.archive.store import Store
 from pipeline.archive.stored_marks import StoredMarks
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
@@ -32,7 +34,7 @@ from pipeline.results.comparator_file import (
     read_comparator,
 )
 from pipeline.results.fingerprints import of_file
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_scan import FailureCode, MeasuredScan
 from pipeline.text.spelling import did_you_mean
 from pipeline.text.text_file import read_json
 from pipeline.text.wording import listed
@@ -77,7 +79,15 @@ def measured(
     if project.scans and made.get(PLACES) != now[PLACES]:
         note = f"The marks were looked for with other {PLACES} than there are now; `reseau measure` looks again."
         data = replace(data, notes=(*data.notes, note))
-    return replace(data, problems=(*data.problems, *(_unlike(made, now) if project.scans else ())))
+    damaged = [
+        Problem(scan.failure.sentence, "Nothing else of this image is shown as measured until then.")
+        for scan in scans.values()
+        if scan.failure is not None and scan.failure.code is FailureCode.DAMAGED
+    ]
+    with Store(path) as store:
+        lines = inapplicable(store, digest)
+    idle = [Problem(f"{project.decisions_path.name}, {line}", "It does not count.") for line in lines]
+    return replace(data, problems=(*data.problems, *damaged, *idle, *(_unlike(made, now) if project.scans else ())))
 
 
 def frames_of(data: ReportData) -> int:

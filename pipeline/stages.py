@@ -14,6 +14,7 @@ from adjust.problem.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.archive.archive_summary import archive_summary, shard_summary
+from pipeline.archive.digests import DamagedError
 from pipeline.archive.judging import drop_all_but, judged_marks, judging_of, marks_as_written, rejudge, tell_written
 from pipeline.archive.measurement import (
     decisions_by,
@@ -180,13 +181,23 @@ def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkO
     from pipeline.archive.measure_archive import measure_archive
 
     with Store(project.measurement_path) as store:
-        tell_place(store, project.path.parent)
-        digest = measure_archive(
-            project, store, lambda: measured_from(project), new.place(project.output / "learned"), reporter, work
-        )
-        if not marks_as_written(store, digest, project.comparator):
-            _write_marks(project, store, digest, new)
-        return digest
+
+        def measured_and_written(options: WorkOptions | None) -> str:
+            tell_place(store, project.path.parent)
+            learned = new.place(project.output / "learned")
+            digest = measure_archive(project, store, lambda: measured_from(project), learned, reporter, options)
+            if not marks_as_written(store, digest, project.comparator):
+                _write_marks(project, store, digest, new)
+            return digest
+
+        try:
+            return measured_and_written(work)
+        except DamagedError as error:  # of a mark, which is noticed where it is read
+            if work is not None and work.only_kept:
+                raise
+            reporter.say(str(error))
+            store.forget_damaged()
+            return measured_and_written(work)
 
 
 def _adjusted_marks(

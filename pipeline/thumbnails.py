@@ -1,6 +1,7 @@
 """The pictures of the marks as the report asks for them: kept when they were measured, or cut from their scans."""
 
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
@@ -11,6 +12,7 @@ from measure.results import MarkMeasurement
 from measure.scans.addresses import scan_path
 from measure.scans.scan import Scan, open_scan
 from pipeline.archive.thumbnails import ThumbnailStore, thumbnails_path
+from pipeline.errors import InputError
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.results.thumbnail import Thumbnail, cut
 
@@ -35,7 +37,10 @@ class Thumbnails:
         }
         self._fingerprints = fingerprints or {}
         is_kept = measurement is not None and thumbnails_path(measurement).exists()
-        self._kept = ThumbnailStore.beside(measurement) if is_kept and measurement is not None else None
+        self._kept: ThumbnailStore | None = None
+        if is_kept and measurement is not None:
+            with suppress(InputError):  # of a damaged file, without which pictures are cut from the scans
+                self._kept = ThumbnailStore.beside(measurement)
         self._open: tuple[Path, Scan] | None = None
 
     def __enter__(self) -> Self:

@@ -29,6 +29,7 @@ def _summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
     sentence = f"Measured: {len(status.scans)} scans: {told}."
     named, more = worst_named(status.scans, NAMED, False)
     problems = [Problem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
+    problems += [Problem(f"decisions.jsonl, {line}", "It does not count.") for line in status.idle_decisions]
     if more:
         problems.append(Problem(f"{more} more need a look.", "Run `reseau status` with --verdict or --csv."))
     level: Level = "good" if status.all_good else "look"

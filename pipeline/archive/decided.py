@@ -16,6 +16,7 @@ from measure.fiducial_options import CLICK_SIGMA_PX, Click
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.status import Status
+from pipeline.archive.digests import row_digest
 from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, standing
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan
@@ -39,6 +40,17 @@ def by_image(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Decision]]:
         if one.about[2] != LEARNED:
             told[one.image].append(one)
     return told
+
+
+def decisions_hash(decisions: Sequence[Decision]) -> str:
+    """Of all decisions about an image; "" where there are none."""
+    if not decisions:
+        return ""
+    told = [
+        (str(one.decision), *one.about, one.col_px, one.row_px, one.pose, one.note, one.who, one.fingerprint)
+        for one in decisions
+    ]
+    return row_digest(*told)
 
 
 def decided(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf) -> Decided:
@@ -74,7 +86,9 @@ def before_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> Mea
 
 def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
     """The scan as decisions have it, whatever the checks say, and who made how many of them."""
-    people = Counter(one.who or "somebody" for one in counting.values())
+    marks = {(scan.frame.image, mark.point, mark.kind) for mark in scan.frame.marks}
+    applied = [one for about, one in counting.items() if not about[1] or about in marks]
+    people = Counter(one.who or "somebody" for one in applied)
     return replace(_changed(scan, counting), decided_by=dict(sorted(people.items())))
 
 

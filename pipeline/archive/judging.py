@@ -13,6 +13,16 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from pipeline.archive.digests import (
+    IS_JUDGING_SOUND,
+    DamagedError,
+    check_judging,
+    damaged_judging,
+    is_sound,
+    marks_digest,
+    seal,
+    seal_judging,
+)
 from pipeline.archive.store import MARK_COLUMNS, Json, Store, mark_of, places, row_of
 from pipeline.archive.verdicts import Verdict, verdict_of
 from pipeline.results.comparator_file import MarkRow
@@ -35,11 +45,13 @@ class Judging:
 
 @dataclass(frozen=True)
 class JudgedScan:
-    """name: of the image. result: the row of what was measured. record: as it is now, beside all others."""
+    """name: of the image. result: the row of what was measured. record: as it is now, beside all others. decisions: a
+    hash of those about the image that were taken in."""
 
     name: str
     result: int
     record: Json
+    decisions: str = ""
 
 
 @dataclass(frozen=True)
@@ -75,6 +87,7 @@ def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots
     with store.writing():
         db.execute("delete from judging where digest = ?", (digest,))
         db.execute("update judging set digest = ? where id = ?", (digest, row))
+        seal_judging(db, row)
     return digest
 
 
@@ -91,13 +104,16 @@ def _taken(store: Store, judging: int, number: int, lot: Lot) -> str:
     if found is None:
         return ""
     before, old, output = found
+    if not _is_lot_sound(db, before, old):
+        return ""
+    frame = "scan, result, name, verdict, own_marks, detail, decisions, marks_digest"
     with store.writing():
         db.execute(
-            "insert into judged_frame (judging, lot, scan, result, name, verdict, own_marks, detail) "
-            "select ?, ?, scan, result, name, verdict, own_marks, detail from judged_frame "
+            f"insert into judged_frame (judging, lot, {frame}) select ?, ?, {frame} from judged_frame "
             "where judging = ? and lot = ?",
             (judging, number, before, old),
         )
+        db.execute(f"{seal('judged_frame')} where judging = ? and lot = ?", (judging, number))
         db.execute(
             f"insert into judged (judging, result, number, {MARK_COLUMNS}) select ?, result, number, {MARK_COLUMNS} "
             "from judged where judging = ? and result in "
@@ -105,6 +121,25 @@ def _taken(store: Store, judging: int, number: int, lot: Lot) -> str:
             (judging, before, before, old),
         )
     return str(output)
+
+
+def _is_lot_sound(db: sqlite3.Connection, judging: int, lot: int) -> bool:
+    """Whether its frames and their own marks are as they were written."""
+    rows = db.execute(
+        f"select result, own_marks, marks_digest, {is_sound('judged_frame')} from judged_frame "
+        "where judging = ? and lot = ?",
+        (judging, lot),
+    ).fetchall()
+    return all(
+        is_whole and (not own_marks or marks_digest(_own_marks(db, judging, result)) == digest)
+        for result, own_marks, digest, is_whole in rows
+    )
+
+
+def _own_marks(db: sqlite3.Connection, judging: int, result: int) -> list[tuple[Any, ...]]:
+    """The rows of the marks of a frame that are other ones than were measured."""
+    query = f"select number, {MARK_COLUMNS} from judged where judging = ? and result = ? order by number"
+    return db.execute(query, (judging, result)).fetchall()
 
 
 def _judged(store: Store, judging: int, number: int, frames: Iterable[JudgedScan]) -> str:
@@ -124,17 +159,23 @@ def drop_all_but(store: Store, digest: str) -> None:
 
 
 def judging_of(store: Store, digest: str) -> Judging | None:
-    """The judging of that digest."""
-    query = "select id, digest, made_from, input from judging where digest = ?"
+    """The judging of that digest. Raises DamagedError where it is not as it was written."""
+    query = f"select {IS_JUDGING_SOUND}, id, digest, made_from, input from judging where digest = ?"
     found = store.connection.execute(query, (digest,)).fetchone()
-    return None if found is None else Judging(found[0], found[1], json.loads(found[2]), found[3])
+    if found is None:
+        return None
+    is_whole, row, digest, made_from, input_hash = found
+    if not is_whole:
+        raise damaged_judging(store.path)
+    return Judging(row, digest, json.loads(made_from), input_hash)
 
 
 def rejudge(store: Store, before: Judging, records: Mapping[str, Json]) -> str:
     """Keep another judging of the same results, after a look that a later `measure` does not take; give its digest."""
-    query = "select name, result from judged_frame where judging = ? order by name"
+    check_judging(store.connection, before.row, store.path)
+    query = "select name, result, decisions from judged_frame where judging = ? order by name"
     rows = store.connection.execute(query, (before.row,)).fetchall()
-    frames = [JudgedScan(name, result, records[name]) for name, result in rows]
+    frames = [JudgedScan(name, result, records[name], decisions) for name, result, decisions in rows]
     return judge(store, before.made_from, f"looked again {before.input}", frames)
 
 
@@ -146,22 +187,33 @@ def latest(store: Store) -> Judging | None:
     return None if found is None else judging_of(store, found[0])
 
 
-def judged_records(store: Store, judging: Judging, images: Collection[str] | None = None) -> Iterator[tuple[str, Json]]:
-    """Name and record of every frame, by name: where its file is now, and as all scans together show it. images: of
-    these alone."""
+def judged_records(
+    store: Store, judging: Judging, images: Collection[str] | None = None
+) -> Iterator[tuple[str, Json | DamagedError]]:
+    """Name and record of every frame, by name: where its file is now, and as all scans together show it; in the place
+    of a record that is not as it was written what is to be said of it. images: of these alone. Raises DamagedError
+    where the list of the frames is not as it was written."""
     db = store.connection
+    if images is None:
+        check_judging(db, judging.row, store.path)
+    wanted = "" if images is None else "and f.name in (select value from json_each(?))"
     frames = db.execute(
-        "select judged_frame.name, judged_frame.result, own_marks, judged_frame.detail, uri from judged_frame "
-        "join scan on scan.id = judged_frame.scan where judging = ? order by judged_frame.name",
-        (judging.row,),
+        f"select f.name, f.result, own_marks, f.detail, uri, f.marks_digest, {is_sound('judged_frame', 'f')} and "
+        f"{is_sound('scan')} from judged_frame f left join scan on scan.id = f.scan where judging = ? {wanted} "
+        "order by f.name",
+        (judging.row, *([] if images is None else [json.dumps(sorted(images))])),
     )
-    for name, result, own_marks, detail, uri in frames:
-        if images is not None and name not in images:
+    for name, result, own_marks, detail, uri, digest, is_whole in frames:
+        try:
+            record = store.record(result)
+        except DamagedError:
+            is_whole = False
+        marks = _own_marks(db, judging.row, result) if own_marks else []
+        if not is_whole or (own_marks and marks_digest(marks) != digest):
+            yield name, DamagedError.of_image(name, store.path)
             continue
-        record = store.record(result)
         if own_marks:
-            query = f"select {MARK_COLUMNS} from judged where judging = ? and result = ? order by number"
-            record["marks"] = [mark_of(row) for row in db.execute(query, (judging.row, result))]
+            record["marks"] = [mark_of(row) for _, *row in marks]
         record.update(json.loads(detail) if detail else {})
         yield name, {**record, "scan": uri}
 
@@ -181,22 +233,24 @@ def _written(digest: str, comparator: Path) -> dict[str, Any]:
 
 
 def judged_marks(store: Store, judging: Judging, images: Collection[str] | None = None) -> Iterator[MarkRow]:
-    """Every mark of every frame, by the frames' names, as all scans together show it. images: of these alone."""
+    """Every mark of every frame, by the frames' names, as all scans together show it. images: of these alone. Raises
+    DamagedError where one of them is not as it was written."""
     db = store.connection
-    columns = (
-        "point, kind, col_px, row_px, var_col, var_row, cov, case when var_col is null then causes end, status, reason"
-    )
-    as_measured = f"select {columns} from mark where result = ?2 order by number"
-    own = f"select {columns} from judged where judging = ?1 and result = ?2 order by number"
+    check_judging(db, judging.row, store.path)
+    as_measured = f"select number, {MARK_COLUMNS} from mark where result = ? order by number"
     frames = db.execute(
-        "select name, result, own_marks from judged_frame where judging = ? order by name", (judging.row,)
+        "select f.name, f.result, own_marks, case when own_marks then f.marks_digest else result.marks_digest end, "
+        f"{is_sound('judged_frame', 'f')} and {is_sound('result')} from judged_frame f "
+        "left join result on result.id = f.result where judging = ? order by f.name",
+        (judging.row,),
     )
-    for name, result, own_marks in frames:
+    for name, result, own_marks, digest, is_whole in frames:
         if images is not None and name not in images:
             continue
-        for point, kind, col, row, *spread, causes, status, reason in db.execute(
-            own if own_marks else as_measured, (judging.row, result)
-        ):
+        rows = _own_marks(db, judging.row, result) if own_marks else db.execute(as_measured, (result,)).fetchall()
+        if not is_whole or marks_digest(rows) != digest:
+            raise DamagedError.of_image(name, store.path)
+        for _, point, kind, col, row, *spread, causes, status, _, reason, _ in rows:
             center = None if col is None else (col, row)
             yield MarkRow(name, point, kind, center, _covariance(spread, causes), status, reason)
 
@@ -221,12 +275,17 @@ def _write(db: sqlite3.Connection, judging: int, lot: int, frame: JudgedScan, me
     verdict: Verdict = verdict_of(now)
     scan, key = db.execute("select scan, fingerprint from result where id = ?", (frame.result,)).fetchone()
     db.execute(
-        f"insert into judged_frame (judging, lot, scan, result, name, verdict, own_marks, detail) values ({places(8)})",
-        (judging, lot, scan, frame.result, frame.name, str(verdict), own_marks, detail),
+        "insert into judged_frame (judging, lot, scan, result, name, verdict, own_marks, detail, decisions) "
+        f"values ({places(9)})",
+        (judging, lot, scan, frame.result, frame.name, str(verdict), own_marks, detail, frame.decisions),
     )
     rows: list[tuple[Any, ...]] = [row_of(mark) for mark in now["marks"]] if own_marks else []
     db.executemany(
         f"insert into judged (judging, result, number, {MARK_COLUMNS}) values ({places(15)})",
         ((judging, frame.result, number, *row) for number, row in enumerate(rows)),
     )
+    digest = marks_digest(_own_marks(db, judging, frame.result) if own_marks else [])
+    where = "where judging = ? and scan = ?"
+    db.execute(f"update judged_frame set marks_digest = ? {where}", (digest, judging, scan))
+    db.execute(f"{seal('judged_frame')} {where}", (judging, scan))
     return json.dumps([frame.name, key, detail, rows]).encode()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from measure.errors import MeasurementError
 from pipeline.archive.cluster import cluster_executor
+from pipeline.archive.decision_check import tell_inapplicable
 from pipeline.archive.judging import judge_lots, latest
 from pipeline.archive.key import shard_of
 from pipeline.archive.moved import find_moved, hash_contents
@@ -24,6 +25,7 @@ from pipeline.measuring.scan_task import scan_tasks
 from pipeline.measuring.tied import tied
 from pipeline.measuring.tone_stage import said_of_tones
 from pipeline.progress import Reporter
+from pipeline.text.wording import counted
 from pipeline.workers import worker_pool
 
 
@@ -44,6 +46,9 @@ def measure_archive(
     """
     options = options or WorkOptions()
     names = check_measurable(project)
+    lost = store.forget_damaged() if options.retry or store.has_damaged_rows() else 0
+    if lost:
+        reporter.say(f"{store.path}: {counted(lost, 'result')} stored there not as written: measured again")
     if options.retry:
         store.forget_failed()
     with executor_of(project, options) as executor, ThumbnailStore.beside(store.path) as thumbnails:
@@ -67,10 +72,13 @@ def measure_archive(
         told = input_of(tasks, work, copies, made)
         before = latest(store)
         if before is not None and before.input == told:
+            tell_inapplicable(learned, store, before.digest, work)
             return before.digest
         share = partial(tied, learned, reporter=reporter, executor=executor)
         lots = judged_lots(learned, tasks, work, copies, share, told)
-        return judge_lots(store, made, told, lots)
+        digest = judge_lots(store, made, told, lots)
+        tell_inapplicable(learned, store, digest, work)
+        return digest
 
 
 def executor_of(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:

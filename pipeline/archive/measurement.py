@@ -7,12 +7,15 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
+from measure.reason import Code, Reason
+from measure.results import FrameMeasurement
+from pipeline.archive.digests import DamagedError
 from pipeline.archive.judging import judged_records, judging_of, latest
 from pipeline.archive.store import Store
 from pipeline.errors import InputError
 from pipeline.results.comparator_file import DecidedBy
 from pipeline.results.measured_record import scan_of
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
 _PLACE = "project folder"
 
@@ -97,4 +100,10 @@ def measured_scans(path: Path, digest: str = "", images: Collection[str] | None 
             raise InputError(f"{path}: its scans are not judged yet. Run `reseau measure`, which goes on with them.")
         folder = path.parent / (store.told(_PLACE) or {"path": ".."})["path"]
         for name, record in judged_records(store, judging, images):
-            yield scan_of(name, record, folder)
+            yield _damaged(name, record) if isinstance(record, DamagedError) else scan_of(name, record, folder)
+
+
+def _damaged(image: str, error: DamagedError) -> MeasuredScan:
+    """A scan of which nothing stored is used."""
+    frame = FrameMeasurement(image, (), problems=(Reason(str(error), Code.FAILED_SCAN),))
+    return MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, str(error)))

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.archive.schema import opened
-from pipeline.archive.store import Store
+from pipeline.archive.digests import damaged_results, is_sound, seal
+from pipeline.archive.store import Store, seal_result
 from pipeline.errors import InputError
 
 _SCAN = (
@@ -18,11 +18,13 @@ _MARK = "number, point, kind, col_px, row_px, var_col, var_row, cov, causes, sta
 
 @dataclass(frozen=True)
 class Merged:
-    """Of one store: its results, and how many of them were new here."""
+    """Of one store: its results, how many of them were new here, and how many are not as they were written and were
+    not taken."""
 
     path: Path
     results: int
     new: int
+    damaged: int = 0
 
 
 def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
@@ -33,12 +35,17 @@ def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
             raise InputError(f"{path}: there is no such store. Name the out/measurement.db of each shard.")
         if path.resolve() == store.path.resolve():
             raise InputError(f"{path}: is the store that the others are to be joined in. Name the others only.")
-        opened(path).close()
+        Store(path).close()
     return [_taken(store, path) for path in others]
 
 
 def _taken(store: Store, path: Path) -> Merged:
     db = store.connection
+    with Store(path) as other:
+        damaged = damaged_results(other.connection)
+    db.execute("create temp table if not exists damaged (result integer)")
+    db.execute("delete from damaged")
+    db.executemany("insert into damaged values (?)", ((row,) for row in damaged))
     db.execute("attach ? as other", (str(path),))
     try:
         results = db.execute("select count(*) from other.result").fetchone()[0]
@@ -46,14 +53,14 @@ def _taken(store: Store, path: Path) -> Merged:
             new = _insert(db)
     finally:
         db.execute("detach other")
-    return Merged(path, results, new)
+    return Merged(path, results, new, len(damaged))
 
 
 def _insert(db: sqlite3.Connection) -> int:
     """Every table in the order in which they refer to one another; rows that are there stay as they are."""
     before = db.execute("select coalesce(max(id), 0) from main.result").fetchone()[0]
     db.execute(
-        f"insert into main.scan ({_SCAN}, name) select {_SCAN}, null from other.scan where true "
+        f"insert into main.scan ({_SCAN}, name) select {_SCAN}, null from other.scan where {is_sound('scan')} "
         "on conflict (uri) do update set bytes = excluded.bytes, mtime_ns = excluded.mtime_ns, etag = excluded.etag, "
         "identity_hash = excluded.identity_hash, content_hash = excluded.content_hash "
         "where excluded.mtime_ns > mtime_ns"  # a file that was changed meanwhile
@@ -68,7 +75,8 @@ def _insert(db: sqlite3.Connection) -> int:
         "join other.program p on p.id = r.program join main.program program on (program.version, "
         "program.measure_revision, program.python, program.libraries) = "
         "(p.version, p.measure_revision, p.python, p.libraries) "
-        "join other.options o on o.id = r.options join main.options options on options.hash = o.hash order by r.id"
+        "join other.options o on o.id = r.options join main.options options on options.hash = o.hash "
+        f"where r.id not in (select result from damaged) and {is_sound('scan', 's')} order by r.id"
     )
     db.execute(
         f"insert into main.mark (result, {_MARK}) select result.id, {_MARK} from main.result result "
@@ -76,5 +84,10 @@ def _insert(db: sqlite3.Connection) -> int:
         "where result.id > ?",
         (before,),
     )
-    db.execute("insert or ignore into main.kept (key, value) select key, value from other.kept")
-    return int(db.execute("select count(*) from main.result where id > ?", (before,)).fetchone()[0])
+    sound = f"from other.kept where {is_sound('kept')}"
+    db.execute(f"insert or ignore into main.kept (key, value, digest) select key, value, digest {sound}")
+    new = db.execute("select id from main.result where id > ?", (before,)).fetchall()
+    for (result,) in new:
+        seal_result(db, result)
+    db.execute(seal("scan"))
+    return len(new)

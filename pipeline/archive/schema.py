@@ -9,6 +9,7 @@ import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.archive.digests import add_digests, row_digest
 from pipeline.errors import InputError, what_to_do_about_store
 
 APPLICATION = 0x52455345  # "RESE": `file` and this program know the file by it
@@ -109,7 +110,20 @@ alter table judged_frame add column lot integer not null default 0;
 # A hash of what the project asked for when it was known last whether the scan's result is current.
 _ASKED = "alter table scan add column asked text"
 
-MIGRATIONS: tuple[str, ...] = (_FIRST, _LOTS, _ASKED)
+# BLAKE2b of rows, see `digests`; decisions: a hash of those about the image that were taken in.
+_DIGESTS = """
+alter table scan add column digest text;
+alter table result add column marks_digest text;
+alter table result add column digest text;
+alter table judging add column frames_digest text;
+alter table judging add column seal text;    -- of the row
+alter table judged_frame add column decisions text;
+alter table judged_frame add column marks_digest text;
+alter table judged_frame add column digest text;
+alter table kept add column digest text;
+"""
+
+MIGRATIONS: tuple[str, ...] = (_FIRST, _LOTS, _ASKED, _DIGESTS)
 VERSION = len(MIGRATIONS)
 
 
@@ -130,15 +144,15 @@ def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
     connection = sqlite3.connect(path, timeout=60.0, isolation_level=None)
     try:
         _check(connection, path, schema)
+        connection.create_function("sqrt", 1, _sqrt, deterministic=True)  # not every SQLite is built with it
+        connection.create_function("row_digest", -1, row_digest, deterministic=True)
         connection.execute("pragma journal_mode = wal")
         connection.execute("pragma synchronous = normal")
         connection.execute("pragma foreign_keys = on")
         migrate(connection, schema)
-        connection.create_function("sqrt", 1, _sqrt, deterministic=True)  # not every SQLite is built with it
-    except sqlite3.DatabaseError as error:
+    except sqlite3.Error as error:
         connection.close()
-        next_step = what_to_do_about_store(error) or _MOVE
-        raise InputError(f"{path}: cannot be used as a store of {schema.what} ({error}). {next_step}") from error
+        raise store_error(path, schema.what, error) from error
     except BaseException:
         connection.close()
         raise
@@ -152,7 +166,10 @@ def migrate(connection: sqlite3.Connection, schema: Schema | None = None) -> Non
     for number, script in enumerate(schema.migrations[version:], version + 1):
         marks = f"pragma application_id = {schema.application}; pragma user_version = {number}"
         try:
-            connection.executescript(f"begin immediate; {script}; {marks}; commit;")
+            connection.executescript(f"begin immediate; {script}; {marks};")
+            if script == _DIGESTS:
+                add_digests(connection)
+            connection.execute("commit")
         except sqlite3.Error:
             if connection.in_transaction:
                 connection.execute("rollback")
@@ -161,6 +178,12 @@ def migrate(connection: sqlite3.Connection, schema: Schema | None = None) -> Non
 
 def _measurements() -> Schema:
     return Schema(APPLICATION, MIGRATIONS, "measurements")
+
+
+def store_error(path: Path, what: str, error: Exception) -> InputError:
+    """What is said of a file that cannot be read or written as a store."""
+    next_step = what_to_do_about_store(error) or _MOVE
+    return InputError(f"{path}: cannot be used as a store of {what} ({error}). {next_step}")
 
 
 _MOVE = "Move it away, and run `reseau measure` again."

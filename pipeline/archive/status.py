@@ -3,8 +3,8 @@
 import csv
 import io
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,11 +14,16 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline.archive.asked import asked_of
+from pipeline.archive.decided import by_image, decisions_hash
+from pipeline.archive.decision_check import inapplicable, shortened, unknown_images
+from pipeline.archive.digests import DamagedError, is_sound
 from pipeline.archive.file_state import FileStates
+from pipeline.archive.judging import judged_records, latest
 from pipeline.archive.store import Store
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
+from pipeline.results.measured_scan import FailureCode
 
 NAMED = 20  # scans that a summary names
 _LOOK = (Verdict.FAILED, Verdict.POOR, Verdict.LOOK)  # the worst first
@@ -40,9 +45,10 @@ class ScanStatus(NamedTuple):  # archives have many
 
 @dataclass(frozen=True)
 class ArchiveStatus:
-    """Every scan of a project, by name. problem: of the store as a whole, such as that it is not there."""
+    """Every scan of a project, by name. idle_decisions: lines of decisions.jsonl that do not apply, and why."""
 
     scans: tuple[ScanStatus, ...]
+    idle_decisions: tuple[str, ...] = ()
 
     @property
     def counts(self) -> Mapping[Verdict, int]:
@@ -51,36 +57,57 @@ class ArchiveStatus:
 
     @property
     def all_good(self) -> bool:
-        return not any(scan.verdict.needs_look for scan in self.scans)
+        return not self.idle_decisions and not any(scan.verdict.needs_look for scan in self.scans)
 
     def of(self, verdict: Verdict | None) -> "ArchiveStatus":
         """The scans of one verdict; None: all."""
-        return self if verdict is None else ArchiveStatus(tuple(s for s in self.scans if s.verdict is verdict))
+        scans = self.scans if verdict is None else tuple(s for s in self.scans if s.verdict is verdict)
+        return replace(self, scans=scans)
 
 
 def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     """By the store, and by which files there are and how they look from outside: no scan is opened. path: of the store,
     if not that of the project."""
     path = path or project.measurement_path
-    rows = {}
+    rows, idle = {}, tuple[str, ...]()
     if path.exists():
         with Store(path) as store:
-            rows = {row[0]: row for row in store.connection.execute(_QUERY)}
+            rows = {row[0]: row for row in _checked(store)}
+            judging = latest(store)
+            idle = inapplicable(store, judging.digest) if judging is not None else ()
     files, cameras = FileStates(project.path.resolve().parent), project.cameras.values()
     camera_names = {id(camera): camera.path.name for camera in cameras}
-    scans, asked = [], asked_of(project)
+    scans, asked, decisions = [], asked_of(project), by_image(project.decisions)
     for name, file in as_named(project.scans).items():
         state, camera = files.of(file), camera_names[id(project.camera_of(name))]
         found = rows.get(state.uri)
         if found is None or found[5] is None:
             scans.append(ScanStatus(name, state.uri, camera, Verdict.WAITING))
             continue
-        _, bytes_, mtime_ns, etag, is_current, verdict, why, failure, seconds, finished, told = found
+        _, bytes_, mtime_ns, etag, is_current, verdict, why, failure, seconds, finished, told, taken_in = found
         is_same = is_current and (bytes_, mtime_ns, etag) == (state.bytes, state.mtime_ns, state.etag)
         is_now = is_same and told in (None, asked(name))
         now = _VERDICTS[verdict] if is_now else Verdict.OLD
+        if is_now and taken_in is not None and taken_in != decisions_hash(decisions.get(name, ())):
+            now, why = Verdict.OLD, "what is decided about it now is not taken in yet"
         scans.append(ScanStatus(name, state.uri, camera, now, why or "", failure or "", seconds, finished))
-    return ArchiveStatus(tuple(sorted(scans, key=itemgetter(0))))
+    unknown = shortened([f"line {number}: {why}" for number, why in sorted(unknown_images(project))])
+    return ArchiveStatus(tuple(sorted(scans, key=itemgetter(0))), tuple(dict.fromkeys((*unknown, *idle))))
+
+
+def _checked(store: Store) -> Iterator[Sequence[Any]]:
+    """The rows of the query; one that is not as it was written says that, and nothing else. Of frames of which a mark's
+    reason may be told, the marks are checked, too."""
+    rows, judging = store.connection.execute(_QUERY).fetchall(), latest(store)
+    told = {row[-2] for row in rows if row[6] and row[-2]}
+    records = judged_records(store, judging, told) if judging is not None and told else ()
+    damaged = {name for name, record in records if isinstance(record, DamagedError)}
+    why = "what is stored of it is not what was measured: `reseau measure --retry` measures it again"
+    for *row, name, is_whole in rows:
+        if is_whole and name not in damaged:
+            yield row
+        else:
+            yield (*row[:5], str(Verdict.FAILED), why, str(FailureCode.DAMAGED), None, "", row[10], None)
 
 
 _VERDICTS = {str(verdict): verdict for verdict in Verdict}
@@ -90,7 +117,10 @@ with latest as (select max(id) as id from judging where digest not like 'unfinis
 seen as (
     select scan.uri, scan.bytes, scan.mtime_ns, scan.etag, scan.is_current, scan.asked,
         coalesce(judged_frame.verdict, result.verdict) as verdict, result.seconds, result.finished,
-        latest.id as judging, scan.id as scan, result.id as result, scan.duplicate_of as original
+        latest.id as judging, scan.id as scan, result.id as result, scan.duplicate_of as original,
+        judged_frame.decisions, judged_frame.name,
+        {scan} and (scan.result is null or {result} and result.scan = scan.id)
+        and (judged_frame.result is null or {frame}) as is_whole
     from scan left join latest left join result on result.id = scan.result
     left join judged_frame on judged_frame.judging = latest.id and judged_frame.scan = scan.id
         and judged_frame.result = scan.result
@@ -110,9 +140,9 @@ select uri, bytes, mtime_ns, etag, is_current, verdict,
          order by number limit 1)
     ) end,
     case when verdict = 'failed' then (select detail ->> '$.failure.code' from result where id = seen.result) end,
-    seconds, finished, asked
+    seconds, finished, asked, decisions, name, is_whole
 from seen
-"""
+""".format(scan=is_sound("scan"), result=is_sound("result"), frame=is_sound("judged_frame"))
 
 
 def status_json(status: ArchiveStatus) -> dict[str, Any]:
@@ -134,6 +164,7 @@ def status_json(status: ArchiveStatus) -> dict[str, Any]:
             for scan in status.scans
             if scan.verdict.needs_look
         },
+        "decisions_that_do_not_apply": list(status.idle_decisions),
     }
 
 
@@ -160,6 +191,8 @@ def print_status(status: ArchiveStatus, console: Console, every: bool = False) -
     named, more = worst_named(status.scans, len(status.scans) if every else NAMED, every)
     for scan in named:
         console.print(Text(f"{scan.verdict}: {scan.image}{f': {scan.why}' if scan.why else ''}"), soft_wrap=True)
+    for line in status.idle_decisions:
+        console.print(Text(f"decisions.jsonl, {line}"), soft_wrap=True)
     if more:
         console.print(Text(f"... and {more} more: --verdict names all of one verdict", style="dim"))
 

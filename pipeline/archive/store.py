@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any, Self
 
 from measure.revision import MEASURE_REVISION
+from pipeline.archive.digests import IS_JUDGING_SOUND, DamagedError, damaged_results, is_sound, marks_digest, seal
 from pipeline.archive.file_state import FileState, Identity
 from pipeline.archive.key import fingerprint, options_hash
-from pipeline.archive.schema import opened
+from pipeline.archive.schema import opened, store_error
 from pipeline.archive.verdicts import Verdict, verdict_of
 
 Json = dict[str, Any]
@@ -61,8 +62,11 @@ class Store:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Raises InputError for whatever SQLite refused in the block: of a damaged file any read may be that."""
         self.close()
+        if isinstance(error, sqlite3.Error):
+            raise store_error(self.path, "measurements", error) from error
 
     def close(self) -> None:
         self._db.close()
@@ -71,18 +75,19 @@ class Store:
 
     def identities(self) -> dict[str, Identity]:
         """Of every scan that was ever measured, by uri, as it was then."""
-        rows = self._db.execute("select uri, bytes, mtime_ns, etag, identity_hash from scan")
+        rows = self._db.execute(f"select uri, bytes, mtime_ns, etag, identity_hash from scan where {is_sound('scan')}")
         return {uri: Identity(FileState(uri, *state), parts) for uri, *state, parts in rows}
 
     def fingerprints(self) -> dict[str, int]:
-        """Every result's row by its fingerprint."""
-        return dict(self._db.execute("select fingerprint, id from result"))
+        """Every result's row by its fingerprint, as the table has it and not an index of it."""
+        return dict(self._db.execute(f"select fingerprint, id from result not indexed where {is_sound('result')}"))
 
     def set_project(self, names: Mapping[str, str]) -> None:
         """names: of the images that the project has now, by uri. None of them is current until it is said."""
         with self.writing():
             self._db.execute("update scan set name = null, is_current = 0")
             self._db.executemany("update scan set name = ? where uri = ?", ((n, uri) for uri, n in names.items()))
+            self._db.execute(seal("scan"))
 
     def set_current(self, results: Mapping[int, str]) -> None:
         """These results are those of their scans by today's file and options, and by what is asked of each."""
@@ -92,6 +97,7 @@ class Store:
                 "where id = (select scan from result where id = ?1)",
                 results.items(),
             )
+            self._db.execute(seal("scan"))
 
     # --- results
 
@@ -104,17 +110,65 @@ class Store:
             if current:
                 values = (result, asked, scan)
                 self._db.execute("update scan set result = ?, is_current = 1, asked = ? where id = ?", values)
+            self._db.execute(f"{seal('scan')} where id = ?", (scan,))
             return result
 
     def record(self, result: int) -> Json:
-        """The record of a result, as it was kept."""
-        rows = self._db.execute(f"select {MARK_COLUMNS} from mark where result = ? order by number", (result,))
-        return {**self.detail(result), "marks": [mark_of(row) for row in rows]}
+        """The record of a result, as it was kept. Raises DamagedError where that was changed since."""
+        detail, digest = self._detail(result)
+        rows = self._db.execute(
+            f"select number, {MARK_COLUMNS} from mark where result = ? order by number", (result,)
+        ).fetchall()
+        if marks_digest(rows) != digest:
+            raise self._damaged(result)
+        try:
+            return {**json.loads(detail), "marks": [mark_of(row) for _, *row in rows]}
+        except (ValueError, TypeError, KeyError):  # of a file that was damaged before its rows had digests
+            raise self._damaged(result) from None
 
     def detail(self, result: int) -> Json:
-        """All of its record but the marks."""
-        (detail,) = self._db.execute("select detail from result where id = ?", (result,)).fetchone()
-        return dict(json.loads(detail))
+        """All of its record but the marks. Raises DamagedError as `record`."""
+        return dict(json.loads(self._detail(result)[0]))
+
+    def _detail(self, result: int) -> tuple[str, str]:
+        query = f"select detail, marks_digest from result where id = ? and {is_sound('result')}"
+        found = self._db.execute(query, (result,)).fetchone()
+        if found is None:
+            raise self._damaged(result)
+        return str(found[0]), str(found[1])
+
+    def _damaged(self, result: int) -> DamagedError:
+        found = self._db.execute(
+            "select coalesce(name, uri) from scan where result = ?1 or id = (select scan from result where id = ?1)",
+            (result,),
+        ).fetchone()
+        return DamagedError.of_image(str(found[0]) if found else "(unknown)", self.path)
+
+    def has_damaged_rows(self) -> bool:
+        """Whether a scan, a result or what scans tell others is not as it was written; marks are not looked at."""
+        tables = ("scan", "result", "kept")
+        found = [f"exists (select 1 from {table} not indexed where not {is_sound(table)})" for table in tables]
+        found += [f"exists (select 1 from judging where digest not like 'unfinished%' and not {IS_JUDGING_SOUND})"]
+        return bool(self._db.execute(f"select {' or '.join(found)}").fetchone()[0])
+
+    def forget_damaged(self) -> int:
+        """Away with results and scans that are not as they were written, so that they are measured again, and with all
+        that was made of them; how many. Raises sqlite3.Error where the file itself is damaged."""
+        with self.writing():
+            lost = damaged_results(self._db)
+            scans = self._db.execute(f"select id from scan where not {is_sound('scan')}").fetchall()
+            for (scan,) in scans:
+                lost |= {row for (row,) in self._db.execute("select id from result where scan = ?", (scan,))}
+            self._db.execute("delete from judging")
+            rows = [(row,) for row in sorted(lost)]
+            self._db.executemany("delete from mark where result = ?", rows)
+            self._db.executemany("update scan set result = null, is_current = 0 where result = ?", rows)
+            self._db.executemany("delete from result where id = ?", rows)
+            self._db.executemany("update scan set duplicate_of = null where duplicate_of = ?", scans)
+            self._db.executemany("delete from scan where id = ?", scans)
+            self._db.execute(f"delete from kept where not {is_sound('kept')}")
+            self._db.execute(seal("scan"))
+        return len(lost)
 
     def written(self) -> set[int]:
         """The rows of the results of scans on which something is written."""
@@ -132,6 +186,7 @@ class Store:
             failed = f"select id from result where verdict = '{Verdict.FAILED}'"
             self._db.execute(f"delete from mark where result in ({failed})")
             self._db.execute(f"update scan set result = null, is_current = 0 where result in ({failed})")
+            self._db.execute(seal("scan"))
             return self._db.execute(f"delete from result where id in ({failed})").rowcount
 
     def failures(self) -> list[str] | None:
@@ -158,15 +213,18 @@ class Store:
             self._db.executemany(
                 "update scan set content_hash = ? where uri = ?", ((hash, uri) for uri, hash in hashes.items())
             )
+            self._db.executemany(f"{seal('scan')} where uri = ?", ((uri,) for uri in hashes))
 
     def set_copies(self, copies: Mapping[str, str]) -> None:
         """copies: by uri the name of the image whose file it is a copy of. No other scan is one."""
         with self.writing():
+            before = self._db.execute("select uri from scan where duplicate_of is not null").fetchall()
             self._db.execute("update scan set duplicate_of = null where duplicate_of is not null")
             self._db.executemany(
                 "update scan set duplicate_of = (select id from scan where name = ?) where uri = ?",
                 ((name, uri) for uri, name in copies.items()),
             )
+            self._db.executemany(f"{seal('scan')} where uri = ?", (*before, *((uri,) for uri in copies)))
 
     def move(self, uri: str, identity: Identity) -> dict[str, str]:
         """A scan's file is elsewhere or touched, its content the same: its results have the key of what it is now.
@@ -190,6 +248,9 @@ class Store:
                 "update result set fingerprint = ? where fingerprint = ?",
                 ((now, before) for before, now in keys.items()),
             )
+            own = "where scan = (select id from scan where uri = ?)"
+            self._db.execute(f"{seal('result')} {own}", (state.uri,))
+            self._db.execute(seal("scan"))
         return keys
 
     def _forget(self, uri: str) -> None:
@@ -205,13 +266,19 @@ class Store:
     # --- what scans of a project tell the others
 
     def told(self, key: str) -> Json | None:
-        """What was kept by `tell`."""
-        row = self._db.execute("select value from kept where key = ?", (key,)).fetchone()
+        """What was kept by `tell`. Raises DamagedError where that was changed since."""
+        row = self._db.execute(f"select value, {is_sound('kept')} from kept where key = ?", (key,)).fetchone()
+        if row is not None and not row[1]:
+            raise DamagedError(
+                f"{self.path}: what is stored of {key.partition(' ')[0]} is not as it was written: the file was "
+                "changed or is damaged. Run `reseau measure --retry`, which makes it again."
+            )
         return None if row is None else json.loads(row[0])
 
     def tell(self, key: str, value: Json) -> None:
         with self.writing():
-            self._db.execute("insert or replace into kept values (?, ?)", (key, json.dumps(value)))
+            self._db.execute("insert or replace into kept (key, value) values (?, ?)", (key, json.dumps(value)))
+            self._db.execute(f"{seal('kept')} where key = ?", (key,))
 
     @property
     def connection(self) -> sqlite3.Connection:
@@ -279,6 +346,7 @@ class Store:
         assert result is not None
         rows = ((result, number, *row_of(mark)) for number, mark in enumerate(record["marks"]))
         self._db.executemany(f"insert into mark (result, number, {MARK_COLUMNS}) values ({places(14)})", rows)
+        seal_result(self._db, result)
         return result
 
     def _options(self, options_json: str) -> int:
@@ -303,6 +371,13 @@ def known_identities(path: Path) -> dict[str, Identity]:
         return {}
     with Store(path) as store:
         return store.identities()
+
+
+def seal_result(db: sqlite3.Connection, result: int) -> None:
+    """Set the digests of a result that was written with its marks, as the table has them now."""
+    rows = db.execute(f"select number, {MARK_COLUMNS} from mark where result = ? order by number", (result,))
+    db.execute("update result set marks_digest = ? where id = ?", (marks_digest(rows), result))
+    db.execute(f"{seal('result')} where id = ?", (result,))
 
 
 def places(count: int) -> str:

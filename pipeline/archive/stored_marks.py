@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.archive.digests import check_judging, damaged_frames
 from pipeline.archive.judging import Judging, judged_marks, judging_of, marks_as_written
 from pipeline.archive.measurement import measured_scans, pitches
 from pipeline.archive.store import Store
@@ -51,12 +52,15 @@ class StoredMarks:
 
     @classmethod
     def of(cls, path: Path, comparator: Path) -> "StoredMarks | None":
-        """path: of the store. None where the file has other marks than the store, or somebody has changed it."""
+        """path: of the store. None where the file has other marks than the store, or somebody has changed either."""
         if not path.exists() or not comparator.exists() or not (digest := measurement_of(comparator)):
             return None
         with Store(path) as store:
             judging = judging_of(store, digest)
             is_written = judging is not None and marks_as_written(store, digest, comparator)
+            if judging is not None and is_written:
+                check_judging(store.connection, judging.row, path)
+                is_written = not damaged_frames(store.connection, judging.row)
         return cls(path, judging) if judging is not None and is_written else None
 
     @cached_property

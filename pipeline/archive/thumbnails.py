@@ -3,11 +3,12 @@
 It holds nothing that the scans do not: it may be deleted, and then pictures are cut from the scans again.
 """
 
+import sqlite3
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
-from pipeline.archive.schema import Schema, opened
+from pipeline.archive.schema import Schema, opened, store_error
 from pipeline.results.thumbnail import StoredThumbnail
 
 _FIRST = """
@@ -20,7 +21,9 @@ create table thumbnail (
     primary key (fingerprint, point, kind)
 );
 """
-_SCHEMA = Schema(0x52455354, (_FIRST,), "thumbnails")  # "REST"
+_DIGESTS = "alter table thumbnail add column digest text"  # BLAKE2b of the picture and where it lies; null: not known
+_SCHEMA = Schema(0x52455354, (_FIRST, _DIGESTS), "thumbnails")  # "REST"
+_DIGEST = "row_digest(point, kind, col_px, row_px, step_px, jpeg)"
 _COLUMNS = "point, kind, col_px, row_px, step_px, jpeg"
 
 
@@ -29,7 +32,7 @@ class ThumbnailStore:
 
     def __init__(self, path: Path) -> None:
         """Raises InputError for a file that is no such store."""
-        self._db = opened(path, _SCHEMA)
+        self._path, self._db = path, opened(path, _SCHEMA)
 
     @classmethod
     def beside(cls, measurement: Path) -> "ThumbnailStore":
@@ -39,8 +42,11 @@ class ThumbnailStore:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Raises InputError for what SQLite refused of this file in the block."""
         self.close()
+        if isinstance(error, sqlite3.Error):
+            raise store_error(self._path, "thumbnails", error) from error
 
     def close(self) -> None:
         self._db.close()
@@ -52,14 +58,18 @@ class ThumbnailStore:
             f"insert or replace into thumbnail (fingerprint, {_COLUMNS}) values (?, ?, ?, ?, ?, ?, ?)",
             ((fingerprint, one.point, one.kind, *one.origin_px, one.step_px, one.jpeg) for one in thumbnails),
         )
+        self._db.execute(f"update thumbnail set digest = {_DIGEST} where fingerprint = ?", (fingerprint,))
         self._db.execute("commit")
 
     def of(self, fingerprint: str, point: str = "", kind: str = "frame") -> StoredThumbnail | None:
-        """That of a mark of a result, or of the whole scan; None where there is none."""
-        where = "fingerprint = ? and point = ? and kind = ?"
-        found = self._db.execute(
-            f"select {_COLUMNS} from thumbnail where {where}", (fingerprint, point, kind)
-        ).fetchone()
+        """That of a mark of a result, or of the whole scan; None where there is none that is as it was written."""
+        where = f"fingerprint = ? and point = ? and kind = ? and digest is {_DIGEST}"
+        try:
+            found = self._db.execute(
+                f"select {_COLUMNS} from thumbnail where {where}", (fingerprint, point, kind)
+            ).fetchone()
+        except sqlite3.Error:  # the scan itself is there
+            return None
         if found is None:
             return None
         point, kind, col_px, row_px, step_px, jpeg = found
@@ -79,7 +89,8 @@ class ThumbnailStore:
         for path in filter(Path.is_file, map(thumbnails_path, measurements)):
             opened(path, _SCHEMA).close()
             self._db.execute("attach ? as other", (str(path),))
-            self._db.execute("insert or ignore into thumbnail select * from other.thumbnail")
+            columns = f"fingerprint, {_COLUMNS}, digest"
+            self._db.execute(f"insert or ignore into thumbnail ({columns}) select {columns} from other.thumbnail")
             self._db.execute("detach other")
 
 

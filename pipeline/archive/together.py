@@ -50,7 +50,10 @@ def judged_lots(
     keys, said = work.keys(), _said_by_writing(project, own, work)
 
     def lot(some: Sequence[ScanTask], depends_on: object, scans: Callable[[], Iterable[MeasuredScan]]) -> Lot:
-        results = [[task.name, keys[task.name], work.counting(task.name)] for task in some]
+        results = [
+            [task.name, keys[task.name], work.counting(task.name), *filter(None, [work.decisions_hash(task.name)])]
+            for task in some
+        ]
         made_by = [version("reseau"), MEASURE_REVISION]
         return Lot(
             fingerprint([results, depends_on, made_by]), lambda: (_judged(scan, work, project) for scan in scans())
@@ -169,7 +172,8 @@ def _with_said(scan: MeasuredScan, said: Said) -> MeasuredScan:
 
 def _judged(scan: MeasuredScan, work: Work, project: Project) -> JudgedScan:
     name = scan.frame.image
-    return JudgedScan(name, work.results[name], record_of(work.decided(scan), project.path.resolve().parent))
+    record = record_of(work.decided(scan), project.path.resolve().parent)
+    return JudgedScan(name, work.results[name], record, work.decisions_hash(name))
 
 
 def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:

@@ -31,7 +31,7 @@ MEANING = {
     Verdict.POOR: "Hardly usable: too few marks were found to tell where the frame is, or to check one by another.",
     Verdict.FAILED: "Nothing was measured: the file is missing, damaged or no scan, or its process was ended.",
     Verdict.WAITING: "Not measured yet.",
-    Verdict.OLD: "Measured with other options, or before the file was changed; not measured as it is now.",
+    Verdict.OLD: "Stale: the file, the options or the decisions about it are others than when it was measured.",
 }
 
 NEXT_STEP = {
@@ -41,7 +41,7 @@ NEXT_STEP = {
     Verdict.POOR: "Look at the scan: is it of this camera, whole, sharp? Scan it again, or name it in `exclude`.",
     Verdict.FAILED: "Mend or replace the file, which is noticed; `--retry` after an outage; or name it in `exclude`.",
     Verdict.WAITING: "Run `reseau measure`.",
-    Verdict.OLD: "Run `reseau measure`: it measures these anew, and no others.",
+    Verdict.OLD: "Run `reseau measure`: it measures or judges these anew, and no others.",
 }
 
 _OF_MARK = {

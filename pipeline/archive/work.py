@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from measure.scans.addresses import scan_path
 from pipeline.archive.asked import asked_of
-from pipeline.archive.decided import after_checks, before_checks, by_image, decided
+from pipeline.archive.decided import after_checks, before_checks, by_image, decided, decisions_hash
 from pipeline.archive.expected_time import ExpectedTime
 from pipeline.archive.file_state import FileState, FileStates, Identity
 from pipeline.archive.identity import parts_hash
@@ -95,9 +95,22 @@ class Work:
         bare = {"marks": (), "problems": (), "problem_codes": (), "notes": ()}
         return scan_of(name, {**self._store.detail(self.results[name]), **bare}, self._folder)
 
+    @property
+    def decisions(self) -> Mapping[str, Sequence[Decision]]:
+        """All about scans, by image, the oldest first."""
+        return self._decisions
+
+    def counting_of(self, name: str) -> Mapping[About, Decision]:
+        """The decisions that count of an image, by what they are about."""
+        return self._counting.get(name, {})
+
     def counting(self, name: str) -> list[Decision]:
         """The decisions that count of an image."""
         return [one for _, one in sorted(self._counting.get(name, {}).items())]
+
+    def decisions_hash(self, name: str) -> str:
+        """Of the decisions about an image, whether they count or not."""
+        return decisions_hash(self._decisions.get(name, ()))
 
     def decided(self, scan: MeasuredScan) -> MeasuredScan:
         """A scan that was checked, as decisions have it."""

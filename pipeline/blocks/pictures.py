@@ -15,6 +15,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.frame_chain import FrameChain
 from pipeline.resampling.resample_stage import ResampleTask
+from pipeline.text.output_paths import file_word, path_below
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -93,9 +94,9 @@ def write_pictures(
         lattice = lattice_of(camera, task.pitch_mm)
         picture, mask = _cut(task.target, lattice)
         mask = mask & _usable(camera, lattice)
-        name = f"{_word(task.camera)}/{task.image.replace('/', '_')}.png"
+        name = f"{file_word(task.camera)}/{task.image.replace('/', '_')}.png"
         for kind, content in (("pictures", _eight_bits(picture, mask)), ("masks", mask.astype(np.uint8) * 255)):
-            path = folder / kind / (name if kind == "pictures" else f"{name}.png")
+            path = path_below(folder / kind, name, "" if kind == "pictures" else ".png")
             path.parent.mkdir(parents=True, exist_ok=True)
             if not cv2.imwrite(str(path), content):
                 raise InputError(f"{path}: cannot be written. Make room there, or set another output folder.")
@@ -152,7 +153,3 @@ def _eight_bits(picture: Array, mask: NDArray[np.bool_]) -> Picture:
     dark, light = np.percentile(picture[mask], (_DARKEST, _LIGHTEST))
     scaled = (picture - dark) * (255.0 / max(light - dark, 1e-9))
     return np.asarray(np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
-
-
-def _word(name: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in name)

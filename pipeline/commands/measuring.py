@@ -139,7 +139,8 @@ def merge(
 
     taken, summary = run_merge(read(project), stores, Reporter())
     if not as_json:
-        say(*(f"{one.path}: {counted(one.results, 'result')}, {one.new} of them new" for one in taken))
+        left_out = {one.path: f", {one.damaged} not as written and left out" if one.damaged else "" for one in taken}
+        say(*(f"{o.path}: {counted(o.results, 'result')}, {o.new} of them new{left_out[o.path]}" for o in taken))
     return finish(summary, as_json)
 
 

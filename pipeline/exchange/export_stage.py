@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.metadata import version
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, read_block
@@ -15,6 +15,7 @@ from pipeline.exchange.convention import FORMATS, Convention, ExportOptions, Wri
 from pipeline.files.project_file import Project
 from pipeline.results.comparator_file import decisions_of, decisions_told
 from pipeline.text.atomic import write_atomically, writing
+from pipeline.text.output_paths import path_below
 
 README = "README.txt"
 _HEAD = "Written by reseau"
@@ -79,12 +80,14 @@ def _is_own(path: Path) -> bool:
 
 
 def publish(folder: Path, files: Mapping[str, str | bytes]) -> None:
-    """All files into a folder of their own, which then takes the place of the earlier one."""
+    """All files into a folder of their own, which then takes the place of the earlier one. Raises InputError for the
+    name of a file that would lead out of it."""
     new = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     old = folder.with_name(f".{folder.name}.{os.getpid()}.old")
     try:
-        for place, content in files.items():
-            write_atomically(new / PurePosixPath(place), content)
+        places = {path_below(folder, name).relative_to(folder): content for name, content in files.items()}
+        for place, content in places.items():
+            write_atomically(new / place, content)
         with writing(folder):
             if folder.exists():
                 os.replace(folder, old)

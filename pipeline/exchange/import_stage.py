@@ -1,6 +1,5 @@
 """`reseau import`: marks, cameras and poses of other programs, and certificates, as files of this one."""
 
-import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import ELEMENTS
 from pipeline.results.comparator_file import COLUMNS, comparator_from_pixel
 from pipeline.text.csv_table import csv_line
+from pipeline.text.output_paths import file_word
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,7 @@ def _cameras(cameras: Sequence[CameraFile]) -> dict[str, str]:
     """camera.toml, or files by name where there are several; equal ones once."""
     files: dict[str, str] = {}
     for camera in cameras:
-        word = re.sub(r"[^\w.-]", "-", camera.name) or "camera"
-        name = "camera.toml" if len(cameras) == 1 else f"{word}.toml"
+        name = "camera.toml" if len(cameras) == 1 else f"{file_word(camera.name or 'camera')}.toml"
         text = camera_text(replace(camera, path=Path(name)), lambda *_: "")
         if files.setdefault(name, text) != text:
             raise InputError(f"two cameras of the name {camera.name!r} differ. Import them one by one.")

@@ -18,6 +18,7 @@ from pipeline.exchange.pinhole import check_misfit, sight_misfit_mm
 from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, xml_lines, xml_text
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.canvas import Canvas
+from pipeline.text.output_paths import file_word
 
 CONVENTION = Convention(
     (0.5, 0.5),
@@ -48,7 +49,7 @@ def write(block: Block, options: ExportOptions) -> Written:
         lens, box = sheared_lens(block, own[0], at_ideal=False), box_of(block, own[0], options)
         misfit = {frame.image: (lens.largest_mm + sight_misfit_mm(block, frame)) / box.pitch_mm for frame in own}
         check_misfit(misfit, options, "metashape")
-        files[f"{_calibration_name(camera)}.xml"] = _calibration(lens, box)
+        files[f"{file_word(camera)}.xml"] = _calibration(lens, box)
         notes.append(f"{camera}: the lens was fitted over the frame: off by {max(misfit.values()):.2g} px at most.")
     data = {
         "cameras": {camera: _camera(block, camera, files) for camera in dict.fromkeys(f.camera for f in frames)},
@@ -85,7 +86,7 @@ def _camera(block: Block, name: str, files: dict[str, str | bytes]) -> dict[str,
         if adjusted
         else {fiducial.id: fiducial.xy_mm for fiducial in file.fiducials}
     )
-    calibration = f"{_calibration_name(name)}.xml"
+    calibration = f"{file_word(name)}.xml"
     return {
         "focal_length_mm": adjusted["principal_distance_mm"]["value"] if adjusted else file.principal_distance_mm,
         "calibration": calibration if calibration in files else None,
@@ -135,10 +136,6 @@ def _calibration(lens: FittedLens, box: Canvas) -> str:
     for name, value in values.items():
         content += xml_lines(name, plain_number(value))
     return xml_text(xml_lines("calibration", content))
-
-
-def _calibration_name(camera: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in camera)
 
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:

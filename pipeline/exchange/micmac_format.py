@@ -20,6 +20,7 @@ from pipeline.exchange.xml_tree import Element, numbers_of, plain_number, read_x
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.image_names import image_name
+from pipeline.text.output_paths import file_word
 
 Array = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ def write(block: Block, options: ExportOptions) -> Written:
     left_out: list[str] = []
     for camera in cameras:
         frames = [frame for frame in block.frames if frame.camera == camera]
-        folder = f"{_file_word(camera)}/" if len(cameras) > 1 else ""
+        folder = f"{file_word(camera)}/" if len(cameras) > 1 else ""
         part = _camera_files(block, camera, frames, options)
         files |= {f"{folder}{place}": content for place, content in part.files.items()}
         notes += part.notes
@@ -85,7 +86,7 @@ def _camera_files(block: Block, camera: str, frames: Sequence[OutFrame], options
     reech = _REECH if fiducials else ""
     misfit = {each.image: (lens.largest_mm + sight_misfit_mm(block, each)) / box.pitch_mm for each in oriented}
     check_misfit(misfit, options, "micmac")
-    calibration = f"Ori-Reseau/AutoCal_{_file_word(camera)}.xml"
+    calibration = f"Ori-Reseau/AutoCal_{file_word(camera)}.xml"
     files[calibration] = _calibration(lens, box)
     for frame in oriented:
         files[f"Ori-Reseau/Orientation-{reech}{frame.file_name}.xml"] = _orientation(frame, calibration)
@@ -247,10 +248,6 @@ def affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canva
 
 def _no_orientation(camera: str) -> tuple[str, ...]:
     return (f"{camera}: no image is oriented, so there are marks only: camera and poses come by object points.",)
-
-
-def _file_word(name: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in name)
 
 
 def _numbers(values: Array) -> str:

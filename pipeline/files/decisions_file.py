@@ -4,20 +4,29 @@ The last line about a mark counts; an `undo` takes back the last one before it. 
 only grows, so that who decided what, and when, can be seen for ever.
 """
 
+import gc
 import json
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from measure.marks.poses import POSES
 from pipeline.errors import InputError
-from pipeline.text.atomic import writing
+from pipeline.results.fingerprints import NO_FINGERPRINT
+from pipeline.text.atomic import write_atomically, writing
 from pipeline.text.spelling import did_you_mean
 from pipeline.text.text_file import read_bytes, shown
+
+try:
+    import fcntl
+except ImportError:  # not every system has it
+    fcntl = None  # type: ignore[assignment]
 
 FILE = "decisions.jsonl"
 KINDS = ("fiducial", "target", "tie")
@@ -51,13 +60,16 @@ About = tuple[str, str, str]  # image, point, kind; of a pose: image, "", ""; of
 
 OF_SCANS = (Choice.POSE, Choice.LEARN, Choice.UNDO)  # and of no single mark
 _LONGEST_LINE = 4_000_000  # bytes
+_AT_A_TIME = 10_000  # lines
+_MOST_MB = 2000
+_NO_PLACES: Mapping[str, tuple[float, float]] = {}
 
 
 @dataclass(frozen=True)
 class Decision:
     """One line. point, kind: of the mark; "" for a pose. col_px, row_px: of `place`. fingerprint: of the result that
     was looked at, and of `learn` the SHA-256 of the scan's file; window: what of it was seen, first column, first row,
-    width and height in px. px: of `learn`. when: ISO 8601."""
+    width and height in px. px: of `learn`. when: ISO 8601. line: its number in the file, 0 of one that is in none."""
 
     image: str
     decision: Choice
@@ -72,6 +84,7 @@ class Decision:
     fingerprint: str = ""
     window: tuple[float, float, float, float] | None = None
     px: Mapping[str, tuple[float, float]] = field(default_factory=dict, hash=False)
+    line: int = field(default=0, compare=False, metadata=NO_FINGERPRINT)
 
     @property
     def about(self) -> About:
@@ -80,37 +93,70 @@ class Decision:
 
 
 def read_decisions(path: Path) -> tuple[Decision, ...]:
-    """All of them; none where there is no such file. A last line that a crash cut short was never confirmed, and does
-    not count. Raises InputError naming the line."""
+    """All of them; none where there is no such file. A last line that was cut short does not count, and
+    `cut_short_line` names it. Raises InputError naming the line."""
     return parse_decisions(path, decisions_bytes(path))
 
 
-def decisions_bytes(path: Path) -> bytes:
-    """The file as it stands; nothing where there is none. Raises InputError for what is no file."""
+def decisions_bytes(path: Path, start: int = 0) -> bytes:
+    """The file as it stands, from a byte on, without lines that a process was ended over before all of them were
+    written; nothing where there is no file. Raises InputError for what is no file."""
     try:
-        return read_bytes(path)
+        with _locked(path):
+            data, confirmed = read_bytes(path, _MOST_MB), _confirmed_bytes(path)
     except FileNotFoundError:
         return b""
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; decisions are a file. Move the folder away.") from None
+    return data[start:confirmed]
 
 
 def parse_decisions(path: Path, data: bytes, first_line: int = 1) -> tuple[Decision, ...]:
     """The same of lines of the file, from one on. path: for messages."""
-    lines = data.split(b"\n")
-    if lines[-1] and not _is_json(lines[-1]):
+    lines, decisions = data.split(b"\n"), list[Decision]()
+    if _is_cut_short(lines[-1]):
         lines.pop()
-    return tuple(_decision(path, number, line) for number, line in enumerate(lines, first_line) if line.strip())
+    with _without_search_for_cycles():
+        for start in range(0, len(lines), _AT_A_TIME):
+            numbered = list(enumerate(lines[start : start + _AT_A_TIME], first_line + start))
+            numbered = [(number, line) for number, line in numbered if line and not line.isspace()]
+            number = 0
+            try:
+                for number, told in _objects(numbered):
+                    decisions.append(_decision(told, number))
+            except _LineError as error:
+                raise InputError(f"{path}, line {error.number or number}{error}") from None
+    return tuple(decisions)
+
+
+def cut_short_line(data: bytes) -> int:
+    """The number of the last line of a file where that was cut short and does not count; else 0."""
+    return data.count(b"\n") + 1 if _is_cut_short(data[data.rfind(b"\n") + 1 :]) else 0
 
 
 def append_decisions(path: Path, decisions: Iterable[Decision]) -> None:
-    """Add lines, and return when they are on the disk. Raises WriteError where that cannot be done."""
-    text = "".join(json.dumps(_told(decision), ensure_ascii=False) + "\n" for decision in decisions)
-    with writing(path), path.open("a+b") as file:
-        _end_last_line(file)
-        file.write(text.encode())
-        file.flush()
-        os.fsync(file.fileno())
+    """Add lines, all or none of them, and return when they are on the disk.
+
+    Raises InputError for a decision that would not be read again, before anything is written, and WriteError where
+    the lines cannot be written; then the file is as it was.
+    """
+    text = "".join(_checked_line(decision) for decision in decisions)
+    with writing(path), path.open("a+b") as file, _locked(path, exclusive=True):
+        confirmed = _confirmed_bytes(path)
+        if confirmed is not None:  # a process was ended over its lines
+            file.truncate(confirmed)
+        _end_last_line(file, path)
+        size, journal = file.seek(0, os.SEEK_END), _journal_path(path)
+        write_atomically(journal, str(size))
+        try:
+            file.write(text.encode())
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException:
+            _truncate(path, size)
+            raise
+        finally:
+            journal.unlink(missing_ok=True)
 
 
 def standing(decisions: Sequence[Decision]) -> Mapping[About, Decision]:
@@ -137,124 +183,264 @@ def learned_from(decisions: Sequence[Decision], images: Collection[str]) -> Deci
     return max(left, key=own.index, default=None)
 
 
-def _told(decision: Decision) -> Mapping[str, Any]:
-    return {name: value for name, value in asdict(decision).items() if value not in (None, "", {})}
+# --- writing: the size before the lines stands in a file beside them until all of them are on the disk
 
 
-def _end_last_line(file: BinaryIO) -> None:
-    """A line that somebody wrote without its end gets it; half a line, of a crash, goes."""
+def _checked_line(decision: Decision) -> str:
+    values = {key: getattr(decision, key) for key in _CHECKS}
+    told = {key: value for key, value in values.items() if value not in (None, "", {})}
+    try:
+        line = json.dumps(told, ensure_ascii=False, allow_nan=False)
+        _decision(_json_object(line.encode()), 0)
+    except (_LineError, ValueError) as error:
+        about = f"{decision.image}{f', {decision.point}' if decision.point else ''}"
+        raise InputError(f"the decision about {about}{error}. Nothing was written.") from None
+    return f"{line}\n"
+
+
+def _journal_path(path: Path) -> Path:
+    return path.with_name(f".{path.name}.size")
+
+
+def _confirmed_bytes(path: Path) -> int | None:
+    """How many bytes of the file count, where a process was ended over its lines; None: all."""
+    try:
+        return int(_journal_path(path).read_bytes())
+    except (OSError, ValueError):
+        return None
+
+
+@contextmanager
+def _locked(path: Path, exclusive: bool = False) -> Iterator[None]:
+    """While nobody else writes the file; where the file system has no locks, at once."""
+    with path.open("rb") as file:
+        if fcntl is not None:
+            with suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
+        yield
+
+
+def _truncate(path: Path, size: int) -> None:
+    """To what stood there before. What a buffer still holds is not written any more: it would be an error again."""
+    with suppress(OSError):
+        os.truncate(path, size)
+
+
+def _end_last_line(file: BinaryIO, path: Path) -> None:
+    """A line that somebody wrote without its end gets it; half a line goes. Raises InputError for any other line that
+    is none: with an end it would spoil all that is written behind it."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - _LONGEST_LINE))
     data = file.read()
     last = data[data.rfind(b"\n") + 1 :]
-    if last and _is_json(last):
-        file.write(b"\n")
-    elif last:
+    if _is_cut_short(last):
         file.truncate(size - len(last))
+    elif last.strip():
+        try:
+            _decision(_json_object(last), 0)
+        except _LineError as error:
+            raise InputError(f"{path}, its last line{error} Nothing was written.") from None
+        file.write(b"\n")
 
 
-def _is_place(value: Any) -> bool:
-    is_two = isinstance(value, list) and len(value) == 2
-    return is_two and all(isinstance(one, int | float) and abs(one) < 1e9 for one in value)
+# --- a line and its values
 
 
-def _is_json(line: bytes) -> bool:
+class _LineError(Exception):
+    """What is wrong in a line, as it goes on behind the line's number. number: where only this tells it."""
+
+    def __init__(self, message: str, key: str = "", number: int = 0) -> None:
+        super().__init__(f"{f', {key}' if key else ''}: {message}")
+        self.number = number
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is no number of JSON")
+
+
+_read_json = json.JSONDecoder(parse_constant=_no_number).decode
+
+
+def _is_cut_short(line: bytes) -> bool:
+    """Whether a line ends before its object does, as after a crash; a line with a typing error does not."""
     try:
-        json.loads(line)
+        _read_json(line.decode("utf-8", "replace"))
+    except json.JSONDecodeError as error:
+        ends = error.pos >= len(error.doc.rstrip()) or error.msg.startswith("Unterminated string")
+        return ends and line.lstrip().startswith(b"{")
     except (ValueError, RecursionError):
-        return False
-    return True
+        pass
+    return False
 
 
-def _decision(path: Path, number: int, line: bytes) -> Decision:
+@contextmanager
+def _without_search_for_cycles() -> Iterator[None]:
+    """A million objects without any cycle are made in half the time."""
+    was_enabled = gc.isenabled()
+    gc.disable()
     try:
-        told = json.loads(line)
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def _objects(numbered: Sequence[tuple[int, bytes]]) -> Iterable[tuple[int, Any]]:
+    """The lines' objects, read at once, and one by one only where that fails."""
+    numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
+    if {line[:1] + line[-1:] for line in lines} == {b"{}"}:
+        with suppress(ValueError, RecursionError):
+            told = _read_json(f"[{b','.join(lines).decode()}]")
+            if len(told) == len(lines):
+                return zip(numbers, told, strict=True)
+    return ((number, _json_object(line, number)) for number, line in numbered)
+
+
+def _json_object(line: bytes, number: int = 0) -> Any:
+    try:
+        return _read_json(line.decode())
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}, line {number}: is no JSON ({error}). Mend the line, or take it out.") from None
+        raise _LineError(f"is no JSON ({error}). Mend the line, or take it out.", number=number) from None
+
+
+def _decision(told: Any, number: int) -> Decision:
+    """A line's object, checked key by key."""
     if not isinstance(told, dict):
-        raise InputError(f"{path}, line {number}: must be a JSON object, not {shown(told)}.")
-    line_of = _Line(path, number, told)
-    choice = line_of.one_of("decision", [str(choice) for choice in Choice])
-    decision = Decision(
-        image=line_of.text("image", needed=True),
-        decision=Choice(choice),
-        point=line_of.text("point", needed=choice not in OF_SCANS),
-        kind=_kind(line_of, choice),
-        col_px=line_of.number("col_px", needed=choice == Choice.PLACE),
-        row_px=line_of.number("row_px", needed=choice == Choice.PLACE),
-        pose=line_of.one_of("pose", POSES) if choice == Choice.POSE else "",
-        note=line_of.text("note"),
-        who=line_of.text("who"),
-        when=line_of.when(),
-        fingerprint=line_of.text("fingerprint"),
-        window=line_of.window(),
-        px=line_of.places("px") if choice == Choice.LEARN else {},
-    )
-    if choice in (Choice.POSE, Choice.LEARN) and decision.point:
-        what = "a pose" if choice == Choice.POSE else "what is learned"
-        raise line_of.error("point", f"is of no use: {what} is of the whole scan. Take it out.")
+        raise _LineError(f"must be a JSON object, not {shown(told)}.")
+    for key in _checked_keys((*told, *map(type, told.values()))):
+        told[key] = _CHECKS[key](key, told[key])
+    if "decision" not in told:
+        raise _LineError("is missing.", "decision")
+    choice, needed = _RULES[told["decision"]]
+    for key in needed:
+        if not told.get(key) and told.get(key) != 0.0:
+            raise _LineError(f"must be {_MUST_BE[key]}, not None." if key in _MUST_BE else "is missing.", key)
+    if choice is _POSE or choice is _LEARN:
+        if told.get("point"):
+            what = "a pose" if choice is _POSE else "what is learned"
+            raise _LineError(f"is of no use: {what} is of the whole scan. Take it out.", "point")
+        told["kind"] = "" if choice is _POSE else LEARNED
+    if choice is not _POSE:
+        told["pose"] = ""
+    if choice is not _LEARN:
+        told["px"] = _NO_PLACES
+    told["decision"], told["line"] = choice, number
+    decision = object.__new__(Decision)  # of a million, the constructor of a frozen dataclass takes most of the time
+    object.__setattr__(decision, "__dict__", told)
     return decision
 
 
-def _kind(line: "_Line", choice: str) -> str:
-    if choice == Choice.POSE:
-        return ""
-    return LEARNED if choice == Choice.LEARN else line.one_of("kind", (*KINDS, LEARNED), needed=False)
+@lru_cache(maxsize=4096)
+def _checked_keys(form: tuple[Any, ...]) -> tuple[str, ...]:
+    """Which values of a line are to be checked one by one. form: its keys, and then the types of its values."""
+    keys, types = form[: len(form) // 2], form[len(form) // 2 :]
+    unknown = next((key for key in keys if key not in _CHECKS), None)
+    if unknown is not None:
+        hint = did_you_mean(unknown, _CHECKS)
+        raise _LineError(f"there is no such key.{hint} Known: {', '.join(_CHECKS)}.", unknown)
+    is_text = {key: _CHECKS[key] is _check_text and type is str for key, type in zip(keys, types, strict=True)}
+    return tuple(key for key in keys if not is_text[key])
 
 
-class _Line:
-    """A line of the file, its values checked."""
+def _check_text(key: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise _LineError(f"must be text, not {shown(value)}.", key)
+    return value
 
-    def __init__(self, path: Path, number: int, told: Mapping[str, Any]) -> None:
-        self._path, self._number, self._told = path, number, told
 
-    def error(self, key: str, message: str) -> InputError:
-        return InputError(f"{self._path}, line {self._number}, {key}: {message}")
+def _check_choice(key: str, value: Any) -> str:
+    return value if value.__class__ is str and value in _RULES else _one_of(key, value, _RULES)
 
-    def text(self, key: str, needed: bool = False) -> str:
-        value = self._told.get(key, "")
-        if not isinstance(value, str):
-            raise self.error(key, f"must be text, not {shown(value)}.")
-        if needed and not value:
-            raise self.error(key, "is missing.")
-        return value
 
-    def one_of(self, key: str, choices: Sequence[str], needed: bool = True) -> str:
-        value = self.text(key, needed)
-        if value not in choices and (needed or value):
-            hint = did_you_mean(value, choices)
-            raise self.error(key, f"must be one of {', '.join(choices)}, not {shown(value)}.{hint}")
-        return value
+def _check_kind(key: str, value: Any) -> str:
+    return value if value.__class__ is str and value in _KINDS_OR_NONE else _one_of(key, value, _KINDS_OR_NONE[1:])
 
-    def number(self, key: str, needed: bool) -> float | None:
-        value = self._told.get(key)
-        if value is None and not needed:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
-            raise self.error(key, f"must be a number of pixels, not {shown(value)}.")
-        return float(value)
 
-    def places(self, key: str) -> dict[str, tuple[float, float]]:
-        value = self._told.get(key)
-        if not isinstance(value, dict) or not value or not all(map(_is_place, value.values())):
-            raise self.error(key, 'must be columns and rows by fiducial: {"1": [1863, 1786], ...}.')
-        return {point: (float(col), float(row)) for point, (col, row) in value.items()}
+def _check_pose(key: str, value: Any) -> str:
+    return _one_of(key, value, POSES) if value != "" else value
 
-    def when(self) -> str:
-        value = self.text("when")
-        try:
-            if value:
-                datetime.fromisoformat(value)
-        except ValueError:
-            raise self.error("when", f"must be a time as 2026-01-31T12:00:00+00:00, not {shown(value)}.") from None
-        return value
 
-    def window(self) -> tuple[float, float, float, float] | None:
-        value = self._told.get("window")
-        if value is None:
-            return None
-        is_four = isinstance(value, list) and len(value) == 4
-        if not is_four or not all(isinstance(one, int | float) and abs(one) < 1e9 for one in value):
-            raise self.error("window", "must be four numbers of pixels: first column, first row, width, height.")
-        col, row, width, height = map(float, value)
-        return col, row, width, height
+def _one_of(key: str, value: Any, choices: Collection[str]) -> str:
+    text = _check_text(key, value)
+    if text not in choices:
+        raise _LineError(f"must be one of {', '.join(choices)}, not {shown(value)}.{did_you_mean(text, choices)}", key)
+    return text
+
+
+def _is_pixel(value: Any) -> bool:
+    return (value.__class__ is float or value.__class__ is int) and -1e9 < value < 1e9
+
+
+def _check_pixels(key: str, value: Any) -> float | None:
+    if value is None:
+        return None
+    if not _is_pixel(value):
+        raise _LineError(f"must be {_MUST_BE[key]}, not {shown(value)}.", key)
+    return float(value)
+
+
+def _check_places(key: str, value: Any) -> dict[str, tuple[float, float]]:
+    if not isinstance(value, dict) or not all(map(_is_place, value.values())):
+        raise _LineError(f"must be {_MUST_BE[key]}, not {shown(value)}.", key)
+    return {point: (float(col), float(row)) for point, (col, row) in value.items()}
+
+
+def _is_place(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_pixel, value))
+
+
+def _check_time(key: str, value: Any) -> str:
+    text = _check_text(key, value)
+    if not _is_time(text):
+        raise _LineError(f"must be a time as 2026-01-31T12:00:00+00:00, not {shown(text)}.", key)
+    return text
+
+
+@lru_cache(maxsize=4096)
+def _is_time(text: str) -> bool:
+    try:
+        return not text or bool(datetime.fromisoformat(text))
+    except ValueError:
+        return False
+
+
+def _check_window(key: str, value: Any) -> tuple[float, float, float, float] | None:
+    if value is None:
+        return None
+    if value.__class__ is not list or len(value) != 4 or not all(map(_is_pixel, value)):
+        raise _LineError("must be four numbers of pixels: first column, first row, width, height.", key)
+    return tuple(map(float, value))  # type: ignore[return-value]  # they are four
+
+
+_KINDS_OR_NONE = ("", *KINDS, LEARNED)
+_CHECKS: Mapping[str, Callable[[str, Any], Any]] = {
+    "image": _check_text,
+    "decision": _check_choice,
+    "point": _check_text,
+    "kind": _check_kind,
+    "col_px": _check_pixels,
+    "row_px": _check_pixels,
+    "pose": _check_pose,
+    "note": _check_text,
+    "who": _check_text,
+    "when": _check_time,
+    "fingerprint": _check_text,
+    "window": _check_window,
+    "px": _check_places,
+}
+_POSE, _LEARN = Choice.POSE, Choice.LEARN
+_RULES: Mapping[str, tuple[Choice, tuple[str, ...]]] = {  # the choice, and the keys that it needs
+    "accept": (Choice.ACCEPT, ("image", "point")),
+    "reject": (Choice.REJECT, ("image", "point")),
+    "absent": (Choice.ABSENT, ("image", "point")),
+    "place": (Choice.PLACE, ("image", "point", "col_px", "row_px")),
+    "pose": (Choice.POSE, ("image", "pose")),
+    "learn": (Choice.LEARN, ("image", "px")),
+    "undo": (Choice.UNDO, ("image",)),
+}
+_MUST_BE = {
+    "col_px": "a number of pixels",
+    "row_px": "a number of pixels",
+    "pose": f"one of {', '.join(POSES)}",
+    "px": 'columns and rows by fiducial: {"1": [1863, 1786], ...}',
+}

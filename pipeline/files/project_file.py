@@ -17,7 +17,7 @@ from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.decisions_file import FILE as DECISIONS
-from pipeline.files.decisions_file import Decision, learned_from, read_decisions
+from pipeline.files.decisions_file import Decision, cut_short_line, decisions_bytes, learned_from, parse_decisions
 from pipeline.files.distances_file import GivenDistance, read_distances
 from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.learned_table import Clicks
@@ -28,6 +28,7 @@ from pipeline.files.scan_files import FoundScans, as_named, find_scans
 from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
 from pipeline.results.adjustment_reader import covariance_path
+from pipeline.text.output_paths import path_below
 from pipeline.text.tables import Table, read_toml
 
 if TYPE_CHECKING:
@@ -47,7 +48,8 @@ class Project:
     left_out: the images that `exclude` leaves out.
     tone: the curve of the scans: auto, one of TONES, or the power of the grey value that light grows as.
     unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
-    decisions: that a person made about marks and poses, the oldest first.
+    decisions: that a person made about marks and poses, the oldest first. decisions_cut_short: the number of their last
+    line where that was cut short and does not count, else 0.
     board_bend_sigma: of how far the middle of the board, which is all object points, stands off its plane, in the
     user's unit; 0 flat, inf unknown.
     crs: what the object coordinates are, as "EPSG:25832"; empty where nobody says it.
@@ -76,6 +78,7 @@ class Project:
     crs: str = ""
     board_bend_sigma: float = 0.0
     decisions: tuple[Decision, ...] = ()
+    decisions_cut_short: int = 0
 
     def open_scan(self, name: str) -> "Scan":
         """The scan of an image. Raises MeasurementError where it cannot be read."""
@@ -139,10 +142,7 @@ class Project:
 
     def frame_page_path(self, image: str) -> Path:
         """The page of one image, in folders as its name has them. Raises InputError for a name that is no path."""
-        parts = image.split("/")
-        if any(part in ("", ".", "..") for part in parts) or "\\" in image or ":" in image:
-            raise InputError(f"image {image!r}: its name cannot be that of a file, so it has no page. Rename its scan.")
-        return self.output.joinpath("frames", *parts[:-1], f"{parts[-1]}.html")
+        return path_below(self.output / "frames", image, ".html")
 
     @property
     def results(self) -> tuple[Path, ...]:
@@ -262,13 +262,14 @@ def read_project(path: Path) -> Project:
 def with_decisions(project: Project) -> Project:
     """The project with what is decided now. Marks that are to be learned, and that the camera's own file does not show,
     are shown where a person decided. Raises InputError naming the line, or the marks that are missing."""
-    decisions = read_decisions(project.decisions_path)
+    data = decisions_bytes(project.decisions_path)
+    decisions, cut_short = parse_decisions(project.decisions_path, data), cut_short_line(data)
     cameras = dict(project.cameras)
     for name, camera in project.cameras.items():
         if camera.is_asked:
             images = {image for image in project.scans if project.camera_of(image) is camera}
             cameras[name] = replace(camera, clicks=_shown(project, camera, learned_from(decisions, images)))
-    return replace(project, cameras=cameras, decisions=decisions)
+    return replace(project, cameras=cameras, decisions=decisions, decisions_cut_short=cut_short)
 
 
 def _shown(project: Project, camera: CameraFile, shown: Decision | None) -> Clicks | None:

@@ -33,6 +33,7 @@ _FILES = {
     "given_distances",
     "images_path",
     "decisions",
+    "decisions_cut_short",
 }
 _NO_MATTER = {"max_pixels", "crs"}
 # Of a camera: what tells where its targets are, but not what its marks are.

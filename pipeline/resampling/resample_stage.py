@@ -28,6 +28,7 @@ from pipeline.resampling.source import source_of
 from pipeline.results.adjustment_reader import read_adjustment
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.atomic import check_writable
+from pipeline.text.output_paths import path_below
 from pipeline.workers import worker_pool
 
 BEST: Degree = 5
@@ -142,7 +143,7 @@ def resample_tasks(
             pitch_mm=pitch_mm,
             degree=degree,
             max_pixels=project.max_pixels,
-            target=folder / f"{frame}.tif",
+            target=path_below(folder, frame, ".tif"),
             part=image if frame != image else "",
         )
     return list(tasks.values()), failed

@@ -12,6 +12,8 @@ import numpy as np
 
 from pipeline.text.text_file import read_bytes
 
+_PLAIN = {str, int, bool, type(None)}  # most values by far
+NO_FINGERPRINT = {"fingerprint": False}  # metadata of a field that tells nothing of a value
 _PIECES, _PIECE = 8, 32768  # of a scan, spread evenly from its first byte to its last
 
 
@@ -23,7 +25,8 @@ def fingerprint(value: object) -> str:
 def canonical_json(value: object) -> str:
     """Such a value as JSON: equal values give equal text, and any other value gives another.
 
-    The order of a mapping does not count, nor where a file stands: a project may be moved, and its files rewritten.
+    The order of a mapping does not count, nor where a file stands: a project may be moved, and its files rewritten. Nor
+    do fields of dataclasses that are NO_FINGERPRINT by their metadata.
     Arrays are told by their form and the SHA-256 of their numbers, numbers that are not finite by their names.
     """
     return json.dumps(_json(value), ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
@@ -54,8 +57,11 @@ def of_scan(path: Path) -> str:
 
 
 def _json(value: Any) -> Any:
+    if value.__class__ in _PLAIN or (value.__class__ is float and math.isfinite(value)):
+        return value
     if is_dataclass(value) and not isinstance(value, type):
-        return {"is": type(value).__name__, **{one.name: _json(getattr(value, one.name)) for one in fields(value)}}
+        told = {one.name: _json(getattr(value, one.name)) for one in fields(value) if one.metadata != NO_FINGERPRINT}
+        return {"is": type(value).__name__, **told}
     if isinstance(value, Mapping):
         if all(isinstance(key, str) for key in value):
             return {str(key): _json(item) for key, item in value.items()}

@@ -18,6 +18,7 @@ class FailureCode(StrEnum):
     PITCH = "pitch"
     MEMORY = "memory"
     ENDED = "ended"
+    DAMAGED = "damaged"
     FAULT = "fault"
 
 
@@ -29,6 +30,7 @@ MEANING = {
     FailureCode.PITCH: "Neither the project nor the file says what a pixel measures, and no marks tell it.",
     FailureCode.MEMORY: "The memory was full.",
     FailureCode.ENDED: "The process that measured it was ended, most likely because the memory was full.",
+    FailureCode.DAMAGED: "What is stored of it was changed or is damaged, and is not used: `--retry`.",
     FailureCode.FAULT: "A fault of the program itself.",
 }
 

@@ -59,10 +59,8 @@ class Ledger:
         """What stands behind all that was read; None where that is not there any more as it was."""
         if not self._tail.endswith(b"\n"):
             return None
-        with self._path.open("rb") as file:
-            file.seek(self._end - len(self._tail))
-            goes_on = file.read(len(self._tail)) == self._tail
-            return file.read() if goes_on else None
+        data = decisions_bytes(self._path, self._end - len(self._tail))
+        return data[len(self._tail) :] if data.startswith(self._tail) else None
 
     def _take(self, data: bytes) -> frozenset[str]:
         new = parse_decisions(self._path, data, self._lines + 1)

@@ -1,7 +1,5 @@
 """What of the store a person looks at: one frame of the latest judging with its result, as JSON for the page."""
 
-import json
-import sqlite3
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,8 +12,9 @@ from numpy.typing import NDArray
 from measure.covariance import MEANING
 from measure.marks.shapes import FrameCorner, LayoutMark
 from measure.results import MarkMeasurement
-from pipeline.archive.judging import Judging, latest
-from pipeline.archive.store import MARK_COLUMNS, Store, mark_of
+from pipeline.archive.digests import DamagedError
+from pipeline.archive.judging import Judging, judged_records, latest
+from pipeline.archive.store import Store
 from pipeline.files.camera_file import CameraFile
 from pipeline.results.measured_record import scan_of
 from pipeline.results.measured_scan import MeasuredScan
@@ -143,16 +142,14 @@ class Looking:
     def at(self, image: str) -> LookedAt:
         """Raises KeyError where no such image is judged."""
         with Store(self._store) as store:
-            row = store.connection.execute(_ONE, (image,)).fetchone()
-            if row is None:
+            judging = latest(store)
+            row = store.connection.execute(_ONE, (image, -1 if judging is None else judging.row)).fetchone()
+            if row is None or judging is None:
                 raise KeyError(image)
-            judging, result, own_marks, detail, uri, verdict, key = row
-            record = store.record(result)
-            if own_marks:
-                record["marks"] = _own_marks(store.connection, judging, result)
-        record.update(json.loads(detail) if detail else {})
-        scan = scan_of(image, {**record, "scan": uri}, self._folder)
-        return LookedAt(scan, verdict, key, self._camera_of(image))
+            ((_, record),) = judged_records(store, judging, {image})
+        if isinstance(record, DamagedError):
+            raise record
+        return LookedAt(scan_of(image, record, self._folder), str(row[0]), str(row[1]), self._camera_of(image))
 
     def others(self, image: str, point: str, kind: str) -> Sequence[str]:
         """Frames beside which the mark is shown: of the same camera, where it was measured."""
@@ -163,9 +160,7 @@ class Looking:
 
 
 _ONE = """
-select f.judging, f.result, f.own_marks, f.detail, s.uri, f.verdict, r.fingerprint
-from judged_frame f join scan s on s.id = f.scan join result r on r.id = f.result
-where f.name = ? and f.judging = (select max(id) from judging)
+select f.verdict, r.fingerprint from judged_frame f join result r on r.id = f.result where f.name = ? and f.judging = ?
 """
 
 _BESIDE = """
@@ -179,11 +174,6 @@ join mark m on m.result = f.result
 where f.judging = (select max(id) from judging) and f.name <> ? and m.point = ? and m.kind = ? and m.status = 'measured'
 order by abs(s.id - own.id) limit ?
 """
-
-
-def _own_marks(db: sqlite3.Connection, judging: int, result: int) -> list[Json]:
-    query = f"select {MARK_COLUMNS} from judged where judging = ? and result = ? order by number"
-    return [mark_of(row) for row in db.execute(query, (judging, result))]
 
 
 def mark_json(mark: MarkMeasurement) -> Json:

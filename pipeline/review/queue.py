@@ -15,6 +15,8 @@ from enum import StrEnum
 
 from measure.reason import Code
 from measure.status import Status
+from pipeline.archive.digests import damaged_frames, damaged_sentence
+from pipeline.archive.verdicts import Verdict
 from pipeline.files.project_file import Project
 
 
@@ -71,9 +73,14 @@ class Entry:
 
 def queue_of(project: Project, db: sqlite3.Connection | None, judging: int) -> tuple[Entry, ...]:
     """Every question of a judging, the worst first. db: None where nothing is judged yet."""
-    frames = {frame.result: frame for frame in _frames(db, judging)} if db else {}
+    damaged = damaged_frames(db, judging) if db else {}
+    frames = {frame.result: frame for frame in _frames(db, judging) if frame.result not in damaged} if db else {}
     marks = sorted(_marks(db, judging, frames), key=_badness) if db else []
     bare = [
+        Entry(Question.FRAME, (image,), ("",), "", str(Verdict.FAILED), 0, damaged_sentence(image, "measurement.db"))
+        for image in sorted(damaged.values())
+    ]
+    bare += [
         Entry(Question.FRAME, (f.image,), (f.key,), f.camera, f.verdict, 0, f.problem or "no mark was found in it")
         for f in sorted(frames.values(), key=lambda frame: frame.image)
         if f.marks == 0

@@ -329,9 +329,13 @@ async def _body(request: Request) -> Any:
         if len(data) > _LARGEST_BODY:
             raise InputError("that is too much for one request.")
     try:
-        return json.loads(data)
+        return json.loads(data, parse_constant=_no_number)
     except (ValueError, RecursionError):
         raise InputError("that is no JSON.") from None
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is no number of JSON")
 
 
 def _refusal(error: Exception) -> Response:

@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import closing
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -18,6 +19,7 @@ from drawn_frames import layout_of
 from drawn_project import CAMERA, write_project
 
 from measure.marks.shapes import MarkShape, polygon
+from pipeline.archive.digests import add_digests
 from pipeline.archive.schema import opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
@@ -336,11 +338,13 @@ def test_status_tells_what_changed_outside(folder: Path, capsys: SAID) -> None:
 
 
 def test_status_says_why_a_scan_needs_a_look(folder: Path) -> None:
-    with sqlite3.connect(folder / "out" / "measurement.db") as db:
+    db = opened(folder / "out" / "measurement.db")
+    with closing(db):
         db.execute("update result set pose_decided = 0")
         db.execute("update judged_frame set verdict = 'look'")
         db.execute("""update judged_frame set detail = '{"pose": {"name": "90", "decided": false}}' where name = 'b'""")
         db.execute("""update judged_frame set detail = '{"pose": {"name": "90", "decided": true}}' where name = 'c'""")
+        add_digests(db)
     status = archive_status(read_project(folder / "project.toml"))
     whys = {scan.image: scan.why for scan in status.scans}
     assert whys == {"a": "pose 0 is assumed", "b": "pose 90 is assumed", "c": ""}

@@ -1,6 +1,7 @@
 """decisions.jsonl: what counts of it, what it changes, and what is said of a file that is not as it should be."""
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.archive.decided import after_checks, before_checks, decided
 from pipeline.cli import run
-from pipeline.errors import InputError
+from pipeline.errors import InputError, WriteError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
@@ -72,9 +73,131 @@ def test_a_line_cut_short_does_not_count_and_the_next_one_stands_by_itself(tmp_p
     assert [one.decision for one in read_decisions(path)] == [Choice.ACCEPT, Choice.REJECT]
 
 
+def test_lines_that_a_full_disk_stops_are_all_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a roll, decided at once: none of its lines counts, and the message says so."""
+    path = tmp_path / "decisions.jsonl"
+    append_decisions(path, [mark_decision(Choice.ACCEPT)])
+    before = path.read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("pipeline.files.decisions_file.os.fsync", full)
+        broken.setattr("pipeline.files.decisions_file.write_atomically", lambda file, text: file.write_text(text))
+        with pytest.raises(WriteError, match="Nothing was changed there"):
+            append_decisions(path, [Decision(f"f{k}", Choice.POSE, pose="90") for k in range(120)])
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_lines_that_a_process_was_ended_over_do_not_count(tmp_path: Path) -> None:
+    """What stands beside the file then tells where the lines that count end."""
+    path = tmp_path / "decisions.jsonl"
+    append_decisions(path, [mark_decision(Choice.ACCEPT)])
+    size = path.stat().st_size
+    append_decisions(path, [Decision(f"f{k}", Choice.POSE, pose="90") for k in range(120)])
+    path.write_bytes(path.read_bytes()[:5000])  # 74 lines, say, and half of one
+    path.with_name(".decisions.jsonl.size").write_text(str(size))
+    assert read_decisions(path) == (mark_decision(Choice.ACCEPT),)
+    append_decisions(path, [mark_decision(Choice.REJECT)])
+    assert [one.decision for one in read_decisions(path)] == [Choice.ACCEPT, Choice.REJECT]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "decision",
+    [
+        place("1", float("nan")),
+        place("1", 1e300),
+        mark_decision(Choice.ACCEPT, window=(0.0, float("inf"), 1.0, 1.0)),
+        Decision("a", Choice.LEARN, px={"1": (float("nan"), 0.0)}),
+        mark_decision(Choice.ACCEPT, when="now"),
+        mark_decision(Choice.ACCEPT, note="\ud800"),
+        Decision("a", Choice.ACCEPT),
+    ],
+)
+def test_what_would_not_be_read_is_not_written(decision: Decision, tmp_path: Path) -> None:
+    path = tmp_path / "decisions.jsonl"
+    with pytest.raises(InputError, match=r"the decision about a.*Nothing was written"):
+        append_decisions(path, [mark_decision(Choice.ACCEPT), decision])
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    "line", ['{"image": "a" "point": "1"}', "nothing", "{'image': 'a'}", '{"image": "a", "decision": NaN}']
+)
+def test_a_typing_error_in_the_last_line_is_named(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "decisions.jsonl"
+    append_decisions(path, [mark_decision(Choice.ACCEPT)])
+    with path.open("a") as file:
+        file.write(line)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=r"line 2: is no JSON"):
+        read_decisions(path)
+    with pytest.raises(InputError, match=r"its last line: is no JSON.*Nothing was written"):
+        append_decisions(path, [mark_decision(Choice.REJECT)])
+    assert path.read_bytes() == before
+
+
+def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = write_project(tmp_path / "p", ["a", "b"])
+    path = project.with_name("decisions.jsonl")
+    unknown = [
+        Decision("z", Choice.REJECT, "1", "fiducial", who="ann"),
+        mark_decision(Choice.REJECT, "99", who="ann"),
+        mark_decision(Choice.UNDO, "2"),
+        mark_decision(Choice.REJECT, "3", fingerprint="another result"),
+    ]
+    append_decisions(path, unknown)
+    with path.open("a") as file:
+        file.write('{"image": "a", "decision": "reject", "point": "4"')
+    words = (
+        "line 1: the project has no image 'z'",
+        "line 2: image 'a' has no fiducial '99'",
+        "line 3: there is nothing to undo about fiducial '2' of image 'a'",
+        "line 4: what was decided about fiducial '3' of image 'a' is of an earlier result",
+        "line 5: is cut short, or has a typing error",
+    )
+    for command in ("measure", "report", "status"):
+        assert run([command, str(project)]) == 1, command
+        told = " ".join(capsys.readouterr().out.split())
+        assert [word for word in words if word not in told] == [], command
+        assert "Decisions stand behind" not in told
+
+
+def test_status_is_stale_until_a_decision_is_taken_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = write_project(tmp_path / "p", ["a", "b"])
+    assert run(["measure", str(project)]) == 0
+    append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.REJECT)])
+    capsys.readouterr()
+    assert run(["status", str(project), "--json"]) == 1
+    images = json.loads(capsys.readouterr().out)["images"]
+    assert {image: one["verdict"] for image, one in images.items()} == {"a": "old"}
+    assert "not taken in yet" in images["a"]["why"]
+    run(["measure", str(project)])
+    capsys.readouterr()
+    run(["status", str(project), "--json"])
+    assert "old" not in {one["verdict"] for one in json.loads(capsys.readouterr().out)["images"].values()}
+
+
+@pytest.mark.slow
+def test_a_million_lines_are_read_in_five_seconds(tmp_path: Path) -> None:
+    line = '{{"image": "box/{0:05d}", "point": "{1}", "kind": "fiducial", "decision": "reject", "who": "ann"}}'
+    path = tmp_path / "decisions.jsonl"
+    path.write_text("\n".join(line.format(k % 50_000, k % 8) for k in range(1_000_000)) + "\n")
+    began = time.process_time()
+    assert len(read_decisions(path)) == 1_000_000
+    assert time.process_time() - began < 5.0
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [
+        (
+            '{"image": "a", "decision": "accept", "piont": "1"}',
+            "line 2, piont: there is no such key. Did you mean 'point'",
+        ),
         ('{"image": "a", "decision": "acept", "point": "1"}', "line 2, decision.*Did you mean 'accept'"),
         ('{"image": "a", "decision": "accept"}', "line 2, point: is missing"),
         ('{"decision": "accept", "point": "1"}', "line 2, image: is missing"),

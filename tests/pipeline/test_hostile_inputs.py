@@ -1,0 +1,355 @@
+"""Hostile inputs, seeded: what is kept is never believed when it was changed, no name is a path, no line is in part.
+
+Every trial ends in the right result or in one message. Counted are tracebacks, wrong results given as right, and files
+outside of the folder that a command was given.
+"""
+
+import random
+import shutil
+import sqlite3
+import string
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from drawn_project import write_project
+from exported_project import adjusted_project
+
+from adjust.errors import AdjustmentError
+from measure.errors import MeasurementError
+from measure.scans.addresses import Address
+from pipeline.archive.measurement import measured_scans
+from pipeline.archive.status import archive_status
+from pipeline.archive.store import Store
+from pipeline.cli import run
+from pipeline.errors import InputError
+from pipeline.exchange.convention import ExportOptions
+from pipeline.exchange.export_stage import run_export
+from pipeline.exchange.import_stage import run_import
+from pipeline.exchange.incoming import ImportOptions
+from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions
+from pipeline.files.project_file import read_project
+from pipeline.results.measured_record import record_of
+from pipeline.results.measured_scan import FailureCode
+from pipeline.review.queue import queue_of
+from pipeline.text.image_names import names_below
+
+REFUSED = (InputError, MeasurementError, AdjustmentError)
+SECRETS = ("hunter2", "s3cr3t-signature", "AKIAEXAMPLE")
+Damage = Callable[[random.Random, Path], None]
+GOOD, WRONG, TRACEBACK, OUTSIDE = "right or refused", "wrong as right", "traceback", "outside"
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("hostile") / "p"
+    project = write_project(folder, ["a", "b", "c"])
+    assert run(["measure", str(project)]) == 0
+    append_decisions(folder / "decisions.jsonl", [Decision("b", Choice.REJECT, "1", "fiducial", who="ann")])
+    run(["measure", str(project)])
+    with sqlite3.connect(folder / "out" / "measurement.db") as db:
+        db.execute("pragma wal_checkpoint(truncate)")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def adjusted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return adjusted_project(tmp_path_factory.mktemp("adjusted"))
+
+
+def outcome(trial: Callable[[], str]) -> str:
+    try:
+        return trial()
+    except REFUSED:
+        return GOOD
+    except Exception:
+        import traceback
+
+        traceback.print_exc()
+        return TRACEBACK
+
+
+# --- the results database
+
+
+def readings(folder: Path) -> dict[str, Any]:
+    """What every reader makes of a project's store; of what it refuses, nothing."""
+    project = read_project(folder / "project.toml")
+    path, told = project.measurement_path, dict[str, Any]()
+
+    def scans() -> Any:
+        scans = measured_scans(path)
+        return {s.frame.image: record_of(s, folder) for s in scans if s.failure is None or _is_own(s.failure.code)}
+
+    def questions() -> Any:
+        with Store(path) as store:
+            queue = queue_of(project, store.connection, 1)
+        return [entry for entry in queue if entry.fingerprints != ("",)]
+
+    def statuses() -> Any:
+        scans = archive_status(project).scans
+        return {scan.image: scan for scan in scans if scan.verdict not in ("failed", "waiting", "old")}
+
+    for name, reading in (("scans", scans), ("questions", questions), ("status", statuses)):
+        try:
+            told[name] = reading()
+        except REFUSED:
+            told[name] = None
+    return told
+
+
+def _is_own(code: FailureCode) -> bool:
+    return code is not FailureCode.DAMAGED
+
+
+def is_right(found: Any, right: Any) -> bool:
+    """Whether all that is told is right: what is left out was refused."""
+    if found is None:
+        return True
+    if isinstance(right, dict):
+        return all(name in right and right[name] == value for name, value in found.items())
+    return all(one in right for one in found)
+
+
+def database_trial(
+    rng: random.Random, measured: Path, folder: Path, damage: Callable[[random.Random, Path], None]
+) -> str:
+    right = readings(measured)
+    shutil.copytree(measured, folder)
+    for name in ("a", "b", "c"):
+        shutil.copystat(measured / f"{name}.tif", folder / f"{name}.tif")
+    damage(rng, folder / "out" / "measurement.db")
+
+    def trial() -> str:
+        found = readings(folder)
+        return GOOD if all(is_right(found[name], right[name]) for name in right) else WRONG
+
+    return outcome(trial)
+
+
+def change_bytes(rng: random.Random, path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    for _ in range(rng.choice([1, 1, 2, 8, 64])):
+        at = rng.randrange(len(data))
+        data[at] = rng.choice([0, 255, data[at] ^ (1 << rng.randrange(8)), rng.randrange(256)])
+    if rng.random() < 0.1:
+        del data[rng.randrange(len(data)) :]
+    path.write_bytes(data)
+
+
+TABLES = ("scan", "result", "mark", "judging", "judged_frame", "judged", "kept", "options", "program", "judged_lot")
+
+
+def change_values(rng: random.Random, path: Path) -> None:
+    values = [
+        None,
+        0,
+        1,
+        -1,
+        2.5,
+        1e300,
+        "",
+        "x",
+        "../../x",
+        "[]",
+        "{}",
+        "null",
+        b"\xff\x00",
+        "a",
+        "good",
+        "measured",
+        2**62,
+    ]
+    with sqlite3.connect(path, isolation_level=None) as db:
+        db.execute("pragma foreign_keys = off")
+        table = rng.choice(TABLES)
+        columns = [row[1] for row in db.execute(f"pragma table_info({table})")]
+        column = rng.choice(columns)
+        rows = db.execute(f"select {', '.join(columns)} from {table}").fetchall()
+        if not rows:
+            return
+        row = rng.choice(rows)
+        now = row[columns.index(column)]
+        other = rng.choice(rows)[columns.index(column)]
+        value = rng.choice([*values, now + 5.0 if isinstance(now, int | float) else f"{now}x", other])
+        where = " and ".join(f"{name} is ?" for name in columns)
+        try:
+            if rng.random() < 0.1:
+                db.execute(f"delete from {table} where {where}", row)
+            else:
+                db.execute(f"update {table} set {column} = ? where {where}", (value, *row))
+        except sqlite3.Error:  # not null, unique
+            pass
+        db.execute("pragma wal_checkpoint(truncate)")
+
+
+# --- decisions
+
+
+def decisions_trial(rng: random.Random, measured: Path, folder: Path) -> str:
+    """A file of good lines, one of them spoiled: all good ones are read, or the bad one is named; and appending writes
+    all of a batch or nothing."""
+    folder.mkdir(parents=True)
+    path = folder / "decisions.jsonl"
+    choices = (Choice.ACCEPT, Choice.REJECT, Choice.ABSENT, Choice.UNDO)
+    lines = [Decision(rng.choice("abz"), rng.choice(choices), rng.choice("129"), "fiducial") for _ in range(8)]
+    append_decisions(path, lines)
+    data = bytearray(path.read_bytes())
+    kind = rng.randrange(4)
+    if kind == 0:
+        at = rng.randrange(len(data))
+        data[at] = rng.randrange(256)
+    elif kind == 1:
+        del data[rng.randrange(len(data)) :]
+    elif kind == 2:
+        data += rng.choice([b"{}", b"[]", b"NaN", b"\x00", b'{"image": "a", "decision": "pose", "pose": NaN}'])
+    path.write_bytes(data)
+
+    def trial() -> str:
+        read = read_decisions(path)
+        if kind == 3 and read != tuple(lines):
+            return WRONG
+        bad = Decision("a", Choice.PLACE, "1", "fiducial", col_px=rng.choice([float("nan"), 1e300]), row_px=1.0)
+        before = path.read_bytes()
+        try:
+            append_decisions(path, [lines[0], bad])
+        except InputError:
+            return GOOD if path.read_bytes() == before else WRONG
+        return WRONG
+
+    return outcome(trial)
+
+
+# --- imports, names
+
+
+def word(rng: random.Random) -> str:
+    pieces = ["..", "/", "\\", ".", "x", "~", "C:", "\0", "\n", "%2e%2e", "σ", " ", "a" * 300, "$(x)", "<b>", '"', "'"]
+    return "".join(rng.choice(pieces) for _ in range(rng.randrange(1, 6)))
+
+
+def xml(text: str) -> str:
+    return "".join(f"&#{ord(letter)};" if letter in '<>&"' else letter for letter in text)
+
+
+def imports_trial(rng: random.Random, folder: Path) -> str:
+    folder.mkdir(parents=True)
+    place = rng.choice(["1 2", "nan 1", "1e999 0", "x", "1"])
+    mark = f"<OneMesureAF1I><NamePt>{xml(word(rng))}</NamePt><PtIm>{place}</PtIm></OneMesureAF1I>"
+    one = f"<MesureAppuiFlottant1Im><NameIm>{xml(word(rng))}</NameIm>{mark * rng.randrange(3)}</MesureAppuiFlottant1Im>"
+    text = bytearray(one.encode())
+    if rng.random() < 0.3:
+        text[rng.randrange(len(text))] = rng.randrange(256)
+    source = folder / rng.choice(["MeasuresIm-a.xml", "MeasuresCamera.xml", "MesIm-a.xml", "a.xml"])
+    source.write_bytes(text)
+    format = rng.choice(["micmac", "mmvii", "metashape", "opencv", "certificate", "bingo"])
+    before = files(folder.parent)
+
+    def trial() -> str:
+        run_import(format, [source], folder / "out", ImportOptions(pitch_um=10.0, sigma_px=0.1))
+        return GOOD
+
+    told = outcome(trial)
+    new = files(folder.parent) - before
+    return OUTSIDE if any(not path.is_relative_to(folder / "out") for path in new) else told
+
+
+def names_trial(rng: random.Random, adjusted: Path, folder: Path) -> str:
+    folder.mkdir(parents=True)
+    name = word(rng)
+    for file in ("project.toml", "camera.toml", "points.csv"):
+        if (adjusted.parent / file).exists():
+            shutil.copy(adjusted.parent / file, folder / file)
+    project = folder / "project.toml"
+    project.write_text(project.read_text().replace('scans = ["scans/*.tif"]\n', ""))
+    cell = '"' + name.replace('"', '""') + '"'
+    lines = adjusted.with_name("comparator.csv").read_text().splitlines()
+    (folder / "comparator.csv").write_text(
+        "\n".join(cell + line[2:] if line.startswith("f1,") else line for line in lines)
+    )
+    before = files(folder.parent)
+
+    def trial() -> str:
+        run_export(read_project(project), rng.choice(["csv", "mmvii", "micmac"]), folder / "o" / "out", ExportOptions())
+        return GOOD
+
+    told = outcome(trial)
+    new = files(folder.parent) - before
+    return OUTSIDE if any(not path.is_relative_to(folder / "o" / "out") for path in new) else told
+
+
+def files(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if path.is_file()}
+
+
+# --- addresses
+
+
+def addresses_trial(rng: random.Random) -> str:
+    """No secret is told, and another signature is the same scan."""
+    signed = [
+        "X-Amz-Signature={0}&X-Amz-Credential={1}&X-Amz-Date={2}",
+        "AWSAccessKeyId={1}&Signature={0}&Expires={2}",
+        "sv={2}&se={2}&sr=b&sig={0}",
+        "token={0}",
+        "Policy={2}&Signature={0}&Key-Pair-Id={1}",
+        "X-Goog-Signature={0}&X-Goog-Date={2}",
+    ]
+    form, user = rng.choice(signed), rng.choice(["", "ann:hunter2@", "hunter2@", "ann%40x:hunter2@"])
+    host, path = rng.choice(["h.org", "h.org:8080", "[::1]"]), rng.choice(["0001.tif", "a/b/0001.tif", "a b/0001.tif"])
+    base = f"{rng.choice(['https', 'http', 'HTTPS'])}://{user}{host}/{path}"
+
+    def query() -> str:
+        when = "".join(rng.choices(string.digits, k=8))
+        return form.format(f"s3cr3t-signature{rng.choice('/+=%')}{rng.random()}", f"AKIAEXAMPLE{when}", when)
+
+    def trial() -> str:
+        one, two = Address(f"{base}?{query()}"), Address(f"{base}?{query()}")
+        told = [str(one), repr(one), one.name, *names_below([one, one.with_name("b.tif")]), f"{one}", str([one])]
+        if str(one) != str(two) or any(secret in text for secret in SECRETS for text in told):
+            return WRONG
+        return GOOD if "?" not in names_below([one])[0] and names_below([one]) == ["0001"] else WRONG
+
+    return outcome(trial)
+
+
+KINDS = ("bytes", "values", "decisions", "imports", "names")
+
+
+def study(kind: str, count: int, seed: int, measured: Path, adjusted: Path, folder: Path) -> Counter[str]:
+    counts = Counter[str]()
+    for number in range(count):
+        rng, place = random.Random(f"{kind} {seed} {number}"), folder / f"{kind}{number}"
+        match kind:
+            case "bytes":
+                told = database_trial(rng, measured, place, change_bytes)
+            case "values":
+                told = database_trial(rng, measured, place, change_values)
+            case "decisions":
+                told = decisions_trial(rng, measured, place)
+            case "imports":
+                told = imports_trial(rng, place / "p")
+            case "names":
+                told = names_trial(rng, adjusted, place / "p")
+            case _:
+                told = addresses_trial(rng)
+        if told != GOOD:
+            print(kind, seed, number, told)
+        counts[told] += 1
+        shutil.rmtree(place, ignore_errors=True)
+    return counts
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hostile_inputs_end_in_the_right_result_or_in_a_message(
+    kind: str, measured: Path, adjusted: Path, tmp_path: Path
+) -> None:
+    assert study(kind, 12, 1, measured, adjusted, tmp_path) == {GOOD: 12}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_thousands_of_hostile_inputs(kind: str, measured: Path, adjusted: Path, tmp_path: Path) -> None:
+    assert study(kind, 600, 36, measured, adjusted, tmp_path) == {GOOD: 600}
