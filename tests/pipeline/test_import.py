@@ -85,7 +85,7 @@ def test_fiducials_that_count_from_a_corner_give_no_principal_point_at_the_origi
     assert (
         "the files give no principal point. Adjusting starts at the middle of the fiducials, (118.9, -117.5) mm" in told
     )
-    written = (tmp_path / "in" / "camera.toml").read_text()
+    written = (folder / "camera.toml").read_text()
     bare = tmp_path / "bare.toml"
     bare.write_text("\n".join(line for line in written.splitlines() if not line.startswith("principal_point_mm")))
     assert read_camera(bare).principal_point_mm == pytest.approx((118.923, -117.5))
