@@ -12,7 +12,7 @@ from measure.annotations.read import read_writing
 from measure.attempts import best_of, find_frame, named, posed
 from measure.fiducial_options import FiducialOptions
 from measure.frames.chance import doubt
-from measure.frames.clicked_frame import clicked_frame, is_shown, with_clicks
+from measure.frames.clicked_frame import clicked_frame, contradicted_pose, is_shown, with_clicks
 from measure.frames.fiducial_rows import absent_frame, lost_frame, present_frame
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
@@ -27,6 +27,7 @@ from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+from measure.status import Status
 
 Array = NDArray[np.float64]
 
@@ -55,10 +56,21 @@ def measure_fiducials(
     if is_shown(layout, options):
         frame, pose = clicked_frame(scan, layout, pitch_um, options)
         lines = _read(scan, layout, frame) if options.writing == "all" else None
-        return with_clicks(
+        shown = with_clicks(
             replace(present_frame(scan, layout, frame, pose, pitch_um, (), NO_REASON), writing=lines), options.clicks
         )
+        contradiction = contradicted_pose(layout, options, pitch_um)
+        return _refused(shown, contradiction) if contradiction else shown
     return with_clicks(_searched(scan, layout, pitch_um, options), options.clicks)
+
+
+def _refused(frame: FrameMeasurement, why: Reason) -> FrameMeasurement:
+    """The frame, none of its marks an observation."""
+    marks = (
+        replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
+        for mark in frame.marks
+    )
+    return replace(frame, marks=tuple(marks), problems=(why.told(f"{why}."), *frame.problems))
 
 
 def _searched(

@@ -50,6 +50,7 @@ class Code(StrEnum):
     FEW_TIES = "few-ties"
     OTHER_PART = "other-part"
     COPY = "copy"
+    SECOND_PICTURE = "second-picture"
     CLICKED = "clicked"
     DECIDED = "decided"
 
@@ -93,6 +94,7 @@ MEANING = {
     Code.PLATE: "The plate in the picture contradicts the camera.",
     Code.FEW_TIES: "Fewer natural points were found than wanted.",
     Code.OTHER_PART: "Another scan of its frame shows it, for that was scanned in parts.",
+    Code.SECOND_PICTURE: "Its file holds a further picture of full size, or its scan shows a further frame.",
     Code.COPY: "The scan's file is a copy of another one, whose marks count.",
     Code.CLICKED: "A person pointed at it, and nothing could be matched there.",
     Code.DECIDED: "A person decided so.",

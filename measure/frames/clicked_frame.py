@@ -12,7 +12,7 @@ from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
-from measure.reason import Code, Reason
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
@@ -38,9 +38,7 @@ def clicked_frame(
     camera, clicked = _shown(layout, options.clicks)
     pixel_mm = np.array(pitch_um or (1.0, 1.0)) / 1000.0
     up_mm = clicked * pixel_mm * (1.0, -1.0)
-    poses = POSES if options.pose == "auto" else (options.pose,)
-    found = [(pose, *_similarity(camera, up_mm, pose)) for pose in poses]
-    pose, up, _ = min(found, key=lambda one: (round(one[2] / np.ptp(up_mm), 9), abs(_turn_rad(one[1], one[0]))))
+    pose, up = _clicked_pose(camera, up_mm, POSES if options.pose == "auto" else (options.pose,))
     if pitch_um is None:  # then it is what the marks' separations say
         pixel_mm = pixel_mm / float(np.sqrt(abs(np.linalg.det(up[:, :2]))))
         up = up / np.sqrt(abs(np.linalg.det(up[:, :2])))
@@ -50,10 +48,31 @@ def clicked_frame(
     placements = [Placement(pose, matrix, 0.0, len(camera), polarity, 1, pitch_mm) for polarity in polarities]
     frames = [measure_frame(scan, layout, placement, options) for placement in placements]
     frame = max(frames, key=lambda one: (one.measured, int(one.belongs.sum())))
-    singular = np.linalg.svd(camera - camera.mean(axis=0), compute_uv=False)
-    tells = bool(options.pose != "auto" or singular[1] > _COLLINEAR * singular[0])
+    tells = options.pose != "auto" or not on_a_line(camera)
     evidence = _TOLD if tells else ("the marks that were pointed at lie on a line, which has two sides.",)
     return frame, Pose(pose, tells, evidence)
+
+
+def contradicted_pose(layout: FiducialLayout, options: FiducialOptions, pitch_um: tuple[float, float] | None) -> Reason:
+    """Why the clicks do not go with the scan orientation that is set; empty where they do, or cannot tell."""
+    camera, clicked = _shown(layout, options.clicks)
+    if options.pose == "auto" or on_a_line(camera):
+        return NO_REASON
+    pose, _ = _clicked_pose(camera, clicked * np.array(pitch_um or (1.0, 1.0)) / 1000.0 * (1.0, -1.0), POSES)
+    if pose == options.pose:
+        return NO_REASON
+    told = (
+        f"the marks that were pointed at show the scan orientation {pose}, and {options.pose} is set. A viewer that "
+        "obeys the file's orientation tag shows other columns and rows than the file has. Point at them in the picture "
+        "as it is stored, or set the right orientation"
+    )
+    return Reason(told, Code.POSE)
+
+
+def on_a_line(places: Array) -> bool:
+    """Whether places (n, 2) do not tell a mirrored frame from one that is not."""
+    singular = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+    return bool(singular[1] <= _COLLINEAR * singular[0])
 
 
 def with_clicks(frame: FrameMeasurement, clicks: Sequence[Click]) -> FrameMeasurement:
@@ -69,6 +88,13 @@ def _shown(layout: FiducialLayout, clicks: Sequence[Click]) -> tuple[Array, Arra
     known = [click for click in clicks if click.point in places]
     camera = np.array([places[click.point] for click in known]).reshape(-1, 2)
     return camera, np.array([(click.col_px, click.row_px) for click in known]).reshape(-1, 2)
+
+
+def _clicked_pose(camera: Array, up_mm: Array, poses: Sequence[str]) -> tuple[str, Array]:
+    """Of the poses the one that fits the marks best, and is turned least; and its similarity (2, 3)."""
+    found = [(pose, *_similarity(camera, up_mm, pose)) for pose in poses]
+    pose, up, _ = min(found, key=lambda one: (round(one[2] / np.ptp(up_mm), 9), abs(_turn_rad(one[1], one[0]))))
+    return pose, up
 
 
 def _similarity(camera: Array, up_mm: Array, pose: str) -> tuple[Array, float]:

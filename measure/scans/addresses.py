@@ -14,6 +14,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
+from measure.scans.scan_part import ScanPart, is_scan_part
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
@@ -105,9 +106,11 @@ _counting = Lock()
 
 
 def scan_path(text: str | Path) -> Path:
-    """The file or the address that a text names."""
+    """The file or the address that a text names, or the part of a file."""
     if isinstance(text, Path):
         return text
+    if is_scan_part(text):
+        return ScanPart(text)
     return Address(text) if is_address(text) else Path(text)
 
 

@@ -41,10 +41,11 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
     """
     start = first_bytes(path)
     if start[:4] in TIFF_STARTS:
-        segments, pitch, notes, _ = open_tiff(path, max_pixels)
+        opened = open_tiff(path, max_pixels)
+        segments, notes = opened.segments, (*opened.problems, *opened.notes)
         segments.close()
         bits = int(segments.full_scale_dn + 1).bit_length() - 1
-        return ScanHead("TIFF", segments.width_px, segments.height_px, segments.channels, bits, pitch, notes)
+        return ScanHead("TIFF", segments.width_px, segments.height_px, segments.channels, bits, opened.pitch, notes)
     if not start.startswith((JPEG_START, PNG_START)):
         raise no_picture(path, start)
     data, end = _head_and_end(path)

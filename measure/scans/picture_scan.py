@@ -17,17 +17,17 @@ from measure.scans.compression import jpeg_headers, rounding_step_dn
 from measure.scans.jpeg_stream import decoded, picture_size
 from measure.scans.radiometry import Radiometry, Samples
 from measure.scans.resolution import JFIF_UNIT, NO_TAGS, PNG_UNIT, Pitch, pitch_from_density
-from measure.scans.segments import LostPart, Place, Segments
+from measure.scans.segments import LostPart, OpenedPicture, Place
 from measure.scans.size_limit import check_size
-from measure.scans.tiff_scan import orientation_notes, tag_pitch
+from measure.scans.tiff_scan import orientation_notes, orientation_of, tag_pitch
 
 JPEG_START, PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _PNG_SIZE = slice(16, 25)  # width, height and the bits of a sample: IHDR is the first chunk (PNG specification, 11.2.2)
 _MOST_CHANNELS = 4
 
 
-def open_picture(path: Path, start: bytes, max_pixels: int | None = None) -> tuple[Segments, Pitch, tuple[str, ...]]:
-    """A JPEG or PNG picture, its pitch, and notes. start: the file's first bytes; max_pixels: as `check_size` takes it.
+def open_picture(path: Path, start: bytes, max_pixels: int | None = None) -> OpenedPicture:
+    """A JPEG or PNG picture. start: the file's first bytes; max_pixels: as `check_size` takes it.
 
     Raises MeasurementError for a truncated file, for one that is no picture, and for one that claims more than such a
     file can hold.
@@ -35,11 +35,12 @@ def open_picture(path: Path, start: bytes, max_pixels: int | None = None) -> tup
     if start.startswith(JPEG_START):
         data = path.read_bytes()
         samples, damage = _jpeg_samples(path, data, max_pixels)
-        return WholePicture(samples, rounding_step_dn(data), damage), jpeg_pitch(data), _jpeg_notes(data)
+        orientation, picture = _jpeg_orientation(data), WholePicture(samples, rounding_step_dn(data), damage)
+        return OpenedPicture(picture, jpeg_pitch(data), orientation_notes(orientation), orientation=orientation)
     if not start.startswith(PNG_START):
         raise no_picture(path, start)
     data = path.read_bytes()
-    return WholePicture(_png_samples(path, data, max_pixels)), png_pitch(data), ()
+    return OpenedPicture(WholePicture(_png_samples(path, data, max_pixels)), png_pitch(data))
 
 
 def no_picture(path: Path, start: bytes) -> MeasurementError:
@@ -132,16 +133,16 @@ def jpeg_pitch(data: bytes) -> Pitch:
     return pitch
 
 
-def _jpeg_notes(data: bytes) -> tuple[str, ...]:
-    """On the orientation that an Exif block gives."""
+def _jpeg_orientation(data: bytes) -> int:
+    """As an Exif block gives it; 1 without one."""
     for marker, body in jpeg_headers(data):
         if marker == 0xE1 and body.startswith(b"Exif\0\0"):
             try:
                 with TiffFile(BytesIO(body[6:])) as file:
-                    return orientation_notes(file.pages.first.aspage())
+                    return orientation_of(file.pages.first.aspage())
             except DECODING_ERRORS:
-                return ()
-    return ()
+                return 1
+    return 1
 
 
 def _exif_pitch(exif: bytes, otherwise: Pitch) -> Pitch:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from itertools import product
 from math import lcm
@@ -19,7 +20,7 @@ from measure.scans.parallel import side_by_side
 from measure.scans.picture_scan import open_picture
 from measure.scans.radiometry import Samples
 from measure.scans.resolution import Pitch
-from measure.scans.segments import LostPart, SegmentCache, Segments
+from measure.scans.segments import LostPart, OpenedPicture, SegmentCache, Segments
 from measure.scans.tiff_scan import TIFF_STARTS, open_tiff
 from measure.scans.tiff_segments import RawRows
 from measure.scans.tone import LINEAR, Tone
@@ -45,20 +46,13 @@ class Scan:
     width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows;
     tone: what is believed of the curve between light and these grey values.
     pitch_um: (x, y) from the file's resolution tags, None where it has none that can be believed, and then pitch_note
-    says why.
+    says why. problems: what of the file needs a look, a sentence each; orientation: as `OpenedPicture` has it.
     The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        segments: Segments,
-        pitch: Pitch,
-        notes: tuple[str, ...] = (),
-        overviews: Sequence[Segments] = (),
-    ) -> None:
-        """overviews: the same picture made small, which the file has too, and which stand in for it where it is looked
-        at small."""
+    def __init__(self, path: Path, segments: Segments, pitch: Pitch, opened: OpenedPicture | None = None) -> None:
+        """opened: what the file says beside its picture."""
+        opened = opened or OpenedPicture(segments, pitch)
         self.path = path
         self.name = path.stem
         self.width_px = segments.width_px
@@ -67,13 +61,15 @@ class Scan:
         self.full_scale_dn = segments.full_scale_dn
         self.pitch_um = pitch.um
         self.pitch_note = pitch.note
+        self.problems = opened.problems
+        self.orientation = opened.orientation
         self.tone = LINEAR
-        self._file_notes = notes
+        self._file_notes = opened.notes
         self._segments = segments
         self._cache = SegmentCache(segments)
         self._source = segments if isinstance(segments, RawRows) else self._cache
         self._reduced: dict[int, Array] = {}
-        self._overviews = [Scan(path, own, pitch) for own in overviews]
+        self._overviews = [Scan(path, own, pitch) for own in opened.overviews]
         self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
     @property
@@ -370,14 +366,13 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     """
     path = scan_path(path)
     start = first_bytes(path)
-    if start[:4] in TIFF_STARTS:
-        segments, pitch, notes, overviews = open_tiff(path, max_pixels)
-    else:
-        (segments, pitch, notes), overviews = open_picture(path, start, max_pixels), ()
+    opened = open_tiff(path, max_pixels) if start[:4] in TIFF_STARTS else open_picture(path, start, max_pixels)
+    segments = opened.segments
     is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px
     if isinstance(path, Address) and is_one:
-        notes = *notes, "the file has its picture in one piece, and was fetched whole: of tiles, most would not be"
-    return Scan(path, segments, pitch, notes, overviews)
+        whole = "the file has its picture in one piece, and was fetched whole: of tiles, most would not be"
+        opened = replace(opened, notes=(*opened.notes, whole))
+    return Scan(path, segments, opened.pitch, opened)
 
 
 def first_bytes(path: Path) -> bytes:

@@ -8,6 +8,7 @@ from threading import Lock
 from typing import Protocol
 
 from measure.scans.radiometry import Samples
+from measure.scans.resolution import Pitch
 
 Place = tuple[int, int]  # row and column in a grid of segments
 
@@ -56,6 +57,22 @@ class Segments(Protocol):
         `fetched` gives it."""
 
     def close(self) -> None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedPicture:
+    """A scan's picture as its file gives it.
+
+    notes: what is unusual about the file, a sentence each; problems: what needs a look; overviews: the same picture
+    made small; orientation: the tag by which viewers turn the picture, 1 where they do not (TIFF 6.0).
+    """
+
+    segments: Segments
+    pitch: Pitch
+    notes: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
+    overviews: tuple[Segments, ...] = ()
+    orientation: int = 1
 
 
 @dataclass(eq=False)

@@ -22,7 +22,8 @@ def thumbnail(scan: Scan, largest_px: int) -> Scan:
     same = size == grey.shape[::-1]
     samples = grey if same else np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint16)
     pitch = Pitch(None if scan.pitch_um is None else (shrunk * scan.pitch_um[0], shrunk * scan.pitch_um[1]))
-    return Scan(scan.path, WholePicture(samples[:, :, None], scan.rounding_step_dn * unit / shrunk), pitch)
+    picture = WholePicture(samples[:, :, None], scan.rounding_step_dn * unit / shrunk)
+    return Scan(scan.path, picture, pitch)
 
 
 def _reduced(scan: Scan, factor: int) -> NDArray[np.uint16]:

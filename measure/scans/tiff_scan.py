@@ -13,7 +13,8 @@ from measure.scans.broken import DECODING_ERRORS, broken, unsupported
 from measure.scans.compression import rounding_step_dn
 from measure.scans.radiometry import Radiometry
 from measure.scans.resolution import NO_TAGS, TIFF_UNIT, Pitch, pitch_from_density
-from measure.scans.segments import Segments
+from measure.scans.scan_part import ScanPart
+from measure.scans.segments import OpenedPicture, Segments
 from measure.scans.size_limit import check_size
 from measure.scans.tiff_directory import BadDirectory, Extent, check_directories
 from measure.scans.tiff_segments import JPEG_COMPRESSIONS, RawRows, TiffSegments
@@ -26,13 +27,14 @@ _UNCOMPRESSED = 1
 _LOOKED_AT_BYTES = 1 << 16  # after the last that a file accounts for
 _JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
 _REDUCED_IMAGE, _TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
+_ALPHA = (1, 2)  # of ExtraSamples: associated and unassociated transparency
+_FULL_SIZE = 0.6  # of the largest picture's side: what is smaller is an overview
 
 
-def open_tiff(
-    path: Path, max_pixels: int | None = None
-) -> tuple[Segments, Pitch, tuple[str, ...], tuple[Segments, ...]]:
-    """The first full-resolution picture of a TIFF file, its pitch, notes, and of an address its overviews: a file is
-    read sooner than their makers' ways of averaging are known. max_pixels: as `check_size` takes it.
+def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
+    """The first full-resolution picture of a TIFF file, or that of the page that the path names; of an address its
+    overviews too: a file is read sooner than their makers' ways of averaging are known. max_pixels: as `check_size`
+    takes it.
 
     Raises MeasurementError for a truncated file, for pictures that are no grey, palette or colour scan of up to
     16 bits a sample, and for those that claim more than such a file can hold.
@@ -43,7 +45,7 @@ def open_tiff(
     except (BadDirectory, *DECODING_ERRORS) as error:
         raise broken(path, str(error)) from error
     try:
-        page, notes = _main_page(file, path)
+        page, problems = _main_page(file, path)
         _check_original(page, path)
         radiometry = _page_radiometry(page, path)
         _check_sizes(page, path, max_pixels)
@@ -51,7 +53,9 @@ def open_tiff(
         kind = RawRows if _is_raw(page) else TiffSegments
         segments: Segments = kind(file, page, path, radiometry, _page_rounding_step_dn(file, page))
         overviews = _overviews(file, page, path) if isinstance(path, Address) else ()
-        return segments, tag_pitch(page), notes, overviews
+        orientation = orientation_of(page)
+        notes = (*orientation_notes(orientation), *_band_notes(page, radiometry))
+        return OpenedPicture(segments, tag_pitch(page), notes, problems, overviews, orientation)
     except DECODING_ERRORS as error:
         file.close()
         raise broken(path, str(error)) from error
@@ -61,16 +65,54 @@ def open_tiff(
 
 
 def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
-    """The first page that is neither a thumbnail nor a mask."""
-    pages = [page.aspage() for page in file.pages]
-    full = [page for page in pages if not int(page.subfiletype) & (_REDUCED_IMAGE | _TRANSPARENCY_MASK)]
-    full = [page for page in full if page.imagewidth > 0 and page.imagelength > 0]
-    if not full:
+    """The page that the path names, or else the first one that is a picture; and what it leaves out."""
+    pictures = _full_pictures(file)
+    if not pictures:
         raise broken(path, "it holds no picture")
-    notes = []
-    if len(full) > 1:
-        notes.append(f"the file holds {len(full)} pictures: the first was taken")
-    return full[0], (*notes, *orientation_notes(full[0]))
+    pages = ", ".join(map(str, pictures))
+    if isinstance(path, ScanPart):
+        if path.page not in pictures:
+            raise MeasurementError(
+                f"{path}: page {path.page} of this file is no picture of full size; such are {pages}"
+            )
+        return pictures[path.page], ()
+    first, page = next(iter(pictures.items()))
+    if len(pictures) == 1:
+        return page, ()
+    told = f"the file holds {len(pictures)} pictures of full size (pages {pages}), and page {first} was measured"
+    return page, (f"{told}: name those that are frames in images.csv, by the column page",)
+
+
+def _full_pictures(file: TiffFile) -> dict[int, TiffPage]:
+    """The pictures by their pages, from 1: each the largest of what stands on the page and below it, without masks and
+    without what is small beside others, a thumbnail or an overview, whether the file says so or not."""
+    largest: dict[int, TiffPage] = {}
+    for number, page in enumerate((page.aspage() for page in file.pages), 1):
+        below = page.pages if page.subifds and page.pages is not None else ()
+        own = [one for one in (page, *(one.aspage() for one in below)) if _is_picture(one)]
+        if own:
+            largest[number] = max(own, key=lambda one: one.imagewidth * one.imagelength)
+    side = max((np.sqrt(page.imagewidth * page.imagelength) for page in largest.values()), default=0.0)
+    return {
+        number: page
+        for number, page in largest.items()
+        if np.sqrt(page.imagewidth * page.imagelength) > _FULL_SIZE * side
+    }
+
+
+def _is_picture(page: TiffPage) -> bool:
+    """Whether it is neither a reduced picture nor a mask by its tags, and has pixels."""
+    is_reduced = int(page.subfiletype) & (_REDUCED_IMAGE | _TRANSPARENCY_MASK)
+    return not is_reduced and page.imagewidth > 0 and page.imagelength > 0
+
+
+def _band_notes(page: TiffPage, radiometry: Radiometry) -> tuple[str, ...]:
+    """Which of several bands is used; transparency is none."""
+    bands = page.samplesperpixel - sum(int(kind) in _ALPHA for kind in page.extrasamples)
+    if bands <= radiometry.channels:
+        return ()
+    used = "the first is used" if radiometry.channels == 1 else "the first three are used, as red, green and blue"
+    return (f"the picture has {bands} bands: {used}",)
 
 
 def _overviews(file: TiffFile, full: TiffPage, path: Path) -> tuple[Segments, ...]:
@@ -101,9 +143,13 @@ def _check_original(page: TiffPage, path: Path) -> None:
         )
 
 
-def orientation_notes(page: TiffPage) -> tuple[str, ...]:
+def orientation_of(page: TiffPage) -> int:
+    """The tag by which a viewer turns the picture; 1 where it does not."""
+    return int(page.tags.valueof(274, default=1))
+
+
+def orientation_notes(orientation: int) -> tuple[str, ...]:
     """A viewer may show the picture turned: whoever reads places off one must know."""
-    orientation = int(page.tags.valueof(274, default=1))
     if orientation == 1:
         return ()
     return (f"the file's orientation tag ({orientation}) is not applied: columns and rows are as stored",)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
 from measure.fiducials import measure_fiducials
+from measure.frames.clicked_frame import LEAST_CLICKS, on_a_line
 from measure.frames.frame_fit import fit_frame
 from measure.marks import shapes
 from measure.marks.poses import POSES, up_from_camera
@@ -67,10 +68,36 @@ def _clicked(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> C
                     f"which has {scan.width_px} x {scan.height_px} px. Give column and row."
                 )
         px = {id: np.array(place) for id, place in clicks.px.items()}
+        _check_orientation(camera, task, scan, px)
         placement = _drawn_placement(task.options, scan)
         if placement is None:
             placement = _through_clicks(task.options, scan, px)
         return _start(camera, task, scan, placement, px, alike=(task.name,))
+
+
+def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Places) -> None:
+    """Raises InputError where clicks show the frame in another scan orientation than the project sets: a viewer that
+    obeys the file's orientation tag shows other columns and rows than the file has. Where the project sets none, and
+    the clicks were not made in `reseau review`, a file with such a tag leaves open which they are."""
+    if len(px) < LEAST_CLICKS or camera.clicks is None or on_a_line(np.array(list(px.values()))):
+        return
+    given = _up_from_camera(_through_clicks(task.options, scan, px))
+    clicked = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
+    asked = task.options.fiducials.pose
+    if asked == clicked or (asked == "auto" and (scan.orientation == 1 or camera.clicks.who)):
+        return
+    tag = (
+        f"The file's orientation tag ({scan.orientation}) asks viewers to turn the picture, and columns and rows count "
+        "in the picture as it is stored. "
+        if scan.orientation != 1
+        else ""
+    )
+    does = f"sets {asked}" if asked != "auto" else "sets none"
+    raise InputError(
+        f"{camera.path}: the clicks in {task.name} show the frame in the scan orientation {clicked}, and the project "
+        f"{does}. {tag}Click the marks in `reseau review`, which shows it as stored, or set the right orientation "
+        "(pose, in [measure])."
+    )
 
 
 def _in_common(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor | None) -> CameraFile:

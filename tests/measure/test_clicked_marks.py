@@ -44,6 +44,18 @@ def test_three_clicks_find_a_frame_in_any_pose_that_no_search_finds(pose: str, t
     assert_right(result, ALIKE, matrix)
 
 
+def test_clicks_that_contradict_the_set_pose_give_no_observation(tmp_path: Path) -> None:
+    """As in a viewer that turns the picture: the names would be those of other marks."""
+    matrix = pixel_from_camera("180")
+    grey = frame_picture(ALIKE, matrix)
+    result = measured(grey, ALIKE, tmp_path, FiducialOptions("0", clicks=clicks_at(matrix, "124")))
+    assert {mark.status for mark in result.marks} == {Status.REJECTED}
+    assert "show the scan orientation 180, and 0 is set" in result.problems[0]
+    assert_right(
+        measured(grey, ALIKE, tmp_path, FiducialOptions("180", clicks=clicks_at(matrix, "124"))), ALIKE, matrix
+    )
+
+
 def test_clicks_tell_the_pitch_where_nothing_else_does(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0", FAR_TURN_RAD)
     options = FiducialOptions(clicks=clicks_at(matrix, "123"))

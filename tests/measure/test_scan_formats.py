@@ -216,14 +216,51 @@ def test_pitch_of_png_and_jpeg(tmp_path: Path) -> None:
             assert scan.pitch_um == pytest.approx((20.0, 25.0))
 
 
-def test_the_first_full_picture_of_several_is_taken(tmp_path: Path) -> None:
+def test_of_several_full_pictures_the_first_is_taken_and_the_others_need_a_look(tmp_path: Path) -> None:
+    """Those of reduced size and masks do not count, whether their tags say so or not; a path may name a page."""
     with tifffile.TiffWriter(tmp_path / "s.tif") as file:
         file.write(picture()[::4, ::4], subfiletype=1)
         file.write(picture(), metadata=None)
+        file.write(picture()[::2, ::2], metadata=None)
         file.write(np.zeros_like(picture()), metadata=None)
+        file.write(np.zeros(picture().shape, bool), metadata=None, subfiletype=4, photometric="minisblack")
     with open_scan(tmp_path / "s.tif") as scan:
-        assert scan.notes == ("the file holds 2 pictures: the first was taken",)
+        (told,) = scan.problems
+        assert "holds 2 pictures of full size (pages 2, 4), and page 2 was measured" in told
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
+    with open_scan(f"{tmp_path / 's.tif'}#page=4") as scan:
+        assert not scan.problems
+        assert not scan.window(0, 0, scan.width_px, scan.height_px).any()
+    with pytest.raises(MeasurementError, match="page 3 of this file is no picture of full size"):
+        open_scan(f"{tmp_path / 's.tif'}#page=3")
+
+
+@pytest.mark.parametrize("flag", [0, 1])
+def test_a_full_picture_below_a_thumbnail_is_read(flag: int, tmp_path: Path) -> None:
+    """In a SubIFD, as cameras and scanners store it, whether the tags of the first page call it reduced or not."""
+    with tifffile.TiffWriter(tmp_path / "s.tif") as file:
+        file.write(picture()[::8, ::8], subfiletype=flag, subifds=2, metadata=None)
+        file.write(picture(), metadata=None)
+        file.write(picture()[::2, ::2], subfiletype=1, metadata=None)
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert not scan.problems
+
+
+def test_which_band_is_used_is_said(tmp_path: Path) -> None:
+    bands = np.stack([picture()] * 5, axis=-1)
+    told = []
+    for kind, samples, further in (
+        ("minisblack", bands, [0] * 4),
+        ("rgb", bands, [0] * 2),
+        ("rgb", bands[..., :4], [2]),
+    ):
+        tifffile.imwrite(tmp_path / "s.tif", samples, photometric=kind, planarconfig="contig", extrasamples=further)
+        with open_scan(tmp_path / "s.tif") as scan:
+            told.append(scan.notes)
+    assert told[0] == ("the picture has 5 bands: the first is used",)
+    assert told[1] == ("the picture has 5 bands: the first three are used, as red, green and blue",)
+    assert told[2] == ()
 
 
 @pytest.mark.parametrize("pictures", [1, 3])

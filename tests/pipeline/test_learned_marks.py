@@ -302,6 +302,24 @@ def test_clicks_that_cannot_be_are_refused(rendered: Path) -> None:
         learned(replace(project, cameras={"camera.toml": outside}))
 
 
+@pytest.mark.parametrize("pose", ["0", "auto"])
+def test_clicks_that_contradict_the_set_orientation_are_asked(pose: str, rendered: Path, tmp_path: Path) -> None:
+    """As a viewer shows it that obeys the file's orientation tag: turned by 180 degrees, other marks lie there."""
+    picture = tifffile.imread(rendered / "scans" / "f1.tif")
+    (tmp_path / "scans").mkdir()
+    tifffile.imwrite(tmp_path / "scans" / "f1.tif", picture, extratags=[(274, 3, 1, 3, True)])
+    shown = np.array(picture.shape[1::-1]) - 1 - truth(rendered)["f1"]
+    lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, shown.tolist(), strict=True))
+    project = project_of(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose=pose)
+    with pytest.raises(InputError) as raised:
+        learned(project)
+    does = "sets 0" if pose == "0" else "sets none"
+    assert f"show the frame in the scan orientation 180, and the project {does}" in str(raised.value)
+    assert "orientation tag (3) asks viewers to turn the picture" in str(raised.value)
+    if pose == "0":
+        learned(project_of(tmp_path, LEARNED + clicks(rendered)))
+
+
 def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_path: Path) -> None:
     """Crosses clicked beside their middles in one frame: no pose is decided, and all frames repeat them."""
     poses = ("0", "90", "180m")
