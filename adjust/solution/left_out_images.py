@@ -9,6 +9,7 @@ import numpy as np
 from adjust.functional_model.families import parameter_names
 from adjust.problem.camera import Camera, Prior
 from adjust.problem.network import Network
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 
 FITTING = 3.0  # times sigma0 of the others, up to which the standardised residuals of an image agree with them
@@ -73,7 +74,7 @@ def fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[s
 
 def _adjusted(camera: Camera, result: Adjustment) -> Camera:
     def known(name: str, given: Prior | None) -> Prior:
-        return Prior(result.value(f"IO.{camera.name}.{name}"), np.inf if given is None else given.sigma)
+        return Prior(result.value(Parameter.interior(camera.name, name)), np.inf if given is None else given.sigma)
 
     of = camera.distortion
     parameters = {

@@ -235,7 +235,10 @@ def _with_departure(reason: str, departures: Mapping[str, float]) -> tuple[Verdi
 
 def _notes(problem: BareProblem, opencv: OpenCvCalibration, sigmas_tell: bool) -> str:
     """What OpenCV was told that is not quite so."""
-    notes = ["Both take film transformations and object points as known, so these sigmas hold for that case"]
+    notes = [
+        "This checks the adjustment and not the marks: OpenCV is given the same observations. Both take film "
+        "transformations and object points as known, so these sigmas hold for that case"
+    ]
     if not sigmas_tell:
         notes.append(
             "the observations leave no more than OpenCV's rounding, so these sigmas are those assumed beforehand"

@@ -13,6 +13,9 @@ from pipeline.opencv_check.opencv_model import FISHEYE_NAMES, NAMES, Y_UP, Freed
 Array = NDArray[np.float64]
 
 PICTURE_PX = 4000.0  # the frame's longer side, in the pixels in which OpenCV is given the observations
+OBJECT_EXTENT = (
+    100.0  # rms distance of object points from their mean: of a small one, or in metres, OpenCV loses digits
+)
 CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 300, 1e-15)
 FLAT = 1e-3  # OpenCV takes a field for a plane where its smallest extent is below this part of the middle one (squared)
 FEWEST_FLAT, FEWEST_DEEP = 4, 6  # points from which OpenCV begins an image
@@ -61,7 +64,8 @@ def can_begin(xyz: Array) -> bool:
 def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> OpenCvCalibration:
     """OpenCV's least squares from `start` (18,); what `freedom` does not name is held at its start.
 
-    Its points are single precision: object points are taken about their mean, and the frame about its middle.
+    Its points are single precision: object points are taken about their mean and of one size, and the frame about its
+    middle.
     Raises cv2.error where OpenCV refuses.
     """
     pixels = _Pixels.of(images, start)
@@ -147,8 +151,8 @@ def _fisheye_derivatives(xyz: Array, turn: Array, shift: Array, matrix: Array, l
 
 @dataclass(frozen=True)
 class _Pixels:
-    """The images as OpenCV is given them: places (n, 2) in pixels of mm, y down, object points about their mean; offset
-    (2,) of the top left corner, size of the frame."""
+    """The images as OpenCV is given them: places (n, 2) in pixels of mm, y down, object points about their mean and of
+    the extent OBJECT_EXTENT; offset (2,) of the top left corner, size of the frame."""
 
     objects: list[Array]
     places: list[Array]
@@ -164,7 +168,9 @@ class _Pixels:
         offset = np.array([corners[0, 0], -corners[1, 1]]) / mm - 0.5
         middle = np.concatenate([image.xyz for image in images]).mean(axis=0)
         width, height = (int(extent) + 2 for extent in np.ceil((corners[1] - corners[0]) / mm))
-        objects = [image.xyz - middle for image in images]
+        xyz = np.concatenate([image.xyz for image in images]) - middle
+        unit = float(np.sqrt((xyz**2).sum(axis=1).mean())) / OBJECT_EXTENT
+        objects = [(image.xyz - middle) / unit for image in images]
         return cls(objects, [image.xy_mm * Y_UP / mm - offset for image in images], mm, offset, (width, height))
 
     @property

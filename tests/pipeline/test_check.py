@@ -131,6 +131,22 @@ def test_a_moderate_lens_agrees_to_a_tenth_of_a_sigma(distortion: Distortion, as
     assert ("fy" in {row.name for row in check.rows}) == (aspect != 1.0)
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e3])
+def test_the_unit_of_the_object_costs_opencv_no_digits(unit: float) -> None:
+    """Objects of half a millimetre made its standard deviations wrong by factors of thousands."""
+    network = simulated(CONVERGENT, film=False, distortion=free("opencv", "k1", "k2", "p1", "p2", "k3"))
+    network = replace(network, cameras=tuple(replace(each, fiducials={}) for each in network.cameras))
+    points = tuple(
+        ObjectPoint(each.id, *(prior and Prior(unit * prior.value, prior.sigma) for prior in (each.X, each.Y, each.Z)))
+        for each in network.points
+    )
+    scaled, plain = checked(replace(network, points=points)), checked(network)
+    assert (scaled.verdict, plain.verdict) == ("agrees", "agrees")
+    for row, same in zip(scaled.rows, plain.rows, strict=True):
+        assert row.opencv_sigma == pytest.approx(same.opencv_sigma, rel=1e-3)
+        assert row.opencv_sigma == pytest.approx(row.sigma, rel=0.05)
+
+
 def test_parameters_found_are_those_simulated() -> None:
     check = checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
     truth = {
