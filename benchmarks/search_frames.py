@@ -90,12 +90,19 @@ def is_overexposed(seed: int, index: int) -> bool:
 
 
 def case_of(
-    rng: Generator, kind: str, symmetry: str, layout: FiducialLayout, name: str, tones: Tones | None = None
+    rng: Generator,
+    kind: str,
+    symmetry: str,
+    layout: FiducialLayout,
+    name: str,
+    tones: Tones | None = None,
+    gamma: float = 1.0,
 ) -> Case:
     """A frame with the marks of the layout, all else drawn by chance. tones: of marks that grow out of the frame's
-    border, with no pads behind them; else by chance, too."""
+    border, with no pads behind them; else by chance, too. gamma: by which the scanner codes light."""
     of_border, (tones, picture) = tones is not None, (tones, "solid marks") if tones else _tones(rng)
     scene = _scene(rng, layout, tones)
+    scene = replace(scene, scanner=replace(scene.scanner, tone=gamma))
     scene = replace(scene, pad_mm=0.0) if of_border else scene
     truth = frame_truth(scene, 0)
     clutter = _clutter(rng, layout, truth.geometry, tones)

@@ -16,7 +16,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.film import AFFINITY_SIGMA
 from measure.frames.chance import doubt, expected_as_good, expected_where_seen
 from measure.frames.frame import Frame
-from measure.frames.frame_measurement import measure_frame
+from measure.frames.frame_measurement import measure_frame, rename_frame
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.pose.pose_decision import decide_pose
@@ -180,7 +180,7 @@ def best_of(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
         return None
     placements, frames = [found[0], *_others(found)], list[Frame]()
     for placement in placements:
-        frame = _as_its_pictures_say(search, found, placement)
+        frame = _as_its_pictures_say(search, placement)
         if any(before.accepted and before.has_all_of(frame) for before in frames):
             continue
         if frame.is_sure and not _is_outdone(search, frame, placements):
@@ -198,23 +198,23 @@ def _is_outdone(search: FrameSearch, frame: Frame, placements: Sequence[Placemen
     return any(placement.supported > frame.measured for placement in placements) and bool(doubt(search, frame))
 
 
-def _as_its_pictures_say(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> Frame:
+def _as_its_pictures_say(search: FrameSearch, placement: Placement) -> Frame:
     """The frame in a placement. At the right place in a wrong pose unlike marks are not found under one another's
     names: where that is so, the pictures there decide the pose, and the frame is measured in it."""
     frame = measure_frame(search.scan, search.layout, placement, search.options)
     if frame.accepted or not frame.belongs.any() or search.options.pose != "auto":
         return frame
-    pose, renamed = named(search, found, frame)
+    pose = likeliest_pose(search, frame)
     if not pose.decided or pose.name == placement.pose:
         return frame
-    return measure_frame(search.scan, search.layout, renamed, search.options)
+    return rename_frame(search.scan, search.layout, frame, pose.name, search.options)
 
 
 def _in_spite_of_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Seen:
     """The accepted frames under other pitches than the given one, those first that chance makes least, only marks
     without blemish counting. So much freedom finds false frames too."""
     found = search.anywhere(hypotheses)
-    frames = [_as_its_pictures_say(search, found, place) for place in _hardly_by_chance(search, found, len(hypotheses))]
+    frames = [_as_its_pictures_say(search, place) for place in _hardly_by_chance(search, found, len(hypotheses))]
     expected = [(tried * expected_as_good(search, frame), frame) for frame in frames if frame.accepted]
     return found, sorted(expected, key=_expected)
 
@@ -226,7 +226,7 @@ def _at_a_closer_look(search: FrameSearch, hypotheses: Hypotheses, tried: int) -
     The marks' pictures need not be clear: whether a frame is there is one question, which pose it has another."""
     found, seen = search.anywhere(hypotheses), list[tuple[float, Frame]]()
     for place in _hardly_by_chance(search, found, tried):
-        frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
+        frames = [frame for frame in _in_its_likeliest_poses(search, place) if frame.agrees]
         if frames:
             as_measured = min(expected_where_seen(search, frame, _seen_px(frame)) for frame in frames)
             most = max(frames, key=lambda frame: frame.belongs.sum())
@@ -238,16 +238,16 @@ def _expected(seen: tuple[float, Frame]) -> float:
     return seen[0]
 
 
-def _in_its_likeliest_poses(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> list[Frame]:
+def _in_its_likeliest_poses(search: FrameSearch, placement: Placement) -> list[Frame]:
     """The frame in a placement, and in the pose that its pictures like best, for faint marks are not seen under one
     another's names, though they say not surely which these are."""
     frame = measure_frame(search.scan, search.layout, placement, search.options)
     if search.options.pose != "auto" or not frame.belongs.any():
         return [frame]
-    pose, renamed = named(search, found, frame)
+    pose = likeliest_pose(search, frame)
     if pose.name == placement.pose:
         return [frame]
-    return [frame, measure_frame(search.scan, search.layout, renamed, search.options)]
+    return [frame, rename_frame(search.scan, search.layout, frame, pose.name, search.options)]
 
 
 def _seen_px(frame: Frame) -> dict[int, Array]:
@@ -293,17 +293,7 @@ def _too_faint(likeliest: tuple[float, Frame] | None) -> str:
     return f"; {seen}, {by_chance}: no other pitch tells them from it, click those that you see in reseau review"
 
 
-def named(
-    search: FrameSearch, found: Sequence[Placement], frame: Frame, lines: Sequence[Line] = ()
-) -> tuple[Pose, Placement]:
-    """The pose that what is seen of the frame speaks for, and the frame's placement in it. lines: of writing."""
-    each = [posed(found, frame.placement, pose) for pose in POSES]
-    pose = decide_pose(search.scan, search.layout, each, frame, search.options, lines)
-    return pose, each[POSES.index(pose.name)]
-
-
-def posed(found: Sequence[Placement], best: Placement, pose: str) -> Placement:
-    """The placement of a pose at the place of the best one: as it was found, or else the best one's, renamed."""
-    return next(
-        (placement for placement in found if placement.pose == pose and placement.same_place(best)), best.posed(pose)
-    )
+def likeliest_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line] = ()) -> Pose:
+    """The pose that what is seen of the frame speaks for. lines: of writing."""
+    placements = [frame.fitted_placement.posed(pose, frame.camera_mm) for pose in POSES]
+    return decide_pose(search.scan, search.layout, placements, frame, search.options, lines)

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from measure.annotations.detect_text import networks
 from measure.annotations.line import KnownLine, Line
 from measure.annotations.read import read_writing
-from measure.attempts import best_of, find_frame, named, posed
+from measure.attempts import find_frame, likeliest_pose
 from measure.fiducial_options import FiducialOptions
 from measure.frames.chance import doubt
 from measure.frames.clicked_frame import clicked_frame, contradicted_pose, is_shown, with_clicks
 from measure.frames.fiducial_rows import absent_frame, lost_frame, present_frame
 from measure.frames.frame import Frame
-from measure.frames.frame_measurement import measure_frame
+from measure.frames.frame_measurement import measure_frame, rename_frame
 from measure.marks.frame_border import at_border
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import FiducialLayout
@@ -26,7 +26,7 @@ from measure.results import FrameMeasurement, Pose
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
-from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+from measure.search.pitches import pitch_hypotheses
 from measure.status import Status
 
 Array = NDArray[np.float64]
@@ -87,16 +87,13 @@ def _searched(
     lines = _read(scan, layout, frame) if options.writing == "all" else None
     pose, against = Pose(options.pose, True, _SET), NO_REASON
     if options.pose == "auto":
-        frame = _in_every_pose(search, found, frame)
-        pose, placement = named(search, found, frame, lines or ())
+        pose = likeliest_pose(search, frame, lines or ())
         if options.writing == "pose" and not pose.decided and frame.accepted:
             lines = _read(scan, layout, frame, options.known_lines)
-            pose, placement = named(search, found, frame, lines or ())
-        if pose.name != frame.placement.pose:
-            frame = measure_frame(scan, layout, placement, options)
-        frame = _as_if_set(search, hypotheses, frame)
+            pose = likeliest_pose(search, frame, lines or ())
+        frame, pose = _rename(search, frame, pose)
     else:
-        against = _against_the_set_pose(search, found, frame, lines or ())
+        against = _against_the_set_pose(search, frame, lines or ())
     chance = doubt(search, frame)
     problems = [each.told(f"{each}.") for each in (*_rivals(search, found, frame), chance, against) if each]
     doubts = problems if frame.measured else [_UNSURE, *problems]
@@ -105,30 +102,16 @@ def _searched(
     return replace(present_frame(scan, layout, frame, pose, pitch_um, problems, chance), writing=lines)
 
 
-def _in_every_pose(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> Frame:
-    """The frame, or that in another pose at its place in which more of its marks are seen: marks that lean to one side
-    look like their mirror images, moved and turned a little."""
-    if frame.is_whole:
-        return frame
-    others = [pose for pose in search.unlike_poses(frame.placement) if pose != frame.placement.pose]
-    placements = [posed(found, frame.placement, pose) for pose in others]
-    frames = [measure_frame(search.scan, search.layout, placement, search.options) for placement in placements]
-    return max([frame, *frames], key=_worth)
-
-
-def _as_if_set(search: FrameSearch, hypotheses: Sequence[Sequence[PitchHypothesis]], frame: Frame) -> Frame:
-    """The frame, or the one that is found if its pose is set, if more of its marks are seen then: what a search for all
-    poses finds in one of them is not all that a search for that one does."""
-    if frame.is_whole:
-        return frame
-    of_pose = FrameSearch(search.scan, search.layout, replace(search.options, pose=frame.placement.pose))
-    same = [one for group in hypotheses for one in group if one.mm == frame.placement.pitch_mm]
-    again = best_of(of_pose, of_pose.anywhere(same))
-    return frame if again is None else max(frame, again, key=_worth)
-
-
-def _worth(frame: Frame) -> tuple[bool, int, int]:
-    return frame.accepted and not frame.placement.surroundings.robust, frame.measured, int(frame.belongs.sum())
+def _rename(search: FrameSearch, frame: Frame, pose: Pose) -> tuple[Frame, Pose]:
+    """The frame with its marks named as in that pose. Where fewer of them agree then, it stays as it is, its pose being
+    no more than assumed."""
+    if pose.name == frame.placement.pose:
+        return frame, pose
+    renamed = rename_frame(search.scan, search.layout, frame, pose.name, search.options)
+    if renamed is not frame:
+        return renamed, pose
+    against = f"fewer of the marks agree in pose {pose.name} than in pose {frame.placement.pose}, which is assumed."
+    return frame, replace(pose, name=frame.placement.pose, decided=False, evidence=(*pose.evidence, against), rivals=())
 
 
 def _read(
@@ -154,14 +137,14 @@ def _read(
     return read_writing(scan, nets, frame_px)
 
 
-def _against_the_set_pose(
-    search: FrameSearch, found: Sequence[Placement], frame: Frame, lines: Sequence[Line]
-) -> Reason:
+def _against_the_set_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line]) -> Reason:
     """A sentence where what is seen decides for another pose than the one that the project sets."""
-    likeliest, placement = named(search, found, frame, lines)
+    likeliest = likeliest_pose(search, frame, lines)
     if likeliest.name == frame.placement.pose or not frame.measured:
         return NO_REASON
-    pose = decide_pose(search.scan, search.layout, [frame.placement, placement], frame, search.options, lines)
+    own = frame.fitted_placement
+    both = [own, own.posed(likeliest.name, frame.camera_mm)]
+    pose = decide_pose(search.scan, search.layout, both, frame, search.options, lines)
     if not pose.decided or pose.name == frame.placement.pose:
         return NO_REASON
     evidence = " ".join(pose.evidence).rstrip(".")

@@ -30,6 +30,11 @@ PLACEMENTS_BY_CHANCE = _limit(
 FRAME_BY_CHANCE = _limit(
     0.05, "chance having made the frame, where only some of its marks are seen", "its marks are weak, its pose assumed"
 )
+NO_FRAME = _limit(  # likelier than not
+    0.5,
+    "chance having made the frame, where only some of its marks are seen",
+    "none of its marks is an observation: they are predicted",
+)
 CAMERA_BY_CHANCE = _limit(
     0.01,
     "constellations that chance is expected to make as good",

@@ -24,6 +24,7 @@ Picture = NDArray[np.float32]
 Progress = Callable[[str, int, int], None]
 
 STRIP_PX = 256
+BORDER_PX = 2.0  # the Gaussian of the border's texture
 CHANNEL_GAINS = (1.0, 0.94, 0.8)  # a faintly warm film
 
 
@@ -64,23 +65,24 @@ def grey_strips(frame: Frame, index: int, background: Background) -> Iterator[Gr
     geometry, scene = frame.truth.geometry, background.scene
     for row0 in range(0, geometry.height_px, STRIP_PX):
         height = min(STRIP_PX, geometry.height_px - row0)
-        shares = _painted(frame, background, row0, height)
+        shares = _painted(frame, index, background, row0, height)
         if scene.film.grain > 0.0:
             seed = (scene.seed, index, 3)
             shares = shares + scene.film.grain * grain(seed, row0, height, geometry.width_px, scene.film.grain_px)
         yield _digitised(shares, scene, index, row0)
 
 
-def _painted(frame: Frame, background: Background, row0: int, height: int) -> Picture:
+def _painted(frame: Frame, index: int, background: Background, row0: int, height: int) -> Picture:
     """Shares of full scale, after the scanner's optics and averaged over every pixel's area."""
-    geometry, border = frame.truth.geometry, background.scene.tones.border
-    window = (row0, height, geometry.width_px, background.scene.scanner.blur_px)
+    geometry, scene = frame.truth.geometry, background.scene
+    window = (row0, height, geometry.width_px, scene.scanner.blur_px)
     exposed = np.zeros((height, geometry.width_px), np.float32)
     for part in frame.exposed:
         touched = part.rows(*window)
         if touched is not None:
             exposed[touched[0]] += touched[1]
     np.minimum(exposed, 1.0, out=exposed)  # a pocket reaches into the frame
+    border = _border(scene, index, row0, height, geometry.width_px)
     picture = border + exposed * (background.rows(geometry, row0, height) - border)
     for paint in frame.paints:
         touched = paint.rows(*window)
@@ -88,8 +90,17 @@ def _painted(frame: Frame, background: Background, row0: int, height: int) -> Pi
             place, cover = touched
             if paint.inside_frame:
                 cover = cover * exposed[place]
-            picture[place] += cover * (paint.tone - picture[place])
+            tone = border[place] if paint.tone == scene.tones.border else paint.tone
+            picture[place] += cover * (tone - picture[place])
     return np.asarray(picture, np.float32)
+
+
+def _border(scene: Scene, index: int, row0: int, height: int, width_px: int) -> Picture:
+    """What nothing has exposed, with a texture of its own."""
+    border = np.full((height, width_px), scene.tones.border, np.float32)
+    if scene.tones.border_contrast > 0.0:
+        border += scene.tones.border_contrast * grain((scene.seed, index, 5), row0, height, width_px, BORDER_PX)
+    return border
 
 
 def _digitised(shares: Picture, scene: Scene, index: int, row0: int) -> Grey:

@@ -326,9 +326,11 @@ class Scanner:
 
 @dataclass(frozen=True)
 class Tones:
-    """Grey values of the positive, as shares of full scale; contrast: rms of the background's texture."""
+    """Grey values of the positive, as shares of full scale; contrast, border_contrast: rms of the background's and of
+    the border's texture. What is as dark as the border was no more exposed: it shows the border's texture."""
 
     border: float = 0.06
+    border_contrast: float = 0.0
     background: float = 0.42
     contrast: float = 0.1
     mark: float = 0.9

@@ -14,7 +14,7 @@ from scipy.special import bdtrc
 from measure.frames.first_look import strongest
 from measure.frames.frame import CLEAR_LIKENESS, Frame
 from measure.frames.frame_sighter import first_search_px
-from measure.probabilities import FRAME_BY_CHANCE
+from measure.probabilities import FRAME_BY_CHANCE, NO_FRAME
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.search.constellation import sign_of
@@ -35,8 +35,9 @@ _APART = 2.0  # search radii off: beyond what a mark itself answers
 
 
 def doubt(search: FrameSearch, frame: Frame) -> Reason:
-    """A sentence where chance may have made the frame; empty where it is unlikely to. One that was found at a closer
-    look is taken only where chance hardly makes it, though none of its marks may be clear."""
+    """A sentence where chance may have made the frame, with the code no-frame where it is likelier to than not; empty
+    where it is unlikely to. One that was found at a closer look is taken only where chance hardly makes it, though none
+    of its marks may be clear."""
     if frame.placement.surroundings.robust:
         return NO_REASON
     inside = [index for index, sighting in enumerate(frame.sightings) if sighting.inside]
@@ -114,7 +115,7 @@ def _by_places_beside(search: FrameSearch, frame: Frame, inside: Sequence[int], 
     return Reason(
         f"only {found} of {len(inside)} marks were clearly found, and {hits} of {len(places)} places beside them look "
         f"as much like marks: chance finds as many with a probability of {chance:.2f}, and the frame may lie elsewhere",
-        Code.CHANCE,
+        *((Code.CHANCE, Code.NO_FRAME) if chance > NO_FRAME else (Code.CHANCE,)),
     )
 
 

@@ -58,7 +58,10 @@ def present_frame(
 ) -> FrameMeasurement:
     """Of a frame that was found. pitch_um: as given; None: pixels are taken as square. problems: why it may lie
     elsewhere, sentences, beside those that its marks show; chance: why it may be none at all: then none of its marks is
-    certain, nor if it was found at a closer look."""
+    certain, nor if it was found at a closer look. Where chance is likelier to have made it than not, it gives no
+    observation."""
+    if Code.NO_FRAME in chance.codes:
+        return replace(_predicted_frame(scan, layout, frame, chance), pose=pose, problems=tuple(problems))
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
     marks = tuple(_of_assumed_name(row, mark, pose) for row, mark in zip(marks, layout.marks, strict=True))
     weak = chance or (_FAINT if frame.placement.surroundings.robust else NO_REASON)
@@ -68,6 +71,19 @@ def present_frame(
         )
     problems = (*problems, *_problems(frame, pitch_um))
     return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, frame.tone)
+
+
+def _predicted_frame(scan: Scan, layout: FiducialLayout, frame: Frame, why: Reason) -> FrameMeasurement:
+    """Of a frame that may well be none: its marks where they would lie."""
+    marks = tuple(
+        MarkMeasurement(mark.id, "fiducial", place, None, Status.PREDICTED, why)
+        if sighting.inside
+        else MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, sighting.reason)
+        for mark, sighting, place in zip(
+            layout.marks, frame.sightings, frame.fitted_placement.places_px(frame.camera_mm), strict=True
+        )
+    )
+    return FrameMeasurement(scan.name, marks, weights=frame.weights)
 
 
 def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:

@@ -60,8 +60,12 @@ class _Look:
         size = high - low + 1
         finest_px = max(detail_px(mark, reduced[:, :2]), blur_px)
         template = known_picture(mark, centred, int(size[0]), int(size[1]), blur_px)
-        window = scan.reduced_window(reduction, col0, row0, width, tall, expected.weights)
-        self._flat = expected.polarity * surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
+        # A median at the window's end would see half of what lies about it: beside the frame's edge only the border.
+        rim = surroundings.ground_reach_px(finest_px)
+        wide = (col0 - rim, row0 - rim, width + 2 * rim, tall + 2 * rim)
+        window = scan.reduced_window(reduction, *wide, expected.weights)
+        flattened = surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
+        self._flat = expected.polarity * flattened[rim:-rim, rim:-rim]
         self._pattern, self._counts = surroundings.pattern(template, finest_px, self._flat)
         varied = variation(self._flat, self._counts)
         response = correlation(self._flat, self._pattern, self._counts, varied)

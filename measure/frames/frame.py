@@ -1,6 +1,6 @@
 """One frame in one placement: its marks as they were seen, and those told apart that do not belong."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,11 @@ class Frame:
     def fits(self) -> list[Match | None]:
         """The fits of the marks that belong."""
         return [s.fit if ok else None for s, ok in zip(self.sightings, self.belongs, strict=True)]
+
+    @property
+    def fitted_placement(self) -> Placement:
+        """Where the marks that belong put the frame."""
+        return replace(self.placement, pixel_from_camera=self.pixel_from_camera)
 
     @property
     def all_clear(self) -> bool:

@@ -1,6 +1,6 @@
 """A frame while its marks are sighted: what was seen of each so far, which of them agree, and the frame they make."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -114,6 +114,11 @@ class FrameSighter:
         for index, sighting in zip(upwards, sighted, strict=True):
             self.sightings[index] = sighting
 
+    def match_at(self, places_px: Mapping[int, Array]) -> None:
+        """Match marks, by index, at places where they were found before."""
+        for index, place in places_px.items():
+            self.sightings[index] = self._sight_expected(self.expected(index, 0.0).moved(place))
+
     def look_closer(self) -> None:
         """Look closer, where the others put them, at marks that are not clear or do not belong: beside one may lie
         dust, or the frame's edge. Only what is plainly there counts."""
@@ -221,14 +226,17 @@ class FrameSighter:
         return sighting
 
     def _sight_within(self, index: int, search_px: float) -> Sighting:
+        return self._sight_expected(self.expected(index, search_px))
+
+    def _sight_expected(self, expected: MarkPrediction) -> Sighting:
         """At a closer look a mark may be as faint as what texture feigns, where it seldom does so near by: all marks
         together decide of the frame."""
-        sighting = sight(self.scan, self.expected(index, search_px), self.options.match)
+        sighting = sight(self.scan, expected, self.options.match)
         fit, closer = sighting.fit, self.placement.surroundings.robust
         sure = closer and sighting.chance <= FAINT_MARK_BY_NOISE
         least = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
         if fit is not None and (fit.likeness < least[0] or fit.significance < least[1]):
-            return Sighting(sighting.predicted_px, True, None, nothing_within(search_px))
+            return Sighting(sighting.predicted_px, True, None, nothing_within(expected.search_px))
         return sighting
 
     def expected(self, index: int, search_px: float) -> MarkPrediction:

@@ -48,7 +48,8 @@ class Sighting:
 
 
 def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None) -> Sighting:
-    """Look for the mark within the search radius of its predicted place and match it there.
+    """Look for the mark within the search radius of its predicted place and match it there; without a radius, match it
+    at that place.
 
     frame_sigma: standard deviation of the predicted rotation (rad), scale, stretch and shear, where a frame fitted to
     all marks gives them.
@@ -113,7 +114,7 @@ def _fitted(
     mark = expected.mark
     if isinstance(mark, FrameCorner):
         return corner_of_edges(scan, mark, expected), 1.0
-    look = seen(scan, expected)
+    look = seen(scan, expected) if expected.search_px > 0 else (expected.center_px, 0.0)
     if look is None:
         return None, 1.0
     center_px, chance = look

@@ -66,11 +66,41 @@ class Placement:
         sizes = [np.sqrt(abs(np.linalg.det(each.pixel_from_camera[:, :2]))) for each in (self, other)]
         return bool(shift < _SAME_PX * self.reduction and abs(sizes[0] / sizes[1] - 1) < _SAME_SIZE)
 
-    def posed(self, pose: str) -> "Placement":
-        """The same place of the frame, its marks named as in another pose."""
+    def places_px(self, camera_mm: Array) -> Array:
+        """(n, 2) where it puts marks at camera_mm (n, 2)."""
+        return np.asarray(camera_mm @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2])
+
+    def names(self, places_px: Array, camera_mm: Array) -> NDArray[np.intp]:
+        """(k,) which mark lies at each of places_px (k, 2): the nearest one, -1 where it is as far as half way to the
+        next mark, or another place is nearer to it."""
+        own = self.places_px(camera_mm)
+        distance = np.hypot(*np.moveaxis(places_px[:, None] - own[None], -1, 0))
+        apart = np.hypot(*np.moveaxis(own[:, None] - own[None], -1, 0)) + np.diag(np.full(len(own), np.inf))
+        nearest = distance.argmin(axis=1)
+        within = distance.min(axis=1) < apart.min() / 2
+        is_first = distance.argmin(axis=0)[nearest] == np.arange(len(places_px))
+        return np.where(within & is_first, nearest, -1)
+
+    def posed(self, pose: str, camera_mm: Array) -> "Placement":
+        """The same place of the frame, its marks named as in another pose; moved, turned and scaled by what the given
+        coordinates (n, 2) of the marks differ that lie at the same places."""
         turn = np.linalg.inv(up_from_camera(self.pose)) @ up_from_camera(pose)
-        linear = self.pixel_from_camera[:, :2] @ turn
-        return replace(self, pose=pose, pixel_from_camera=np.column_stack([linear, self.pixel_from_camera[:, 2]]))
+        linear, shift = self.pixel_from_camera[:, :2] @ turn, self.pixel_from_camera[:, 2]
+        renamed = replace(self, pose=pose, pixel_from_camera=np.column_stack([linear, shift]))
+        places = self.places_px(camera_mm)
+        names = renamed.names(places, camera_mm)
+        if np.any(names < 0):
+            return renamed
+        pitch = np.array(self.pitch_mm)
+        to, from_ = ((each * pitch) @ (1.0, 1.0j) for each in (places, renamed.places_px(camera_mm)[names]))
+        mean_to, mean_from = to.mean(), from_.mean()
+        scale = np.vdot(from_ - mean_from, to - mean_to) / np.vdot(from_ - mean_from, from_ - mean_from)
+        similarity = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]])
+        moved = np.column_stack([linear, shift]) * pitch[:, None]
+        moved = similarity @ moved
+        offset = mean_to - scale * mean_from
+        moved[:, 2] += (offset.real, offset.imag)
+        return replace(renamed, pixel_from_camera=moved / pitch[:, None])
 
 
 def same_picture(

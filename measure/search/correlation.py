@@ -13,6 +13,7 @@ Map = NDArray[np.float32]
 
 _CLIP = 3.0  # times the local contrast
 _MEAN = 0.3  # of the coarse: the side of the squares whose median is background
+_MEDIAN = 5  # of these squares each way
 _DRAWN = 0.05  # of the mark's own contrast: what differs by more from the ground is the mark
 _SMOOTHED_PX = 3.0  # the standard deviation of a Gaussian that a reduced picture still shows
 _EVEN = 1e-5  # mean square in units of the local contrast: a three hundredth of it is rounding
@@ -32,6 +33,10 @@ class Surroundings:
     beside: float
     robust: bool
     whitened: bool
+
+    def ground_reach_px(self, detail_px: float) -> int:
+        """How far about a pixel its ground is taken from."""
+        return _MEDIAN * _mean_px(self.coarse * detail_px) // 2 + 1
 
     def flattened(self, image: Map, detail_px: float, faint_dn: float) -> Map:
         """The picture freed of what is much coarser than detail_px, in units of its contrast about every pixel: a thin
@@ -122,8 +127,12 @@ def _inverse_covariance(image: Map) -> Map:
 
 
 def _median(image: Map, coarse_px: float) -> Map:
-    """The median of five by five means."""
-    return _enlarged(cv2.medianBlur(_reduced(image, max(1, int(_MEAN * coarse_px))), 5), image)
+    return _enlarged(cv2.medianBlur(_reduced(image, _mean_px(coarse_px)), _MEDIAN), image)
+
+
+def _mean_px(coarse_px: float) -> int:
+    """The side of the squares whose means are compared."""
+    return max(1, int(_MEAN * coarse_px))
 
 
 def _smoothed(image: Map, sigma_px: float) -> Map:

@@ -60,7 +60,8 @@ class _Searched:
             for within_mm in (_TWIN * misfit_mm, misfit_mm)
         )
         if twin:
-            found = [place.posed(pose) for place in self.found[twin]] if self.twins else []
+            camera_mm = np.array([mark.xy_mm for mark in search.marks])
+            found = [place.posed(pose, camera_mm) for place in self.found[twin]] if self.twins else []
         else:
             found = search.of_pose(pose, own)
         self.looks[pose], self.found[pose] = own, found

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from measure import fiducials
 from measure.fiducial_options import FiducialOptions
 from measure.frames.chance import doubt
+from measure.frames.fiducial_rows import present_frame
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, MarkShape, dot
 from measure.pose.pose_decision import decide_pose
 from measure.pose.pose_pictures import SPOILT, Shown, Site
+from measure.results import Pose
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
@@ -125,6 +127,22 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     assert frame.belongs.tolist() == [False, True, True, True]
     sentence = doubt(FrameSearch(scan, DOTS, OPTIONS), frame)
     assert "of 64 places beside them look as much like marks: chance finds as many with a probability of" in sentence
+
+
+def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observation() -> None:
+    """Two marks of four: a similarity goes through any two."""
+    grey = picture(DOTS, "0", hidden=1)
+    at = np.rint(centers_px(DOTS, "0")[2]).astype(int)
+    grey[at[1] - 24 : at[1] + 25, at[0] - 24 : at[0] + 25] = 20000.0
+    scan = scan_of(grey)
+    frame = frame_of(scan, DOTS)
+    chance = doubt(FrameSearch(scan, DOTS, OPTIONS), frame)
+    assert "with a probability of 1.00" in chance
+    result = present_frame(scan, DOTS, frame, Pose("0", False), (50.0, 50.0), (), chance)
+    assert [mark.status for mark in result.marks] == [Status.PREDICTED] * 4
+    assert all(mark.reason == chance and mark.covariance is None for mark in result.marks)
+    np.testing.assert_allclose([mark.center_px for mark in result.marks], centers_px(DOTS, "0"), atol=5.0)
+    assert result.pixel_from_camera is None
 
 
 def test_specks_that_lie_as_all_marks_are_doubted_too() -> None:

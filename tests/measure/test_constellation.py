@@ -98,7 +98,22 @@ def test_a_square_looks_alike_in_all_poses_and_six_marks_do_not() -> None:
 
 def test_a_posed_placement_keeps_its_place() -> None:
     placement = Placement("0", np.array([[2.0, 0.1, 50.0], [0.1, -2.0, 60.0]]), 1.0, 4, 1, 1, (0.5, 0.5))
-    turned = placement.posed("90m")
+    turned = placement.posed("90m", np.array([mark.xy_mm for mark in MARKS[:4]]))
     assert turned.same_place(placement)
     center = turned.pixel_from_camera @ (10.0, 0.0, 1.0)
     np.testing.assert_allclose(center, placement.pixel_from_camera @ (*(up_from_camera("90m") @ (10.0, 0.0)), 1.0))
+
+
+def test_a_posed_placement_is_moved_by_what_the_coordinates_differ() -> None:
+    """Marks opposite each other whose coordinates are not: shifted, turned and larger, as the names are changed."""
+    camera_mm = np.array([(-109.0, 0.3), (109.4, 0.0), (0.0, 109.2), (0.2, -109.0)])
+    placement = Placement("0", np.array([[16.0, 0.3, 2350.0], [0.3, -16.0, 2340.0]]), 1.0, 4, 1, 4, (0.0625, 0.0625))
+    turned = placement.posed("180", camera_mm)
+    opposite = [1, 0, 3, 2]
+    before, after = placement.places_px(camera_mm), turned.places_px(camera_mm)[opposite]
+    assert turned.names(before, camera_mm).tolist() == opposite
+    plain = camera_mm[opposite] @ (-placement.pixel_from_camera[:, :2]).T + placement.pixel_from_camera[:, 2]
+    assert np.hypot(*(plain - before).T).min() > 3.0
+    # What no similarity takes up is left: the sides' lengths differ by 0.2 mm.
+    assert np.hypot(*(after - before).T).max() < 2.5
+    np.testing.assert_allclose((after - before).mean(axis=0), 0.0, atol=1e-9)

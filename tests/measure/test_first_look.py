@@ -9,7 +9,7 @@ from true_marks import KIND, some_mark
 from measure.fiducial_options import FiducialOptions
 from measure.frames.first_look import seen
 from measure.frames.refinement import sight
-from measure.marks.shapes import MarkShape, cross
+from measure.marks.shapes import MarkShape, cross, polygon
 from measure.search.prediction import MarkPrediction
 
 GROUND, CONTRAST = 25000.0, 15000.0
@@ -46,3 +46,22 @@ def test_a_line_far_thinner_than_a_pixel_is_not_seen_in_noise_and_warns_of_nothi
     noise = np.random.default_rng(3).standard_normal((60, 60))
     place = np.array([[1.5, 0.0, 30.0], [0.0, -1.5, 30.0]])  # 0.67 mm a pixel
     assert seen(scan_of(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1)) is None
+
+
+def test_a_solid_mark_at_the_frames_border_is_seen_however_far_about_it_is_sought() -> None:
+    """Its ground is that of the frame, not that of the border, of which the more is seen the smaller the window is."""
+    rng, size, center = np.random.default_rng(4), 400, np.array([200.3, 199.6])
+    block = MarkShape(polygon(((0.0, 0.0), (2.8, 0.0), (2.8, -1.4), (0.56, -1.4))), known_mm=((-9.0, -9.0), (1.9, 9.0)))
+    place = np.column_stack([np.diag([36.0, -36.0]), center])
+    x, y = np.moveaxis((np.stack(np.meshgrid(*[np.arange(size)] * 2), axis=-1) - center) / (36.0, -36.0), -1, 0)
+    exposed = (x < 1.9) & ~((y < 0) & (y > -1.4) & (x > -0.4 * y))
+    ground = 30000 + 2500 * 14 * gaussian_filter(rng.standard_normal((size, size)), 4.0)
+    border = 14000 + 3000 * rng.standard_normal((size, size))
+    light = gaussian_filter(exposed.astype(float), 1.0)
+    scan = scan_of(light * ground + (1 - light) * border)
+    for search_px in (5.0, 24.0):
+        start = np.column_stack([place[:, :2], center + np.array([3.0, -2.0])])
+        look = seen(scan, MarkPrediction(block, start, search_px, -1))
+        assert look is not None
+        assert look[1] < 1e-3
+        assert np.hypot(*(look[0] - center)) < 6.0

@@ -12,8 +12,9 @@ import tifffile
 from small_scene import CAMERA, SCANNER, hidden_field, rendered, scene
 
 import synthetic_images
+from synthetic_images.areas import rounded_rectangle
 from synthetic_images.render import STRIP_PX, render_scene
-from synthetic_images.scene import Compression, Film, Tones
+from synthetic_images.scene import Compression, DrawnMark, Film, SceneFiducial, Tones
 from synthetic_images.tiff import Grey, write_tiff
 
 
@@ -94,6 +95,24 @@ def test_grain_and_noise_have_the_strength_and_the_correlation_asked_for(tmp_pat
     assert below == pytest.approx(0.03**2 * np.exp(-4 / (4 * sigma**2)), rel=0.07)
     seam = float((noise[255] * noise[256]).mean())
     assert seam == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.35)
+
+
+def test_the_border_and_what_was_not_exposed_within_the_frame_have_one_texture(tmp_path: Path) -> None:
+    shadow = DrawnMark(((rounded_rectangle(np.array([1.5, 1.5]), 0.0),),), light=False)
+    made = scene(
+        scanner=replace(SCANNER, blur_px=0.0, margin_mm=2.0),
+        field=hidden_field(),
+        pad_mm=0.0,
+        camera=replace(CAMERA, fiducials=(SceneFiducial("a", (0.0, 0.0), shadow),)),
+        tones=Tones(border=0.3, border_contrast=0.05, dark_mark=0.3, background=0.7, contrast=0.0),
+    )
+    picture, truth = rendered(tmp_path, made)
+    row, col = np.rint(truth.frames[0].fiducials["a"].center_px[::-1]).astype(int)
+    for part in (picture[:40, :], picture[row - 25 : row + 25, col - 25 : col + 25]):
+        assert part.mean() == pytest.approx(0.3, abs=0.01)
+        assert part.std() == pytest.approx(0.05, rel=0.15)
+    exposed = picture[row + 60 : row + 100, col + 60 : col + 100]
+    assert exposed.std() < 1e-4
 
 
 def test_the_same_scene_gives_the_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
