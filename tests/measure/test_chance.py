@@ -141,7 +141,8 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     result = present_frame(scan, DOTS, frame, Pose("0", False), (50.0, 50.0), (), chance)
     assert [mark.status for mark in result.marks] == [Status.PREDICTED] * 4
     assert all(mark.reason == chance and mark.covariance is None for mark in result.marks)
-    np.testing.assert_allclose([mark.center_px for mark in result.marks], centers_px(DOTS, "0"), atol=5.0)
+    for mark, place in zip(result.marks, centers_px(DOTS, "0"), strict=True):
+        assert mark.center_px == pytest.approx(place, abs=5.0)
     assert result.pixel_from_camera is None
 
 

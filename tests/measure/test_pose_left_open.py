@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.frames import refinement
+from measure.frames.first_look import seen
 from measure.frames.frame_measurement import measure_frame, rename_frame
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, polygon, turned_part
 from measure.search.constellation import Placement
@@ -82,7 +83,8 @@ def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(po
         assert frame.pose is not None
         assert frame.pose.name == pose
         assert [mark.status for mark in frame.marks] == [Status.MEASURED] * 4
-        np.testing.assert_allclose([mark.center_px for mark in frame.marks], truth, atol=0.25)
+        for mark, place in zip(frame.marks, truth, strict=True):
+            assert mark.center_px == pytest.approx(place, abs=0.25)
 
 
 def test_marks_that_were_found_are_renamed_and_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,8 +95,7 @@ def test_marks_that_were_found_are_renamed_and_not_sought_again(monkeypatch: pyt
     named_rightly = measure_frame(scan, BLOCKS, start, OPTIONS)
     named_wrongly = measure_frame(scan, BLOCKS, start.posed("0", right_mm(BLOCKS)), OPTIONS)
     assert int(named_wrongly.belongs.sum()) == 4
-    look = refinement.seen
-    monkeypatch.setattr(refinement, "seen", lambda scan, mark: look(scan, mark) if mark.search_px < 2 else None)
+    monkeypatch.setattr(refinement, "seen", lambda scan, mark: seen(scan, mark) if mark.search_px < 2 else None)
     frame = rename_frame(scan, BLOCKS, named_wrongly, "180", OPTIONS)
     assert frame.placement.pose == "180"
     assert int(frame.belongs.sum()) == 4
