@@ -165,11 +165,6 @@ class FrameSearch:
         seen = {index: places[index] for index in np.flatnonzero(inside).tolist()}
         return self._expected(placement, seen, len(seen), search.tolerance_px)
 
-    def unlike_poses(self, placement: Placement) -> tuple[str, ...]:
-        """The poses that show the marks' pictures elsewhere than all before them, under this placement's hypothesis."""
-        searched = self._searched.get(placement.pitch_mm)
-        return tuple(searched.unlike) if searched else self.poses
-
     def was_everywhere(self, placement: Placement) -> bool:
         """Whether the frame was searched in the whole scan, not only in the middle of it."""
         searched = self._searched.get(placement.pitch_mm)
