@@ -6,12 +6,13 @@ is a formula with its derivatives and an entry here.
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.added_terms import ADDED_NAMES, corrected_further, imaged_without
 from adjust.functional_model.correction import (
     Correct,
     Image,
@@ -146,7 +147,23 @@ _WITH_ORDER: dict[str, tuple[range, Callable[[int], Family]]] = {
     "legendre": (LEGENDRE_ORDERS, _legendre),
     "fourier": (FOURIER_ORDERS, _fourier),
 }
+EXTENDED = "+"  # behind a family's name: with the added terms, by which an adjustment tests what the family lacks
 FAMILY_NAMES = (*_FAMILIES, *(f"{name}(n)" for name in _WITH_ORDER))
+
+
+def _extended(of: Family) -> Family:
+    """A family with the added terms behind its own parameters."""
+    count = len(of.parameters)
+    units = of.units or ("mm",) * count
+    return replace(
+        of,
+        parameters=(*of.parameters, *ADDED_NAMES),
+        units=(*units, *("mm",) * len(ADDED_NAMES)),
+        image=imaged_without(of.image, count),
+        correct=corrected_further(of.correct, count),
+        needs="half_mm" if not of.needs else of.needs,
+        apart=lambda parameters: np.concatenate([of.apart(parameters[:count]), parameters[count:]]),
+    )
 
 
 @lru_cache
@@ -154,6 +171,8 @@ def family(name: str) -> Family:
     """The family of a name. Raises ValueError for a name or an order that there is not."""
     if name in _FAMILIES:
         return _FAMILIES[name]
+    if name.endswith(EXTENDED):
+        return _extended(family(name.removesuffix(EXTENDED)))
     spelled = re.fullmatch(r"(\w+)\((\d+)\)", name)
     if spelled is None or spelled[1] not in _WITH_ORDER:
         raise ValueError(f"a distortion family must be one of {', '.join(FAMILY_NAMES)}, not {name}")

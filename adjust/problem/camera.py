@@ -75,7 +75,8 @@ class Camera:
     """Interior orientation, distortion and fiducial marks (by id), with their priors F5 to F9.
 
     principal_distance_mm None: unknown, an approximation is found from the points. The principal point likewise; it
-    then starts at the centre of the frame, `center_mm` in the camera frame.
+    then starts at the centre of the frame, `center_mm` in the camera frame. frame_mm: width and height of the picture,
+    0 where they are not known.
     """
 
     name: str
@@ -85,3 +86,4 @@ class Camera:
     distortion: Distortion = Distortion()
     fiducials: Mapping[str, Fiducial] = field(default_factory=dict)
     center_mm: tuple[float, float] = (0.0, 0.0)
+    frame_mm: tuple[float, float] = (0.0, 0.0)

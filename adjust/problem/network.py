@@ -164,7 +164,10 @@ class Extent:
 
 @dataclass(frozen=True, repr=False)
 class Network:
-    """Everything that one adjustment knows. Names are unique; the order of things does not matter."""
+    """Everything that one adjustment knows. Names are unique; the order of things does not matter.
+
+    transparent: a flat board of given points can be seen from both sides.
+    """
 
     cameras: tuple[Camera, ...]
     images: tuple[Image, ...]
@@ -175,6 +178,7 @@ class Network:
     line_of_sight: LineOfSight = STRAIGHT
     scanners: tuple[Scanner, ...] = ()
     boards: tuple[Board, ...] = ()
+    transparent: bool = False
 
     @cached_property
     def scanner_by_name(self) -> dict[str, Scanner]:

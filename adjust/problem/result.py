@@ -207,6 +207,21 @@ class Contradiction:
         return tuple(np.argsort(-size, kind="stable").tolist())
 
 
+@dataclass(frozen=True)
+class Explanation:
+    """What makes residuals larger than the standard deviations given, beyond chance.
+
+    cause: in words with figures; remedy: what to do. kind: "radial", "decentering", "pixels", "groups", "board" or
+    "noise". p: probability of so much by chance; sigma0: without and with it in the model.
+    """
+
+    kind: str
+    cause: str
+    remedy: str
+    p: float
+    sigma0: tuple[float, float]
+
+
 class Assessment(Protocol):
     """What an adjustment tells of its observations, each part computed where it is asked for (see `Adjustment`)."""
 
@@ -230,6 +245,9 @@ class Assessment(Protocol):
 
     @property
     def suspects(self) -> tuple[Suspect, ...]: ...
+
+    @property
+    def explanations(self) -> tuple[Explanation, ...]: ...
 
     @property
     def warnings(self) -> tuple[str, ...]: ...
@@ -308,6 +326,11 @@ class Adjustment:
     def suspects(self) -> tuple[Suspect, ...]:
         """The worst first."""
         return self.assessment.suspects
+
+    @property
+    def explanations(self) -> tuple[Explanation, ...]:
+        """Of a sigma0 that is too large; suspects are then those of an adjustment with them in the model."""
+        return self.assessment.explanations
 
     @property
     def warnings(self) -> tuple[str, ...]:

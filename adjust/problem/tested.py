@@ -73,7 +73,8 @@ class TestedUnits:
         """(m, 2) positions of the unknowns that the priors are of, ABSENT behind those that stand alone."""
         unknowns = self.problem.unknowns
         given = unknowns.has_prior
-        pairs = [pair for pair in unknowns.fiducial.values() if given[pair].all()]
+        shared = dict.fromkeys(tuple(pair) for pair in unknowns.fiducial.values())  # by cameras of the same marks
+        pairs = [pair for pair in shared if given[list(pair)].all()]
         paired = np.array(pairs, dtype=np.intp).reshape(-1, 2)
         alone = np.setdiff1d(np.flatnonzero(given), paired)
         return np.concatenate([paired, np.column_stack([alone, np.full(len(alone), ABSENT)])])

@@ -115,6 +115,11 @@ def contradictions(search: Search) -> list[Contradiction]:
         scale = learnt
 
 
+def rest_without(search: Search, units: Sequence[int]) -> tuple[float, float]:
+    """v'Pv and redundancy of an adjustment that would do without some units."""
+    return _rest(search, _Covariance(search), units)
+
+
 def _significant_scale(vpv: float, redundancy: float, probabilities: Probabilities) -> float:
     """Root of v'Pv over the redundancy, where that is larger than chance makes it, else 1."""
     chance = redundancy < 1.0 or special.chdtrc(redundancy, vpv) > probabilities.family

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,10 @@ from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment, Cofactor
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.solution.assessment import RunAssessment
+from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
 from adjust.solution.left_out_images import fitting, with_lens, without_images
-from adjust.solution.network_slips import network_slip, stations_elsewhere
 from adjust.solution.options import Datum, Method, Options
+from adjust.solution.plausibility import implausible
 from adjust.solution.runs import Run, again, run
 from adjust.solution.slips import Slip, few_points, freed, slips
 from adjust.undetermined.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
@@ -50,7 +52,7 @@ def adjust(
 
     Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
     has no image, where the chosen datum does not hold the object space, or where a slip that concerns the whole network
-    explains what else contradicts itself everywhere (see `network_slip`).
+    explains what else contradicts itself everywhere (see `blunder_sentence`).
     """
     keep_freed_memory()
     validate(network)
@@ -117,19 +119,23 @@ def _as_a_whole(
         return result
     if not weighs_anew:
         _check_whole(network, result, options)
-    told = stations_elsewhere(network, result)
-    return replace(result, remarks=(*result.remarks, told)) if told else result
+    told = [
+        *filter(None, [stations_elsewhere(network, result)]),
+        *implausible(network, result, partial(_tried, options=options), options.probabilities.family),
+    ]
+    return replace(result, remarks=(*result.remarks, *told)) if told else result
 
 
 def _check_whole(network: Network, given: Adjustment | None, options: Options) -> None:
     """Raise AdjustmentError where a slip of the whole network explains what the network as it is given does not."""
-
-    def tried(other: Network) -> Adjustment | None:
-        return _plainly(other, _own_start(other, options), options)
-
-    slip = network_slip(network, given, tried, options.probabilities.family)
+    slip = blunder_sentence(network, given, partial(_tried, options=options), options.probabilities.family)
     if slip:
         raise AdjustmentError(slip)
+
+
+def _tried(network: Network, options: Options) -> Adjustment | None:
+    """Another network adjusted from its own approximations; None where it cannot begin."""
+    return _plainly(network, _own_start(network, options), options)
 
 
 def _own_start(network: Network, options: Options) -> Approximations | None:

@@ -12,7 +12,16 @@ from adjust.problem.functions import computed_observations
 from adjust.problem.parameter import description
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.problem import Problem
-from adjust.problem.result import Cofactor, Contradiction, FurtherResidual, Group, Reliability, Residuals, Suspect
+from adjust.problem.result import (
+    Cofactor,
+    Contradiction,
+    Explanation,
+    FurtherResidual,
+    Group,
+    Reliability,
+    Residuals,
+    Suspect,
+)
 from adjust.problem.tested import TestedUnits
 from adjust.quality.contradiction import contradictions_of_groups
 from adjust.quality.reliability import Misfits, reliability
@@ -20,6 +29,7 @@ from adjust.quality.residuals import further_residuals, groups, residuals
 from adjust.quality.snooping import contradictions, search, suspects
 from adjust.quality.suspicions import is_gross, swapped_numbers, unchecked_orientations
 from adjust.quality.variance_components import factor_sigmas
+from adjust.solution.explanations import Explained, explain
 from adjust.solution.runs import ROUNDS, Run
 from adjust.undetermined.diagnosis import undetermined, weak_directions
 from adjust.undetermined.flat_valleys import held_directions, inseparable
@@ -85,8 +95,24 @@ class RunAssessment:
         sigma0 = float(np.sqrt(run.vpv / self.redundancy)) if self.redundancy > 0 else 1.0
         return reliability(*at, weights, sigma0, self.redundancy, self.probabilities)
 
+    @property
+    def explanations(self) -> tuple[Explanation, ...]:
+        return self._explained.explanations
+
+    @cached_property
+    def _explained(self) -> Explained:
+        return explain(self.run, self.redundancy, self.probabilities)
+
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
+        """Of the adjustment with what explains the residuals, so that nothing else is blamed for it."""
+        explained = self._explained.run
+        if explained is self.run:
+            return self._suspects
+        return RunAssessment(explained, self.cofactor, self.probabilities)._suspects
+
+    @property
+    def _suspects(self) -> tuple[Suspect, ...]:
         run, found = self.run, self._found
         if found is None or self.reliability is None:
             return ()

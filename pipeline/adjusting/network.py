@@ -58,6 +58,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         observations=_observations(project.adjust, used),
         distances=distances,
         boards=_boards(project),
+        transparent=project.transparent or (project.targets is not None and project.targets.transparent),
         calibrations=calibrations,
         line_of_sight=LineOfSight(
             project.adjust.earth_curvature, project.adjust.refraction, project.unit_mm / UNITS_MM["m"]

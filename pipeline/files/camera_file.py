@@ -145,6 +145,7 @@ class CameraFile:
                 for fiducial in self.fiducials
             },
             center_mm=center_mm,
+            frame_mm=self.frame_mm or (0.0, 0.0),
         )
 
 

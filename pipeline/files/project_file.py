@@ -52,6 +52,7 @@ class Project:
     line where that was cut short and does not count, else 0.
     board_bend_sigma: of how far the middle of the board, which is all object points, stands off its plane, in the
     user's unit; 0 flat, inf unknown.
+    transparent: whether a flat field of object points can be seen from both sides.
     crs: what the object coordinates are, as "EPSG:25832"; empty where nobody says it.
     writing: in which scans is read what is written about the frame, as in `FiducialOptions`.
     """
@@ -77,6 +78,7 @@ class Project:
     left_out: frozenset[str] = frozenset()
     crs: str = ""
     board_bend_sigma: float = 0.0
+    transparent: bool = False
     decisions: tuple[Decision, ...] = ()
     decisions_cut_short: int = 0
 
@@ -233,6 +235,7 @@ def read_project(path: Path) -> Project:
         writing=cast(Reads, measure.text("writing", "pose", get_args(Reads))),
         crs=objects.text("crs", ""),
         board_bend_sigma=objects.sigma("board_bend", 0.0),
+        transparent=objects.flag("transparent", False),
     )
     for each in (table, measure, objects):
         each.done()

@@ -1,7 +1,7 @@
 """The table [targets] of project.toml: what is to be measured beside the fiducials."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
 from measure.marks.shapes import Polarity
@@ -34,6 +34,7 @@ class TargetSettings:
     board: "BoardSpec | None" = None
     code: "RingCode | None" = None
     numbers: Mapping[int, str] = field(default_factory=dict)
+    transparent: bool = False
 
 
 def read_targets(table: Table) -> TargetSettings:
@@ -52,6 +53,7 @@ def read_targets(table: Table) -> TargetSettings:
             raise table.error("kind", f"this {kind} is impossible: {error}.") from None
         diameter = getattr(board, "diameter_mm", None)
         settings = TargetSettings(kind, diameter, board=board)
+    settings = replace(settings, transparent=table.flag("transparent", False))
     table.done()
     return settings
 

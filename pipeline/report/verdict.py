@@ -1,7 +1,7 @@
 """The verdict on a calibration, and what needs a look."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -177,14 +177,22 @@ def _beyond_chance(adjustment: Json, rows: list[Json]) -> list[Json]:
 
 
 def _too_large(adjustment: Json) -> Iterator[Problem]:
+    """A sigma0 beyond chance, with what explains it where something does."""
     _, high = sigma0_bounds(adjustment["redundancy"])
-    if adjustment["sigma0"] > high:
-        yield Problem(
-            f"{_sigma0_and('above', high, adjustment['sigma0'])}: the residuals are larger than the sigmas given "
-            f"({_by_group(adjustment)}).",
-            "Reject gross errors first; then the film or lens has deformation that the model lacks: state it by "
-            "film_sigma_um or add distortion parameters. All sigmas of the result are already multiplied by σ₀.",
-        )
+    explained = [Problem(each["cause"], each["remedy"]) for each in adjustment.get("explanations", ())]
+    if adjustment["sigma0"] <= high:
+        yield from explained
+        return
+    size = f"{_sigma0_and('above', high, adjustment['sigma0'])}: the residuals are larger than the sigmas given"
+    if explained:
+        yield replace(explained[0], what=f"{size}. {explained[0].what}")
+        yield from explained[1:]
+        return
+    yield Problem(
+        f"{size} ({_by_group(adjustment)}).",
+        "Reject gross errors first; then the film or lens has deformation that the model lacks: state it by "
+        "film_sigma_um or add distortion parameters. All sigmas of the result are already multiplied by σ₀.",
+    )
 
 
 def _too_small(adjustment: Json) -> Iterator[str]:

@@ -101,6 +101,10 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "left_out": dict(adjustment.left_out),
         "variance_factors": dict(adjustment.variance_factors),
         "variance_sigmas": dict(adjustment.variance_sigmas),
+        "explanations": [
+            {"kind": each.kind, "cause": each.cause, "remedy": each.remedy, "p": each.p, "sigma0": list(each.sigma0)}
+            for each in adjustment.explanations
+        ],
         "suspects": [suspect_json(suspect) for suspect in adjustment.suspects],
         "reliability": reliability_json(adjustment),
         "cameras": {camera.name: _camera(adjustment, camera) for camera in network.cameras if camera.name in used},

@@ -263,7 +263,7 @@ def test_a_mistake_in_the_datum_gets_a_message(
     lines: str, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At once: it is sought in no observation."""
-    monkeypatch.setattr("adjust.solution.adjustment.network_slip", lambda *_: pytest.fail("sought a slip"))
+    monkeypatch.setattr("adjust.solution.adjustment.blunder_sentence", lambda *_: pytest.fail("sought a slip"))
     free_project(tmp_path, lines)
     with pytest.raises((InputError, AdjustmentError)) as error:
         adjusted(tmp_path)

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 TOLERATED = 2.0  # times the standard deviations that were given, and residuals still need no other explanation
 CLEARLY = 3.0  # times smaller than as it is given a network's sigma0 is with what explains it
 CHECKED = 10  # redundancy from which on an explanation is one
+FEWEST_IMAGES = 3  # of which one that is mirrored is told from the others
+MOST_MIRRORED = 6  # images that are left out in turn, the worst first
 MOST_PAIRS = 15  # of frames that are tried exchanged, the worst first
 UNITS = (1000.0, 100.0, 10.0, 0.3048)  # of one length in another: m, dm, cm, mm, feet
 NEAR = 0.3  # of its distance from the field's middle that a station may lie off where it is given
@@ -52,7 +54,7 @@ class Hypothesis:
     moved: Array = field(default_factory=lambda: np.eye(3))
 
 
-def network_slip(network: Network, given: Adjustment | None, tried: Tried, family: float) -> str:
+def blunder_sentence(network: Network, given: Adjustment | None, tried: Tried, family: float) -> str:
     """The slip of a whole network without which all observations agree, and with which they do not; empty where there
     is none.
 
@@ -63,22 +65,23 @@ def network_slip(network: Network, given: Adjustment | None, tried: Tried, famil
     """
     if given is None:  # the approximations that were given may be all that is wrong
         given = tried(network)
-    if given is not None and _explains(given, family):
+    if given is not None and explains(given, family):
         return ""
     bare = replace(network, images=tuple(replace(image, exterior=None) for image in network.images))
     if _given_stations(network):
         alone = tried(bare)
-        if alone is not None and _explains(alone, family):
+        if alone is not None and explains(alone, family):
             return stations_elsewhere(network, alone)
-    for alike in _hypotheses(network, bare, given):
+    for alike in _hypotheses(network, bare, given, tried, family):
         found = tried(alike[0].network)
         better = found is not None and (given is None or CLEARLY * found.sigma0 < given.sigma0 or not given.converged)
-        if found is not None and better and _explains(found, family):
+        if found is not None and better and explains(found, family):
             return _told(_as_stations_are_given(network, alike, found), found, given, family)
     return ""
 
 
-def _explains(result: Adjustment, family: float) -> bool:
+def explains(result: Adjustment, family: float) -> bool:
+    """Whether v'Pv is within chance for standard deviations TOLERATED times as large, and checked at all."""
     checked = result.termination != "singular" and result.redundancy >= CHECKED
     return checked and bool(chdtrc(result.redundancy, result.vpv / TOLERATED**2) > family)
 
@@ -100,12 +103,15 @@ def _told(slips: Sequence[Hypothesis], found: Adjustment, given: Adjustment | No
     )
 
 
-def _hypotheses(network: Network, bare: Network, given: Adjustment | None) -> Iterator[list[Hypothesis]]:
+def _hypotheses(
+    network: Network, bare: Network, given: Adjustment | None, tried: Tried, family: float
+) -> Iterator[list[Hypothesis]]:
     """Those that leave the same residuals together. bare: the network without orientations."""
     yield [*_mirrored(bare), *_y_down(bare, given)]
     if network.distances:
         yield from ([each] for each in _other_unit(network))
     yield from ([each] for each in _exchanged_frames(network, given))
+    yield from ([each] for each in _mirrored_images(network, given, tried, family))
     yield from ([each] for each in _other_principal_distance(network))
 
 
@@ -161,6 +167,74 @@ def _y_down(network: Network, given: Adjustment | None) -> Iterator[Hypothesis]:
     )
 
 
+def y_downward(network: Network) -> Network | None:
+    """A network of images without fiducials with y of its comparator coordinates pointing the other way; None where
+    there are films."""
+    if any(image.transformation != "none" for image in network.images):
+        return None
+    cameras = tuple(
+        replace(each, center_mm=(each.center_mm[0], -each.center_mm[1])) if each.y0_mm is None else each
+        for each in network.cameras
+    )
+    xy_mm = network.observations.xy_mm * [1.0, -1.0]
+    return replace(network, cameras=cameras, observations=replace(network.observations, xy_mm=xy_mm))
+
+
+def mirrored_images(network: Network, names: Sequence[str]) -> Network:
+    """A network with the comparator coordinates of some images mirrored left to right: about the middle of the picture,
+    where its size is known, or of all marks of its camera."""
+    middle = {camera.name: _middle_mm(network, camera) for camera in network.cameras}
+    turned = np.array([image.name in names and image.transformation == "none" for image in network.images])
+    centers = np.array([middle[image.camera] for image in network.images])[network.image_numbers]
+    xy_mm = network.observations.xy_mm.copy()
+    is_turned = turned[network.image_numbers]
+    xy_mm[is_turned, 0] = 2.0 * centers[is_turned] - xy_mm[is_turned, 0]
+    return replace(network, observations=replace(network.observations, xy_mm=xy_mm))
+
+
+def _middle_mm(network: Network, camera: Camera) -> float:
+    """The middle of the camera's pictures in x."""
+    own = np.array([image.camera == camera.name for image in network.images])[network.image_numbers]
+    x_mm = network.observations.xy_mm[own, 0]
+    if not len(x_mm):
+        return 0.0
+    middle = float(x_mm.min() + x_mm.max()) / 2.0
+    if not camera.frame_mm[0]:
+        return middle if camera.x0_mm is None else camera.x0_mm.value
+    half = camera.frame_mm[0] / 2.0
+    return half if abs(middle - half) < abs(middle) else 0.0
+
+
+def _mirrored_images(network: Network, given: Adjustment | None, tried: Tried, family: float) -> Iterator[Hypothesis]:
+    """Single images of a digital camera, the worst first, without which all others agree."""
+    images = [image for image in network.images if image.transformation == "none"]
+    images = [image for image in images if image.name not in network.without_object]
+    if len(images) < FEWEST_IMAGES:
+        return
+    worst = _squares(network, given)
+    for image in sorted(images, key=lambda image: (-worst[image.name], image.name))[:MOST_MIRRORED]:
+        rest = tried(_without_image(network, image.name))
+        if rest is not None and explains(rest, family):
+            yield Hypothesis(
+                f"image {image.name} is mirrored",
+                "Mirror its picture and measure it again, or its coordinates in comparator.csv.",
+                mirrored_images(network, [image.name]),
+            )
+            return
+
+
+def _without_image(network: Network, name: str) -> Network:
+    observations = network.observations
+    kept = np.flatnonzero(np.array(observations.image) != name)
+    seen = {observations.point[row] for row in kept}
+    return replace(
+        network,
+        images=tuple(image for image in network.images if image.name != name),
+        points=tuple(point for point in network.points if point.id in seen or point.id not in network.observed_points),
+        observations=observations.only(kept),
+    )
+
+
 def _turned(camera: Camera) -> Camera:
     """With y' pointing the other way."""
     marks = {id: Fiducial(mark.x_mm, _opposite(mark.y_mm)) for id, mark in camera.fiducials.items()}
@@ -204,14 +278,19 @@ def _pairs(network: Network, given: Adjustment | None) -> list[tuple[str, str]]:
     """Frames of one camera with film transformations of their own, those with the largest residuals first."""
     images = [image for image in network.images if image.transformation != "none"]
     images = [image for image in images if image.name not in network.without_object]
-    worst = dict.fromkeys((image.name for image in images), 0.0)
-    if given is not None:
-        squared = (given.residuals.v_mm**2).sum(axis=1)
-        sums = np.bincount(network.image_numbers, squared, len(network.images))
-        worst |= {image.name: float(size) for image, size in zip(network.images, sums, strict=True)}
+    worst = _squares(network, given)
     ordered = sorted(images, key=lambda image: (-worst[image.name], image.name))
     pairs = [(a.name, b.name) for a, b in combinations(ordered, 2) if a.camera == b.camera]
     return sorted(pairs, key=lambda pair: -worst[pair[0]] - worst[pair[1]])[:MOST_PAIRS]
+
+
+def _squares(network: Network, given: Adjustment | None) -> dict[str, float]:
+    """The sum of the squared residuals of every image; 0 where there is no adjustment."""
+    if given is None:
+        return dict.fromkeys((image.name for image in network.images), 0.0)
+    squared = (given.residuals.v_mm**2).sum(axis=1)
+    sums = np.bincount(network.image_numbers, squared, len(network.images))
+    return {image.name: float(size) for image, size in zip(network.images, sums, strict=True)}
 
 
 def _as_stations_are_given(network: Network, alike: Sequence[Hypothesis], found: Adjustment) -> Sequence[Hypothesis]:

@@ -1,0 +1,132 @@
+"""Which images of a camera look as if taken with another interior orientation than the rest.
+
+With the rows of one image, its orientation and film eliminated, the shift (c, x0', y0') of that image alone has normal
+equations N d = g; two groups with shifts of their own lower v'Pv by the sum of g' N⁻¹ g of both. The best partition is
+that of weighted two-means.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.least_squares.iteration import linearise
+from adjust.least_squares.numbering import Numbering
+from adjust.solution.runs import Run
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MOST_TURNS = 20  # of two-means
+FLAT = 1e-9  # part of the largest eigenvalue below which an image says nothing of a direction
+DIRECTIONS = 4  # in which groups are looked for: c, the principal point, the scale of the whole image, all three
+
+
+@dataclass(frozen=True)
+class ImageGroups:
+    """images: the smaller group, by name; count: all images; choices: natural logarithm of the partitions there are."""
+
+    images: tuple[str, ...]
+    count: int
+    choices: float
+
+
+def two_groups(run: Run, camera: str) -> ImageGroups | None:
+    """The partition of a camera's images that explains most; None where there are fewer than three images."""
+    names, normal, right = _shifts(run, camera)
+    if len(names) < 3:
+        return None
+    interior = run.end.state.values[run.problem.unknowns.camera[camera][:3]]
+    scale = (interior / np.linalg.norm(interior))[:, None]
+    found = [_partition(normal, right, along) for along in (np.eye(3)[:, :1], np.eye(3)[:, 1:], scale, np.eye(3))]
+    mask = max(found, key=lambda each: _gain(normal, right, each, np.eye(3)))
+    smaller = mask if 2 * mask.sum() <= len(names) else ~mask
+    images = tuple(name for name, is_in in zip(names, smaller, strict=True) if is_in)
+    choices = (len(names) - 1) * float(np.log(2.0)) + float(np.log(DIRECTIONS))
+    return ImageGroups(images, len(names), choices)
+
+
+def _shifts(run: Run, camera: str) -> tuple[list[str], Array, Array]:
+    """The images of a camera, and of each the normal equations (m, 3, 3), (m, 3) of its own c, x0' and y0'."""
+    problem, covariance = run.weighting.applied(run.problem)
+    sigma = problem.unknowns.sigma.copy()
+    sigma[problem.unknowns.camera[camera][:3]] = np.inf
+    freed = replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
+    at = linearise(Numbering(freed), covariance, run.end.state)
+    exterior, _, film, of_camera, *_ = freed.parts
+    own = [*range(freed.parts.width)[exterior.columns], *range(freed.parts.width)[film.columns]]
+    wanted = [of_camera.columns.start + int(np.flatnonzero(of_camera.members == k)[0]) for k in range(3)]
+    names, normal, right = [], [], []
+    for number, image in enumerate(problem.network.images):
+        rows = np.flatnonzero(problem.image_numbers == number)
+        if at is None or image.camera != camera or problem.is_fiducial[rows].all():
+            continue
+        matrix = at.rows.matrix[rows].reshape(2 * len(rows), -1)
+        shift, discrepancy = matrix[:, wanted], at.rows.right[rows].ravel()
+        basis = _basis(matrix[:, own])
+        shift = shift - basis @ (basis.T @ shift)
+        names.append(image.name)
+        normal.append(shift.T @ shift)
+        right.append(shift.T @ (discrepancy - basis @ (basis.T @ discrepancy)))
+    return names, np.array(normal).reshape(-1, 3, 3), np.array(right).reshape(-1, 3)
+
+
+def _basis(columns: Array) -> Array:
+    """Orthonormal columns that span some."""
+    if not columns.shape[1]:
+        return columns
+    left, size, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    return left[:, size > FLAT * size[0]]
+
+
+def _partition(normal: Array, right: Array, along: Array) -> Mask:
+    """The better of two-means from the best threshold of each coordinate, for shifts in the span of `along` (3, k)."""
+    normal, right = along.T @ normal @ along, right @ along
+    whole = np.eye(along.shape[1])
+    shifts = (np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right[..., None])[..., 0]
+    starts = [_threshold(normal, right, shift) for shift in shifts.T]
+    found = [_two_means(normal, right, start) for start in starts]
+    return max(found, key=lambda each: _gain(normal, right, each, whole))
+
+
+def _threshold(normal: Array, right: Array, shift: Array) -> Mask:
+    """The images whose shift (m,) is above the best of all thresholds."""
+    order = np.argsort(shift, kind="stable")
+    below = np.cumsum(normal[order], axis=0)[:-1], np.cumsum(right[order], axis=0)[:-1]
+    above = normal.sum(axis=0) - below[0], right.sum(axis=0) - below[1]
+    best = int(np.argmax(_quadratic(*below) + _quadratic(*above)))
+    mask = np.ones(len(order), dtype=bool)
+    mask[order[: best + 1]] = False
+    return mask
+
+
+def _two_means(normal: Array, right: Array, mask: Mask) -> Mask:
+    for _ in range(MOST_TURNS):
+        gains = []
+        for members in (mask, ~mask):
+            shift = _solved(normal[members].sum(axis=0), right[members].sum(axis=0))
+            gains.append(right @ shift - 0.5 * ((normal @ shift) @ shift))
+        moved = gains[0] > gains[1]
+        if (moved == mask).all() or moved.all() or not moved.any():
+            return mask
+        mask = moved
+    return mask
+
+
+def _gain(normal: Array, right: Array, mask: Mask, along: Array) -> float:
+    """By how much v'Pv falls with shifts (in the span of `along`) of two groups."""
+    return float(sum(_quadratic(*_summed(normal, right, members, along)) for members in (mask, ~mask)))
+
+
+def _summed(normal: Array, right: Array, members: Mask, along: Array) -> tuple[Array, Array]:
+    return along.T @ normal[members].sum(axis=0) @ along, right[members].sum(axis=0) @ along
+
+
+def _quadratic(normal: Array, right: Array) -> Array:
+    """g' N⁻¹ g of one (k, k), (k,) or many."""
+    solved = np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right[..., None]
+    return np.asarray((right[..., None, :] @ solved)[..., 0, 0])
+
+
+def _solved(normal: Array, right: Array) -> Array:
+    return np.asarray(np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right)

@@ -1,0 +1,158 @@
+"""Whether the standard deviations given to the marks are too small everywhere, and nothing else is wrong.
+
+The residuals are then those of a larger noise: normally distributed, alike in all images, and independent of their
+neighbours. With a standard deviation added to that of all marks, of targets alone or of fiducials alone, every group of
+observations agrees.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.spatial import KDTree
+from scipy.special import chdtr, chdtrc, ndtr
+
+from adjust.problem.tested import TestedUnits
+from adjust.quality.residuals import group_sums, residuals
+from adjust.solution.runs import Run, again
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FEWEST = 30  # coordinates from which on residuals tell what they are distributed like
+CHANCE = 0.001  # of each test below which residuals are no mere noise
+UNCHECKED = 0.05  # redundancy number below which a residual tells nothing
+KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")), ("fiducials", ("fiducial",)))
+STEPS = 20
+
+
+@dataclass(frozen=True)
+class AddedNoise:
+    """The marks that it is added to, its standard deviation in mm, and the adjustment with it."""
+
+    marks: str
+    sigma_mm: float
+    run: Run
+
+
+def added_noise(run: Run, redundancy: int) -> AddedNoise | None:
+    """The standard deviation that, added to those of marks, explains all residuals; None where it does not."""
+    if not _is_noise(run):
+        return None
+    kind = np.array(run.problem.network.observations.kind)
+    for marks, kinds in KINDS:
+        members = np.isin(kind, kinds)
+        if marks != "marks" and members.all():
+            continue
+        sigma_mm = _added_sigma(run, members, redundancy)
+        if sigma_mm is None:
+            continue
+        noisy = _with_noise(run, members, sigma_mm)
+        if noisy.converged and noisy.found is not None and _groups_agree(noisy):
+            return AddedNoise(marks, sigma_mm, noisy)
+    return None
+
+
+def _is_noise(run: Run) -> bool:
+    """Whether standardised residuals are normally distributed, alike in all images and independent of neighbours."""
+    if run.found is None:
+        return False
+    v = residuals(run.end.v_mm, run.found, run.weighting)
+    checked = (v.redundancy > UNCHECKED).all(axis=1)
+    if 2 * checked.sum() < FEWEST:
+        return False
+    w, images = v.w[checked], run.problem.image_numbers[checked]
+    places = run.end.computed_mm[checked]
+    points = np.array(run.problem.network.observations.point)[checked]
+    rotations = run.end.state.rotations
+    in_object = np.einsum("nji,nj->ni", rotations[images][:, :2], w)
+    return (
+        _is_normal(w)
+        and _is_alike(w, v.redundancy[checked], images)
+        and not _is_shared(w, places, images, same_image=True)
+        and not _is_shared(w, places, images, same_image=False)
+        and not _is_shared_by_point(in_object, points, images)
+    )
+
+
+def _is_normal(w: Array) -> bool:
+    """By the kurtosis of all coordinates, with its standard deviation √(24 / n)."""
+    w = w.ravel()
+    kurtosis = np.mean(w**4) / np.mean(w**2) ** 2 - 3.0
+    return bool(ndtr(-abs(kurtosis) / np.sqrt(24.0 / len(w))) > 0.5 * CHANCE)
+
+
+def _is_alike(w: Array, redundancy: Array, images: NDArray[np.intp]) -> bool:
+    """Whether the mean square of every image is that of all, by chi-square of their differences."""
+    shares = np.bincount(images, (w**2 * redundancy).sum(axis=1))
+    freedom = np.bincount(images, redundancy.sum(axis=1))
+    present = freedom > 1.0
+    if present.sum() < 2:
+        return True
+    variance = shares.sum() / freedom.sum()
+    square = ((shares[present] / variance - freedom[present]) ** 2 / (2.0 * freedom[present])).sum()
+    return bool(chdtrc(present.sum() - 1, square) > CHANCE)
+
+
+def _is_shared(w: Array, places: Array, images: NDArray[np.intp], same_image: bool) -> bool:
+    """Whether nearest neighbours, in the same image or in others, have residuals alike."""
+    products = []
+    for image in np.unique(images):
+        own = np.flatnonzero(images == image)
+        others = own if same_image else np.flatnonzero(images != image)
+        if len(others) < 3:
+            continue
+        nearest = np.asarray(KDTree(places[others]).query(places[own], 2)[1])[:, int(same_image)]
+        products.append((w[own] * w[others[nearest]]).sum(axis=1))
+    return bool(products) and _is_positive(np.concatenate(products))
+
+
+def _is_shared_by_point(in_object: Array, points: NDArray[np.str_], images: NDArray[np.intp]) -> bool:
+    """Whether a point's residuals, turned into the axes of the object, are alike in one image and the next."""
+    order = np.lexsort((images, points))
+    follows = points[order][1:] == points[order][:-1]
+    products = (in_object[order][1:] * in_object[order][:-1]).sum(axis=1)[follows]
+    return len(products) > 2 and _is_positive(products)
+
+
+def _is_positive(products: Array) -> bool:
+    """Whether products of residuals, which are 0 on the average where these are independent, are positive."""
+    z = products.sum() / np.sqrt(2.0 * (products**2).sum())  # most neighbours count twice
+    return bool(ndtr(-z) < 0.5 * CHANCE)
+
+
+def _added_sigma(run: Run, members: Mask, redundancy: int) -> float | None:
+    """The standard deviation in mm with which v'Pv, for the same residuals, is the redundancy."""
+    given = run.problem.network.observations.covariance_mm2 / run.weighting.weights[: len(members), None, None]
+    v = run.end.v_mm
+    rest = run.end.vpv - float(np.einsum("ni,nij,nj->n", v, np.linalg.inv(given), v)[members].sum())
+
+    def excess(variance: float) -> float:
+        weight = np.linalg.inv(given[members] + variance * np.eye(2))
+        return float(np.einsum("ni,nij,nj->", v[members], weight, v[members])) + rest - redundancy
+
+    largest = float((v**2).max())
+    if excess(largest) >= 0.0:
+        return None
+    return float(np.sqrt(brentq(excess, 0.0, largest, rtol=1e-6)))
+
+
+def _with_noise(run: Run, members: Mask, sigma_mm: float) -> Run:
+    network = run.problem.network
+    covariance = network.observations.covariance_mm2 + np.where(members, sigma_mm**2, 0.0)[:, None, None] * np.eye(2)
+    observations = replace(network.observations, covariance_mm2=covariance)
+    problem = replace(run.problem, network=replace(network, observations=observations))
+    return again(replace(run, problem=problem), run.weighting, STEPS, run.end.state)
+
+
+def _groups_agree(run: Run) -> bool:
+    """Whether every group of observations agrees with its standard deviations, neither too small nor too large."""
+    units, found = TestedUnits(run.problem), run.found
+    if found is None:
+        return False
+    for name in np.unique(units.groups):
+        vpv, freedom = group_sums(units, found, (units.groups == name) & run.weighting.used)
+        if freedom > 1.0 and min(chdtr(freedom, vpv), chdtrc(freedom, vpv)) < CHANCE:
+            return False
+    return True
