@@ -1,5 +1,6 @@
 """Initial values for an adjustment, from the network alone: nobody has to supply approximations."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.projection import folded_over
 from adjust.functional_model.rotation import angles_from_rotation, angles_near
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.closed_form import KnownField
+from adjust.initial_values.closed_form import KnownField, taper
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.initial_values.frames import Frames, frames_of
 from adjust.initial_values.joined_frames import Film, joined_frames, whole_frames
@@ -25,6 +26,8 @@ from adjust.validation import validate
 
 Array = NDArray[np.float64]
 
+FEWEST_KNOWN = 4  # points of an image that tell a principal distance together with others
+STRAIGHT = 0.1  # change of scale across the image of a flat field that is hardly any
 MOST_FOLDED = 0.05  # part of an image's points that gross errors may put where the distortion has no image
 
 
@@ -118,11 +121,31 @@ def _interior(camera: Camera, frames: Frames) -> Array:
     else:
         found = find_wide_distance(fields, camera.distortion, camera.distortion.values)
     if found is None:
-        raise AdjustmentError(
-            f"the principal distance of camera {camera.name} cannot be found from its images: they see too few known "
-            "points, or only a plane parallel to the image. Give an approximate principal_distance_mm."
-        )
+        why = _why_no_distance(fields)
+        raise AdjustmentError(f"the principal distance of camera {camera.name} cannot be found from its images: {why}")
     return np.array([found, x0, y0])
+
+
+def _why_no_distance(fields: Sequence[KnownField]) -> str:
+    """Why images of known points do not tell the principal distance, and what would."""
+    enough = [field for field in fields if len(field.xyz) >= FEWEST_KNOWN]
+    if not enough:
+        return (
+            f"none shows {FEWEST_KNOWN} points whose X, Y and Z are known. Give an approximate principal_distance_mm, "
+            "or the coordinates of more points."
+        )
+    tapers = [taper(field) for field in enough]
+    largest = max((each for each in tapers if each is not None), default=np.inf)
+    if None in tapers or largest > STRAIGHT:
+        return (
+            "they see too few known points, or only a plane parallel to the image. Give an approximate "
+            "principal_distance_mm."
+        )
+    return (
+        f"all {len(enough)} look straight at a flat field (its scale changes by {100.0 * largest:.2g} % at most across "
+        "an image), where a longer principal distance is a larger distance from the field. Take images tilted by 20 to "
+        "40 degrees in different directions, or give principal_distance_mm with its standard deviation (0 fixes it)."
+    )
 
 
 def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> list[KnownField]:

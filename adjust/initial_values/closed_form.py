@@ -83,6 +83,20 @@ def principal_distance_together(seen: Sequence[KnownField]) -> tuple[float, floa
     return batch.some(agreeing).distance_together() if 2 * agreeing.sum() > len(some) else None
 
 
+def taper(field: KnownField) -> float | None:
+    """By what part the scale changes across the image of a flat field, by its homography; None where it is not flat."""
+    centred = field.xyz - field.xyz.mean(axis=0)
+    _, extents, axes = np.linalg.svd(centred, full_matrices=False)
+    if extents[1] <= LINE * extents[0] or extents[2] > PLANE * extents[0]:
+        return None
+    places = np.column_stack([centred @ axes[:2].T / extents[0], np.ones(len(centred))])
+    xy = field.xy_mm / np.abs(field.xy_mm).max()
+    nothing = np.zeros_like(places)
+    rows = [np.hstack([places, nothing, -xy[:, :1] * places]), np.hstack([nothing, places, -xy[:, 1:] * places])]
+    depth = places @ np.linalg.svd(np.vstack(rows))[2][-1][6:]
+    return float(np.ptp(depth) / abs(depth.mean()))
+
+
 def _batches(seen: Sequence[KnownField], images: Sequence[int]) -> Iterator[Indices]:
     """Of some images those of about as many points, some at a time."""
     counts = np.array([len(field.xyz) for field in seen], dtype=np.intp)

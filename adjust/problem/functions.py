@@ -181,7 +181,8 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         _fill(
             by_unknowns, rows, parts.board, [applied(by_point, problem.lifted_by[rows, k]) for k in parts.board.members]
         )
-        _fill(by_unknowns, rows, parts.camera, [at.by_quantity(k) for k in parts.camera.members])
+        own = [k for k in parts.camera.members if k < len(interior) + len(parameters)]  # others have other families
+        _fill(by_unknowns, rows, parts.camera, [at.by_quantity(k) for k in own])
     for part, of_film, of_distorted in (
         (parts.film, film.by_parameters, at_distorted.by_parameters),
         (parts.scanner, film.by_scanner, at_distorted.by_scanner),

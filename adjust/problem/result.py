@@ -272,6 +272,7 @@ class Adjustment:
     remarks: on how the adjustment came about, the first of the warnings.
     slips: sentences on given points so far off that the observations do not agree, or have no solution, for them.
     left_out: by name, the images for which no orientation was found, and why; the network is that of the others.
+    misread: sentences on images that are mirrored; what else there seems to be is theirs.
     """
 
     network: Network
@@ -293,6 +294,7 @@ class Adjustment:
     remarks: tuple[str, ...] = ()
     slips: tuple[str, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
+    misread: tuple[str, ...] = ()
 
     @property
     def residuals(self) -> Residuals:
@@ -325,19 +327,19 @@ class Adjustment:
     @property
     def suspects(self) -> tuple[Suspect, ...]:
         """The worst first."""
-        return self.assessment.suspects
+        return () if self.misread else self.assessment.suspects
 
     @property
     def explanations(self) -> tuple[Explanation, ...]:
         """Of a sigma0 that is too large; suspects are then those of an adjustment with them in the model."""
-        return self.assessment.explanations
+        return () if self.misread else self.assessment.explanations
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the user should look at; where slips kept it from a solution, all else there seems to be is theirs."""
         spoilt = self.slips and not self.converged
         left_out = (f"Left out of the adjustment: {reason}" for reason in self.left_out.values())
-        return (*self.slips, *left_out, *self.remarks, *(() if spoilt else self.assessment.warnings))
+        return (*self.misread, *self.slips, *left_out, *self.remarks, *(() if spoilt else self.assessment.warnings))
 
     @property
     def notes(self) -> tuple[str, ...]:

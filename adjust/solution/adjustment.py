@@ -21,7 +21,7 @@ from adjust.solution.assessment import RunAssessment
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
 from adjust.solution.left_out_images import fitting, with_lens, without_images
 from adjust.solution.options import Datum, Method, Options
-from adjust.solution.plausibility import implausible
+from adjust.solution.plausibility import with_plausibility
 from adjust.solution.runs import Run, again, run
 from adjust.solution.slips import Slip, few_points, freed, slips
 from adjust.undetermined.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
@@ -119,11 +119,9 @@ def _as_a_whole(
         return result
     if not weighs_anew:
         _check_whole(network, result, options)
-    told = [
-        *filter(None, [stations_elsewhere(network, result)]),
-        *implausible(network, result, partial(_tried, options=options), options.probabilities.family),
-    ]
-    return replace(result, remarks=(*result.remarks, *told)) if told else result
+    if elsewhere := stations_elsewhere(network, result):
+        result = replace(result, remarks=(*result.remarks, elsewhere))
+    return with_plausibility(network, result, partial(_tried, options=options), options.probabilities.family)
 
 
 def _check_whole(network: Network, given: Adjustment | None, options: Options) -> None:

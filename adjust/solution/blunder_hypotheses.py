@@ -27,6 +27,8 @@ MOST_MIRRORED = 6  # images that are left out in turn, the worst first
 MOST_PAIRS = 15  # of frames that are tried exchanged, the worst first
 UNITS = (1000.0, 100.0, 10.0, 0.3048)  # of one length in another: m, dm, cm, mm, feet
 NEAR = 0.3  # of its distance from the field's middle that a station may lie off where it is given
+PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # of one principal distance in another unit, or with another pixel pitch
+ROUND = 0.05  # that a found ratio may be off one of these
 FLAT = 1e-3  # thickness of a field, in its extents, whose mirror image is that of the stations
 
 AXES = {  # the slips that mirror the points, and what takes them back
@@ -45,13 +47,15 @@ Tried = Callable[[Network], Adjustment | None]
 class Hypothesis:
     """A slip in words, what to do about it, and the network without it.
 
-    moved (3, 3): what takes the points as they are given to where they are without it.
+    moved (3, 3): what takes the points as they are given to where they are without it. distance: the camera
+    whose principal distance is not what is given, and that in mm.
     """
 
     words: str
     remedy: str
     network: Network
     moved: Array = field(default_factory=lambda: np.eye(3))
+    distance: tuple[str, float] = ("", 0.0)
 
 
 def blunder_sentence(network: Network, given: Adjustment | None, tried: Tried, family: float) -> str:
@@ -97,10 +101,23 @@ def _told(slips: Sequence[Hypothesis], found: Adjustment, given: Adjustment | No
         stands = "the iteration does not come to rest"
     else:
         stands = f"σ₀ is {given.sigma0:.3g}, which chance makes it with a probability below {100.0 * family:g} %"
+    camera, given_mm = slips[0].distance
+    if camera:
+        what += _found_distance(camera, given_mm, found)
     return (
         f"{what[0].upper()}{what[1:]}. Without this all {len(found.network.observations)} observations agree "
         f"(σ₀ = {found.sigma0:.2f}); as it stands, {stands}. {slips[0].remedy}"
     )
+
+
+def _found_distance(camera: str, given_mm: float, found: Adjustment) -> str:
+    """What a principal distance is found to be, and whether it is the given one in another unit or pixel pitch."""
+    c = found.value(f"IO.{camera}.c")
+    times = max(c / given_mm, given_mm / c)
+    how = "long" if c < given_mm else "short"
+    is_unit = any(abs(times / each - 1.0) < ROUND for each in PITCHES)
+    why = f", so that it is given {times:.3g} times too {how}: another unit, or a wrong pitch_um" if is_unit else ""
+    return f": it is found as {c:.6g} mm{why}"
 
 
 def _hypotheses(
@@ -218,9 +235,30 @@ def _mirrored_images(network: Network, given: Adjustment | None, tried: Tried, f
             yield Hypothesis(
                 f"image {image.name} is mirrored",
                 "Mirror its picture and measure it again, or its coordinates in comparator.csv.",
-                mirrored_images(network, [image.name]),
+                _mirrored_image(network, image.name, rest),
             )
             return
+
+
+def _mirrored_image(network: Network, name: str, rest: Adjustment) -> Network:
+    """A network with one image mirrored; where the picture's middle is not known, with a principal point of its own and
+    the lens that the rest of the images have.
+    """
+    turned = mirrored_images(network, [name])
+    camera = network.camera_by_name[network.image_by_name[name].camera]
+    if camera.frame_mm[0]:
+        return turned
+    known = {each: Prior(rest.value(f"IO.{camera.name}.{each}")) for each in camera.distortion.parameters}
+    own = replace(
+        camera,
+        name=f"{camera.name} ({name})",
+        principal_distance_mm=Prior(rest.value(f"IO.{camera.name}.c")),
+        x0_mm=None,
+        y0_mm=None,
+        distortion=replace(camera.distortion, parameters=known),
+    )
+    images = tuple(replace(image, camera=own.name) if image.name == name else image for image in turned.images)
+    return replace(turned, images=images, cameras=(*turned.cameras, own))
 
 
 def _without_image(network: Network, name: str) -> Network:
@@ -257,6 +295,7 @@ def _other_principal_distance(network: Network) -> Iterator[Hypothesis]:
                 f"the principal distance of camera {camera.name} is not the {given.value:g} mm that are given",
                 "Correct it, or give it with the standard deviation that it has.",
                 replace(network, cameras=others),
+                distance=(camera.name, given.value),
             )
 
 

@@ -6,7 +6,7 @@ down mirrors all images. The mirrored network is adjusted, and told with its sig
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +29,16 @@ AROUND = 0.25  # of the extent of all marks that a picture of unknown size may r
 NAMED = 5
 
 
-def implausible(network: Network, result: Adjustment, tried: Tried, family: float) -> list[str]:
-    """Sentences on what contradicts the geometry of photographs in a result."""
+def with_plausibility(network: Network, result: Adjustment, tried: Tried, family: float) -> Adjustment:
+    """A result with sentences on what contradicts the geometry of photographs."""
     if result.termination == "singular" or not network.observed_points:
-        return []
+        return result
     outside = _outside(network, result)
     said = [*_marks_outside(network, outside, result, tried, family)]
-    said += _both_sides(network, result, tried, family)
+    misread = tuple(_both_sides(network, result, tried, family))
     if result.converged and not outside.any():
         said += [told for camera in network.cameras for told in _principal_point(camera, network, result, family)]
-    return said
+    return replace(result, misread=misread, remarks=(*result.remarks, *said))
 
 
 @dataclass(frozen=True)

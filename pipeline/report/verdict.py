@@ -100,9 +100,21 @@ def _no_solution(adjustment: Json) -> Iterator[Problem]:
     if not adjustment["converged"] and not adjustment["singular"]:
         yield Problem(
             f"The iteration did not come to rest ({adjustment['termination']}, {adjustment['iterations']} iterations).",
-            "Look for wrong point numbers and gross errors among the largest residuals, at the approximate "
-            "orientations, and at the units: [object] unit of points and stations, mm in the camera's file.",
+            _why_no_rest(adjustment),
         )
+
+
+def _why_no_rest(adjustment: Json) -> str:
+    """What to look at where an iteration does not come to rest."""
+    if any(warning.startswith("Practically singular") for warning in adjustment["warnings"]):
+        return (
+            "The images hardly determine what is named below as practically singular: add what is advised there, or "
+            "fix it."
+        )
+    return (
+        "Look for wrong point numbers and gross errors among the largest residuals, at the approximate orientations, "
+        "and at the units: [object] unit of points and stations, mm in the camera's file."
+    )
 
 
 def _unchecked(adjustment: Json) -> Iterator[Problem]:

@@ -10,19 +10,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.rotation import rotation_from_angles
+from adjust.errors import AdjustmentError
+from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.problem.camera import Camera, Distortion, Prior
-from adjust.problem.network import Image, Network, ObjectPoint
+from adjust.problem.network import Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.problem.probabilities import Probabilities
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 
 C_MM, HALF_MM, SIGMA_MM = 10.0, np.array([6.4, 4.8]), 0.001
 MIDDLE_MM = np.array([6.4, -4.8])  # of the picture, in the comparator
-NOISE = "noise too small"
+NOTHING, NOISE = "nothing", "noise too small"
 MANY = 3.0  # times what a test detects
 LENS = {"k1": -0.22, "k2": 0.11, "p1": 4e-4, "p2": -3e-4, "k3": -0.02}
 
@@ -50,11 +50,19 @@ class Effects:
     scale: float = 0.0
     bend: float = 0.0
     noise: float = 1.0
+    pitch: float = 1.0
+    object_unit: float = 1.0
+    mirrored: bool = False
+    y_down: bool = False
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A misfit: its effect of size 1, the free parameters of the lens, how many unknowns its test has, the words."""
+    """A misfit: its effect of size 1, the free parameters of the lens, how many unknowns its test has, the words.
+
+    boards, fields: which of them; sized: whether it has a size; c_given, stations_given, frame_given: what else the
+    network knows.
+    """
 
     effect: Callable[[float], Effects]
     words: tuple[str, ...]
@@ -63,17 +71,21 @@ class Kind:
     size: int = 1
     boards: bool = True
     fields: bool = True
+    sized: bool = True
+    c_given: bool = False
+    stations_given: bool = False
+    frame_given: bool = False
 
 
 def scene(seed: int, flat: bool) -> Scene:
     rng = np.random.default_rng([36, seed])
-    count = int(rng.integers(6, 15))
+    count = int(rng.integers(6, 11))
     if flat:
-        columns, rows = int(rng.integers(7, 12)), int(rng.integers(5, 9))
+        columns, rows = int(rng.integers(6, 10)), int(rng.integers(5, 8))
         x, y = np.meshgrid(np.arange(columns) * 25.0, np.arange(rows) * 25.0)
         points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     else:
-        points = rng.uniform(-1.0, 1.0, (60, 3)) * [120.0, 90.0, 80.0]
+        points = rng.uniform(-1.0, 1.0, (40, 3)) * [120.0, 90.0, 80.0]
     middle = points.mean(axis=0)
     angles = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(-np.pi, np.pi, count)])
     rotations = rotation_from_angles(angles)
@@ -100,22 +112,37 @@ def network(made: Scene, effects: Effects, kind: Kind, rng: np.random.Generator 
     xy_mm = np.concatenate(places)
     if rng is not None:
         xy_mm = xy_mm + rng.normal(0.0, SIGMA_MM * effects.noise, xy_mm.shape)
+    xy_mm = effects.pitch * xy_mm * [1.0, -1.0 if effects.y_down else 1.0]
     given = {name: Prior(0.0, np.inf) for name in kind.free}
-    camera = Camera(
-        "cam", None, None, None, Distortion("opencv", given), center_mm=(float(MIDDLE_MM[0]), float(MIDDLE_MM[1]))
-    )
+    middle = effects.pitch * MIDDLE_MM * [1.0, -1.0 if effects.y_down else 1.0]
+    c = Prior(C_MM, 0.005) if kind.c_given else None
+    frame = (float(2.0 * HALF_MM[0]), float(2.0 * HALF_MM[1])) if kind.frame_given else (0.0, 0.0)
+    camera = Camera("cam", c, None, None, Distortion("opencv", given), {}, (float(middle[0]), float(middle[1])), frame)
+    exterior = _exteriors(made) if kind.stations_given else {}
     return Network(
         (camera,),
-        tuple(Image(name, "cam", "none") for name in dict.fromkeys(images)),
-        tuple(ObjectPoint(f"p{k}", *(Prior(float(value)) for value in xyz)) for k, xyz in enumerate(made.points)),
+        tuple(Image(name, "cam", "none", exterior.get(name)) for name in dict.fromkeys(images)),
+        tuple(
+            ObjectPoint(f"p{k}", *(Prior(float(value)) for value in effects.object_unit * xyz))
+            for k, xyz in enumerate(made.points)
+        ),
         Observations(
             tuple(images),
             tuple(points),
             ("target",) * len(images),
             xy_mm,
-            np.tile(SIGMA_MM**2 * np.eye(2), (len(images), 1, 1)),
+            np.tile((effects.pitch * SIGMA_MM) ** 2 * np.eye(2), (len(images), 1, 1)),
         ),
     )
+
+
+def _exteriors(made: Scene) -> dict[str, Exterior]:
+    """Stations and attitudes as they are known beforehand, roughly."""
+    rows = zip(made.stations, made.rotations, strict=True)
+    return {
+        f"im{i:02d}": Exterior(np.concatenate([station + 10.0, angles_from_rotation(rotation) + 0.02]))
+        for i, (station, rotation) in enumerate(rows)
+    }
 
 
 def _projected(made: Scene, effects: Effects, kind: Kind, image: int, rotation: Array, station: Array) -> Array:
@@ -137,11 +164,13 @@ def _projected(made: Scene, effects: Effects, kind: Kind, image: int, rotation: 
     at = np.stack([c * xd * (1.0 + effects.b1), -c * yd], axis=1) + made.point_mm
     at[:, 0] += own * effects.crop
     at[:, 1] += 0.7 * own * effects.crop
+    if effects.mirrored and image == int(np.argmax(made.groups)):
+        at[:, 0] = 2.0 * MIDDLE_MM[0] - at[:, 0]
     return np.asarray(at * (1.0 + own * effects.scale))
 
 
 KINDS = {
-    "nothing": Kind(lambda e: Effects(), ()),
+    NOTHING: Kind(lambda e: Effects(), ()),
     "pixels not square": Kind(lambda e: Effects(b1=1e-3 * e), ("pixels of camera cam are not square",)),
     "two principal distances": Kind(lambda e: Effects(zoom=0.05 * e), ("another principal distance",)),
     "sizes: scaled": Kind(lambda e: Effects(scale=0.01 * e), ("images of different sizes in one camera (scaled)",)),
@@ -160,6 +189,19 @@ KINDS = {
         lens={"k1": -0.2, "k2": 0.1}, size=2
     ),
     "board bent": Kind(lambda e: Effects(bend=0.5 * e), ("is not flat",), size=2, fields=False),
+    "pitch ten times too large": Kind(
+        lambda e: Effects(pitch=10.0), ("principal distance of camera cam is not the 10 mm",), sized=False, c_given=True
+    ),
+    "mm for m, stations in m": Kind(
+        lambda e: Effects(object_unit=1000.0), ("points are 1000 times too large",), sized=False, stations_given=True
+    ),
+    "one image mirrored": Kind(lambda e: Effects(mirrored=True), ("is mirrored",), sized=False),
+    "one image mirrored, frame_mm": Kind(
+        lambda e: Effects(mirrored=True), ("is mirrored",), sized=False, frame_given=True
+    ),
+    "y downward, frame_mm": Kind(
+        lambda e: Effects(y_down=True), ("points down",), sized=False, frame_given=True
+    ),
     NOISE: Kind(lambda e: Effects(noise=1.0 + 0.5 * e), ("too small everywhere",)),
 }  # fmt: skip
 
@@ -175,23 +217,28 @@ def drawn(name: str, seed: int, many: float = MANY) -> Network:
 
 
 def _size(name: str, kind: Kind, made: Scene, many: float) -> float:
-    if name == "nothing":
-        return 0.0
+    if name == NOTHING or not kind.sized:
+        return 1.0
     wanted = (many * Probabilities().noncentrality(kind.size)) ** 2
     if name == NOISE:
         count = 2 * len(network(made, Effects(), kind, None).observations)
         return 2.0 * (np.sqrt(1.0 + many * 4.13 * np.sqrt(2.0 / count)) - 1.0)  # of the test of v'Pv
     size = 1.0
-    for _ in range(3):
+    for _ in range(2):
         result = adjust(network(made, kind.effect(size), kind, None))
         size *= float(np.sqrt(wanted / result.vpv))
     return size
 
 
-def said(result: Adjustment) -> list[str]:
-    """What a user is told to look at."""
+def said(given: Network) -> tuple[list[str], float]:
+    """What a user is told to look at, and sigma0; nan where nothing is adjusted."""
+    try:
+        result = adjust(given)
+    except AdjustmentError as error:
+        return [str(error)], np.nan
     causes = [each.cause for each in result.explanations]
-    return [*causes, *result.warnings, *(f"{each.tested.name} is suspect" for each in result.suspects)]
+    suspects = [f"{each.tested.name} is suspect" for each in result.suspects]
+    return [*causes, *result.warnings, *suspects], result.sigma0
 
 
 def outcome(name: str, sentences: list[str]) -> str:

@@ -17,6 +17,7 @@ from adjust.problem.parameter import Parameter
 from adjust.problem.result import (
     Adjustment,
     Contradiction,
+    Explanation,
     FurtherResidual,
     Group,
     Iteration,
@@ -97,6 +98,7 @@ class Told:
     variance_sigmas: Mapping[str, float] = field(default_factory=dict)
     reliability: Reliability | None = None
     suspects: tuple[Suspect, ...] = ()
+    explanations: tuple[Explanation, ...] = ()
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
