@@ -70,6 +70,16 @@ def test_sigma0_above_and_below_its_bounds(adjusted: ReportData) -> None:
         assert words in " ".join(verdict.notes)
 
 
+def test_what_explains_a_large_sigma0_stands_in_place_of_advice_on_gross_errors(adjusted: ReportData) -> None:
+    found = [
+        {"kind": "pixels", "cause": "The pixels are not square.", "remedy": "Give b1.", "p": 1e-9, "sigma0": [1.6, 1]}
+    ]
+    text = told(changed(adjusted, sigma0=1.6, explanations=found))
+    assert "larger than the sigmas given. The pixels are not square. Give b1." in text
+    assert "gross errors" not in text
+    assert told(changed(adjusted, explanations=found)) == "The pixels are not square. Give b1."
+
+
 def suspect(**values: object) -> Json:
     row: Json = {"name": "target 1 in image f2", "group": "target", "owner": "f2", "point": "1", "w": -9.3, "alike": []}
     return row | {"removed": False} | values
