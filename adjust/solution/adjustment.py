@@ -57,11 +57,13 @@ def adjust(
     keep_freed_memory()
     validate(network)
     options = options or Options()
+    tried, family = partial(_tried, options=options), options.probabilities.family
     if approximations is not None:
-        return _as_a_whole(network, approximations, None, options)
+        return with_plausibility(_as_a_whole(network, approximations, None, options), tried, family)
     part, start, left_out = _orientable(network, options)
     result = _as_a_whole(part, None, start, options)
-    return _tried_again(network, result, left_out, options) if left_out else result
+    found = _tried_again(network, result, left_out, options) if left_out else result
+    return with_plausibility(found, tried, family)
 
 
 def _orientable(network: Network, options: Options) -> tuple[Network, Approximations | None, dict[str, str]]:
@@ -121,7 +123,7 @@ def _as_a_whole(
         _check_whole(network, result, options)
     if elsewhere := stations_elsewhere(network, result):
         result = replace(result, remarks=(*result.remarks, elsewhere))
-    return with_plausibility(network, result, partial(_tried, options=options), options.probabilities.family)
+    return result
 
 
 def _check_whole(network: Network, given: Adjustment | None, options: Options) -> None:

@@ -112,7 +112,7 @@ def _told(slips: Sequence[Hypothesis], found: Adjustment, given: Adjustment | No
 
 def _found_distance(camera: str, given_mm: float, found: Adjustment) -> str:
     """What a principal distance is found to be, and whether it is the given one in another unit or pixel pitch."""
-    c = found.value(f"IO.{camera}.c")
+    c = found.value(Parameter.interior(camera, "c"))
     times = max(c / given_mm, given_mm / c)
     how = "long" if c < given_mm else "short"
     is_unit = any(abs(times / each - 1.0) < ROUND for each in PITCHES)
@@ -248,11 +248,11 @@ def _mirrored_image(network: Network, name: str, rest: Adjustment) -> Network:
     camera = network.camera_by_name[network.image_by_name[name].camera]
     if camera.frame_mm[0]:
         return turned
-    known = {each: Prior(rest.value(f"IO.{camera.name}.{each}")) for each in camera.distortion.parameters}
+    known = {each: Prior(rest.value(Parameter.interior(camera.name, each))) for each in camera.distortion.parameters}
     own = replace(
         camera,
         name=f"{camera.name} ({name})",
-        principal_distance_mm=Prior(rest.value(f"IO.{camera.name}.c")),
+        principal_distance_mm=Prior(rest.value(Parameter.interior(camera.name, "c"))),
         x0_mm=None,
         y0_mm=None,
         distortion=replace(camera.distortion, parameters=known),

@@ -173,9 +173,9 @@ def continued(run: Run, network: Network, like: dict[str, str] | None = None) ->
     old, state, like = run.problem.unknowns, run.end.state, like or {}
     problem = number(network, _approximations(run.problem, network, state, like), run.problem.by_elements)
     unknowns = problem.unknowns
-    position = {name: i for i, name in enumerate(old.names)}
-    new = np.array([i for i, name in enumerate(unknowns.names) if name in position], dtype=np.intp)
-    at = np.array([position[unknowns.names[i]] for i in new], dtype=np.intp)
+    position = {parameter: i for i, parameter in enumerate(old.parameters)}
+    new = np.array([i for i, parameter in enumerate(unknowns.parameters) if parameter in position], dtype=np.intp)
+    at = np.array([position[unknowns.parameters[i]] for i in new], dtype=np.intp)
     given, sigma, start = unknowns.given.copy(), unknowns.sigma.copy(), unknowns.start.copy()
     given[new], sigma[new], start[new] = old.given[at], old.sigma[at], state.values[at]
     camera, fiducial = dict(unknowns.camera), dict(unknowns.fiducial)

@@ -15,6 +15,7 @@ from scipy.special import chdtri
 from adjust.problem.camera import Camera
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network
+from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 from adjust.solution.blunder_hypotheses import Tried, explains, mirrored_images, y_downward
 from adjust.solution.model_hypotheses import known_places
@@ -29,8 +30,9 @@ AROUND = 0.25  # of the extent of all marks that a picture of unknown size may r
 NAMED = 5
 
 
-def with_plausibility(network: Network, result: Adjustment, tried: Tried, family: float) -> Adjustment:
+def with_plausibility(result: Adjustment, tried: Tried, family: float) -> Adjustment:
     """A result with sentences on what contradicts the geometry of photographs."""
+    network = result.network
     if result.termination == "singular" or not network.observed_points:
         return result
     outside = _outside(network, result)
@@ -190,10 +192,10 @@ def _sides(network: Network, result: Adjustment) -> dict[str, float]:
 def _principal_point(camera: Camera, network: Network, result: Adjustment, family: float) -> Iterator[str]:
     if camera.name in network.idle_cameras or all(image.camera != camera.name for image in network.images):
         return
-    names = [f"IO.{camera.name}.{axis}" for axis in ("x0", "y0")]
-    found = np.array([result.value(name) for name in names])
+    parameters = [Parameter.interior(camera.name, axis) for axis in ("x0", "y0")]
+    found = result.values_of(parameters)
     told = f"The principal point of camera {camera.name} is found at ({found[0]:.4g}, {found[1]:.4g}) mm"
-    far = _far_from_given(camera, found, result, names, family)
+    far = _far_from_given(camera, found, result, parameters, family)
     if far:
         yield f"{told}, {far}"
         return
@@ -217,13 +219,15 @@ def _principal_point(camera: Camera, network: Network, result: Adjustment, famil
     )
 
 
-def _far_from_given(camera: Camera, found: Array, result: Adjustment, names: Sequence[str], family: float) -> str:
+def _far_from_given(
+    camera: Camera, found: Array, result: Adjustment, parameters: Sequence[Parameter], family: float
+) -> str:
     """Where the principal point is given, if the images contradict it beyond chance; empty where they do not."""
     priors = [prior for prior in (camera.x0_mm, camera.y0_mm) if prior is not None and 0.0 < prior.sigma < np.inf]
-    if len(priors) < len(names):
+    if len(priors) < len(parameters):
         return ""
     given, sigma = (np.array([getattr(prior, key) for prior in priors]) for key in ("value", "sigma"))
-    covariance = np.diag(sigma**2) - result.cofactor_of(names)
+    covariance = np.diag(sigma**2) - result.cofactor_of(parameters)
     size, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
     along = axes.T @ ((found - given) / sigma)
     checked = size > 1e-6
