@@ -1,6 +1,7 @@
 # Two commands on a fresh machine with Python 3.11 or newer: `make demo` and `make test`.
 PYTHON ?= python3
 VENV := .venv
+PLAIN := .venv-plain
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 TESTED := $(VENV)/ready-to-test
@@ -18,7 +19,7 @@ test: lint
 # where the environment forbids it: every process that a test starts would compile the program anew.
 suite: export OPENBLAS_NUM_THREADS = 1
 suite: export PYTHONDONTWRITEBYTECODE =
-suite: $(TESTED)
+suite: $(TESTED) $(PLAIN)/ready
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 lint: $(TESTED)
@@ -28,14 +29,14 @@ lint: $(TESTED)
 types: $(TESTED)
 	$(BIN)/mypy
 
-# What running needs. The second lock file's package carries the networks that read writing; what it asks for itself would
-# replace OpenCV.
-$(READY): requirements.lock requirements-no-deps.lock pyproject.toml
+# What running needs: for a user, and in a second environment for the tests of what a user has, to which nothing is added.
+# The second lock file's package carries the networks that read writing; what it asks for itself would replace OpenCV.
+$(READY) $(PLAIN)/ready: %/ready: requirements.lock requirements-no-deps.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "reseau needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Say which one to use: make PYTHON=python3.12")'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --requirement requirements.lock
-	$(BIN)/pip install --quiet --no-deps --requirement requirements-no-deps.lock
-	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
+	$(PYTHON) -m venv $*
+	$*/bin/pip install --quiet --requirement requirements.lock
+	$*/bin/pip install --quiet --no-deps --requirement requirements-no-deps.lock
+	$*/bin/pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
 # What testing needs beside it: the checkers, the extras of every command, and what stands in for servers.
@@ -44,4 +45,4 @@ $(TESTED): $(READY) requirements-test.lock
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(PLAIN) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -26,6 +26,13 @@ class WriteError(InputError):
     """A file cannot be written: what stood there is as it was."""
 
 
+def missing_extra(user: str, packages: str, extra: str) -> InputError:
+    """What a command or option answers where the packages that it needs are not installed."""
+    return InputError(
+        f"{user} needs {packages}, which this installation lacks. Install: pip install 'reseau[{extra}]'."
+    )
+
+
 def what_to_do(error: OSError) -> str:
     """The next step after what the operating system refused."""
     return _ADVICE.get(error.errno or 0, "Check the path, and that the drive is there.")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from synthetic_images.areas import Area, Point
 from synthetic_images.bend import is_term
 from synthetic_images.checks import not_negative, one_of, positive, unique
-from synthetic_images.writing import FONTS
+from synthetic_images.writing import check_font
 
 Array = NDArray[np.float64]
 
@@ -213,7 +213,7 @@ class Writing:
         if not self.text.strip():
             raise ValueError("writing without any text; leave it out")
         positive(f"writing {self.text!r}: height_mm", self.height_mm)
-        one_of(f"writing {self.text!r}: font", self.font, FONTS)
+        check_font(f"writing {self.text!r}: font", self.font)
 
 
 @dataclass(frozen=True, eq=False)

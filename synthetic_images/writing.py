@@ -1,12 +1,14 @@
 """Writing as areas: letters of Matplotlib's fonts by their outlines, those of OpenCV's fonts by what it draws."""
 
 from functools import lru_cache
+from importlib.util import find_spec
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from synthetic_images.areas import Area
+from synthetic_images.checks import one_of
 
 Array = NDArray[np.float64]
 
@@ -16,13 +18,23 @@ HERSHEY = {
     "hershey-duplex": cv2.FONT_HERSHEY_DUPLEX,
     "hershey-italic": cv2.FONT_HERSHEY_SIMPLEX | cv2.FONT_ITALIC,
 }
-OUTLINED = ("DejaVu Sans", "DejaVu Sans Mono", "DejaVu Serif", "STIXGeneral", "cmr10")  # that Matplotlib brings along
+OUTLINED = ("DejaVu Sans", "DejaVu Sans Mono", "DejaVu Serif", "STIXGeneral", "cmr10")  # Matplotlib's own, an extra
 HANDWRITING = "handwriting"  # hershey-italic, no letter like the next
 FONTS = (*HERSHEY, *OUTLINED, HANDWRITING)
 _CAPITAL_PX = 120  # of a letter that OpenCV draws, before its outlines are taken
 _STROKE_PX = 12
 _BLANK = 0.5  # of a capital's height
 _UNEVEN_RAD, _UNEVEN = 0.08, 0.07  # of handwriting: a letter's turn, and its size and place in capitals' heights
+
+
+def check_font(what: str, font: str) -> None:
+    """Raises ValueError for a font that there is not, or not in this installation."""
+    one_of(what, font, FONTS)
+    if font in OUTLINED and find_spec("matplotlib") is None:
+        raise ValueError(
+            f"{what}: {font!r} comes with Matplotlib, which is not installed. Install it: pip install "
+            f"'reseau[fonts]', or take one of {', '.join((*HERSHEY, HANDWRITING))}"
+        )
 
 
 @lru_cache(maxsize=256)

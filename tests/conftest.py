@@ -1,13 +1,18 @@
 """What all tests share: the last lines of a run say what was left out for want of data, or of a browser."""
 
 import browser
+import plain_environment
 import pytest
 from real_data import DATA, REASON
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     skipped = [str(each.longrepr) for each in terminalreporter.stats.get("skipped", [])]
-    for reason, need in ((REASON, f"real data in {DATA}"), (browser.REASON, "a browser: install chromium")):
+    for reason, need in (
+        (REASON, f"real data in {DATA}"),
+        (browser.REASON, "a browser: install chromium"),
+        (plain_environment.REASON, f"an environment without extras: make {plain_environment.READY}"),
+    ):
         count = sum(reason in each for each in skipped)
         if count:
             terminalreporter.write_line(f"LEFT OUT: {count} tests that need {need}", yellow=True)

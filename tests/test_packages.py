@@ -1,8 +1,12 @@
 """Who may import whom: measure, adjust and synthetic_images know none of the others, pipeline knows them all."""
 
 import ast
+import re
+import sys
+import tomllib
 from functools import cache
 from graphlib import TopologicalSorter
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -25,6 +29,8 @@ ADJUST_FROM_THE_GROUND_UP = (
     "target_names",
     "choices",
 )  # folders, and the files at the root
+TYPES_ALONE = {"_typeshed"}  # known to type checkers, and not to Python
+LOADED_BY_OTHERS = {"s3fs"}  # by fsspec, for addresses of its scheme
 FORBIDDEN_LIBRARIES = {"adjust": {"cv2", "skimage", "tifffile", "imagecodecs"}}
 
 
@@ -111,3 +117,34 @@ def rooms_used(room: Path, package: str) -> set[str]:
             else:
                 modules |= {alias.name for alias in node.names}
     return {f"{name}.__init__".split(".")[1] for name in modules if name.split(".")[0] == package}
+
+
+def test_what_the_packages_import_is_declared_and_what_is_declared_is_imported() -> None:
+    """By the distributions that bring the modules: pip installs these."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = (one for name, own in project["optional-dependencies"].items() if name != "dev" for one in own)
+    declared = {normal(re.split(r"[\[<>=]", requirement)[0]) for requirement in (*project["dependencies"], *extras)}
+    files = [file for package in PACKAGES for file in (ROOT / package).rglob("*.py")]
+    names = set[str]().union(*(imported(file) | imported_by_name(file) for file in files))
+    brought_by = packages_distributions()
+    used = {}
+    for name in names - PACKAGES - TYPES_ALONE - set(sys.stdlib_module_names):
+        assert name in brought_by, f"{name} is imported, and not installed"
+        used[name] = {normal(distribution) for distribution in brought_by[name]}
+    assert [name for name, distributions in used.items() if not distributions & declared] == []
+    assert declared - set[str]().union(*used.values()) == LOADED_BY_OTHERS
+
+
+def imported_by_name(file: Path) -> set[str]:
+    """The top-level names in calls of `import_module` with a text."""
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "import_module":
+            (name,) = node.args
+            if isinstance(name, ast.Constant):
+                names.add(name.value.split(".")[0])
+    return names
+
+
+def normal(distribution: str) -> str:
+    return re.sub(r"[-_.]+", "-", distribution).lower()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from measure.errors import MeasurementError
 from measure.revision import MEASURE_REVISION
 from measure.scans.addresses import is_address, scan_path
-from pipeline.errors import InputError
+from pipeline.errors import InputError, missing_extra
 from pipeline.workers import KILLS, WorkerKilled, processes, work_alone
 
 if TYPE_CHECKING:
@@ -36,9 +36,7 @@ def cluster_executor(address: str, scans: Sequence[str], workers: int | None = N
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise InputError(
-            "--cluster needs Dask, which is not installed here. Install it: pip install 'reseau[cluster]'."
-        ) from None
+        raise missing_extra("--cluster", "Dask", "cluster") from None
     with ExitStack() as stack:
         if address == LOCAL:
             count = workers or processes(len(scans) or 1)

@@ -46,12 +46,13 @@ def measure_archive(
     """
     options = options or WorkOptions()
     names = check_measurable(project)
-    lost = store.forget_damaged() if options.retry or store.has_damaged_rows() else 0
-    if lost:
-        reporter.say(f"{store.path}: {counted(lost, 'result')} stored there not as written: measured again")
-    if options.retry:
-        store.forget_failed()
     with executor_of(project, options) as executor, ThumbnailStore.beside(store.path) as thumbnails:
+        # Once nothing stands in the way of measuring again.
+        lost = store.forget_damaged() if options.retry or store.has_damaged_rows() else 0
+        if lost:
+            reporter.say(f"{store.path}: {counted(lost, 'result')} stored there not as written: measured again")
+        if options.retry:
+            store.forget_failed()
         if options.moved:
             thumbnails.rekey(find_moved(store, project, reporter))
         work = Work(project, store, executor, options, thumbnails)

@@ -24,6 +24,7 @@ from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
 from pipeline.text.image_names import image_name, names_below
 from pipeline.text.toml_text import quoted
+from pipeline.text.wording import counted
 
 Json = dict[str, Any]
 
@@ -186,7 +187,8 @@ def project_text(new: NewProject) -> str:
     """project.toml. Raises InputError where no scan is left."""
     cameras = new.cameras
     if not cameras:
-        raise InputError(f"{', '.join(map(str, new.given))}: of {new.found.files} files none can be read as a scan.")
+        given, reason = ", ".join(map(str, new.given)), next(iter(new.found.broken.values()), "")
+        raise InputError(f"{given}: of {counted(new.found.files, 'file')} none can be read as a scan. {reason}".strip())
     names = defaultdict[str, int](int)
     for camera in cameras.values():
         names[camera] += 1

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import angles_from_rotation
 from adjust.problem.network import Exterior
-from pipeline.blocks.mapping import Mapped, given_interior, mapped
+from pipeline.blocks.mapping import Mapped, given_interior, mapped, quiet_colmap
 from pipeline.blocks.pictures import BlockPicture, write_pictures
 from pipeline.blocks.ties import oriented_by_control, tie_marks
 from pipeline.errors import InputError
@@ -51,8 +51,10 @@ class OrientedBlock:
 def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: Reporter) -> OrientedBlock:
     """All up to the adjustment, which is then run as of any project.
 
-    Raises InputError where fiducials were not measured yet, where COLMAP orients nothing, or control is missing.
+    Raises InputError where COLMAP is not installed, fiducials were not measured yet, COLMAP orients nothing, or control
+    is missing.
     """
+    quiet_colmap()  # before the resampling, which takes far longer
     if not project.comparator.exists():
         raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first: films come by it.")
     marks = read_comparator(project.comparator)

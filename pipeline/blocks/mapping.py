@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.blocks.pictures import BlockPicture, Lattice
 from pipeline.errors import InputError
-from pipeline.exchange.colmap_format import CONVENTION, imported
+from pipeline.exchange.colmap_format import CONVENTION, import_pycolmap
 from pipeline.files.camera_file import CameraFile
 
 Array = NDArray[np.float64]
@@ -58,7 +58,7 @@ def mapped(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], fol
 
 def quiet_colmap() -> Any:
     """pycolmap, which then tells of errors only."""
-    pycolmap = imported()
+    pycolmap = import_pycolmap("reseau block")
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     return pycolmap
 

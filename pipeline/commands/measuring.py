@@ -22,7 +22,7 @@ from pipeline.commands.shared import (
     show,
     with_project,
 )
-from pipeline.errors import InputError
+from pipeline.errors import InputError, missing_extra
 from pipeline.terminal import PlainConsole, plain
 from pipeline.text.wording import counted
 
@@ -181,7 +181,7 @@ def review(
     try:
         from pipeline.review.server import serve
     except ModuleNotFoundError:
-        raise InputError("review needs starlette and uvicorn. Install them: pip install 'reseau[review]'.") from None
+        raise missing_extra("reseau review", "Starlette and Uvicorn", "review") from None
     serve(read(project, max_pixels), port, who, not no_browser, typer.echo)
     return DONE
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, missing_extra
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import BROWN, RATIONAL
@@ -30,7 +30,7 @@ _FISHEYE = "OPENCV_FISHEYE"
 
 def write(block: Block, options: ExportOptions) -> Written:
     """sparse/*.bin; a camera an image, for every resampled frame has its own first pixel."""
-    pycolmap = imported()
+    pycolmap = import_pycolmap("the format colmap")
     frames, left_out = pinhole_frames(block, options, (BROWN, RATIONAL), "colmap", knows_fisheye=True)
     made = reconstruction(pycolmap, block, frames)
     with tempfile.TemporaryDirectory() as folder:
@@ -44,12 +44,12 @@ def write(block: Block, options: ExportOptions) -> Written:
     )
 
 
-def imported() -> Any:
-    """Raises InputError where pycolmap is not installed."""
+def import_pycolmap(user: str) -> Any:
+    """pycolmap. Raises InputError, which names its user, where it is not installed."""
     try:
         import pycolmap
     except ImportError:
-        raise InputError("colmap needs pycolmap. Install it with: pip install reseau[blocks]") from None
+        raise missing_extra(user, "pycolmap", "blocks") from None
     return pycolmap
 
 
@@ -89,7 +89,7 @@ def colmap_camera(pycolmap: Any, frame: PinholeFrame, number: int) -> Any:
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Folders of reconstructions (.bin or .txt): poses as approximations, and cameras of the models that OpenCV has."""
-    pycolmap = imported()
+    pycolmap = import_pycolmap("the format colmap")
     cameras, poses, notes = [], [], []
     for path in paths:
         folder = path if path.is_dir() else path.parent

@@ -2,7 +2,7 @@
 
 import io
 
-from pipeline.errors import InputError
+from pipeline.errors import missing_extra
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import ExportOptions, Written
 from pipeline.exchange.tables import CONVENTION as CONVENTION
@@ -19,7 +19,7 @@ def _bytes(table: Table) -> bytes:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise InputError("parquet needs pyarrow. Install it with: pip install reseau[parquet]") from None
+        raise missing_extra("the format parquet", "pyarrow", "parquet") from None
     made = pyarrow.table(table).replace_schema_metadata({"conventions": CONVENTION.axes})
     written = io.BytesIO()
     pyarrow.parquet.write_table(made, written)

@@ -1,0 +1,57 @@
+"""What a user has who installed no extra: every command works or names the extra that it needs."""
+
+import json
+import subprocess
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import plain_environment
+import pytest
+
+from pipeline.cli import COMMANDS, DONE, LOOK, WRONG_INPUT
+
+pytestmark = [
+    pytest.mark.xdist_group("plain installation"),  # the commands are run once for all
+    pytest.mark.skipif(not plain_environment.PYTHON.exists(), reason=plain_environment.REASON),
+]
+MODULES_OF_EXTRAS = {"pipeline.review.server": "anyio", "pipeline.review.safety": "starlette"}
+READS_WRITING = "rapidocr-onnxruntime"  # installed for the files that it carries, without what it asks for
+
+
+@cache
+def found_there() -> dict[str, Any]:
+    """What `every_command.py` says in the plain environment."""
+    with TemporaryDirectory() as folder:
+        told = _run("-P", str(Path(__file__).with_name("every_command.py")), folder)
+    assert told.returncode == 0, told.stderr
+    return dict(json.loads(told.stdout))
+
+
+def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [str(plain_environment.PYTHON), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=plain_environment.plain_variables())
+
+
+def test_every_command_works_or_names_the_extra_that_it_needs() -> None:
+    calls = found_there()["calls"]
+    assert {call["arguments"][0] for call in calls} == set(COMMANDS)
+    for call in calls:
+        told = f"{call['arguments']}: {call['messages']}"
+        if call["extra"]:
+            assert call["code"] == WRONG_INPUT, told
+            assert f"'reseau[{call['extra']}]'" in call["messages"], told
+            assert call["messages"].count("reseau: ") == 1, told
+        else:
+            assert call["code"] in (DONE, LOOK), told
+
+
+def test_every_module_can_be_imported() -> None:
+    assert found_there()["modules"] == MODULES_OF_EXTRAS
+
+
+def test_the_lock_file_holds_what_the_project_asks_for() -> None:
+    """And what each of its packages asks for, in versions that suit."""
+    lines = _run("-m", "pip", "check").stdout.splitlines()
+    assert [line for line in lines if not line.startswith(f"{READS_WRITING} ")] == []
