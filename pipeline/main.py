@@ -20,6 +20,7 @@ def main() -> None:
     gc.set_threshold(_OBJECTS)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as an interrupt does, worker processes with it
     try:
+        importlib.import_module("pipeline.terminal").outlive_readers()
         sys.exit(importlib.import_module("pipeline.cli").run())
     except KeyboardInterrupt:  # while the modules are imported: later the command line answers for it
         sys.exit(_INTERRUPTED)

@@ -33,13 +33,13 @@ from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
-from pipeline.publishing.made_from import adjusted_from, measured_from
+from pipeline.publishing.made_from import adjusted_from, differing, measured_from
 from pipeline.publishing.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
 from pipeline.report.page import write_frame_page, write_report
 from pipeline.report_data import adjusted, frame_data, measured, report_data
 from pipeline.results.adjustment_file import write_adjustment
-from pipeline.results.adjustment_reader import covariance_path
+from pipeline.results.adjustment_reader import covariance_path, read_adjustment
 from pipeline.results.comparator_file import ComparatorPoint, measurement_of, read_comparator, write_comparator
 from pipeline.results.fingerprints import of_file
 from pipeline.results.frames_file import for_images, write_frames
@@ -123,13 +123,14 @@ def run_adjust(project: Project, reporter: Reporter) -> Summary:
 
 
 def run_check(project: Project, reporter: Reporter) -> Summary:
-    """The adjustment, made anew from comparator.csv, against OpenCV's calibration."""
+    """The adjustment, made anew from comparator.csv, against OpenCV's calibration. Raises InputError where what is
+    made so is not what adjustment.json holds: that one is never written here."""
     with unpublished(project) as new:
         with reporter.stage("checking") as count:
             count(project.comparator.name, 0, 1)
-            adjustment = adjust_marks(project, _given_marks(project, new))
-            _write_adjustment(project, adjustment, new)
-            _write_check(project, adjustment, new)
+            marks = _given_marks(project, new)
+            _check_adjusted(project, marks)
+            _write_check(project, adjust_marks(project, marks), new)
         data = adjusted(project, new.at)
         new.publish()
     return summarise(data, {"check": project.check_path})
@@ -280,6 +281,14 @@ def _fill_images(project: Project, scans: Iterable[MeasuredScan]) -> None:
 def _write_adjustment(project: Project, adjustment: Adjustment, new: Unpublished) -> None:
     made_from = adjusted_from(project, _given_marks(project, new))
     write_adjustment(adjustment, new.place(project.adjustment_path), made_from)
+
+
+def _check_adjusted(project: Project, marks: Sequence[ComparatorPoint]) -> None:
+    """Raises InputError where there is no adjustment of these marks and of the project as it is."""
+    path = project.adjustment_path
+    made_from = read_adjustment(path).get("made_from") or {}
+    if others := differing(made_from, adjusted_from(project, marks)):
+        raise InputError(f"{path}: is of other {' and '.join(others)} than there are now. Run `reseau adjust` first.")
 
 
 def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> None:

@@ -1,10 +1,13 @@
 """What a terminal is given: no control characters from names in files, and letters that it lacks spelled out."""
 
 import codecs
+import io
+import os
 import re
 import sys
 import unicodedata
 from collections.abc import Iterable
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
@@ -27,6 +30,32 @@ class PlainConsole(Console):
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(plain(segment.text), segment.style)
+
+
+def outlive_readers() -> None:
+    """From now on the streams of this process drop what nobody reads any more: `reseau status | head` ends with the
+    code that the command has without `head`."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if not isinstance(stream, io.TextIOWrapper):  # there is none, or it is a test's
+            continue
+        raw = _Patient(stream.fileno(), "wb", closefd=False)
+        buffered = io.BufferedWriter(raw)
+        lines = stream.line_buffering or stream.write_through
+        setattr(sys, name, io.TextIOWrapper(buffered, stream.encoding, stream.errors, line_buffering=lines))
+
+
+class _Patient(io.FileIO):
+    """A file that takes everything once its pipe is closed."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self.fileno())
+            os.close(nowhere)
+            return super().write(data)
 
 
 def spell_out_missing_letters() -> None:

@@ -3,6 +3,7 @@
 import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from measure.scans.addresses import Address, addresses_below
 from measure.scans.head import ScanHead, read_head
 from pipeline.archive.identity import content_hash, parts_hash
 from pipeline.errors import InputError
+from pipeline.files.scan_patterns import folders_below
 from pipeline.progress import Count
 from pipeline.text.image_names import SCAN_ENDINGS
 
@@ -86,15 +88,21 @@ def _files(given: Sequence[Path]) -> tuple[list[Path], Counter[str]]:
         if not path.is_dir():
             files[path] = None
             continue
-        for folder, folders, names in os.walk(path):
-            folders[:] = [name for name in folders if not name.startswith(".")]
-            for name in names:
-                file = Path(folder, name)
-                if not name.startswith(".") and file.suffix.lower() in SCAN_ENDINGS:
+        for place in folders_below(path):
+            for name in _file_names(path / place):
+                file = path / place / name
+                if file.suffix.lower() in SCAN_ENDINGS:
                     files[file] = None
-                elif not name.startswith("."):
+                else:
                     endings[file.suffix] += 1
     return sorted(files), endings
+
+
+def _file_names(folder: Path) -> list[str]:
+    """Those that are not hidden."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        return [entry.name for entry in entries if not entry.is_dir() and not entry.name.startswith(".")]
+    return []
 
 
 def _no_scan(given: Sequence[Path], endings: Mapping[str, int]) -> str:

@@ -5,6 +5,7 @@ of MIGRATIONS, and none that stands there is changed any more.
 """
 
 import math
+import os
 import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,7 +142,7 @@ def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
     InputError for a file of another kind, or of a later version."""
     schema = schema or _measurements()
     path.parent.mkdir(parents=True, exist_ok=True)
-    connection = sqlite3.connect(path, timeout=60.0, isolation_level=None)
+    connection = _connection(path)
     try:
         _check(connection, path, schema)
         connection.create_function("sqrt", 1, _sqrt, deterministic=True)  # not every SQLite is built with it
@@ -157,6 +158,16 @@ def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
         connection.close()
         raise
     return connection
+
+
+def _connection(path: Path) -> sqlite3.Connection:
+    """To read and write; to read alone where the folder cannot be written, for SQLite makes files beside its own."""
+    name, is_address = str(path), path.exists() and not all(os.access(one, os.W_OK) for one in (path.parent, path))
+    if is_address:
+        log = path.with_name(f"{path.name}-wal")  # of a process that has it open
+        is_open = log.exists() and log.stat().st_size > 0
+        name = f"{path.absolute().as_uri()}?mode=ro{'' if is_open else '&immutable=1'}"
+    return sqlite3.connect(name, timeout=60.0, isolation_level=None, uri=is_address)
 
 
 def migrate(connection: sqlite3.Connection, schema: Schema | None = None) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from measure.errors import MeasurementError
 from measure.scans.addresses import found_addresses, is_address, scan_path
+from pipeline.files.scan_patterns import each_once, found_names
 from pipeline.text.image_names import names_below
 from pipeline.text.tables import Table
 
@@ -44,7 +45,7 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
     """The scan files that the patterns find, without those that `exclude` names or finds. Raises InputError for a
     pattern that finds nothing, and for files whose images would have the same name."""
     folder = table.file.parent
-    found = dict[str, Named]()  # paths are slow keys
+    found, is_named = dict[str, Named](), dict[str, bool]()  # paths are slow keys
     for pattern in patterns:
         try:
             own = _found(pattern, folder)
@@ -55,8 +56,11 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
         if not own:
             raise table.error("scans", _nothing_found(pattern, folder / pattern))
         found |= {str(file): file for file in own}
+        if not is_address(pattern):
+            is_named |= {str(file): own == [str(folder / pattern)] for file in own}
     left_out = {str(file): file for pattern in exclude for file in _found(pattern, folder)}
-    files = [file for text, file in found.items() if text not in left_out]
+    repeated = is_named.keys() - each_once(is_named, [text for text in left_out if not is_address(text)])
+    files = [file for text, file in found.items() if text not in left_out and text not in repeated]
     if not files:
         what = "leaves no scan of those that scans names. Shorten it." if found else ""
         raise table.error(
@@ -86,8 +90,7 @@ def _found(pattern: str, folder: Path) -> Sequence[Named]:
         return found_addresses(pattern)
     if (folder / pattern).is_file():
         return [str(folder / pattern)]
-    names = glob.glob(pattern, root_dir=folder, recursive=True)
-    return _without_folders(_below(folder, sorted(names)))
+    return _without_folders(_below(folder, sorted(found_names(pattern, folder))))
 
 
 def _below(folder: Path, names: Sequence[str]) -> list[str]:

@@ -114,20 +114,33 @@ def _window(scan: Scan, col0: int, row0: int, size: int) -> NDArray[np.uint8]:
     if col0 >= scan.width_px or row0 >= scan.height_px or col0 + size <= 0 or row0 + size <= 0:
         raise MeasurementError("the window is outside of the scan")
     step = max(1, size // _WINDOW_PX)
-    grey = scan.window(col0, row0, size, size) if step == 1 else _reduced_window(scan, col0, row0, size, step)
     if step > 1:
-        return stretched(np.asarray(grey, dtype=np.float64))
-    inside = scan.inside(col0, row0, size, size)
-    shown = stretched(np.asarray(grey, dtype=np.float64))
-    shown[~inside] = _NOTHING
+        return _reduced_window(scan, col0, row0, size // step, step)
+    shown = stretched(np.asarray(scan.window(col0, row0, size, size), dtype=np.float64))
+    shown[~scan.inside(col0, row0, size, size)] = _NOTHING
     return shown
 
 
-def _reduced_window(scan: Scan, col0: int, row0: int, size: int, step: int) -> Array:
-    """Bounded in memory: rows of the window at a time."""
-    side = size // step
-    rows = [scan.window(col0, row0 + step * k, side * step, step) for k in range(side)]
-    return np.stack([row.reshape(step, side, step).mean(axis=(0, 2)) for row in rows])
+def _reduced_window(scan: Scan, col0: int, row0: int, side: int, step: int) -> NDArray[np.uint8]:
+    """side x side pixels, each the mean of step x step of the scan. Only what the scan has is read, and only one row of
+    these pixels is held at a time."""
+    shown = np.full((side, side), _NOTHING, np.uint8)
+    cols, rows = _pixels_on(col0, scan.width_px, side, step), _pixels_on(row0, scan.height_px, side, step)
+    if cols and rows:
+        means = [_means(scan, col0 + step * cols.start, row0 + step * row, len(cols), step) for row in rows]
+        shown[rows.start : rows.stop, cols.start : cols.stop] = stretched(np.stack(means))
+    return shown
+
+
+def _pixels_on(start_px: int, extent_px: int, side: int, step: int) -> range:
+    """Which of a row or column of reduced pixels show something of a scan."""
+    return range(max(0, -start_px // step), min(side, -((start_px - extent_px) // step)))
+
+
+def _means(scan: Scan, col0: int, row0: int, count: int, step: int) -> Array:
+    """(count,) reduced pixels side by side."""
+    grey = scan.window(col0, row0, count * step, step)
+    return np.asarray(grey.reshape(step, count, step).mean(axis=(0, 2), dtype=np.float64))
 
 
 def _residual(scan: Scan, mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> NDArray[np.uint8]:

@@ -345,3 +345,14 @@ def test_the_help_does_not_wait_for_what_commands_need() -> None:
     assert done.stdout == "\n"
     program = "import sys, pipeline.stages; sys.exit('pipeline.measuring.measured' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["template", "scene"], 0), (["template", "nothing"], 2)])
+def test_a_reader_that_stops_reading_does_not_change_the_exit_code(arguments: list[str], code: int) -> None:
+    """As `head` does. 1 would say that something needs a look."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-c", "from pipeline.main import main; main()", *arguments]
+    done = subprocess.run(command, stdout=writing, stderr=writing, check=False)
+    os.close(writing)
+    assert done.returncode == code

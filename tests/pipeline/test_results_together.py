@@ -192,6 +192,24 @@ def test_what_was_made_from_something_else_is_said_and_not_shown(
     assert {name for name in ("adjustment", "check") if told[name] is not None} == kept
 
 
+def test_a_check_writes_nothing_but_its_own_file(project: Path, capsys: SAID) -> None:
+    def states() -> dict[str, tuple[int, int]]:
+        paths = [path for path in project.rglob("*") if path.is_file() and path.name != "check.json"]
+        return {str(path): ((state := path.stat()).st_mtime_ns, state.st_ino) for path in paths}
+
+    before = states()
+    (project / "out" / "check.json").unlink()
+    assert run(["check", str(project / "project.toml")]) == 0
+    assert states() == before
+    assert json.loads((project / "out" / "check.json").read_text(encoding="utf-8"))["verdict"] == "agrees"
+    surer_camera(project)
+    assert run(["check", str(project / "project.toml")]) == 2
+    assert "is of other cameras than there are now. Run `reseau adjust` first." in capsys.readouterr().err
+    (project / "out" / "adjustment.json").unlink()
+    assert run(["check", str(project / "project.toml")]) == 2
+    assert "Run `reseau adjust` first." in capsys.readouterr().err
+
+
 def test_files_that_say_the_same_in_other_letters_are_the_same(project: Path, tmp_path: Path) -> None:
     """Moved, saved by an editor with other line ends, lines exchanged and commented: nothing is new."""
     code, _ = shown(project)

@@ -364,3 +364,14 @@ def test_the_identity_of_what_is_no_scan(tmp_path: Path) -> None:
     assert file_state(tmp_path / "none.tif", tmp_path).bytes == -1
     state = file_state(tmp_path / "text.tif", tmp_path / "project")
     assert (state.uri, state.bytes) == ("../text.tif", 10)
+
+
+def test_a_store_in_a_folder_that_cannot_be_written_is_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Store(path) as store:
+        row = store.keep(kept(3), "box/3")
+    monkeypatch.setattr("pipeline.archive.schema.os.access", lambda *_: False)
+    with Store(path) as store:
+        assert store.record(row)["marks"]
+        assert [file.name for file in path.parent.iterdir()] == [path.name]  # SQLite would put two files beside it
+        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+            store.keep(kept(4), "box/4")
