@@ -101,7 +101,7 @@ def tried(python: str, distribution: Path, bounds: Path | None, environment: Pat
     """What came out in an environment of its own, and how many things failed."""
     made_environment(python, environment)
     bin = environment / "bin"
-    install = [bin / "pip", "install", "--quiet", "--only-binary", ":all:", "--no-binary", "reseau"]
+    install: list[str | Path] = [bin / "pip", "install", "--quiet", "--only-binary", ":all:", "--no-binary", "reseau"]
     install += ["--constraint", bounds] if bounds else []
     done = run([*install, distribution])
     if done.returncode:

@@ -43,7 +43,7 @@ def import_statements(file: Path) -> tuple[ast.Import | ast.ImportFrom, ...]:
 
 def imported(file: Path) -> set[str]:
     """The top-level names that a file imports."""
-    names = set()
+    names = set[str]()
     for node in import_statements(file):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
@@ -137,11 +137,11 @@ def test_what_the_packages_import_is_declared_and_what_is_declared_is_imported()
 
 def imported_by_name(file: Path) -> set[str]:
     """The top-level names in calls of `import_module` with a text."""
-    names = set()
+    names = set[str]()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "import_module":
             (name,) = node.args
-            if isinstance(name, ast.Constant):
+            if isinstance(name, ast.Constant) and isinstance(name.value, str):
                 names.add(name.value.split(".")[0])
     return names
 

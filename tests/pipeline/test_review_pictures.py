@@ -23,6 +23,7 @@ def test_a_wide_window_takes_little_memory_and_shows_the_scan_in_its_place(tmp_p
     pictures.close()
     assert peak < 20e6
     shown = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert shown is not None
     assert shown.shape == (480, 480)
     assert set(np.unique(shown[:2])) == set(np.unique(shown[8:])) == {128}  # beyond the scan
     assert shown[2:5, 2:7].max() == 0
