@@ -57,8 +57,9 @@ def _shifts(run: Run, camera: str) -> tuple[list[str], Array, Array]:
     own = [*range(freed.parts.width)[exterior.columns], *range(freed.parts.width)[film.columns]]
     wanted = [of_camera.columns.start + int(np.flatnonzero(of_camera.members == k)[0]) for k in range(3)]
     names, normal, right = [], [], []
-    for number, image in enumerate(problem.network.images):
-        rows = np.flatnonzero(problem.image_numbers == number)
+    order = np.argsort(problem.image_numbers, kind="stable")
+    counts = np.bincount(problem.image_numbers, minlength=len(problem.network.images))
+    for image, rows in zip(problem.network.images, np.split(order, np.cumsum(counts)[:-1]), strict=True):
         if at is None or image.camera != camera or problem.is_fiducial[rows].all():
             continue
         matrix = at.rows.matrix[rows].reshape(2 * len(rows), -1)

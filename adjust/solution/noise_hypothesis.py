@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 
 FEWEST = 30  # coordinates from which on residuals tell what they are distributed like
 CHANCE = 0.001  # of each test below which residuals are no mere noise
+NEIGHBOURS = 8  # that are looked at, the nearest first
 UNCHECKED = 0.05  # redundancy number below which a residual tells nothing
 KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")), ("fiducials", ("fiducial",)))
 STEPS = 20
@@ -96,16 +97,16 @@ def _is_alike(w: Array, redundancy: Array, images: NDArray[np.intp]) -> bool:
 
 
 def _is_shared(w: Array, places: Array, images: NDArray[np.intp], same_image: bool) -> bool:
-    """Whether nearest neighbours, in the same image or in others, have residuals alike."""
-    products = []
-    for image in np.unique(images):
-        own = np.flatnonzero(images == image)
-        others = own if same_image else np.flatnonzero(images != image)
-        if len(others) < 3:
-            continue
-        nearest = np.asarray(KDTree(places[others]).query(places[own], 2)[1])[:, int(same_image)]
-        products.append((w[own] * w[others[nearest]]).sum(axis=1))
-    return bool(products) and _is_positive(np.concatenate(products))
+    """Whether nearest neighbours, in the same image or in another, have residuals alike."""
+    if same_image:  # far apart in a third coordinate, images keep to themselves
+        apart = 10.0 * float(np.ptp(places, axis=0).max())
+        places = np.column_stack([places, apart * images])
+    near = np.asarray(KDTree(places).query(places, min(NEIGHBOURS, len(places)))[1])
+    wanted = (images[near] == images[:, None]) == same_image
+    wanted &= near != np.arange(len(w))[:, None]
+    rows = np.flatnonzero(wanted.any(axis=1))
+    nearest = near[rows, wanted[rows].argmax(axis=1)]
+    return len(rows) > 2 and _is_positive((w[rows] * w[nearest]).sum(axis=1))
 
 
 def _is_shared_by_point(in_object: Array, points: NDArray[np.str_], images: NDArray[np.intp]) -> bool:

@@ -60,19 +60,23 @@ class _Picture:
 
 
 def _picture(camera: Camera, xy_mm: Array, digital: bool) -> _Picture | None:
-    """Where the picture lies; None where its size is not known. Of a digital camera it counts from the first pixel, as
-    the comparator does, or from its middle if nearly all marks lie in it then, and more.
+    """Where the picture lies; None where its size is not known.
+
+    Of a digital camera it counts from the first pixel, as the comparator does, of a film camera it lies about the
+    middle of the fiducial marks; about the origin if nearly all observed marks (n, 2) lie in it then, and more.
     """
     size = np.array(camera.frame_mm)
     if not size.all():
         return None
-    if not digital:
-        places = np.array([[mark.x_mm.value, mark.y_mm.value] for mark in camera.fiducials.values()])
-        center = (places.min(axis=0) + places.max(axis=0)) / 2.0 if len(places) else np.zeros(2)
-        return _Picture(center - size / 2.0, center + size / 2.0)
-    middle, corner = _Picture(-size / 2.0, size / 2.0), _Picture(size * [0.0, -1.0], size * [1.0, 0.0])
+    low = size * [0.0, -1.0] if digital else _fiducial_center_mm(camera) - size / 2.0
+    usual, middle = _Picture(low, low + size), _Picture(-size / 2.0, size / 2.0)
     outside = middle.outside(xy_mm).mean()
-    return middle if outside < min(1.0 - NEARLY_ALL, corner.outside(xy_mm).mean()) else corner
+    return middle if outside < min(1.0 - NEARLY_ALL, usual.outside(xy_mm).mean()) else usual
+
+
+def _fiducial_center_mm(camera: Camera) -> Array:
+    places = np.array([[mark.x_mm.value, mark.y_mm.value] for mark in camera.fiducials.values()])
+    return np.asarray((places.min(axis=0) + places.max(axis=0)) / 2.0) if len(places) else np.zeros(2)
 
 
 def _outside(network: Network, result: Adjustment) -> Mask:
@@ -81,8 +85,7 @@ def _outside(network: Network, result: Adjustment) -> Mask:
     observations = network.observations
     outside = np.zeros(len(observations), dtype=bool)
     for camera in network.cameras:
-        names = [image.name for image in network.images if image.camera == camera.name]
-        rows = np.flatnonzero(np.isin(observations.image, names) & ~observations.is_fiducial)
+        rows = _targets(network, camera)
         if not len(rows):
             continue
         digital = _is_digital(network, camera)
@@ -95,14 +98,20 @@ def _outside(network: Network, result: Adjustment) -> Mask:
     return outside
 
 
+def _targets(network: Network, camera: Camera) -> NDArray[np.intp]:
+    """The observations of object points by a camera."""
+    own = np.array([image.camera == camera.name for image in network.images])
+    return np.flatnonzero(own[network.image_numbers] & ~network.observations.is_fiducial)
+
+
 def _in_camera(network: Network, result: Adjustment, rows: NDArray[np.intp]) -> Array:
     """Observed camera coordinates (m, 2) of some observations."""
     xy_mm = network.straight_xy_mm[rows].copy()
     numbers = network.image_numbers[rows]
-    for number in np.unique(numbers):
-        image = network.images[number]
+    order = np.argsort(numbers, kind="stable")
+    for own in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
+        image = network.images[numbers[own[0]]]
         if image.transformation != "none":
-            own = numbers == number
             xy_mm[own] = adjusted_image(result, image.name).film.camera_from_comparator(xy_mm[own])
     return xy_mm
 
@@ -199,8 +208,7 @@ def _principal_point(camera: Camera, network: Network, result: Adjustment, famil
     if far:
         yield f"{told}, {far}"
         return
-    rows = np.flatnonzero(~network.observations.is_fiducial)
-    rows = rows[[network.images[i].camera == camera.name for i in network.image_numbers[rows]]]
+    rows = _targets(network, camera)
     xy_mm = _in_camera(network, result, rows)
     digital = _is_digital(network, camera)
     picture = _picture(camera, xy_mm, digital)
