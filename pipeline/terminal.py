@@ -12,6 +12,8 @@ from typing import Any
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
+from measure.scans.addresses import public_text
+
 SPELLED = {
     "σ": "sigma", "µ": "u", "μ": "u", "±": "+-", "₀": "0", "²": "^2", "°": " deg", "×": "x", "′": "'", "–": "-",
     "—": "-", "−": "-", "…": "...", "·": ".", "√": "sqrt", "≤": "<=", "≥": ">=",
@@ -20,8 +22,9 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2
 
 
 def plain(text: str) -> str:
-    """The text with control characters as their codes: a name could recolour a terminal, or rewrite what it shows."""
-    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+    """The text with control characters as their codes: a name could recolour a terminal, or rewrite what it shows. And
+    without the credentials and signatures of addresses."""
+    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], public_text(text))
 
 
 class PlainConsole(Console):

@@ -13,13 +13,15 @@ from threading import Thread
 @dataclass
 class RangeServer:
     """gets, sent_bytes: of requests that were answered with a part of a file. failures: of the next GETs, in their
-    order: a status, or how many seconds they are kept waiting. by_ranges: whether it knows them."""
+    order: a status, or how many seconds they are kept waiting. by_ranges: whether it knows them. signature: of a
+    query, without which it refuses."""
 
     url: str = ""
     gets: int = 0
     sent_bytes: int = 0
     failures: list[int | float] = field(default_factory=list)
     by_ranges: bool = True
+    signature: str = ""
 
 
 @contextmanager
@@ -53,8 +55,10 @@ def range_server(folder: Path) -> Iterator[RangeServer]:
 
         def _data(self) -> bytes | None:
             """None where the refusal was sent."""
-            file, is_closed = folder / self.path.lstrip("/"), self.path.startswith("/closed/")
-            if self.path.endswith("/") and file.is_dir() and not is_closed:
+            path, _, query = self.path.partition("?")
+            is_signed = counted.signature in query
+            file, is_closed = folder / path.lstrip("/"), path.startswith("/closed/") or not is_signed
+            if path.endswith("/") and file.is_dir() and not is_closed:
                 names = [f"{one.name}{'/' * one.is_dir()}" for one in sorted(file.iterdir())]
                 links = ["../", "?C=N;O=D", *names]
                 return "".join(f'<a href="{name}">{name}</a>\n' for name in links).encode()

@@ -1,7 +1,10 @@
 """Scans that are no local files, but objects in a store or files of a server, read by ranges of their bytes."""
 
+import hashlib
 import os
+import re
 import stat
+import sys
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -31,12 +34,65 @@ _TIMEOUT_S = 30.0  # without a byte
 _CHECKSUMS = ("ETag", "Content-MD5", "Digest", "Last-Modified")  # of which servers give at least one, mostly
 
 
+_SECRET = re.compile(
+    r"x-(amz|goog|oss|ms|cos)-.*|.*(token|secret|passw|credential|accesskey|signature|api_?-?key|auth).*|googleaccessid|"
+    r"key-pair-id|policy|sig|expires|exp|pwd|hmac|md5|st|se|sp|sr|sv|spr|sip|ss|srt|sk[a-z]{1,3}|sdd|sas|ticket|"
+    r"session.*|jwt|hdn.*|user(name)?",
+    re.IGNORECASE,
+)  # names of what a query has of a signature, by the stores and servers that are in use
+_ADDRESS = re.compile(r"\b([A-Za-z][A-Za-z0-9+.-]*:/{1,2})([^\s/?#@'\"<>]*@)?([^\s?#'\"<>]*)(\?[^\s'\"<>]*)?")
+_locations: dict[str, str] = {}  # where what is shown of an address is fetched from, with its credentials or signature
+
+
+def public_address(text: str) -> str:
+    """An address as it may be shown and kept: without user and password, and without a signature, so that another
+    signature is the same address. What else its query says stands there as a hash; any other text as it is."""
+    if not is_address(text):
+        return text
+    scheme, _, rest = text.partition("://")
+    rest, _, query = rest.partition("#")[0].partition("?")
+    host, slash, path = rest.partition("/")
+    own = [part for part in query.split("&") if part and not _SECRET.fullmatch(part.partition("=")[0])]
+    told = f"?query={hashlib.sha256('&'.join(sorted(own)).encode()).hexdigest()[:12]}" if own else ""
+    return f"{scheme.lower()}://{host.rpartition('@')[2]}{slash}{path}{told}"
+
+
+def public_text(text: str) -> str:
+    """A text with all addresses in it without user, password and query."""
+    return _ADDRESS.sub(r"\1\3", text) if ":/" in text else text
+
+
+def _registered(segment: Any) -> Any:
+    """What is shown of an address; where it is fetched from is remembered."""
+    if not isinstance(segment, str) or not is_address(segment):
+        return segment
+    shown = public_address(segment)
+    if shown != segment:
+        _locations[shown] = segment
+    return shown
+
+
 class Address(PosixPath):
     """`s3://bucket/key`, `https://host/path` or `http://host/path`: a path whose file stands elsewhere.
+
+    As a text it has no user, password or signature; `location` has them, for those who fetch it.
 
     Its methods raise MissingError where nothing is there, UnreachableError where that cannot be told or read after some
     tries, and MeasurementError where the extra of reseau that reaches it is not installed.
     """
+
+    def __new__(cls, *segments: Any) -> "Address":
+        return super().__new__(cls, *map(_registered, segments))
+
+    if sys.version_info >= (3, 12):
+
+        def __init__(self, *segments: Any) -> None:
+            super().__init__(*map(_registered, segments))
+
+    @property
+    def location(self) -> str:
+        """The address with all that it takes to fetch it."""
+        return _locations.get(str(self), str(self))
 
     def __str__(self) -> str:
         return super().__str__().replace(":/", "://", 1)
@@ -45,7 +101,7 @@ class Address(PosixPath):
         return str(self)
 
     def __reduce__(self) -> tuple[type["Address"], tuple[str]]:
-        return Address, (str(self),)
+        return Address, (self.location,)
 
     @property
     def etag(self) -> str:
@@ -114,6 +170,12 @@ def scan_path(text: str | Path) -> Path:
     return Address(text) if is_address(text) else Path(text)
 
 
+def location_of(path: str | Path) -> str:
+    """A text by which a file or an address can be opened, in another process, too. It is not to be shown or kept."""
+    known = scan_path(path)
+    return known.location if isinstance(known, Address) else str(path)
+
+
 def is_address(text: str) -> bool:
     scheme, colon, _ = text.partition("://")
     return bool(colon) and scheme.lower() in _EXTRAS
@@ -135,7 +197,7 @@ def addresses_below(address: Address) -> list[Path]:
     Raises as `Address` does."""
     system = _file_system(address)
     if _scheme(address) == "s3":
-        names = _persistently(address, lambda: list(system.find(str(address))))
+        names = _persistently(address, lambda: list(system.find(address.location)))
         return [Address(f"s3://{name}") for name in sorted(names)]
     files, seen, folders = set[str](), set[str](), [f"{address}/"]
     while folders:
@@ -222,7 +284,7 @@ def _known(address: Address) -> _Object:
 def _asked(address: Address) -> _Object:
     """Asked for anew; blocks of the same content are kept."""
     system = _file_system(address)
-    info = _persistently(address, lambda: _info(system, str(address)))
+    info = _persistently(address, lambda: _info(system, address.location))
     size, etag = info.get("size"), next((str(info[key]) for key in _CHECKSUMS if info.get(key)), "")
     if size is None:
         raise UnreachableError(f"{address}: its server does not say how large it is. Download it, and name the file.")
@@ -249,7 +311,7 @@ def _info(system: Any, address: str) -> Mapping[str, Any]:
 
 
 def _whole(address: Address, cat_ranges: Any, starts: list[int], ends: list[int]) -> list[bytes]:
-    parts: list[bytes] = cat_ranges([str(address)] * len(starts), starts, ends, on_error="raise")
+    parts: list[bytes] = cat_ranges([address.location] * len(starts), starts, ends, on_error="raise")
     for part, start, end in zip(parts, starts, ends, strict=True):
         if len(part) > end - start:
             raise UnreachableError(
@@ -281,7 +343,7 @@ def _told(error: Exception) -> str:
         return "its store or server forbids to read it (403): check your credentials and its permissions"
     if isinstance(error, TimeoutError):
         return f"its store or server did not answer within {_TIMEOUT_S:g} s"
-    return f"it cannot be reached ({type(error).__name__}: {error})"
+    return f"it cannot be reached ({type(error).__name__}: {public_text(str(error))})"
 
 
 def _status(error: Exception) -> int | None:

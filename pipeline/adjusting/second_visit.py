@@ -12,7 +12,7 @@ from adjust.problem.result import Adjustment
 from measure.checks.lost_pixels import without_lost
 from measure.reason import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
-from measure.scans.addresses import scan_path
+from measure.scans.addresses import location_of, scan_path
 from measure.scans.scan import open_scan
 from measure.status import Status
 from measure.targets.measure_targets import TargetPrediction
@@ -57,7 +57,7 @@ def measure_again(
     field = _with_adjusted_points(target_field(project), adjustment)
     sought = {scan.frame.image: _missed(field, scan, adjustment, settings) for scan in scans}
     visits = [
-        Visit(scan.frame.image, scan.scan, missed, settings, project.max_pixels)
+        Visit(scan.frame.image, location_of(scan.scan), missed, settings, project.max_pixels)
         for scan in scans
         if (missed := sought[scan.frame.image])
     ]

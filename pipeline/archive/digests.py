@@ -115,8 +115,8 @@ def damaged_judging(path: object) -> DamagedError:
 
 
 def _frames_digest(db: sqlite3.Connection, judging: int) -> str:
-    frames = db.execute("select digest from judged_frame where judging = ? order by scan", (judging,)).fetchall()
-    return row_digest(*(digest for (digest,) in frames))
+    query = "select scan, result, digest from judged_frame where judging = ? order by scan"
+    return row_digest(*db.execute(query, (judging,)))
 
 
 _JUDGING = "row_digest(judging.id, judging.digest, made_from, judging.input, frames_digest)"

@@ -15,7 +15,7 @@ class ExpectedTime:
     def __init__(self, tasks: Sequence[ScanTask], cameras: Sequence[str], at_a_time: int) -> None:
         """tasks: all that are to be measured; cameras: of each; at_a_time: how many processes measure them."""
         kinds = zip(tasks, cameras, strict=True)
-        self._kind = {task.name: f"{camera} {task.scan.rpartition('.')[2].lower()}" for task, camera in kinds}
+        self._kind = {task.name: f"{camera} {task.shown_scan.rpartition('.')[2].lower()}" for task, camera in kinds}
         self._left = Counter(self._kind.values())
         self._done, self._bytes = defaultdict[str, list[float]](list), defaultdict[str, float](float)
         self._at_a_time = at_a_time

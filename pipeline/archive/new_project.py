@@ -285,8 +285,8 @@ def _address_patterns(new: NewProject, given: Address) -> list[str]:
     """Stores find what a pattern names; of servers every scan is named."""
     below = [path for path in new.cameras if path.is_relative_to(given)]
     if below == [given] or not _has_patterns(given):
-        return [str(path) for path in below]
-    return [f"{glob.escape(str(given))}/**/*{ending}" for ending in sorted({path.suffix for path in below})]
+        return [path.location if isinstance(path, Address) else str(path) for path in below]
+    return [f"{glob.escape(given.location)}/**/*{ending}" for ending in sorted({path.suffix for path in below})]
 
 
 def _has_patterns(path: Path) -> bool:
@@ -307,7 +307,7 @@ def _exclude_lines(new: NewProject) -> list[str]:
 
 
 def _seen_from(folder: Path, path: Path) -> str:
-    return str(path) if isinstance(path, Address) else Path(os.path.relpath(path, folder)).as_posix()
+    return path.location if isinstance(path, Address) else Path(os.path.relpath(path, folder)).as_posix()
 
 
 def _totals(new: NewProject) -> dict[tuple[str, str], tuple[int, int]]:

@@ -10,9 +10,11 @@ import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
 
+from measure.scans.addresses import public_address
 from pipeline.archive.digests import add_digests, row_digest
 from pipeline.errors import InputError, what_to_do_about_store
 
+STORE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # of a damaged file; SQLite's own sentence may be damaged, too
 APPLICATION = 0x52455345  # "RESE": `file` and this program know the file by it
 
 _FIRST = """
@@ -151,7 +153,7 @@ def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
         connection.execute("pragma synchronous = normal")
         connection.execute("pragma foreign_keys = on")
         migrate(connection, schema)
-    except sqlite3.Error as error:
+    except STORE_ERRORS as error:
         connection.close()
         raise store_error(path, schema.what, error) from error
     except BaseException:
@@ -179,12 +181,27 @@ def migrate(connection: sqlite3.Connection, schema: Schema | None = None) -> Non
         try:
             connection.executescript(f"begin immediate; {script}; {marks};")
             if script == _DIGESTS:
+                _forget_secrets(connection)
                 add_digests(connection)
             connection.execute("commit")
-        except sqlite3.Error:
+        except STORE_ERRORS:
             if connection.in_transaction:
                 connection.execute("rollback")
             raise
+
+
+def _forget_secrets(connection: sqlite3.Connection) -> None:
+    """Away with scans that an earlier version kept by addresses with passwords or signatures: they are not asked for by
+    these any more."""
+    rows = connection.execute("select id, uri from scan where uri like '%://%'").fetchall()
+    secret = [(row,) for row, uri in rows if public_address(uri) != uri]
+    if secret:
+        connection.execute("pragma secure_delete = on")
+        connection.execute("delete from judging")
+        connection.executemany("update scan set duplicate_of = null where duplicate_of = ?", secret)
+        connection.executemany("delete from mark where result in (select id from result where scan = ?)", secret)
+        connection.executemany("delete from result where scan = ?", secret)
+        connection.executemany("delete from scan where id = ?", secret)
 
 
 def _measurements() -> Schema:

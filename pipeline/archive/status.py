@@ -16,7 +16,7 @@ from rich.text import Text
 from pipeline.archive.asked import asked_of
 from pipeline.archive.decided import by_image, decisions_hash
 from pipeline.archive.decision_check import inapplicable, shortened, unknown_images
-from pipeline.archive.digests import DamagedError, is_sound
+from pipeline.archive.digests import DamagedError, check_judging, is_sound
 from pipeline.archive.file_state import FileStates
 from pipeline.archive.judging import judged_records, latest
 from pipeline.archive.store import Store
@@ -99,6 +99,8 @@ def _checked(store: Store) -> Iterator[Sequence[Any]]:
     """The rows of the query; one that is not as it was written says that, and nothing else. Of frames of which a mark's
     reason may be told, the marks are checked, too."""
     rows, judging = store.connection.execute(_QUERY).fetchall(), latest(store)
+    if judging is not None:
+        check_judging(store.connection, judging.row, store.path)
     told = {row[-2] for row in rows if row[6] and row[-2]}
     records = judged_records(store, judging, told) if judging is not None and told else ()
     damaged = {name for name, record in records if isinstance(record, DamagedError)}

@@ -19,7 +19,7 @@ from measure.revision import MEASURE_REVISION
 from pipeline.archive.digests import IS_JUDGING_SOUND, DamagedError, damaged_results, is_sound, marks_digest, seal
 from pipeline.archive.file_state import FileState, Identity
 from pipeline.archive.key import fingerprint, options_hash
-from pipeline.archive.schema import opened, store_error
+from pipeline.archive.schema import STORE_ERRORS, opened, store_error
 from pipeline.archive.verdicts import Verdict, verdict_of
 
 Json = dict[str, Any]
@@ -65,7 +65,7 @@ class Store:
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Raises InputError for whatever SQLite refused in the block: of a damaged file any read may be that."""
         self.close()
-        if isinstance(error, sqlite3.Error):
+        if isinstance(error, STORE_ERRORS):
             raise store_error(self.path, "measurements", error) from error
 
     def close(self) -> None:

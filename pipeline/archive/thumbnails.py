@@ -3,12 +3,11 @@
 It holds nothing that the scans do not: it may be deleted, and then pictures are cut from the scans again.
 """
 
-import sqlite3
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
-from pipeline.archive.schema import Schema, opened, store_error
+from pipeline.archive.schema import STORE_ERRORS, Schema, opened, store_error
 from pipeline.results.thumbnail import StoredThumbnail
 
 _FIRST = """
@@ -45,7 +44,7 @@ class ThumbnailStore:
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Raises InputError for what SQLite refused of this file in the block."""
         self.close()
-        if isinstance(error, sqlite3.Error):
+        if isinstance(error, STORE_ERRORS):
             raise store_error(self._path, "thumbnails", error) from error
 
     def close(self) -> None:
@@ -68,7 +67,7 @@ class ThumbnailStore:
             found = self._db.execute(
                 f"select {_COLUMNS} from thumbnail where {where}", (fingerprint, point, kind)
             ).fetchone()
-        except sqlite3.Error:  # the scan itself is there
+        except STORE_ERRORS:  # the scan itself is there
             return None
         if found is None:
             return None

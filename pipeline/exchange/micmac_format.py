@@ -267,6 +267,10 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
             raise InputError(f"{path}: has no <MesureAppuiFlottant1Im>. Measures of marks are read, and nothing else.")
         if path.name == "MeasuresCamera.xml":
             places = {point: place * _Y_DOWN for point, place, _ in _points(root, path)}
+            if not places:
+                raise InputError(
+                    f"{path}: has no mark <OneMesureAF1I>, so nothing is known of the camera. Name another."
+                )
             cameras.append(fiducial_camera(path.parent.parent.name or "camera", places))
             continue
         for image in images:

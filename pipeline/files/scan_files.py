@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.addresses import found_addresses, is_address, scan_path
+from measure.scans.addresses import found_addresses, is_address, public_text, scan_path
 from pipeline.files.scan_patterns import each_once, found_names
 from pipeline.text.image_names import names_below
 from pipeline.text.tables import Table
@@ -52,9 +52,11 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
         except MeasurementError as error:
             raise table.error("scans", str(error)) from error
         if not own and is_address(pattern):
-            raise table.error("scans", f"{pattern!r} finds no object. Check the bucket, the folder and the ending.")
+            raise table.error(
+                "scans", f"{public_text(pattern)!r} finds no object. Check the bucket, the folder and the ending."
+            )
         if not own:
-            raise table.error("scans", _nothing_found(pattern, folder / pattern))
+            raise table.error("scans", public_text(_nothing_found(pattern, folder / pattern)))
         found |= {str(file): file for file in own}
         if not is_address(pattern):
             is_named |= {str(file): own == [str(folder / pattern)] for file in own}

@@ -18,6 +18,7 @@ from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
+from measure.scans.addresses import public_text
 from measure.scans.scan import Scan
 from measure.status import Status
 from pipeline.errors import InputError, what_to_do
@@ -48,7 +49,7 @@ def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
     return failed_scan(
         task,
         FailureCode.ENDED,
-        f"{task.scan}: the process that measured it was ended, most likely because the memory was full{told}. "
+        f"{task.shown_scan}: the process that measured it was ended, most likely because the memory was full{told}. "
         "Close other programs, and measure it again.",
     )
 
@@ -66,6 +67,7 @@ def measured_scan(task: ScanTask, look: Look | None = None) -> MeasuredScan:
 
 def failed_scan(task: ScanTask, code: FailureCode, sentence: str) -> MeasuredScan:
     """Of a scan that could not be measured: a row for each mark that would have been sought, all of them absent."""
+    sentence = public_text(sentence)
     reason = Reason(f"the scan could not be measured: {sentence}", Code.FAILED_SCAN)
     fiducials, targets = [mark.id for mark in task.options.camera.drawn], task.options.targets
     marks = (
@@ -73,7 +75,7 @@ def failed_scan(task: ScanTask, code: FailureCode, sentence: str) -> MeasuredSca
         *(MarkMeasurement(id, "target", None, None, Status.ABSENT, reason) for id in (targets.ids if targets else ())),
     )
     frame = FrameMeasurement(task.name, marks, problems=(Reason(sentence, Code.FAILED_SCAN),))
-    return MeasuredScan.failed(task.scan, frame, Failure(code, sentence))
+    return MeasuredScan.failed(task.shown_scan, frame, Failure(code, sentence))
 
 
 def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
@@ -90,13 +92,16 @@ def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
         case InputError():
             return FailureCode.PITCH, told
         case MemoryError():
-            return FailureCode.MEMORY, f"{task.scan}: the memory was full. Close other programs, and measure it again."
+            return (
+                FailureCode.MEMORY,
+                f"{task.shown_scan}: the memory was full. Close other programs, and measure it again.",
+            )
         case OSError():
-            return FailureCode.UNREADABLE, f"{task.scan}: {error.strerror or told}. {what_to_do(error)}"
+            return FailureCode.UNREADABLE, f"{task.shown_scan}: {error.strerror or told}. {what_to_do(error)}"
     where = traceback.extract_tb(error.__traceback__)[-1]
     return (
         FailureCode.FAULT,
-        f"{task.scan}: a fault of reseau itself; please report it: {type(error).__name__}: {told}, in "
+        f"{task.shown_scan}: a fault of reseau itself; please report it: {type(error).__name__}: {told}, in "
         f"{Path(where.filename).name}, line {where.lineno}.",
     )
 
@@ -113,7 +118,7 @@ def _opened_and_measured(task: ScanTask, look: Look | None) -> MeasuredScan:
         curve = (frame.tone.note,) if frame.tone else ()
         file_notes = (f"{note[0].upper()}{note[1:]}." for note in scan.notes)
         notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame))
-        measured = MeasuredScan(task.scan, scan.width_px, scan.height_px, pitch, frame, notes)
+        measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, notes)
         if misplaced := misplaced_principal_point(options.camera, measured):
             measured = replace(
                 measured, frame=replace(frame, problems=(*frame.problems, Reason(misplaced, Code.OFF_GIVEN)))

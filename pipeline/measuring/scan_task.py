@@ -13,7 +13,7 @@ from measure.annotations.line import KnownLine
 from measure.errors import MissingError
 from measure.fiducial_options import FiducialOptions
 from measure.results import Pose
-from measure.scans.addresses import scan_path
+from measure.scans.addresses import location_of, public_address, scan_path
 from measure.scans.tone import SaidOfTone
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -74,6 +74,11 @@ class ScanTask:
         whatever may change the result changes it."""
         return self.options.json
 
+    @property
+    def shown_scan(self) -> str:
+        """The scan as it may be shown and kept."""
+        return public_address(self.scan)
+
     def opened(self) -> "Scan":
         """The scan. Raises MeasurementError where it cannot be read."""
         if not self.scan:
@@ -105,7 +110,7 @@ def scan_tasks(
     options = options_of(project, said or {})
     scans = {name: project.scans.get(name) for name in names}
     return tuple(
-        ScanTask(name, "" if scan is None else str(scan), options(name), project.max_pixels)
+        ScanTask(name, "" if scan is None else location_of(scan), options(name), project.max_pixels)
         for name, scan in scans.items()
     )
 

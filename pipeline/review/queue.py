@@ -15,7 +15,7 @@ from enum import StrEnum
 
 from measure.reason import Code
 from measure.status import Status
-from pipeline.archive.digests import damaged_frames, damaged_sentence
+from pipeline.archive.digests import check_judging, damaged_frames, damaged_sentence
 from pipeline.archive.verdicts import Verdict
 from pipeline.files.project_file import Project
 
@@ -73,11 +73,21 @@ class Entry:
 
 def queue_of(project: Project, db: sqlite3.Connection | None, judging: int) -> tuple[Entry, ...]:
     """Every question of a judging, the worst first. db: None where nothing is judged yet."""
+    if db:
+        check_judging(db, judging, project.measurement_path)
     damaged = damaged_frames(db, judging) if db else {}
     frames = {frame.result: frame for frame in _frames(db, judging) if frame.result not in damaged} if db else {}
     marks = sorted(_marks(db, judging, frames), key=_badness) if db else []
     bare = [
-        Entry(Question.FRAME, (image,), ("",), "", str(Verdict.FAILED), 0, damaged_sentence(image, "measurement.db"))
+        Entry(
+            Question.FRAME,
+            (image,),
+            ("",),
+            "",
+            str(Verdict.FAILED),
+            0,
+            damaged_sentence(image, project.measurement_path.name),
+        )
         for image in sorted(damaged.values())
     ]
     bare += [

@@ -20,6 +20,7 @@ from exported_project import adjusted_project
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
 from measure.scans.addresses import Address
+from pipeline.archive.judging import latest
 from pipeline.archive.measurement import measured_scans
 from pipeline.archive.status import archive_status
 from pipeline.archive.store import Store
@@ -85,7 +86,8 @@ def readings(folder: Path) -> dict[str, Any]:
 
     def questions() -> Any:
         with Store(path) as store:
-            queue = queue_of(project, store.connection, 1)
+            judging = latest(store)
+            queue = queue_of(project, store.connection, judging.row) if judging is not None else ()
         return [entry for entry in queue if entry.fingerprints != ("",)]
 
     def statuses() -> Any:
@@ -315,7 +317,7 @@ def addresses_trial(rng: random.Random) -> str:
     return outcome(trial)
 
 
-KINDS = ("bytes", "values", "decisions", "imports", "names")
+KINDS = ("bytes", "values", "decisions", "imports", "names", "addresses")
 
 
 def study(kind: str, count: int, seed: int, measured: Path, adjusted: Path, folder: Path) -> Counter[str]:

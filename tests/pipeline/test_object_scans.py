@@ -141,3 +141,54 @@ def test_an_address_that_does_not_answer_costs_the_others_nothing(
         codes = dict(db.execute(query))
     assert codes == {"a": None, "closed/b": "unreachable"}
     assert "forbids to read it (403)" in capsys.readouterr().err
+
+
+def test_credentials_and_signatures_are_used_and_told_nowhere(
+    local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By two processes, which are given them. Another signature is the same scan; a wrong one is told without it."""
+    monkeypatch.setattr(addresses, "_WAITS_S", (0.01,))
+    with range_server(local) as server:
+        for signature, left in (("s3cr3t1", "0 of 2"), ("s3cr3t2", "2 of 2"), ("s3cr3t3", "")):
+            server.signature = "s3cr3t2" if signature == "s3cr3t3" else signature
+            url, query = server.url.replace("://", "://ann:hunter2@"), f"X-Amz-Date=1&X-Amz-Signature={signature}"
+            folder = of_scans(tmp_path / "p", f'"{url}/a.tif?{query}", "{url}/b.tif?{query}"')
+            code = measured(folder, "--workers", "2")
+            said = capsys.readouterr()
+            assert f"{left} scans are measured already" in said.err or not left
+            assert code == (0 if left else 2)  # where no scan can be read
+            run(["report", str(folder / "project.toml")])
+            run(["status", str(folder / "project.toml"), "--csv"])
+            after = capsys.readouterr()
+            told = [said.out, said.err, after.out, after.err]
+            told += [path.read_bytes().decode("latin-1") for path in folder.rglob("*") if path.is_file()]
+            told = [text for text in told if "scans = [" not in text]  # the user's own file
+            for secret in ("s3cr3t", "hunter2", "ann:"):
+                assert not [text for text in told if secret in text], secret
+    assert {row.partition(",")[0] for row in rows(folder)[1:]} == {"a", "b"}
+
+
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        ("https://ann:pw@h.org/a.tif", "https://h.org/a.tif"),
+        ("https://h.org/a.tif?X-Amz-Signature=1/2&X-Amz-Date=3", "https://h.org/a.tif"),
+        ("https://h.org/a.tif?sv=1&sig=a%2Fb", "https://h.org/a.tif"),
+        ("s3://key:secret@prints/a.tif", "s3://prints/a.tif"),
+        ("HTTPS://h.org/a.tif#x", "https://h.org/a.tif"),
+        ("scans/a@b?c.tif", "scans/a@b?c.tif"),
+    ],
+)
+def test_what_is_shown_of_an_address(address: str, shown: str) -> None:
+    assert addresses.public_address(address) == shown
+    assert addresses.location_of(addresses.scan_path(address)) == (address if "://" in address else shown)
+
+
+def test_scans_that_a_query_tells_apart_are_two() -> None:
+    one, two, again = (f"https://h.org/get?id={k}&token={token}" for k, token in ((1, "a"), (2, "a"), (1, "b")))
+    assert addresses.public_address(one) == addresses.public_address(again) != addresses.public_address(two)
+
+
+def test_a_text_is_shown_without_what_opens_its_addresses() -> None:
+    told = "'htps://ann:pw@h.org/a.tif?token=1' finds no file: /x/htps:/ann:pw@h.org/a.tif, tcp://host:8786"
+    assert addresses.public_text(told) == "'htps://h.org/a.tif' finds no file: /x/htps:/h.org/a.tif, tcp://host:8786"
