@@ -1,7 +1,7 @@
 """Frames measured with their pose left open and with it set: whatever is found with the true pose set must be found
 with `pose = "auto"`, of every kind of mark.
 
-python benchmarks/pose_left_open.py OUT.jsonl [--frames 300] [--first 0] [--seed 1] [--auto]
+python benchmarks/pose_left_open.py OUT.jsonl [--frames 300] [--first 0] [--seed 1] [--pitch 28] [--auto]
 
 One line a frame is added to OUT.jsonl, and frames that stand there already are left out. Then the table of all its
 lines is printed: how many marks are found with the true pose set, with the pose that auto took set, and with auto; how
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from search import lines
-from search_frames import FRAME_MM, GIVEN_SIGMA_MM, Case, case_of, draw_case
+from search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, Case, case_of, draw_case
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
@@ -62,22 +62,24 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pitch", type=float, default=PITCH_UM)
     parser.add_argument("--auto", action="store_true")
     given = parser.parse_args()
     done = {line["frame"] for line in lines(given.out)}
     for index in range(given.first, given.first + given.frames):
         if index not in done:
             with given.out.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"frame": index, **compared(some_case(given.seed, index), given.auto)}) + "\n")
+                case = some_case(given.seed, index, given.pitch)
+                file.write(json.dumps({"frame": index, **compared(case, given.auto)}) + "\n")
     print_table(lines(given.out))
 
 
-def some_case(seed: int, index: int) -> Case:
+def some_case(seed: int, index: int, pitch_um: float) -> Case:
     """A third of the frames as the study of the search draws them, a third with solid marks at the frame's border, and
     a third with marks that reach into it."""
     group = index // DRAWN % 3
     if group == 0:
-        return draw_case(seed, index)
+        return draw_case(seed, index, pitch_um)
     rng = np.random.default_rng([seed, index])
     outlines = (SOLID, INTO_THE_FRAME)[group - 1]
     kind = tuple(outlines)[index % DRAWN]
@@ -85,7 +87,8 @@ def some_case(seed: int, index: int) -> Case:
     if group == 1:
         beyond = max(x for x, _ in outline) == 0.0
         at = EDGE_MM - (min(x for x, _ in outline) + OVERLAP_MM if beyond else max(x for x, _ in outline))
-        return case_of(rng, kind, "alike", solid_layout(rng, outline, at), f"{index}.tif", SOLID_TONES)
+        layout = solid_layout(rng, outline, at)
+        return case_of(rng, kind, "alike", layout, f"{index}.tif", SOLID_TONES, pitch_um=pitch_um)
     layout = solid_layout(rng, outline, EDGE_MM - INSIDE_MM, UNEVEN_MM)
     border = float(rng.uniform(0.04, 0.25))
     tones = Tones(
@@ -96,7 +99,8 @@ def some_case(seed: int, index: int) -> Case:
         mark=0.9,
         dark_mark=border,
     )
-    return case_of(rng, kind, "uneven", layout, f"{index}.tif", tones, float(rng.choice([0.8, 1.0, 1.6, 2.2])))
+    gamma = float(rng.choice([0.8, 1.0, 1.6, 2.2]))
+    return case_of(rng, kind, "uneven", layout, f"{index}.tif", tones, gamma, pitch_um)
 
 
 def solid_layout(rng: np.random.Generator, outline: Outline, at_mm: float, uneven_mm: float = 0.0) -> FiducialLayout:

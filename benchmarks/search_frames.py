@@ -74,11 +74,11 @@ class Case:
     without_marks: Callable[[], Array]
 
 
-def draw_case(seed: int, index: int) -> Case:
+def draw_case(seed: int, index: int, pitch_um: float = PITCH_UM) -> Case:
     """The index-th frame of the study of that seed."""
     rng = np.random.default_rng([seed, index])
     kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
-    return case_of(rng, kind, symmetry, _layout(rng, kind, symmetry), f"{index}.tif")
+    return case_of(rng, kind, symmetry, _layout(rng, kind, symmetry), f"{index}.tif", pitch_um=pitch_um)
 
 
 def is_overexposed(seed: int, index: int) -> bool:
@@ -97,12 +97,13 @@ def case_of(
     name: str,
     tones: Tones | None = None,
     gamma: float = 1.0,
+    pitch_um: float = PITCH_UM,
 ) -> Case:
     """A frame with the marks of the layout, all else drawn by chance. tones: of marks that grow out of the frame's
     border, with no pads behind them; else by chance, too. gamma: by which the scanner codes light."""
     of_border, (tones, picture) = tones is not None, (tones, "solid marks") if tones else _tones(rng)
     scene = _scene(rng, layout, tones)
-    scene = replace(scene, scanner=replace(scene.scanner, tone=gamma))
+    scene = replace(scene, scanner=replace(scene.scanner, tone=gamma, pitch_um=(pitch_um, pitch_um)))
     scene = replace(scene, pad_mm=0.0) if of_border else scene
     truth = frame_truth(scene, 0)
     clutter = _clutter(rng, layout, truth.geometry, tones)
@@ -115,7 +116,7 @@ def case_of(
         picture=picture + (", negative" if scene.scanner.negative else ""),
         layout=layout,
         pose=scene.images[0].pose,
-        pitch_um=PITCH_UM * float(rng.uniform(0.99, 1.01)) if rng.random() < 0.9 else None,
+        pitch_um=pitch_um * float(rng.uniform(0.99, 1.01)) if rng.random() < 0.9 else None,
         scan=Scan(Path(name), WholePicture(grey[..., None]), NO_TAGS),
         centers_px={id: position.center_px for id, position in positions.items()},
         hidden=frozenset(id for id, position in positions.items() if position.hidden),
