@@ -169,7 +169,7 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
             told = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
             beside = Reason(
                 f"the scan shows another frame {told} beside this one, with {other.supported} marks where this one has "
-                f"{best.supported}: give a scan of one frame",
+                f"{best.supported}: give a scan of one frame, or name both in images.csv by the column window",
                 Code.OTHER_FRAME,
             )
             shifted = Reason(

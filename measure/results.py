@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Literal
 
@@ -132,3 +132,26 @@ class FrameMeasurement:
         )
         head = "".join(f"<th>{name}</th>" for name in ("mark", "status", "column, row (px)", "sigmas (px)", "reason"))
         return f"<p>{escape(repr(self))}</p><table><tr>{head}</tr>{rows}</table>"
+
+
+def moved_frame(frame: FrameMeasurement, shift_px: Array) -> FrameMeasurement:
+    """The frame where pixels count from elsewhere: all its places moved by (2,) column and row."""
+    return replace(
+        frame,
+        marks=tuple(_moved_mark(mark, shift_px) for mark in frame.marks),
+        pixel_from_camera=None
+        if frame.pixel_from_camera is None
+        else frame.pixel_from_camera + np.column_stack([np.zeros((2, 2)), shift_px]),
+        writing=None if frame.writing is None else tuple(_moved_line(line, shift_px) for line in frame.writing),
+    )
+
+
+def _moved_mark(mark: MarkMeasurement, shift_px: Array) -> MarkMeasurement:
+    places = {"junction_col_px": shift_px[0], "junction_row_px": shift_px[1]}
+    quality = {key: value + places.get(key, 0.0) for key, value in mark.quality.items()}
+    return replace(mark, center_px=None if mark.center_px is None else mark.center_px + shift_px, quality=quality)
+
+
+def _moved_line(line: Line, shift_px: Array) -> Line:
+    outline = tuple((col + float(shift_px[0]), row + float(shift_px[1])) for col, row in line.outline_px)
+    return replace(line, outline_px=outline)

@@ -20,6 +20,7 @@ from measure.scans.parallel import side_by_side
 from measure.scans.picture_scan import open_picture
 from measure.scans.radiometry import Samples
 from measure.scans.resolution import Pitch
+from measure.scans.scan_part import ScanPart
 from measure.scans.segments import LostPart, OpenedPicture, SegmentCache, Segments
 from measure.scans.tiff_scan import TIFF_STARTS, open_tiff
 from measure.scans.tiff_segments import RawRows
@@ -176,6 +177,11 @@ class Scan:
     def lost_in(self, col0: int, row0: int, width: int, height: int) -> str:
         """Why the file does not give some pixels of a window, a part of a sentence; empty where it gives all."""
         return next((part.why for part in self._lost_of(col0, row0, width, height)), "")
+
+    @property
+    def lost(self) -> Sequence[LostPart]:
+        """What the file was found not to give so far."""
+        return self._segments.lost
 
     @property
     def is_lost(self) -> bool:
@@ -366,6 +372,8 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     """
     path = scan_path(path)
     start = first_bytes(path)
+    if isinstance(path, ScanPart) and (path.page or 1) > 1 and start[:4] not in TIFF_STARTS:
+        raise MeasurementError(f"{path}: such a file has one page: take `page` out of images.csv")
     opened = open_tiff(path, max_pixels) if start[:4] in TIFF_STARTS else open_picture(path, start, max_pixels)
     segments = opened.segments
     is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px

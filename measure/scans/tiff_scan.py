@@ -70,7 +70,7 @@ def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
     if not pictures:
         raise broken(path, "it holds no picture")
     pages = ", ".join(map(str, pictures))
-    if isinstance(path, ScanPart):
+    if isinstance(path, ScanPart) and path.page:
         if path.page not in pictures:
             raise MeasurementError(
                 f"{path}: page {path.page} of this file is no picture of full size; such are {pages}"

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from measure.errors import MissingError, UnreachableError
 from measure.scans.addresses import Address
+from measure.scans.scan_part import whole_file
 
 
 class FileState(NamedTuple):  # archives have many
@@ -44,7 +45,7 @@ class FileStates:
             if isinstance(path, Address):
                 stat = path.stat()
                 return FileState(str(path), stat.st_size, etag=path.etag)
-            stat = os.stat(str(path))
+            stat = os.stat(whole_file(str(path)))
         except (OSError, MissingError, UnreachableError):
             return FileState(self.uri(path), -1)
         return FileState(self.uri(path), stat.st_size, stat.st_mtime_ns)

@@ -9,6 +9,7 @@ from measure.errors import MeasurementError, MissingError, UnreachableError
 from measure.scans.addresses import Address, tiff_file
 from measure.scans.broken import DECODING_ERRORS
 from measure.scans.scan import Scan, open_scan
+from measure.scans.scan_part import whole_file
 from pipeline.results.fingerprints import of_scan
 
 _HEAD_BYTES = 1 << 16
@@ -27,7 +28,8 @@ def parts_hash(path: Path, max_pixels: int | None = None) -> str:
     try:
         if isinstance(path, Address) and path.etag:
             return hashlib.sha256(f"{path.etag} {path.stat().st_size}".encode()).hexdigest()
-        digest = hashlib.sha256(of_scan(path).encode())
+        part = str(path).removeprefix(whole_file(str(path)))  # two parts of one file are two scans
+        digest = hashlib.sha256(f"{of_scan(path)}{part}".encode())
         with path.open("rb") as file:
             digest.update(file.read(_HEAD_BYTES))
     except (OSError, MissingError, UnreachableError):

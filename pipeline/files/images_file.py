@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from adjust.problem.network import Exterior
+from measure.scans.scan_part import Window
 from pipeline.errors import InputError
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import Row, read_csv
@@ -18,6 +19,7 @@ from pipeline.text.text_file import read_bytes
 
 ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = tuple(f"s{element}" for element in ELEMENTS)
+_FURTHER = ("camera", "scanner", "part_of", "page", "window")
 WRITTEN = ("run", "frame", "date", "time", "height", "scale", "camera_number")  # what may be read on the film
 
 
@@ -25,7 +27,8 @@ WRITTEN = ("run", "frame", "date", "time", "height", "scale", "camera_number")  
 class GivenImages:
     """By image name: exterior orientation (None where the line gives none), the camera file's name and the scanner's
     ("" where none), and the frame of which it is one of several overlapping scans ("" where it is the only one): such
-    parts have the orientation that one of their lines gives. asks_writing: whether there is a column for what may be
+    parts have the orientation that one of their lines gives. cuts: the page and the window of a scan's file that the
+    image is, where a line says either. asks_writing: whether there is a column for what may be
     read on the film."""
 
     exterior: Mapping[str, Exterior | None]
@@ -33,6 +36,7 @@ class GivenImages:
     scanner: Mapping[str, str] = field(default_factory=dict)
     asks_writing: bool = False
     part_of: Mapping[str, str] = field(default_factory=dict)
+    cuts: Mapping[str, tuple[int | None, Window | None]] = field(default_factory=dict)
 
     def parts_of(self, frame: str) -> tuple[str, ...]:
         """The scans of a frame that was scanned in parts, in the order of their names."""
@@ -45,16 +49,41 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
     antenna: the offset of the point whose X0, Y0, Z0 are given from the projection centre, as in `Exterior`.
     """
     exterior: dict[str, Exterior | None] = {}
-    camera, scanner, part_of, asks_writing = {}, {}, {}, False
-    for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera", "scanner", "part_of", *WRITTEN)):
+    camera, scanner, part_of, cuts, asks_writing = {}, {}, {}, dict[str, tuple[int | None, Window | None]](), False
+    for row in read_csv(
+        path, ("image",), (*ELEMENTS, *SIGMAS, "camera", "scanner", "part_of", "page", "window", *WRITTEN)
+    ):
         name = image_name(row.name("image"))
         if name in exterior:
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
         exterior[name] = _exterior(row, antenna)
         camera[name], scanner[name], part_of[name] = row.text("camera"), row.text("scanner"), row.text("part_of")
+        page, window = _page(row), _window(row)
+        if page or window:
+            cuts[name] = page, window
         asks_writing = any(column in row.cells for column in WRITTEN)
     _join(path, exterior, camera, part_of)
-    return GivenImages(exterior, camera, scanner, asks_writing, part_of)
+    return GivenImages(exterior, camera, scanner, asks_writing, part_of, cuts)
+
+
+def _page(row: Row) -> int | None:
+    text = row.text("page")
+    if not text:
+        return None
+    if not text.isdecimal() or int(text) < 1:
+        raise row.error("page", f"is {text!r}: the number of a page in the file, from 1, is right.")
+    return int(text)
+
+
+def _window(row: Row) -> Window | None:
+    text = row.text("window")
+    if not text:
+        return None
+    numbers = text.split()
+    if len(numbers) != 4 or not all(number.isdecimal() for number in numbers) or "0" in numbers[2:]:
+        raise row.error("window", f'is {text!r}: "col row width height" in px of the scan is right.')
+    col, row_px, width, height = map(int, numbers)
+    return col, row_px, width, height
 
 
 def _join(

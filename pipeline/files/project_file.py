@@ -24,7 +24,7 @@ from pipeline.files.learned_table import Clicks
 from pipeline.files.library import camera_path
 from pipeline.files.pitch import FINEST_PITCH_UM
 from pipeline.files.points_file import GivenPoints, read_points
-from pipeline.files.scan_files import FoundScans, as_named, find_scans
+from pipeline.files.scan_files import FoundScans, as_named, find_scans, with_cuts
 from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
 from pipeline.results.adjustment_reader import covariance_path
@@ -245,7 +245,7 @@ def read_project(path: Path) -> Project:
     project = replace(
         project,
         cameras=_cameras(table, camera, images),
-        scans=found.files,
+        scans=with_cuts(found.files, images, named.get("images")),
         left_out=found.left_out,
         given_points=read_points(named["points"]) if "points" in named else None,
         given_images=images,

@@ -10,6 +10,9 @@ from pathlib import Path
 
 from measure.errors import MeasurementError
 from measure.scans.addresses import found_addresses, is_address, public_text, scan_path
+from measure.scans.scan_part import part_text
+from pipeline.errors import InputError
+from pipeline.files.images_file import GivenImages
 from pipeline.files.scan_patterns import each_once, found_names
 from pipeline.text.image_names import names_below
 from pipeline.text.tables import Table
@@ -78,6 +81,29 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
             raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
         scans[name] = file
     return FoundScans(ScanFiles(scans), frozenset(names_below(files, left_out.values())))
+
+
+def with_cuts(scans: Mapping[str, Path], images: GivenImages | None, path: Path | None) -> Mapping[str, Path]:
+    """The scans, those of which images.csv names pages or windows replaced by these. Such an image is called as its
+    scan, or so with something behind it. Raises InputError where it is called as no scan."""
+    if images is None or not images.cuts:
+        return scans
+    named = dict(as_named(scans))
+    cut, replaced = dict[str, Named](), set[str]()
+    for image, (page, window) in images.cuts.items():
+        names = [name for name in named if image.startswith(name)]
+        if not names:
+            raise InputError(
+                f"{path}: image {image!r} has a page or a window, but no scan is called as it begins. Name it as its "
+                "scan, or so with something behind: 0001-left of 0001.tif."
+            )
+        scan = max(names, key=len)
+        if is_address(str(named[scan])):
+            raise InputError(f"{path}: image {image!r}: pages and windows are of files, not of {named[scan]}. Copy it.")
+        cut[image] = part_text(str(named[scan]), page, window)
+        replaced.add(scan)
+    replaced -= images.exterior.keys()  # a line of its own makes it an image beside them
+    return ScanFiles({name: file for name, file in named.items() if name not in replaced} | cut)
 
 
 def as_named(scans: Mapping[str, Path]) -> Mapping[str, Named]:

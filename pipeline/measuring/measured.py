@@ -17,9 +17,12 @@ from measure.fiducials import measure_fiducials
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
 from measure.reason import Code, Reason
-from measure.results import FrameMeasurement, MarkMeasurement
+from measure.results import FrameMeasurement, MarkMeasurement, moved_frame
 from measure.scans.addresses import public_text
 from measure.scans.scan import Scan
+from measure.scans.scan_part import ScanPart, Window
+from measure.scans.scan_window import windowed
+from measure.second_frame import second_frame
 from measure.status import Status
 from pipeline.errors import InputError, what_to_do
 from pipeline.measuring.camera_model import misplaced_principal_point
@@ -107,27 +110,47 @@ def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
 
 
 def _opened_and_measured(task: ScanTask, look: Look | None) -> MeasuredScan:
-    options = task.options
     with task.opened() as scan:
-        # Fiducials are seen through the curve; targets have edges all round, and are measured as they are.
-        tone = tone_before(options.tone, options.said, scan.path)
-        frame = replace(_fiducials(options, scan.seen_through(tone)), image=task.name)
-        pitch, problems, notes = _pitch(options, scan, frame)
-        of_file = (Reason(f"{told[0].upper()}{told[1:]}.", Code.SECOND_PICTURE) for told in scan.problems)
-        frame = replace(frame, problems=(*of_file, *frame.problems, *problems))
-        curve = (frame.tone.note,) if frame.tone else ()
-        file_notes = (f"{note[0].upper()}{note[1:]}." for note in scan.notes)
-        notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame))
-        measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, notes)
-        if misplaced := misplaced_principal_point(options.camera, measured):
-            measured = replace(
-                measured, frame=replace(frame, problems=(*frame.problems, Reason(misplaced, Code.OFF_GIVEN)))
-            )
-        measured = measure_targets(options, scan, measured)
-        measured = replace(measured, frame=with_damage(scan, measured.frame))
+        window = scan.path.window if isinstance(scan.path, ScanPart) else None
+        measured = _in_window(task, scan, window) if window else _measured(task, scan, task.options)
         if look is not None:
             look(scan, measured)
         return measured
+
+
+def _in_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
+    """The scan with what a window of it shows, all places in pixels of the whole scan."""
+    try:
+        seen = windowed(scan, window)
+    except ValueError as error:
+        raise MeasurementError(f"{scan.path}: {error}: correct images.csv") from None
+    first = np.array(window[:2], float)
+    fiducials = task.options.fiducials
+    clicks = (replace(one, col_px=one.col_px - first[0], row_px=one.row_px - first[1]) for one in fiducials.clicks)
+    options = replace(task.options, fiducials=replace(fiducials, clicks=tuple(clicks)))
+    measured = _measured(task, seen, options)
+    frame = moved_frame(measured.frame, first)
+    return replace(measured, width_px=scan.width_px, height_px=scan.height_px, frame=frame)
+
+
+def _measured(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
+    """What a scan shows, whole or in a window."""
+    # Fiducials are seen through the curve; targets have edges all round, and are measured as they are.
+    tone = tone_before(options.tone, options.said, scan.path)
+    frame = replace(_fiducials(options, scan.seen_through(tone)), image=task.name)
+    pitch, problems, notes = _pitch(options, scan, frame)
+    of_file = (Reason(f"{told[0].upper()}{told[1:]}.", Code.SECOND_PICTURE) for told in scan.problems)
+    frame = replace(frame, problems=(*of_file, *frame.problems, *problems))
+    curve = (frame.tone.note,) if frame.tone else ()
+    file_notes = (f"{note[0].upper()}{note[1:]}." for note in scan.notes)
+    notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame))
+    measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, notes)
+    if misplaced := misplaced_principal_point(options.camera, measured):
+        measured = replace(
+            measured, frame=replace(frame, problems=(*frame.problems, Reason(misplaced, Code.OFF_GIVEN)))
+        )
+    measured = measure_targets(options, scan, measured)
+    return replace(measured, frame=with_damage(scan, measured.frame))
 
 
 def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
@@ -140,6 +163,8 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
             "a part of a frame needs it, for its size says nothing of the pitch."
         )
     measured = measure_fiducials(scan, layout, pitch, options.fiducials)
+    second = second_frame(scan, layout, measured, options.fiducials)
+    measured = replace(measured, problems=(*measured.problems, second) if second else measured.problems)
     if pitch is not None:
         source = "the project" if options.pitch_um is not None else "the scan's file"
         wrong = pitch_problem(measured, layout, pitch, source)
