@@ -33,14 +33,15 @@ class WholePattern:
 
 
 def is_even(grid: Array, size_px: tuple[int, int]) -> bool:
-    """Whether corners (rows, columns, 2) lie evenly under one homography and a lens's radial distortion."""
+    """Whether the lines of corners (rows, columns, 2) lie evenly under one homography and a lens's radial distortion,
+    wherever the detector put single corners."""
     rows, columns = grid.shape[:2]
     places = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
     view = robust_view(places, grid.reshape(-1, 2), size_px)
     if view is None:
         return False
-    off = np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T)
-    return bool(np.all(off < _UNEVEN * _shorter_steps(grid).ravel()))
+    off = np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / _shorter_steps(grid)
+    return all(np.median(line) < _UNEVEN for line in (*off, *off.T))
 
 
 def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:

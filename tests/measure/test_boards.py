@@ -268,6 +268,7 @@ def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int |
     about = np.stack([x - 320, y - 240], axis=-1)
     grid = np.array([320, 240]) + about * (1 - 0.06 * (about**2).sum(axis=1, keepdims=True) / 400**2)
     grid = grid.reshape(7, 9, 2)
+    grid[0, 0] += 20.0  # as detectors put single corners, which the fit finds, or not
     if left_out is not None:
         grid = np.delete(grid, 1 + left_out, axis=0)
     assert is_even(grid, (640, 480)) == (left_out is None)
