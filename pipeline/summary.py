@@ -18,7 +18,7 @@ from pipeline.report.fiducials import Figure
 from pipeline.report.frame_views import camera_of
 from pipeline.report.marks import current_scans
 from pipeline.report.numbers import value_and_sigma
-from pipeline.report.verdict import Verdict, camera_is_calibrated, judge
+from pipeline.report.verdict import Verdict, camera_is_calibrated, has_sigma0, judge
 from pipeline.results.measured_record import pose_record
 
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
@@ -100,8 +100,8 @@ def print_summary(summary: Summary, console: Console) -> None:
 
 
 def _main_numbers(adjustment: Json) -> Json:
-    keys = ("converged", "termination", "iterations", "observations", "unknowns", "redundancy", "sigma0", "cameras")
-    return {key: adjustment[key] for key in keys}
+    how = ("converged", "termination", "iterations", "observations", "unknowns", "redundancy")
+    return {key: adjustment[key] for key in (*how, "sigma0", "sigma0_from", "cameras")}
 
 
 def _frame_table(frames: Mapping[str, Mapping[str, int]], poses: Mapping[str, Json]) -> Table:
@@ -120,9 +120,16 @@ def _frame_table(frames: Mapping[str, Mapping[str, int]], poses: Mapping[str, Js
     return table
 
 
+def _sigma0(adjustment: Json) -> str:
+    """sigma0 with the redundancy of what it comes from; without any, what standard deviations are."""
+    if not has_sigma0(adjustment):
+        return "standard deviations a priori"
+    return f"sigma0 = {adjustment['sigma0']:.3f}, redundancy {adjustment['sigma0_from']['redundancy']:.0f}"
+
+
 def _film_table(adjustment: Json) -> Table:
     """What an adjustment of fiducials alone gives of every image."""
-    title = f"Film transformations (sigma0 = {adjustment['sigma0']:.3f}, redundancy {adjustment['redundancy']})"
+    title = f"Film transformations ({_sigma0(adjustment)})"
     datum = adjustment["groups"].get("datum")
     if datum:
         title += f"; given fiducials: rms {datum['rms_x_um']:.2f}, {datum['rms_y_um']:.2f} um"
@@ -143,8 +150,9 @@ def _film_table(adjustment: Json) -> Table:
 
 
 def _form_table(name: str, form: Figure) -> Table:
-    """Where marks stand otherwise than they are given, free of the datum, and the distances across."""
-    title = f"Form of the fiducials of {name}, less the given one, free of what its films take up"
+    """Where marks stand otherwise than they are given, free of the datum, and the distances that films keep."""
+    after = "" if form.transformation == "none" else f", after a transformation to these ({form.transformation})"
+    title = f"Corrections to the given fiducials of {name}{after}"
     table = Table("mark", "x, um", "sigma", "y, um", "sigma", title=title, title_justify="left")
     sigmas = np.sqrt(np.maximum(np.diag(form.covariance_um2), 0.0)).reshape(-1, 2)
     for id, change, sigma in zip(form.ids, form.change_um, sigmas, strict=True):
@@ -156,7 +164,7 @@ def _form_table(name: str, form: Figure) -> Table:
 
 
 def _camera_table(adjustment: Json) -> Table:
-    title = f"Camera (sigma0 = {adjustment['sigma0']:.3f}, redundancy {adjustment['redundancy']})"
+    title = f"Camera ({_sigma0(adjustment)})"
     table = Table("camera", "parameter", "value", "sigma", title=title, title_justify="left")
     for name, camera in adjustment["cameras"].items():
         if not camera_is_calibrated(camera):

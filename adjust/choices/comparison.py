@@ -37,7 +37,8 @@ class CameraCalibration:
 
     interior (3,): c, x0', y0' in mm; parameters (k,) of the distortion, in the order of `parameter_names`; fiducials:
     camera coordinates (2,) in mm by id. covariance (3 + k + 2 f, 3 + k + 2 f): of all these in this order, fiducials x
-    before y, zero where something was held. redundancy: of the adjustment that it comes from.
+    before y, zero where something was held. redundancy: of the observations that its sigma0 comes
+    from, 0 of a priori standard deviations.
     """
 
     name: str
@@ -46,7 +47,7 @@ class CameraCalibration:
     parameters: Array
     fiducials: dict[str, Array]
     covariance: Array
-    redundancy: int
+    redundancy: float
 
     @property
     def quantities(self) -> tuple[str, ...]:

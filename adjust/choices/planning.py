@@ -79,7 +79,8 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
         result = adjust_problem(problem, options, held)
     own = reduction.inverse.network(result.network)
     adjusted = reduction.unreduced_values(problem.unknowns, result.values, own)
-    expected = replace(result, network=own, values=adjusted, vpv=sigma0**2 * result.redundancy)
+    variance = replace(result.variance, sigma0=sigma0)
+    expected = replace(result, network=own, values=adjusted, vpv=sigma0**2 * result.redundancy, variance=variance)
     return Plan(expected, sigma0, singular, null)
 
 

@@ -180,7 +180,9 @@ def _step(
             promised = factor.length() ** 2 + damping * float(((factor.scale * solution) ** 2).sum())
             bent = step if damping == 0.0 else _bent(numbering, at, damping, step)
             moved = None if bent is None else linearise(numbering, covariance_mm2, problem.moved(at.state, bent))
-            if bent is not None and moved is not None and moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
+            is_rounding = damping == 0.0 and factor.length() < ROUNDING_SIGMAS  # and so is what it does to v'Pv
+            is_better = moved is not None and (is_rounding or moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv))
+            if bent is not None and moved is not None and is_better:
                 gain = (at.vpv - moved.vpv) / promised if promised > VPV_ROUNDING * (1.0 + at.vpv) else 1.0
                 return _Moved(moved, factor.length(), damping, gain, attempts, step, bent)
         damping = 10.0 * damping or lately

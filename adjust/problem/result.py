@@ -81,16 +81,42 @@ class FurtherResidual:
 class Group:
     """A kind of observation: its share of v'Pv over its redundancy (sigma0), rms in um per axis, redundancy.
 
-    sigma0 is 0 and means nothing where the redundancy is 0: there is no check. `target`, `fiducial`: in the comparator;
-    `control`: given object coordinates, rms in millionths of the object unit; `datum`: given places of fiducials (F5,
-    F6); `interior`, `exterior`: given values of mixed units, rms 0; `distance`: distances, rms 0. The first three are
-    always there.
+    sigma0 is 0 and means nothing where the redundancy is below 1: there is no check. `target`, `fiducial`: in the
+    comparator; `control`: given object coordinates, rms in millionths of the object unit; `datum`: given places of
+    fiducials (F5, F6); `interior`, `exterior`: given values of mixed units, rms 0; `distance`: rms 0. The first three
+    are always there.
     """
 
     sigma0: float
     rms_x_um: float
     rms_y_um: float
     redundancy: float
+
+
+class GivenGroup(NamedTuple):
+    """Values that a file gives of one owner, by their group: `datum` of a camera, `interior` of a camera and so on."""
+
+    group: str
+    owner: str
+
+
+@dataclass(frozen=True, eq=False)
+class VarianceFactor:
+    """sigma0, the root of the variance factor, and what it was estimated from.
+
+    redundancy: of the observations that it comes from, 0 where none have enough: sigma0 is then 1, and standard
+    deviations are a priori ones. left_out: given values that only place the datum or agree better than their standard
+    deviations allow, at `positions` (k,) of the unknowns: they take no part in sigma0, and it does not multiply them.
+    """
+
+    sigma0: float
+    redundancy: float
+    left_out: tuple[GivenGroup, ...] = ()
+    positions: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
+
+    @property
+    def is_a_priori(self) -> bool:
+        return self.redundancy == 0.0
 
 
 class Cofactor(Protocol):
@@ -261,9 +287,11 @@ class Adjustment:
     """The result: values, covariance, residuals, and how it came about.
 
     parameters: the keys of all quantities, in the order of values and covariance (omega, phi, kappa in rad); fixed ones
-    included, with zero rows. `value`, `sigma` and the like take a key, or its text in the files. cofactor: a-priori
-    covariance (sigma0 = 1), computed where it is asked for; covariance is sigma0² times that. Without a solution
-    (termination "singular", "diverged") it is zero and means nothing.
+    included, with zero rows. `value`, `sigma` and the like take a key, or its text in the files. variance: sigma0, and
+    what it comes from. cofactor: computed where it is asked for; covariance is sigma0² times that. It is the a-priori
+    covariance (sigma0 = 1) where sigma0 multiplies all that was given; of the values that `variance` leaves out it has
+    the given variances over sigma0². Without a solution (termination "singular", "diverged") it is zero and means
+    nothing.
     assessment: what is told of the observations, computed where it is asked for: `residuals`, `groups`, `reliability`,
     `suspects`, `warnings` and more.
     mirrored: the images whose scan is mirrored, as in `Approximations`.
@@ -282,6 +310,7 @@ class Adjustment:
     unknowns: int
     redundancy: int
     vpv: float
+    variance: VarianceFactor
     parameters: tuple[Parameter, ...]
     values: Array
     cofactor: Cofactor
@@ -352,8 +381,8 @@ class Adjustment:
 
     @property
     def sigma0(self) -> float:
-        """Square root of the a-posteriori variance of unit weight; 1 where there is no redundancy."""
-        return float(np.sqrt(self.vpv / self.redundancy)) if self.redundancy > 0 else 1.0
+        """Square root of the a-posteriori variance of unit weight; 1 where standard deviations are a priori ones."""
+        return self.variance.sigma0
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from adjust.quality.reweighting import Weighting
 Array = NDArray[np.float64]
 
 UM_PER_MM = 1000.0
+NEARLY_ONE = 0.99  # redundancy of a group, below which its residuals say nothing of its standard deviations
 
 
 def residuals(v_mm: Array, found: Misfits | None, weighting: Weighting) -> Residuals:
@@ -84,7 +85,7 @@ def groups(
 
 
 def _group(vpv: float, redundancy: float, rms_x_um: float, rms_y_um: float) -> Group:
-    sigma0 = float(np.sqrt(vpv / redundancy)) if redundancy > UNCHECKED else 0.0
+    sigma0 = float(np.sqrt(vpv / redundancy)) if redundancy > NEARLY_ONE else 0.0
     return Group(sigma0, rms_x_um, rms_y_um, redundancy)
 
 

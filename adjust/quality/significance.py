@@ -5,8 +5,8 @@ value for c, x0' and y0'. With d = x - x0 and Q the cofactor matrix of d,
 
     t = d / (sigma0 √Q)  ~  Student's t with the redundancy r,       F = d' Q⁻¹ d / (k sigma0²)  ~  F(k, r),
 
-where sigma0 is that of the adjustment; without redundancy sigma0 is 1 and t normal. What has a prior is no free
-quantity: the difference from its given value, -v of that observation, has the cofactor sigma² - q (Koch, Parameter
+where sigma0 and r are those of the variance factor; without redundancy sigma0 is 1 and t normal. What has a prior is no
+free quantity: the difference from its given value, -v of that observation, has the cofactor sigma² - q (Koch, Parameter
 estimation and hypothesis testing in linear models, 1999, chapters 4.2 and 4.3).
 """
 
@@ -22,7 +22,7 @@ from adjust.functional_model.families import family
 from adjust.problem.camera import Camera, Prior
 from adjust.problem.network import Board, Scanner
 from adjust.problem.parameter import Kind, Parameter
-from adjust.problem.result import Adjustment
+from adjust.problem.result import Adjustment, GivenGroup
 
 Array = NDArray[np.float64]
 
@@ -107,10 +107,13 @@ def _against_given(adjustment: Adjustment, camera: str, name: str, prior: Prior 
         return None
     cofactor = float(adjustment.cofactor_of([full])[0, 0])
     if np.isfinite(prior.sigma):
-        redundancy = 1.0 - cofactor / prior.sigma**2
+        given = prior.sigma**2
+        if GivenGroup("interior", camera) in adjustment.variance.left_out:
+            given /= adjustment.sigma0**2
+        redundancy = 1.0 - cofactor / given
         if redundancy < UNCHECKED:
             return None
-        cofactor = prior.sigma**2 * redundancy
+        cofactor = given * redundancy
     return _tested(adjustment, name, (name,), np.array([adjustment.value(full) - prior.value]), np.array([[cofactor]]))
 
 
@@ -127,7 +130,7 @@ def _tested(
     scale = np.sqrt(np.diag(cofactor))
     normalised = difference / scale
     variance = adjustment.sigma0**2
-    r = adjustment.redundancy
+    r = adjustment.variance.redundancy
     if len(parameters) == 1:
         t = float(normalised[0]) / float(np.sqrt(variance))
         one_sided = stdtr(r, -abs(t)) if r > 0 else ndtr(-abs(t))

@@ -11,13 +11,15 @@ from scipy.special import chdtrc
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.initial_values.approximations import initial_values
 from adjust.initial_values.far_points import far_points
+from adjust.least_squares.iteration import factorise
 from adjust.least_squares.kept_memory import keep_freed_memory
+from adjust.least_squares.numbering import Numbering
 from adjust.problem.network import STRAIGHT, Approximations, Network
 from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
-from adjust.problem.result import Adjustment, Cofactor
+from adjust.problem.result import Adjustment, Cofactor, VarianceFactor
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
-from adjust.solution.assessment import RunAssessment
+from adjust.solution.assessment import RunAssessment, conditions_of, redundancy_of, variance_of
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
 from adjust.solution.left_out_images import fitting, with_lens, without_images
 from adjust.solution.options import Datum, Method, Options
@@ -280,7 +282,7 @@ def adjust_problem(
     solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted)
     if options.datum == "free":
         solution = _freed(problem, solution, members, options)
-    result = _result(solution, _cofactor(problem, solution, members if options.datum == "free" else None), options)
+    result = _result(problem, solution, members if options.datum == "free" else None, options)
     return replace(result, network=problem.network)
 
 
@@ -337,17 +339,23 @@ def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
     return inner_cofactor(problem, last.numbering, state, factor, members)
 
 
-def _result(last: Run, cofactor: Cofactor, options: Options) -> Adjustment:
+def _result(given: Problem, last: Run, members: Indices | None, options: Options) -> Adjustment:
     problem, state, weighting = last.problem, last.end.state, last.weighting
-    assessment = RunAssessment(last, cofactor, options.probabilities)
+    plain = _cofactor(given, last, members)
+    redundancy = redundancy_of(last, plain)
+    variance = variance_of(last, redundancy)
+    scaled = _with_given_apart(last, variance)
+    cofactor = plain if scaled is last else _cofactor(given, scaled, members)
+    assessment = RunAssessment(last, scaled, cofactor, variance, options.probabilities)
     return Adjustment(
         network=problem.network,
         termination=last.solution.termination,
         iterations=len(last.solution.history),
-        conditions=assessment.conditions,
+        conditions=conditions_of(last, plain),
         unknowns=len(last.numbering.free),
-        redundancy=assessment.redundancy,
+        redundancy=redundancy,
         vpv=last.vpv,
+        variance=variance,
         parameters=problem.unknowns.parameters,
         values=np.where(_meaningless(problem), np.nan, state.values),
         cofactor=cofactor,
@@ -358,6 +366,19 @@ def _result(last: Run, cofactor: Cofactor, options: Options) -> Adjustment:
         weights=weighting.weights[: len(last.end.v_mm)],
         variance_factors=weighting.factors,
     )
+
+
+def _with_given_apart(last: Run, variance: VarianceFactor) -> Run:
+    """The run with such standard deviations of the given values that sigma0 leaves out that sigma0 times the cofactors
+    leaves them as they were given."""
+    if not len(variance.positions):
+        return last
+    unknowns = last.numbering.problem.unknowns
+    sigma = unknowns.sigma.copy()
+    sigma[variance.positions] /= variance.sigma0
+    numbering = Numbering(replace(last.numbering.problem, unknowns=replace(unknowns, sigma=sigma)))
+    factor = factorise(numbering, last.end)
+    return replace(last, numbering=numbering, solution=replace(last.solution, factor=factor), factor=factor)
 
 
 def _meaningless(problem: Problem) -> NDArray[np.bool_]:

@@ -21,6 +21,7 @@ from adjust.problem.result import (
     Reliability,
     Residuals,
     Suspect,
+    VarianceFactor,
 )
 from adjust.problem.tested import TestedUnits
 from adjust.quality.contradiction import contradictions_of_groups
@@ -29,6 +30,7 @@ from adjust.quality.residuals import further_residuals, groups, residuals
 from adjust.quality.snooping import contradictions, search, suspects
 from adjust.quality.suspicions import is_gross, swapped_numbers, unchecked_orientations
 from adjust.quality.variance_components import factor_sigmas
+from adjust.quality.variance_factor import variance_factor
 from adjust.solution.explanations import Explained, explain
 from adjust.solution.runs import ROUNDS, Run
 from adjust.undetermined.diagnosis import undetermined, weak_directions
@@ -36,25 +38,39 @@ from adjust.undetermined.flat_valleys import held_directions, inseparable
 from adjust.undetermined.scanner_directions import hardly_told
 
 
+def conditions_of(run: Run, cofactor: Cofactor) -> int:
+    """Equations, without what the adjustment does without; with what pseudo-observations determine."""
+    problem = run.problem
+    further = sum(len(each.observed) for each in problem.further)
+    held = held_directions(problem, cofactor.variances) if problem.pseudo_observed else 0
+    return int(TestedUnits(problem).sizes[run.weighting.used].sum()) + further + held
+
+
+def redundancy_of(run: Run, cofactor: Cofactor) -> int:
+    """Equations less unknowns."""
+    return conditions_of(run, cofactor) - len(run.numbering.free)
+
+
+def variance_of(run: Run, redundancy: int) -> VarianceFactor:
+    """sigma0 and what it comes from; redundancy: of all."""
+    factor = run.solution.factor
+    if factor is None:
+        return VarianceFactor(float(np.sqrt(run.vpv / redundancy)) if redundancy > 0 else 1.0, max(redundancy, 0))
+    return variance_factor(run.numbering, run.end.state, factor, run.weighting, run.vpv, redundancy)
+
+
 @dataclass(frozen=True)
 class RunAssessment:
-    """The `Assessment` of a run; nothing is computed twice."""
+    """The `Assessment` of a run; nothing is computed twice.
+
+    scaled: the run with the priors that the cofactor matrix has; variance: sigma0, and what it comes from.
+    """
 
     run: Run
+    scaled: Run
     cofactor: Cofactor
+    variance: VarianceFactor
     probabilities: Probabilities
-
-    @cached_property
-    def conditions(self) -> int:
-        """Equations, without what the adjustment does without; with what pseudo-observations determine."""
-        problem = self.run.problem
-        further = sum(len(each.observed) for each in problem.further)
-        held = held_directions(problem, self.cofactor.variances)
-        return int(TestedUnits(problem).sizes[self.run.weighting.used].sum()) + further + held
-
-    @property
-    def redundancy(self) -> int:
-        return self.conditions - len(self.run.numbering.free)
 
     @cached_property
     def residuals(self) -> Residuals:
@@ -72,7 +88,8 @@ class RunAssessment:
         if not run.has_solution or not run.problem.further:
             return ()
         of_state = run.problem, run.end.state, run.end.rows.further
-        return tuple(contradictions_of_groups(*of_state, run.factor, run.vpv, self.redundancy))
+        redundancy, vpv = self._redundancy, self.variance.sigma0**2 * self.variance.redundancy
+        return tuple(contradictions_of_groups(*of_state, run.factor, vpv, redundancy))
 
     @cached_property
     def groups(self) -> Mapping[str, Group]:
@@ -92,8 +109,7 @@ class RunAssessment:
         if found is None:
             return None
         at, weights = (run.numbering, run.end, run.factor, found), run.weighting.weights
-        sigma0 = float(np.sqrt(run.vpv / self.redundancy)) if self.redundancy > 0 else 1.0
-        return reliability(*at, weights, sigma0, self.redundancy, self.probabilities)
+        return reliability(*at, weights, self.variance.sigma0, self._redundancy, self.probabilities)
 
     @property
     def explanations(self) -> tuple[Explanation, ...]:
@@ -101,7 +117,7 @@ class RunAssessment:
 
     @cached_property
     def _explained(self) -> Explained:
-        return explain(self.run, self.redundancy, self.probabilities)
+        return explain(self.run, redundancy_of(self.run, self.cofactor), self.probabilities)
 
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
@@ -109,7 +125,8 @@ class RunAssessment:
         explained = self._explained.run
         if explained is self.run:
             return self._suspects
-        return RunAssessment(explained, self.cofactor, self.probabilities)._suspects
+        variance = variance_of(explained, redundancy_of(explained, self.cofactor))
+        return RunAssessment(explained, explained, self.cofactor, variance, self.probabilities)._suspects
 
     @property
     def _suspects(self) -> tuple[Suspect, ...]:
@@ -118,13 +135,13 @@ class RunAssessment:
             return ()
         tests = search(run.numbering, run.end, run.factor, found, run.weighting, self.probabilities)
         contradicting = contradictions(tests)
-        return suspects(tests, contradicting, run.removed, self.reliability, self.probabilities, self.redundancy)
+        return suspects(tests, contradicting, run.removed, self.reliability, self.probabilities, self._redundancy)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         observations = self.run.problem.network.observations
         unchecked = unchecked_orientations(observations, self.residuals) if self.run.converged else []
-        return (*_warnings(self.run, self.cofactor), *self._swapped, *unchecked)
+        return (*_warnings(self.scaled, self.cofactor), *self._swapped, *unchecked)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
@@ -142,6 +159,11 @@ class RunAssessment:
             return []
         started = computed_observations(problem, problem.start())
         return [] if started is None else swapped_numbers(observations, started - observations.xy_mm)
+
+    @property
+    def _redundancy(self) -> int:
+        """That sigma0 comes from."""
+        return round(self.variance.redundancy)
 
     @property
     def _found(self) -> Misfits | None:

@@ -91,8 +91,8 @@ def _calibration(path: Path, content: Json, name: str, label: str) -> CameraCali
     marks = {id: np.array([mark["x_mm"]["value"], mark["y_mm"]["value"]]) for id, mark in camera["fiducials"].items()}
     unknowns = [Parameter.interior(name, each) for each in ("c", "x0", "y0", *parameter_names(distortion.family))]
     unknowns += [Parameter.fiducial(name, id, axis) for id in marks for axis in "xy"]
-    covariance = read_own_covariance(path).of(unknowns)
-    return CameraCalibration(label, distortion, interior, parameters, marks, covariance, content["redundancy"])
+    covariance, redundancy = read_own_covariance(path).of(unknowns), content["sigma0_from"]["redundancy"]
+    return CameraCalibration(label, distortion, interior, parameters, marks, covariance, redundancy)
 
 
 def _half_mm(path: Path, content: Json, name: str) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from pipeline.report.lens_map import LensMap, lens_map
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import ParameterRow, axes_sentence, group_sentences, high_correlations, parameter_rows
 from pipeline.report.verdict import camera_is_calibrated
-from pipeline.results.adjustment_reader import Covariance
+from pipeline.results.adjustment_reader import Covariance, stored_films
 
 PLOT_PX = 560.0
 LONGEST_VECTOR_PX = 60.0
@@ -68,7 +68,7 @@ class CameraView:
     groups: list[str]
     axes: str
     in_given_figure: list[tuple[str, str, str]]
-    distances: list[fiducials.Distance]
+    distances: tuple[fiducials.Distance, ...]
     correlations: list[tuple[str, str, float]]
     trade_offs: list[str]
     curves: Markup | None
@@ -106,11 +106,11 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
         calibrated=calibrated,
         images=len(images),
         radius_mm=radius_mm,
-        parameters=parameter_rows(name, camera, stored["sigma0"] or 1.0, radius_mm) if calibrated else [],
+        parameters=parameter_rows(name, camera, _prior_scale(name, stored), radius_mm) if calibrated else [],
         groups=group_sentences(camera),
         axes=axes_sentence(camera),
         in_given_figure=_in_given_figure(form) if form and calibrated else [],
-        distances=form.distances if form else [],
+        distances=form.distances if form else (),
         correlations=high_correlations(name, camera, covariance) if covariance else [],
         trade_offs=_trade_offs(name, stored),
         curves=lens.curves_plot(curve, radius_mm) if curve else None,
@@ -138,6 +138,12 @@ def _observed_radius_mm(camera: Json, rows: list[Json]) -> float:
     return float(np.hypot(*offsets.T).max())
 
 
+def _prior_scale(name: str, stored: Json) -> float:
+    """What sigma0 multiplies the given standard deviations of an interior orientation by."""
+    is_left_out = {"group": "interior", "owner": name} in stored["sigma0_from"]["left_out"]
+    return 1.0 if is_left_out else stored["sigma0"] or 1.0
+
+
 def _trade_offs(name: str, stored: Json) -> list[str]:
     """What of a camera trades off, in words."""
     firsts = (parameter_from_text(each["parameters"][0]) for each in stored["correlations"])
@@ -153,8 +159,7 @@ def fiducial_form(name: str, stored: Json, covariance: Covariance, images: list[
     camera = stored["cameras"][name]
     if camera_is_calibrated(camera):
         return fiducials.figure(name, camera, covariance)
-    kinds = {stored["images"][image]["transformation"]["kind"] for image in images}
-    return fiducials.figure_of_films(name, camera, covariance, kinds)
+    return fiducials.figure_of_films(name, camera, covariance, stored_films(stored, images))
 
 
 def _in_given_figure(form: fiducials.Figure) -> list[tuple[str, str, str]]:

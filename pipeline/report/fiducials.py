@@ -1,13 +1,15 @@
 """Fiducial marks, given against estimated, as a figure that is free of the datum in which the camera stands."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from adjust.functional_model.transformation import Film
 from adjust.problem.parameter import Parameter
+from adjust.quality.fiducial_corrections import KEEPS_DISTANCES, corrections_to_given
 from pipeline.drawing import svg
 from pipeline.report.data import Json
 from pipeline.results.adjustment_reader import Covariance
@@ -21,7 +23,7 @@ MARGIN_PX = 58.0
 
 @dataclass(frozen=True)
 class Distance:
-    """Between two marks, in the given figure: mm, less the given one in um, and its standard deviation in um."""
+    """Between two marks: mm, less the given one in um, and its whole standard deviation, the datum's scale included."""
 
     start: str
     end: str
@@ -35,14 +37,17 @@ class Figure:
     """The camera, laid over its given fiducials by what its datum leaves open, and fits them best.
 
     ids (n); given_mm (n, 2); change_um (n, 2): what is left of estimated less given; covariance_um2 (2n, 2n) of all
-    changes. interior_mm (3,): c, x0', y0' laid over along with the marks, interior_sigma_mm (3,); empty without an
-    interior orientation.
+    changes. distances: across, as estimated; none where films alone hold the figure and keep none. transformation: to
+    the given places, after which these changes are left. interior_mm (3,): c, x0', y0' laid over along with the marks,
+    interior_sigma_mm (3,); empty without an interior orientation.
     """
 
     ids: tuple[str, ...]
     given_mm: Array
     change_um: Array
     covariance_um2: Array
+    distances: tuple[Distance, ...]
+    transformation: str
     interior_mm: Array
     interior_sigma_mm: Array
 
@@ -52,22 +57,21 @@ class Figure:
         at = np.arange(len(self.ids))
         return self.covariance_um2.reshape(len(at), 2, len(at), 2)[at, :, at, :]
 
-    @property
-    def distances(self) -> list[Distance]:
-        """From every mark to that which lies farthest from it."""
-        apart = np.linalg.norm(self.given_mm[:, None] - self.given_mm, axis=2)
-        pairs = np.sort(np.stack([np.arange(len(apart)), apart.argmax(axis=1)], axis=1), axis=1)
-        return [self._distance(int(i), int(j)) for i, j in np.unique(pairs, axis=0)]
 
-    def _distance(self, i: int, j: int) -> Distance:
-        changed_mm = self.given_mm + 1e-3 * self.change_um
-        vector_mm = changed_mm[j] - changed_mm[i]
-        length_mm, given_mm = np.linalg.norm(vector_mm), np.linalg.norm(self.given_mm[j] - self.given_mm[i])
-        by_places = np.zeros((len(self.ids), 2))
+def _distances(ids: tuple[str, ...], places_mm: Array, given_mm: Array, covariance_mm2: Array) -> tuple[Distance, ...]:
+    """From every mark to that which lies farthest from it; covariance_mm2 (2n, 2n): of the places, datum and all."""
+    apart = np.linalg.norm(given_mm[:, None] - given_mm, axis=2)
+    pairs = np.sort(np.stack([np.arange(len(apart)), apart.argmax(axis=1)], axis=1), axis=1)
+    found = []
+    for i, j in np.unique(pairs, axis=0).tolist():
+        vector_mm = places_mm[j] - places_mm[i]
+        length_mm = float(np.linalg.norm(vector_mm))
+        by_places = np.zeros_like(places_mm)
         by_places[j], by_places[i] = vector_mm / length_mm, -vector_mm / length_mm
-        variance_um2 = float(by_places.ravel() @ self.covariance_um2 @ by_places.ravel())
-        change_um = 1e3 * float(length_mm - given_mm)
-        return Distance(self.ids[i], self.ids[j], float(length_mm), change_um, float(np.sqrt(max(variance_um2, 0.0))))
+        variance_mm2 = max(float(by_places.ravel() @ covariance_mm2 @ by_places.ravel()), 0.0)
+        change_um = 1e3 * (length_mm - float(apart[i, j]))
+        found.append(Distance(ids[i], ids[j], length_mm, change_um, 1e3 * float(np.sqrt(variance_mm2))))
+    return tuple(found)
 
 
 def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
@@ -85,32 +89,37 @@ def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
     turn_and_scale, shift = _helmert(estimated, given)
     interior = [Parameter.interior(name, each) for each in ("c", "x0", "y0")]
     s = _s_transformation(_similarities(estimated, c, (x0, y0)), 2 * len(ids))
-    reduced = s @ covariance.of([*_places(name, ids), *interior]) @ s.T
+    whole = covariance.of([*_places(name, ids), *interior])
+    reduced = s @ whole @ s.T
     principal_point = turn_and_scale @ (x0, y0) + shift
     return Figure(
         ids=ids,
         given_mm=given,
         change_um=1e3 * (estimated @ turn_and_scale.T + shift - given),
         covariance_um2=1e6 * reduced[:-3, :-3],
+        distances=_distances(ids, estimated, given, whole[:-3, :-3]),
+        transformation="similarity",
         interior_mm=np.array([c * np.sqrt(np.linalg.det(turn_and_scale)), *principal_point]),
         interior_sigma_mm=np.sqrt(np.maximum(np.diag(reduced)[-3:], 0.0)),
     )
 
 
-def figure_of_films(name: str, camera: Json, covariance: Covariance, kinds: Iterable[str]) -> Figure | None:
-    """The same of a camera of which only fiducials were adjusted, with films of these kinds of transformation.
+def figure_of_films(name: str, camera: Json, covariance: Covariance, films: Sequence[Film]) -> Figure | None:
+    """The same of a camera of which only fiducials were adjusted, with these films.
 
-    Nothing but the films holds the marks' figure: its datum takes up all that each film can, of an affine one
-    affinity and shear besides, of others at least as much. None where that is more than the marks tell.
+    Nothing but the films holds the marks' figure: its datum takes up all that each film can. None where that is more
+    than the marks tell.
     """
     ids, given, estimated = _marks(camera)
-    motions = _common_to_films(estimated, set(kinds)) if len(ids) else np.empty((0, 0))
-    if 2 * len(ids) <= motions.shape[1]:
+    left = corrections_to_given(films, estimated, given) if len(ids) else None
+    if left is None:
         return None
-    s = _s_transformation(motions, 2 * len(ids))
-    change_mm = (s @ (estimated - given).ravel()).reshape(-1, 2)
-    covariance_mm2 = s @ covariance.of(_places(name, ids)) @ s.T
-    return Figure(ids, given, 1e3 * change_mm, 1e6 * covariance_mm2, np.empty(0), np.empty(0))
+    whole = covariance.of(_places(name, ids))
+    reduced = left.by_places @ whole @ left.by_places.T
+    distances = _distances(ids, estimated, given, whole) if left.transformation in KEEPS_DISTANCES else ()
+    nothing = np.empty(0)
+    changes = 1e3 * left.corrections_mm, 1e6 * reduced
+    return Figure(ids, given, *changes, distances, left.transformation, nothing, nothing)
 
 
 def figure_plot(change: Figure) -> Markup:
@@ -191,23 +200,3 @@ def _in_order(dx: Array, dy: Array, dc: float) -> Array:
     """Changes of the marks and, last, of the principal point, in the order of the covariance."""
     changes = np.stack([dx, dy], axis=1)
     return np.concatenate([changes[:-1].ravel(), [dc], changes[-1]])
-
-
-def _common_to_films(marks: Array, kinds: set[str]) -> Array:
-    """(2n, d): how marks (n, 2) change with what films of all these kinds take up."""
-    x, y = ((marks - marks.mean(axis=0)) / max(float(np.ptp(marks)), 1.0)).T
-    ones, zeros = np.ones(len(x)), np.zeros(len(x))
-    moved = [(ones, zeros), (zeros, ones), (-y, x), (x, y)]
-    z, order = x + 1j * y, min((int(kind[:-1].partition("(")[2]) for kind in kinds if "(" in kind), default=1)
-    if all(kind.startswith("conformal") for kind in kinds):
-        moved += [(w.real, w.imag) for k in range(2, order + 1) for w in (z**k, 1j * z**k)]
-    elif not any(kind.startswith(("none", "congruent", "similarity", "conformal")) for kind in kinds):
-        moved += [(x, -y), (y, x)]
-        if kinds == {"projective"}:
-            moved += [(x * x, x * y), (x * y, y * y)]
-        elif kinds == {"bilinear"}:
-            moved += [(x * y, zeros), (zeros, x * y)]
-        elif all(kind.startswith("polynomial") for kind in kinds):
-            terms = [x ** (degree - k) * y**k for degree in range(2, order + 1) for k in range(degree + 1)]
-            moved += [pair for term in terms for pair in ((term, zeros), (zeros, term))]
-    return np.stack([np.stack(pair, axis=1).ravel() for pair in moved], axis=1)

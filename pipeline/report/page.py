@@ -23,7 +23,7 @@ from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.parameters import spoken_name
 from pipeline.report.scanner_views import scanner_views
 from pipeline.report.totals import totals_view
-from pipeline.report.verdict import contradiction, critical_w, judge, sigma0_bounds
+from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, has_sigma0, judge, sigma0_bounds
 from pipeline.text.atomic import write_atomically
 
 LIST_LIMIT = 200  # rows of a long table
@@ -90,7 +90,10 @@ def _context(data: ReportData) -> dict[str, Any]:
         "joined": joined_views(data),
         "fractions": list(_fractions(places)),
         "least_marks": LEAST_MARKS,
-        "sigma0_bounds": sigma0_bounds(adjustment["redundancy"]) if adjustment and adjustment["redundancy"] else None,
+        "sigma0_bounds": sigma0_bounds(adjustment["sigma0_from"]["redundancy"])
+        if adjustment and has_sigma0(adjustment)
+        else None,
+        "a_priori": A_PRIORI,
         "points": _points(adjustment) if adjustment else [],
         "list_limit": LIST_LIMIT,
     }

@@ -33,13 +33,14 @@ class ParameterRow:
     meaning: str
 
 
-def parameter_rows(name: str, camera: Json, sigma0: float, radius_mm: float) -> list[ParameterRow]:
-    """Principal distance, principal point and distortion. radius_mm: where the distortion's effect is stated."""
+def parameter_rows(name: str, camera: Json, prior_scale: float, radius_mm: float) -> list[ParameterRow]:
+    """Principal distance, principal point and distortion. radius_mm: where the distortion's effect is stated;
+    prior_scale: what the adjustment has multiplied given standard deviations by."""
     point, distance = camera["principal_point_mm"], camera["principal_distance_mm"]
     interior = [("c", distance), (_SYMBOLS["x0"], point["x"]), (_SYMBOLS["y0"], point["y"])]
     family = camera["distortion"]["family"]
     effects = largest_effects_um(lens(name, camera), radius_mm) if parameter_names(family) else {}
-    rows = [_row(symbol, "mm", quantity, "", _origin(quantity, sigma0)) for symbol, quantity in interior]
+    rows = [_row(symbol, "mm", quantity, "", _origin(quantity, prior_scale)) for symbol, quantity in interior]
     for parameter in parameter_names(family):
         quantity = camera["distortion"].get(parameter)
         if quantity is not None and (quantity["value"] != 0.0 or quantity["sigma"] != 0.0):
@@ -127,7 +128,7 @@ def _given(quantity: Json) -> str:
     return f"{significant(given['value'], 6)} ± {significant(given['sigma'], 2)}"
 
 
-def _origin(quantity: Json, sigma0: float) -> str:
+def _origin(quantity: Json, prior_scale: float) -> str:
     """How far the value moved from the given one, and whether data or prior determined it."""
     given, sigma = quantity.get("given"), quantity["sigma"]
     if sigma is None:
@@ -140,7 +141,7 @@ def _origin(quantity: Json, sigma0: float) -> str:
     p = quantity.get("p")
     if p is not None and p < LEVEL:
         moved += f", more than the given σ allows ({_chance(p)})"
-    left = sigma / (sigma0 * given["sigma"])
+    left = sigma / (prior_scale * given["sigma"])
     if left > MOSTLY_PRIOR:
         return f"{moved}; known from the given value, hardly from the observations"
     share = f"{100.0 * left**2:.0f} %" if left > 0.1 else "below 1 %"

@@ -20,6 +20,10 @@ from pipeline.text.wording import counted, listed
 Level = Literal["good", "look", "failed"]
 Look = Callable[[ReportData, list[Frame]], Iterable[Problem]]
 
+A_PRIORI = (
+    "Standard deviations are a priori ones, as the given sigmas make them: the observations have no redundancy of "
+    "their own that would tell σ₀. Given coordinates with a large sigma place the datum and check nothing."
+)
 CONTRADICTED = 0.01  # probability of so much against an earlier calibration, below which it is a problem
 TOLD = 3  # of its quantities
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
@@ -76,7 +80,12 @@ def camera_is_calibrated(camera: Json) -> bool:
     return camera["principal_distance_mm"]["sigma"] is not None
 
 
-def sigma0_bounds(redundancy: int) -> tuple[float, float]:
+def has_sigma0(adjustment: Json) -> bool:
+    """Whether sigma0 was estimated, and standard deviations are not a priori ones."""
+    return not adjustment["sigma0_from"]["a_priori"]
+
+
+def sigma0_bounds(redundancy: float) -> tuple[float, float]:
     """Where sigma0 lies, with a probability of 99 %, when the a-priori standard deviations are right."""
     low, high = (chdtri(redundancy, 0.5 * above) for above in (1.0 + CONFIDENCE, 1.0 - CONFIDENCE))
     return float(np.sqrt(low / redundancy)), float(np.sqrt(high / redundancy))
@@ -190,7 +199,7 @@ def _beyond_chance(adjustment: Json, rows: list[Json]) -> list[Json]:
 
 def _too_large(adjustment: Json) -> Iterator[Problem]:
     """A sigma0 beyond chance, with what explains it where something does."""
-    _, high = sigma0_bounds(adjustment["redundancy"])
+    _, high = sigma0_bounds(adjustment["sigma0_from"]["redundancy"])
     explained = [Problem(each["cause"], each["remedy"]) for each in adjustment.get("explanations", ())]
     if adjustment["sigma0"] <= high:
         yield from explained
@@ -209,7 +218,7 @@ def _too_large(adjustment: Json) -> Iterator[Problem]:
 
 def _too_small(adjustment: Json) -> Iterator[str]:
     """Better than promised is no harm: a note."""
-    low, _ = sigma0_bounds(adjustment["redundancy"])
+    low, _ = sigma0_bounds(adjustment["sigma0_from"]["redundancy"])
     if adjustment["sigma0"] < low:
         yield (
             f"{_sigma0_and('below', low, adjustment['sigma0'])}: the marks fit better than the sigmas given "
@@ -251,7 +260,7 @@ def _of_solution(look: Callable[[Json], Iterator[Problem]], checked: bool = Fals
     """What an adjustment needs a look at where it has a solution, and redundancy if that is asked for."""
 
     def of(data: ReportData, _: list[Frame]) -> Iterator[Problem]:
-        if data.adjustment is not None and _is_solved(data) and (not checked or data.adjustment["redundancy"] > 0):
+        if data.adjustment is not None and _is_solved(data) and (not checked or has_sigma0(data.adjustment)):
             yield from look(data.adjustment)
 
     return of
@@ -298,8 +307,10 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     if data.adjustment:
         yield from data.adjustment.get("notes", ())
         yield from _weight_notes(data.adjustment)
-        if _is_solved(data) and data.adjustment["redundancy"] > 0:
+        if _is_solved(data) and has_sigma0(data.adjustment):
             yield from _too_small(data.adjustment)
+        elif _is_solved(data):
+            yield A_PRIORI
     if is_film_alone(data):
         for problem in assumed_poses(shots):
             yield f"{problem.what} {problem.next_step}"

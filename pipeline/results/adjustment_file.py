@@ -40,11 +40,14 @@ _AT_A_TIME = 10_000  # words of JSON
 def write_adjustment(adjustment: Adjustment, path: Path, made_from: Mapping[str, str] | None = None) -> None:
     """Write the result to `path` and its covariance beside it, each by way of a temporary file.
 
-    Angles are in degrees in the JSON file and in rad in the covariance. Beyond the keys of the format every quantity
-    has `given`, what was known of it beforehand, and every residual its place in the camera. A camera without an image
-    and a point that nobody saw are not in it. Where no object point is seen, there is no exterior orientation (null)
-    and no calibration (a camera's values are those given, their sigmas null). made_from: fingerprints of all that was
-    adjusted; the covariance has that of the JSON file. Raises InputError where a file cannot be written.
+    Angles are in degrees in the JSON file and in rad in the covariance. sigma0_from: the redundancy of the observations
+    that sigma0 comes from, whether standard deviations are a priori ones for want of these, and the groups of given
+    values that take no part in sigma0 and are not multiplied by it (see `VarianceFactor`). Beyond the keys of the
+    format every quantity has `given`, what was known of it beforehand, and every residual its place in the camera. A
+    camera without an image and a point that nobody saw are not in it. Where no object point is seen, there is no
+    exterior orientation (null) and no calibration (a camera's values are those given, their sigmas null). made_from:
+    fingerprints of all that was adjusted; the covariance has that of the JSON file. Raises InputError where a file
+    cannot be written.
     """
     content = adjustment_json(adjustment)
     content = {"reseau": content.pop("reseau"), "made_from": dict(made_from or {}), **content}
@@ -82,6 +85,11 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "redundancy": adjustment.redundancy,
         "vpv": adjustment.vpv,
         "sigma0": adjustment.sigma0,
+        "sigma0_from": {
+            "redundancy": adjustment.variance.redundancy,
+            "a_priori": adjustment.variance.is_a_priori,
+            "left_out": [each._asdict() for each in adjustment.variance.left_out],
+        },
         "covariance": covariance_note(adjustment),
         "singular": [
             {"parameters": _texts(null.parameters), "cause": null.cause, "remedy": null.remedy}

@@ -3,7 +3,7 @@
 import io
 import math
 import zipfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.camera import Distortion
 from adjust.problem.parameter import (
     Parameter,
@@ -73,7 +74,11 @@ def read_adjustment(path: Path) -> Json:
         raise InputError(f"{path}: is a folder; an adjustment.json is needed here.") from None
     _check(content, _ADJUSTMENT, path, "")
     _check_names(content, path)
-    return dict(content)
+    redundancy = content["redundancy"]
+    whole = {"redundancy": redundancy, "a_priori": redundancy <= 0, "left_out": []}  # of files of earlier versions
+    content = {**content, "sigma0_from": content.get("sigma0_from", whole)}
+    _check(content["sigma0_from"], _SIGMA0_FROM, path, "sigma0_from")
+    return content
 
 
 def _check_names(content: Json, path: Path) -> None:
@@ -152,6 +157,21 @@ def calibrated_lens(camera: Json) -> tuple[Distortion, Array, Array]:
     return distortion, np.array(interior, dtype=float), np.array(values, dtype=float)
 
 
+def stored_films(content: Json, images: Iterable[str]) -> list[Film]:
+    """The film transformations of some images in the contents of adjustment.json, those of the first image first."""
+    places = defaultdict[str, list[tuple[float, float]]](list)
+    for row in content["residuals"]:
+        places[row["image"]].append((row["x_mm"], row["y_mm"]))
+    films = []
+    for image in images:
+        stored = content["images"][image]["transformation"]
+        names = film_parameter_names(stored["kind"])
+        values = [math.radians(stored["angle_deg"]["value"]) if n == "angle" else stored[n]["value"] for n in names]
+        low, high = np.min(places[image], axis=0), np.max(places[image], axis=0)
+        films.append(Film(stored["kind"], np.array(values, dtype=float), 0.5 * (low + high), stored["mirrored"]))
+    return films
+
+
 _AGAIN = "Run `reseau adjust` again; it writes both files."
 
 
@@ -171,6 +191,11 @@ _RESIDUAL_NUMBERS = (
 FURTHER_NUMBERS = ("sigma", "v", "redundancy", "w", "detectable")
 _NAMED = {"name": str, **dict.fromkeys(("value", *FURTHER_NUMBERS), _NUMBER)}
 _QUANTITY = {"value": _NUMBER, "sigma": _NUMBER}
+_SIGMA0_FROM = {
+    "redundancy": (float, int),
+    "a_priori": bool,
+    "left_out": _Each(list, {"group": str, "owner": str}),
+}
 _ADJUSTMENT = {
     "reseau": str,
     "converged": bool,

@@ -1,5 +1,6 @@
 """A made-up calibration of five aerial frames, and its files: result file and report are tested on its numbers."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -25,6 +26,7 @@ from adjust.problem.result import (
     Reliability,
     Residuals,
     Suspect,
+    VarianceFactor,
 )
 from measure.covariance import Cause, Covariance
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
@@ -125,6 +127,7 @@ def adjustment() -> Adjustment:
         unknowns=83,
         redundancy=257,
         vpv=262.1,
+        variance=VarianceFactor(math.sqrt(262.1 / 257), 257),
         parameters=parameters,
         values=values,
         cofactor=Dense(correlation * np.outer(sigmas, sigmas)),

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.images import adjusted_image
 from adjust.problem.network import Image, Network
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment
@@ -77,7 +78,8 @@ def form(kind: str, seed: int) -> Figure:
         ),
     )
     result = adjust(network, approximate(network))
-    found = figure_of_films("K", stored(result), Known(result), {kind})  # type: ignore[arg-type]
+    films = [adjusted_image(result, name).film for name in names]
+    found = figure_of_films("K", stored(result), Known(result), films)  # type: ignore[arg-type]
     assert found is not None
     return found
 
@@ -95,11 +97,9 @@ def test_the_sigmas_of_the_form_hold_against_realisations(kind: str, taken_up: i
     assert ratio.min() > chi2.ppf(1e-4 / len(ratio), free)
     assert ratio.max() < chi2.ppf(1 - 1e-4 / len(ratio), free)
     together = (off**2).sum() / np.trace(claimed) / free
-    assert together == pytest.approx(1.0, abs=0.12)
+    assert together == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / free / (2 * len(IDS) - taken_up)))
     assert np.sqrt(np.diag(claimed)).max() < 1.1e3 * SIGMA_MM / np.sqrt(FRAMES)
-    lengths = np.array([[each.change_um for each in figure.distances] for figure in found])
-    sigma_um = np.array([each.sigma_um for each in found[0].distances])
-    assert np.sqrt((lengths.std(axis=0, ddof=1) ** 2 / sigma_um**2).mean()) == pytest.approx(1.0, abs=0.15)
+    assert not found[0].distances  # no such film keeps any
 
 
 def test_the_form_is_that_of_the_truth() -> None:
