@@ -127,3 +127,20 @@ def test_the_form_of_the_fiducials_is_told_where_they_are_estimated(
     assert len(sigmas_um) == 10
     assert 0.05 < max(sigmas_um) < 1e3 * SIGMA_MM / np.sqrt(60)
     assert "Distances across" not in form
+
+
+def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """sigma0 was 0.003 here, and multiplied the datum's 1 mm: now the shift is known to 1 mm over the root of 5."""
+    project = write_project(tmp_path, {"a": 5})
+    camera = tmp_path / "camera.toml"
+    camera.write_text(camera.read_text(encoding="utf-8").replace("sigma_mm = 0\n", "sigma_mm = 1\n"), encoding="utf-8")
+    run(["adjust", str(project)])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "standard deviations a priori" in printed
+    result = result_of(project)
+    assert result["sigma0_from"] == {"redundancy": 0.0, "a_priori": True, "left_out": []}
+    design = np.column_stack([np.ones(5), comparator_mm(0)])
+    sigma = np.sqrt(np.linalg.inv(design.T @ design)[0, 0] * (1.0 + SIGMA_MM**2))
+    assert result["images"]["a"]["transformation"]["a1"]["sigma"] == pytest.approx(sigma, rel=1e-3)

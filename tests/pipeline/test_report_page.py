@@ -131,10 +131,19 @@ def test_no_check_stands_where_the_redundancy_is_zero() -> None:
     )
 
 
+def test_a_priori_standard_deviations_are_named(adjusted: ReportData) -> None:
+    """One frame whose given coordinates only place the datum has redundancy, but none that tells sigma0."""
+    assert adjusted.adjustment is not None
+    nothing = {"redundancy": 0.0, "a_priori": True, "left_out": []}
+    text = rendered(replace(adjusted, adjustment={**adjusted.adjustment, "sigma0": 1.0, "sigma0_from": nothing})).text
+    assert text.count("Standard deviations are a priori ones") == 2  # as a note, and with the groups
+
+
 def test_an_adjustment_without_any_redundancy_is_not_called_good(adjusted: ReportData) -> None:
     assert adjusted.adjustment is not None
-    unchecked = replace(adjusted, adjustment={**adjusted.adjustment, "redundancy": 0, "sigma0": 1.0})
-    text = rendered(unchecked).text
+    nothing = {"redundancy": 0.0, "a_priori": True, "left_out": []}
+    content = {**adjusted.adjustment, "redundancy": 0, "sigma0": 1.0, "sigma0_from": nothing}
+    text = rendered(replace(adjusted, adjustment=content)).text
     assert "Nothing checks the result" in text
     assert "The redundancy is 0: no check." in text
     assert "! Needs a look" in text
