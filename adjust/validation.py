@@ -37,6 +37,7 @@ def validate(network: Network) -> None:
     _check_antennas(network)
     _check_duplicate_observations(network)
     _check_values(network.observations)
+    _check_places(network)
     _check_parts(network)
     frames = {image.frame: image for image in network.images}
     for (frame, image), shown in zip(frames.items(), _shown(network).tolist()[: len(frames)], strict=True):
@@ -242,8 +243,8 @@ def _check_values(observations: Observations) -> None:
     covariance = observations.covariance_mm2
     finite = np.isfinite(observations.xy_mm).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     variances = np.einsum("nii->ni", covariance)
-    determinant = covariance[:, 0, 0] * covariance[:, 1, 1] - covariance[:, 0, 1] * covariance[:, 1, 0]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
+        determinant = covariance[:, 0, 0] * covariance[:, 1, 1] - covariance[:, 0, 1] * covariance[:, 1, 0]
         symmetric = np.abs(covariance[:, 0, 1] - covariance[:, 1, 0]) <= 1e-9 * np.abs(covariance[:, 1, 0])
     definite = (variances > 0.0).all(axis=1) & (determinant > 0.0) & symmetric
     for good, what in (
@@ -258,6 +259,26 @@ def _check_values(observations: Observations) -> None:
             row = int(np.argmin(good))
             raise AdjustmentError(
                 f"{observations.kind[row]} {observations.point[row]} in image {observations.image[row]} {what}."
+            )
+
+
+def _check_places(network: Network) -> None:
+    """Raise where all fiducials, or all object points, of an image have one and the same place in it."""
+    observations, numbers = network.observations, network.image_numbers
+    for kind, rows in (("fiducials", observations.is_fiducial), ("targets", ~observations.is_fiducial)):
+        chosen = np.flatnonzero(rows)
+        if not chosen.size:
+            continue
+        order = chosen[np.argsort(numbers[chosen], kind="stable")]
+        starts = np.flatnonzero(np.diff(numbers[order], prepend=-1))
+        xy, counts = observations.xy_mm[order], np.diff([*starts, len(order)])
+        is_one = (np.maximum.reduceat(xy, starts) == np.minimum.reduceat(xy, starts)).all(axis=1) & (counts > 1)
+        if is_one.any():
+            row = int(order[starts[np.argmax(is_one)]])
+            raise AdjustmentError(
+                f"image {observations.image[row]}: all its {counts[np.argmax(is_one)]} {kind} are at one place, "
+                f"({xy[starts[np.argmax(is_one)]][0]:g}, {xy[starts[np.argmax(is_one)]][1]:g}) mm. Correct them, or "
+                "leave the image out."
             )
 
 

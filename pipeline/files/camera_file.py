@@ -17,6 +17,7 @@ from pipeline.files.camera_units import check_units
 from pipeline.files.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.files.learned_table import Clicks, LearnedFrom, read_clicks, read_learned_from
 from pipeline.files.mark_table import read_mark
+from pipeline.text.finite import SMALLEST_SIGMA
 from pipeline.text.spelling import did_you_mean
 from pipeline.text.tables import Table, read_toml
 
@@ -248,6 +249,8 @@ def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
         mark = entry.text("mark", choices=(*marks, NO_MARK)) if "mark" in entry else None
         xy = entry.pair("xy_mm")
         sigma = entry.sigma_pair("sigma_mm", (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM))
+        if any(0.0 < one < SMALLEST_SIGMA for one in sigma):
+            raise entry.error("sigma_mm", f"nothing is known to {min(sigma):g} mm. Write 0 for what is to be fixed.")
         drawn = None if mark is None or mark not in marks else _placed(*marks[mark], xy)
         for other in fiducials.values():
             if other.xy_mm == xy:

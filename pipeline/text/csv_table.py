@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
+from pipeline.text.finite import LARGEST, SMALLEST_SIGMA
 from pipeline.text.spelling import did_you_mean
 from pipeline.text.text_file import read_bytes, shown
 
@@ -58,6 +59,8 @@ class Row:
             raise self.error(column, f"must be a number with a decimal point or blank, not {shown(value)}.") from None
         if not math.isfinite(number):
             raise self.error(column, f"must be a finite number or blank, not {shown(value)}.")
+        if abs(number) > LARGEST:
+            raise self.error(column, f"{shown(value)} is larger than anything that is measured. Correct it.")
         return number
 
     def sigma(self, column: str) -> float | None:
@@ -65,6 +68,8 @@ class Row:
         sigma = self.number(column)
         if sigma is not None and sigma < 0.0:
             raise self.error(column, f"is a standard deviation and cannot be negative ({sigma:g}).")
+        if sigma is not None and 0.0 < sigma < SMALLEST_SIGMA:
+            raise self.error(column, f"nothing is known to {sigma:g}. Write 0 for what is to be fixed.")
         return sigma
 
 

@@ -1,8 +1,11 @@
-"""Numbers as JSON knows them."""
+"""Numbers as JSON knows them, and as large or small as anything that is measured."""
 
 import math
 from collections.abc import Mapping
 from typing import Any
+
+LARGEST = 1e15  # of a coordinate, a size, a standard deviation, in whatever unit: squares of larger ones are lost
+SMALLEST_SIGMA = 1e-9  # of a coordinate, in mm, m or degrees: weights of smaller ones swallow all others
 
 
 def without_nan(value: Any) -> Any:

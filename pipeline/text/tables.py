@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
+from pipeline.text.finite import LARGEST
 from pipeline.text.spelling import did_you_mean, nearest
 from pipeline.text.text_file import read_bytes, shown
 from pipeline.text.wording import LISTED
@@ -241,6 +242,8 @@ class Table:
             number = math.inf
         if not math.isfinite(number):
             raise self.error(key, f"must be a number, not {shown(value)}.")
+        if abs(number) > LARGEST:
+            raise self.error(key, f"{shown(value)} is larger than anything that is measured. Correct it.")
         return number
 
     def _sigma(self, key: str, value: Any) -> float:
