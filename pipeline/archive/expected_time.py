@@ -38,7 +38,7 @@ class ExpectedTime:
     def sentence(self) -> str:
         """About how long, and by which kinds."""
         kinds = [
-            f"{kind}: {self._left[kind]} left, {sum(done) / len(done):.2g} s and "
+            f"{kind}: {self._left[kind]} left, {duration(sum(done) / len(done), 1)} and "
             f"{self._bytes[kind] / len(done) / 1e6:.0f} MB read each"
             for kind, done in sorted(self._done.items())
         ]
@@ -46,8 +46,12 @@ class ExpectedTime:
         return f"about {duration(self.left_s)} left ({'; '.join(kinds[:_NAMED])}{more})"
 
 
-def duration(seconds: float) -> str:
-    """In words, to two digits or so."""
+def duration(seconds: float, decimals: int = 0) -> str:
+    """In words, to two digits or so. decimals: of less than ten seconds."""
     if seconds >= 2 * _HOUR_S:
         return f"{seconds / _HOUR_S:.1f} hours"
-    return f"{seconds / _MINUTE_S:.0f} minutes" if seconds >= 2 * _MINUTE_S else f"{seconds:.0f} s"
+    return (
+        f"{seconds / _MINUTE_S:.0f} minutes"
+        if seconds >= 2 * _MINUTE_S
+        else f"{seconds:.{decimals if seconds < 10 else 0}f} s"
+    )

@@ -18,6 +18,9 @@ FREE = "free"
 MOST_MB = 4  # marks that were learned from 12,000 scans make a camera file of this size
 
 _DEEP = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){30}""")
+_BARE = re.compile(
+    r"""\s*(?P<key>[\w."'-]+)\s*=\s*(?:(?P<word>[A-Za-z][\w./-]*)|(?P<number>[+-]?\d[\d.]*)\s*[A-Za-zµμ°%]+)\s*(?:\#.*)?$"""
+)
 _LONGEST_PATH, _LONGEST_NAME = 4000, 255  # bytes, of most file systems
 
 
@@ -42,8 +45,20 @@ def _parse(path: Path) -> dict[str, Any]:
     except RecursionError:
         raise InputError(f"{path}: is not valid TOML here: lists or tables stand in one another too deep.") from None
     except ValueError as error:  # a syntax error, or a number of thousands of digits
-        in_path = " (a path has / in the place of \\)" if re.search("Unescaped|hex value", str(error)) else ""
-        raise InputError(f"{path}: is not valid TOML: {error}. Mend that line{in_path}.") from None
+        raise InputError(f"{path}: is not valid TOML: {error}. {_mending(text, str(error))}") from None
+
+
+def _mending(text: str, error: str) -> str:
+    """What the line of a syntax error should be, where that can be told."""
+    if re.search("Unescaped|hex value", error):
+        return "Mend that line (a path has / in the place of \\)."
+    place = re.search(r"at line (\d+)", error)
+    found = _BARE.match(text.splitlines()[int(place[1]) - 1]) if place else None
+    if found and found["word"]:
+        return f'Text stands in quotes: {found["key"]} = "{found["word"]}".'
+    if found:
+        return f"A number stands without its unit, which the key names: {found['key']} = {found['number']}."
+    return "Mend that line."
 
 
 def _toml_files_in(folder: Path) -> str:

@@ -445,3 +445,19 @@ def test_a_tone_curve_that_is_none(tmp_path: Path, said: str, words: list[str]) 
 def test_rows_go_down_and_y_goes_up() -> None:
     np.testing.assert_allclose(comparator_from_pixel(np.array([[3.0, 5.0]]), (20.0, 10.0)), [[0.06, -0.05]])
     np.testing.assert_allclose(pixel_from_comparator(np.array([0.06, -0.05]), (20.0, 10.0)), [3.0, 5.0])
+
+
+@pytest.mark.parametrize(
+    ("line", "remedy"),
+    [
+        ("k3 = free", 'Text stands in quotes: k3 = "free".'),
+        ("kind = ring-cross  # of the RC8", 'Text stands in quotes: kind = "ring-cross".'),
+        ("pitch_um = 5 um", "A number stands without its unit, which the key names: pitch_um = 5."),
+        ("frame_mm = [228.0, 228.0", "Mend that line."),
+    ],
+)
+def test_a_value_without_quotes_or_with_a_unit_is_told_as_it_should_be(tmp_path: Path, line: str, remedy: str) -> None:
+    (tmp_path / "camera.toml").write_text(f'name = "K"\n{line}\n', encoding="utf-8")
+    with pytest.raises(InputError) as refused:
+        read_toml(tmp_path / "camera.toml")
+    assert str(refused.value).endswith(remedy)
