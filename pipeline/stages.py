@@ -280,7 +280,8 @@ def _fill_images(project: Project, scans: Iterable[MeasuredScan]) -> None:
 
 def _write_adjustment(project: Project, adjustment: Adjustment, new: Unpublished) -> None:
     made_from = adjusted_from(project, _given_marks(project, new))
-    write_adjustment(adjustment, new.place(project.adjustment_path), made_from)
+    frames_mm = {each.name: each.frame_mm for each in project.cameras.values() if each.frame_mm is not None}
+    write_adjustment(adjustment, new.place(project.adjustment_path), made_from, frames_mm)
 
 
 def _check_adjusted(project: Project, marks: Sequence[ComparatorPoint]) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from adjust.functional_model.distortion import image_equations
+from adjust.functional_model.displacement import Displacement
+from adjust.functional_model.displacement import displacement as lens_displacement
 from adjust.functional_model.families import family, parameter_names
-from adjust.functional_model.projection import ideal_from_observed
 from adjust.problem.camera import Distortion
 from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
@@ -44,18 +44,6 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Displacement:
-    """Observed less ideal point (n, 2) in um, and its derivatives (n, 2, 1 + k) by c and the parameters.
-
-    imaged (n,): which points the lens shows anything at; the others are nan, the derivatives 0.
-    """
-
-    value_um: Array
-    by_unknowns_um: Array
-    imaged: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
 class Curves:
     """Over the radius (n,) in mm, in um.
 
@@ -76,21 +64,8 @@ def lens(name: str, camera: Json) -> Lens:
 
 
 def displacement(of: Lens, from_principal_point_mm: Array) -> Displacement:
-    """What the lens does at observed points (n, 2), counted from the principal point.
-
-    By the implicit function theorem: F(point, ray, unknowns) = 0 gives the ray's derivatives.
-    """
-    c, principal_point = of.interior[0], of.interior[1:]
-    xy = principal_point + from_principal_point_mm
-    ideal, imaged = ideal_from_observed(of.distortion, of.interior, of.parameters, xy)
-    ideal[~imaged] = principal_point
-    ray = (ideal - principal_point) / c
-    equations = image_equations(of.distortion, of.interior, of.parameters, xy, ray)
-    by_unknowns = np.concatenate([equations.by_interior[:, :, :1], equations.by_parameters], axis=2)
-    derivatives = c * np.linalg.solve(equations.by_ray, by_unknowns)
-    derivatives[:, :, 0] -= ray
-    derivatives[~imaged] = 0.0
-    return Displacement(np.where(imaged[:, None], 1e3 * (xy - ideal), np.nan), 1e3 * derivatives, imaged)
+    """What the lens does at observed points (n, 2), counted from the principal point."""
+    return lens_displacement(of.distortion, of.interior, of.parameters, from_principal_point_mm)
 
 
 def curves(of: Lens, covariance: Covariance, largest_radius_mm: float) -> Curves:

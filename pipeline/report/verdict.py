@@ -26,6 +26,7 @@ A_PRIORI = (
 )
 CONTRADICTED = 0.01  # probability of so much against an earlier calibration, below which it is a problem
 TOLD = 3  # of its quantities
+LEAST_SHARE = 0.5  # of the corner's radius within which an estimated lens is known
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
 
 # Observations other than marks, by their key in adjustment.json: what is said of one and of many, and what to do.
@@ -239,6 +240,43 @@ def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
     return f"σ₀ = {sigma0:.{digits}f} is {side} {bound:.{digits}f}"
 
 
+def _lens_problems(adjustment: Json) -> Iterator[Problem]:
+    """Lenses that were estimated in less than half of the picture: from half the radius to the corner the seventh power
+    of k3 grows by 128, so that a hundredth of a pixel inside is more than a pixel there."""
+    for name, camera in _estimated_lenses(adjustment):
+        if camera["lens_known"]["share"] < LEAST_SHARE:
+            yield Problem(
+                f"{_lens_known(name, camera['lens_known'])}.",
+                "Observe targets out to the corners of the picture, or use the lens within that radius only.",
+            )
+
+
+def _lens_notes(adjustment: Json) -> Iterator[str]:
+    for name, camera in _estimated_lenses(adjustment):
+        if camera["lens_known"]["share"] >= LEAST_SHARE:
+            yield f"{_lens_known(name, camera['lens_known'])}."
+
+
+def _estimated_lenses(adjustment: Json) -> Iterator[tuple[str, Json]]:
+    """Cameras with a distortion parameter that was estimated, whose frame's size is known."""
+    for name, camera in adjustment["cameras"].items():
+        parameters = (each for each in camera["distortion"].values() if isinstance(each, dict))
+        known = camera.get("lens_known")
+        if known and known["corner_mm"] is not None and any(each["sigma"] for each in parameters):
+            yield name, camera
+
+
+def _lens_known(name: str, known: Json) -> str:
+    """How far out, and how well there and beyond."""
+    corner = known["corner_sigma_um"]
+    beyond = "the lens shows nothing there" if corner is None else f"there its standard deviation is {corner:.2g} µm"
+    inside = "" if known["sigma_um"] is None else f", with a standard deviation of up to {known['sigma_um']:.2g} µm"
+    return (
+        f"The distortion of {name} is known up to {known['radius_mm']:.3g} mm from the principal point{inside}, "
+        f"{100.0 * known['share']:.0f} % of the way to the corner of the picture; beyond it is extrapolated, {beyond}"
+    )
+
+
 def _check_problems(check: Json) -> Iterator[Problem]:
     if check["verdict"] == "differs":
         yield Problem(
@@ -284,6 +322,7 @@ NEEDS_A_LOOK: dict[str, Look] = {
     "warnings": lambda data, _: map(Problem, data.adjustment["warnings"] if data.adjustment else ()),
     "σ₀": _of_solution(_too_large, checked=True),
     "redundancy": _of_solution(_unchecked),
+    "reach of the lens": _of_solution(_lens_problems),
     "distances, calibrations, antennas": _of_solution(_further_problems),
     "gross errors": _of_solution(lambda adjustment: _suspects(adjustment["suspects"])),
     "OpenCV": lambda data, _: _check_problems(data.check) if data.check else (),
@@ -306,6 +345,7 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield f"OpenCV cannot check this calibration. {data.check['reason']}"
     if data.adjustment:
         yield from data.adjustment.get("notes", ())
+        yield from _lens_notes(data.adjustment)
         yield from _weight_notes(data.adjustment)
         if _is_solved(data) and has_sigma0(data.adjustment):
             yield from _too_small(data.adjustment)

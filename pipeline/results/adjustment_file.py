@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
@@ -20,6 +21,7 @@ from adjust.problem.network import EXTERIOR_NAMES, Board, Image, ObjectPoint, Sc
 from adjust.problem.parameter import Kind, Parameter
 from adjust.problem.result import Adjustment, Contradiction, FurtherResidual
 from adjust.quality.correlation import correlations
+from adjust.quality.lens_reach import lens_reach
 from adjust.quality.significance import SignificanceTest, board_tests, group_tests, parameter_tests, scanner_tests
 from pipeline.results.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.results.covariance_arrays import covariance_arrays, covariance_note
@@ -37,9 +39,15 @@ DEG_PER_RAD = 180.0 / math.pi
 _AT_A_TIME = 10_000  # words of JSON
 
 
-def write_adjustment(adjustment: Adjustment, path: Path, made_from: Mapping[str, str] | None = None) -> None:
+def write_adjustment(
+    adjustment: Adjustment,
+    path: Path,
+    made_from: Mapping[str, str] | None = None,
+    frames_mm: Mapping[str, tuple[float, float]] | None = None,
+) -> None:
     """Write the result to `path` and its covariance beside it, each by way of a temporary file.
 
+<<<<<<< HEAD
     Angles are in degrees in the JSON file and in rad in the covariance. sigma0_from: the redundancy of the observations
     that sigma0 comes from, whether standard deviations are a priori ones for want of these, and the groups of given
     values that take no part in sigma0 and are not multiplied by it (see `VarianceFactor`). Beyond the keys of the
@@ -48,8 +56,16 @@ def write_adjustment(adjustment: Adjustment, path: Path, made_from: Mapping[str,
     exterior orientation (null) and no calibration (a camera's values are those given, their sigmas null). made_from:
     fingerprints of all that was adjusted; the covariance has that of the JSON file. Raises InputError where a file
     cannot be written.
+=======
+    Angles are in degrees in the JSON file and in rad in the covariance. Beyond the keys of the format every quantity
+    has `given`, what was known of it beforehand, and every residual its place in the camera. frames_mm: by camera the
+    size of its frame. A camera without an image
+    and a point that nobody saw are not in it. Where no object point is seen, there is no exterior orientation (null)
+    and no calibration (a camera's values are those given, their sigmas null). made_from: fingerprints of all that was
+    adjusted; the covariance has that of the JSON file. Raises InputError where a file cannot be written.
+>>>>>>> 6ccdda1 (Say in every result how far out the lens is known, against the corner of the picture: a lens known inside a quarter of the radius passed without a word)
     """
-    content = adjustment_json(adjustment)
+    content = adjustment_json(adjustment, frames_mm)
     content = {"reseau": content.pop("reseau"), "made_from": dict(made_from or {}), **content}
     # Both are whole before either takes its place: a covariance belongs to its adjustment.
     with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
@@ -69,8 +85,9 @@ def _json_text(content: Json) -> Iterator[str]:
     yield "\n"
 
 
-def adjustment_json(adjustment: Adjustment) -> Json:
+def adjustment_json(adjustment: Adjustment, frames_mm: Mapping[str, tuple[float, float]] | None = None) -> Json:
     """The result as `adjustment.json` holds it; numbers that mean nothing are still NaN or infinite."""
+    frames_mm = frames_mm or {}
     network = adjustment.network
     used = {image.camera for image in network.images}
     return {
@@ -115,7 +132,11 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         ],
         "suspects": [suspect_json(suspect) for suspect in adjustment.suspects],
         "reliability": reliability_json(adjustment),
-        "cameras": {camera.name: _camera(adjustment, camera) for camera in network.cameras if camera.name in used},
+        "cameras": {
+            camera.name: _camera(adjustment, camera) | _lens_known(adjustment, camera, frames_mm.get(camera.name))
+            for camera in network.cameras
+            if camera.name in used
+        },
         "scanners": {scanner.name: _scanner(adjustment, scanner) for scanner in network.scanners},
         "boards": {board.name: _board(adjustment, board) for board in network.boards},
         "images": {image.name: _image(adjustment, image) for image in network.images},
@@ -179,6 +200,14 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
             for x, y in [[Parameter.fiducial(camera.name, id, axis) for axis in "xy"]]
         },
     }
+
+
+def _lens_known(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float] | None) -> Json:
+    """How far out the lens is known; nothing where there is no solution, or no target."""
+    if not adjustment.converged or camera.name in adjustment.network.idle_cameras:
+        return {}
+    reach = lens_reach(adjustment, camera, frame_mm)
+    return {} if reach is None else {"lens_known": asdict(reach) | {"share": reach.share}}
 
 
 def distortion_settings(distortion: Distortion) -> Json:

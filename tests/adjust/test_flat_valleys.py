@@ -13,6 +13,7 @@ from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.problem.result import Adjustment
+from adjust.quality.lens_reach import lens_reach
 from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
@@ -159,3 +160,21 @@ def test_the_distortion_is_as_uncertain_as_it_claims() -> None:
     for pairs in squares.values():
         realised, claimed = np.sqrt(np.mean(pairs, axis=0))
         assert 0.82 < realised / claimed < 1.18
+
+
+def test_how_far_out_the_lens_is_known() -> None:
+    """The outermost corner of the board against the picture's, and a standard deviation that grows beyond."""
+    result = adjust(board_network(0, EIGHT))
+    camera = result.network.cameras[0]
+    reach = lens_reach(result, camera, (float(FRAME_MM[0]), float(FRAME_MM[1])))
+    assert reach is not None
+    x0, y0 = result.value("IO.cam.x0"), result.value("IO.cam.y0")
+    offsets = result.network.observations.xy_mm - (x0, y0)
+    assert reach.radius_mm == pytest.approx(np.hypot(*offsets.T).max())
+    assert reach.corner_mm == pytest.approx(max(np.hypot(x - x0, y - y0) for x in (0.0, 12.8) for y in (0.0, -9.6)))
+    assert reach.share == pytest.approx(reach.radius_mm / reach.corner_mm)
+    assert reach.sigma_um < 3.0
+    assert not reach.corner_sigma_um < 20.0
+    unknown = lens_reach(result, camera, None)
+    assert unknown is not None
+    assert np.isnan(unknown.corner_mm)

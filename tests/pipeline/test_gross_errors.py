@@ -117,3 +117,19 @@ def test_an_image_without_orientation_is_left_out_and_named(tmp_path: Path) -> N
     assert run(["check", str(project)]) in (0, 1)
     assert run(["report", str(project)]) == 1
     assert "Left out of the adjustment: image f2" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("frame_mm", "level"), [(228.0, 0), (600.0, 1)])
+def test_a_lens_known_in_the_middle_alone_needs_a_look(frame_mm: float, level: int, tmp_path: Path) -> None:
+    """Targets within some 110 mm of the principal point: most of a picture of 228 mm, a quarter of one of 600 mm."""
+    free = {"k3": np.inf, "k5": np.inf}
+    network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 40), free=free)
+    project = write_network(network, tmp_path)
+    camera = tmp_path / "camera.toml"
+    camera.write_text(camera.read_text(encoding="utf-8").replace("228.0", str(frame_mm)), encoding="utf-8")
+    assert run(["adjust", str(project)]) == level
+    known = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))["cameras"]["K"]["lens_known"]
+    assert (known["share"] < 0.5) is bool(level)
+    assert known["corner_sigma_um"] > known["sigma_um"] > 0.0
+    assert run(["report", str(project)]) in (0, level)
+    assert "of the way to the corner of the picture" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
