@@ -47,7 +47,6 @@ def write_adjustment(
 ) -> None:
     """Write the result to `path` and its covariance beside it, each by way of a temporary file.
 
-<<<<<<< HEAD
     Angles are in degrees in the JSON file and in rad in the covariance. sigma0_from: the redundancy of the observations
     that sigma0 comes from, whether standard deviations are a priori ones for want of these, and the groups of given
     values that take no part in sigma0 and are not multiplied by it (see `VarianceFactor`). Beyond the keys of the
@@ -55,15 +54,7 @@ def write_adjustment(
     camera without an image and a point that nobody saw are not in it. Where no object point is seen, there is no
     exterior orientation (null) and no calibration (a camera's values are those given, their sigmas null). made_from:
     fingerprints of all that was adjusted; the covariance has that of the JSON file. Raises InputError where a file
-    cannot be written.
-=======
-    Angles are in degrees in the JSON file and in rad in the covariance. Beyond the keys of the format every quantity
-    has `given`, what was known of it beforehand, and every residual its place in the camera. frames_mm: by camera the
-    size of its frame. A camera without an image
-    and a point that nobody saw are not in it. Where no object point is seen, there is no exterior orientation (null)
-    and no calibration (a camera's values are those given, their sigmas null). made_from: fingerprints of all that was
-    adjusted; the covariance has that of the JSON file. Raises InputError where a file cannot be written.
->>>>>>> 6ccdda1 (Say in every result how far out the lens is known, against the corner of the picture: a lens known inside a quarter of the radius passed without a word)
+    cannot be written. frames_mm: by camera the size of its frame.
     """
     content = adjustment_json(adjustment, frames_mm)
     content = {"reseau": content.pop("reseau"), "made_from": dict(made_from or {}), **content}
