@@ -107,6 +107,16 @@ def check_judging(db: sqlite3.Connection, judging: int, path: object) -> None:
         raise damaged_judging(path)
 
 
+def check_judgings(db: sqlite3.Connection, path: object) -> None:
+    """Raises DamagedError where any judging that was finished is not as it was written, or is lost."""
+    lost = db.execute(
+        f"select exists (select 1 from judging where seal is not null and not {IS_JUDGING_SOUND}) or "
+        "exists (select 1 from judged_frame where judging not in (select id from judging))"
+    ).fetchone()[0]
+    if lost:
+        raise damaged_judging(path)
+
+
 def damaged_judging(path: object) -> DamagedError:
     return DamagedError(
         f"{path}: the list of judged images is not as it was written: the file was changed or is damaged. "

@@ -17,6 +17,7 @@ from pipeline.archive.digests import (
     IS_JUDGING_SOUND,
     DamagedError,
     check_judging,
+    check_judgings,
     damaged_judging,
     is_sound,
     marks_digest,
@@ -180,7 +181,8 @@ def rejudge(store: Store, before: Judging, records: Mapping[str, Json]) -> str:
 
 
 def latest(store: Store) -> Judging | None:
-    """The one that was made last."""
+    """The one that was made last. Raises DamagedError where one is lost, or not as it was written."""
+    check_judgings(store.connection, store.path)
     found = store.connection.execute(
         f"select digest from judging where not {_UNFINISHED} order by id desc limit 1"
     ).fetchone()

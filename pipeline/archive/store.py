@@ -159,7 +159,8 @@ class Store:
             scans = self._db.execute(f"select id from scan where not {is_sound('scan')}").fetchall()
             for (scan,) in scans:
                 lost |= {row for (row,) in self._db.execute("select id from result where scan = ?", (scan,))}
-            self._db.execute("delete from judging")
+            for table in ("judged", "judged_frame", "judged_lot", "judging"):  # also of a judging that is lost
+                self._db.execute(f"delete from {table}")
             rows = [(row,) for row in sorted(lost)]
             self._db.executemany("delete from mark where result = ?", rows)
             self._db.executemany("update scan set result = null, is_current = 0 where result = ?", rows)

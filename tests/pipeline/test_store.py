@@ -384,3 +384,21 @@ def test_a_store_in_a_folder_that_cannot_be_written_is_read(path: Path, monkeypa
         assert [file.name for file in path.parent.iterdir()] == [path.name]  # SQLite would put two files beside it
         with pytest.raises(sqlite3.OperationalError, match="readonly"):
             store.keep(kept(4), "box/4")
+
+
+@pytest.mark.parametrize(
+    "change", ["delete from judging", "update judging set digest = 'unfinished'", "update judging set id = 9"]
+)
+def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -> None:
+    """Else what each scan gave would stand for what all together say of it."""
+    with Store(path) as store:
+        row = store.keep(kept(1), "1", current=True)
+        judge(store, {}, "a", [JudgedScan("1", row, record(1, problems=["look"]))])
+    with sqlite3.connect(path) as db:
+        db.execute(change)
+    with Store(path) as store:
+        with pytest.raises(InputError, match=r"list of judged images is not as it was written.*measure --retry"):
+            latest(store)
+        store.forget_damaged()
+        assert latest(store) is None
+        assert store.record(row) == record(1)
