@@ -21,7 +21,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from urllib.request import urlopen
+from urllib.request import HTTPCookieProcessor, build_opener
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("measure", "adjust", "pipeline", "synthetic_images")
@@ -140,7 +140,7 @@ def answers(reseau: Path, project: Path) -> bool:
         assert process.stdout is not None
         address = next((line.strip() for line in process.stdout if line.startswith("http")), "")
         try:
-            with urlopen(address) as page:
+            with build_opener(HTTPCookieProcessor).open(address) as page:  # the page sets one, and asks for it
                 return bool(page.status == 200)
         except (OSError, ValueError):
             return False
