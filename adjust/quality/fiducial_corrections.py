@@ -25,12 +25,13 @@ STILL_MM = 1e-9
 class Corrections:
     """What is left of a transformation to the given coordinates, of the kind that the films have in common.
 
-    corrections_mm (n, 2): estimated less given after it. by_places (2n, 2n): their derivatives by the estimated places.
+    corrections_mm (n, 2): estimated less given after it. by_unknowns (2n, 2n + k): their derivatives by the estimated
+    places and by the k parameters of the first film; k is 0 where the transformation does not begin in its comparator.
     """
 
     transformation: str
     corrections_mm: Array
-    by_places: Array
+    by_unknowns: Array
 
 
 def common_transformation(kinds: Collection[str]) -> str:
@@ -55,19 +56,20 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
     places_mm, given_mm (n, 2): of the same marks, estimated and given. The transformation goes from the comparator of
     the first film, if that is of the common kind: only there is the figure what such a film makes of it.
 
-    With x the places in the comparator, T the film, and T* the transformation with the design matrix G that fits the
-    given places best, corrections are T*(x) - given, and change by (I - G (G'G)^-1 G') T*'(x) T'(x)^-1 with the places.
+    With x the places in the comparator, T the film with the design matrix D, and T* the transformation with the design
+    matrix G that fits the given places best, corrections are T*(x) - given. They change by (I - G (G'G)^-1 G') T*' dx,
+    where dx = T'^-1 (dX - D dp) for changes dX of the places and dp of the film: what moves both alike changes nothing.
     """
     common = common_transformation([film.transformation for film in films])
     if 2 * len(places_mm) <= _parameters(common):
         return None
     count = len(places_mm)
-    source, back = places_mm, np.tile(np.eye(2), (count, 1, 1))
+    source, by_unknowns = places_mm, np.eye(2 * count)
     if films[0].transformation == common:
         source, regular = films[0].comparator_from_camera(places_mm)
         if not regular.all():
             return None
-        back = np.asarray(np.linalg.inv(films[0].gradient(source)), dtype=np.float64)
+        by_unknowns = _comparator_by_unknowns(films[0], source)
     parameters, mirrored = fit_transformation(common, source, places_mm)  # which agree, as marks hardly do
     kind = film_kind(common, mirrored)
     center, half = source.mean(axis=0), np.array(0.5 * np.ptp(source, axis=0).max())
@@ -79,6 +81,21 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
         if np.abs(design @ step).max() < STILL_MM:
             break
     projector = np.eye(len(design)) - design @ inverse
-    by_place = kind.gradient(parameters, source) @ back
-    by_places = np.einsum("inj,njk->ink", projector.reshape(2 * count, count, 2), by_place)
-    return Corrections(common, kind.apply(parameters, source) - given_mm, by_places.reshape(2 * count, 2 * count))
+    by_source = _by_coordinates(projector, kind.gradient(parameters, source))
+    return Corrections(common, kind.apply(parameters, source) - given_mm, by_source @ by_unknowns)
+
+
+def _comparator_by_unknowns(film: Film, xy_mm: Array) -> Array:
+    """The derivatives (2n, 2n + k) of comparator coordinates by the camera's and by the film's parameters."""
+    kind, half = film_kind(film.transformation, film.mirrored), np.array(0.5 * np.ptp(xy_mm, axis=0).max())
+    center = xy_mm.mean(axis=0)
+    by_film = kind.design(film.parameters, xy_mm, center, half).reshape(2 * len(xy_mm), -1)
+    by_film = by_film @ np.linalg.inv(kind.by_centred(film.parameters, center, half))
+    back = _by_coordinates(np.eye(2 * len(xy_mm)), np.linalg.inv(film.gradient(xy_mm)))
+    return np.hstack([back, -back @ by_film])
+
+
+def _by_coordinates(matrix: Array, by_place: Array) -> Array:
+    """A matrix (m, 2n) times that with the blocks (n, 2, 2) on its diagonal."""
+    by_pairs = matrix.reshape(len(matrix), -1, 2)
+    return np.einsum("inj,njk->ink", by_pairs, by_place).reshape(len(matrix), -1)

@@ -1,13 +1,13 @@
 """Fiducial marks, given against estimated, as a figure that is free of the datum in which the camera stands."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from adjust.functional_model.transformation import Film
+from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.parameter import Parameter
 from adjust.quality.fiducial_corrections import KEEPS_DISTANCES, corrections_to_given
 from pipeline.drawing import svg
@@ -104,19 +104,22 @@ def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
     )
 
 
-def figure_of_films(name: str, camera: Json, covariance: Covariance, films: Sequence[Film]) -> Figure | None:
-    """The same of a camera of which only fiducials were adjusted, with these films.
+def figure_of_films(name: str, camera: Json, covariance: Covariance, films: Mapping[str, Film]) -> Figure | None:
+    """The same of a camera of which only fiducials were adjusted, with these films by image.
 
     Nothing but the films holds the marks' figure: its datum takes up all that each film can. None where that is more
     than the marks tell.
     """
     ids, given, estimated = _marks(camera)
-    left = corrections_to_given(films, estimated, given) if len(ids) else None
+    left = corrections_to_given(list(films.values()), estimated, given) if len(ids) else None
     if left is None:
         return None
-    whole = covariance.of(_places(name, ids))
-    reduced = left.by_places @ whole @ left.by_places.T
-    distances = _distances(ids, estimated, given, whole) if left.transformation in KEEPS_DISTANCES else ()
+    image, first = next(iter(films.items()))
+    of_film = [Parameter.film(image, each) for each in film_parameter_names(first.transformation)]
+    whole = covariance.of([*_places(name, ids), *of_film[: left.by_unknowns.shape[1] - 2 * len(ids)]])
+    reduced = left.by_unknowns @ whole @ left.by_unknowns.T
+    of_places = whole[: 2 * len(ids), : 2 * len(ids)]
+    distances = _distances(ids, estimated, given, of_places) if left.transformation in KEEPS_DISTANCES else ()
     nothing = np.empty(0)
     changes = 1e3 * left.corrections_mm, 1e6 * reduced
     return Figure(ids, given, *changes, distances, left.transformation, nothing, nothing)

@@ -157,18 +157,18 @@ def calibrated_lens(camera: Json) -> tuple[Distortion, Array, Array]:
     return distortion, np.array(interior, dtype=float), np.array(values, dtype=float)
 
 
-def stored_films(content: Json, images: Iterable[str]) -> list[Film]:
-    """The film transformations of some images in the contents of adjustment.json, those of the first image first."""
+def stored_films(content: Json, images: Iterable[str]) -> dict[str, Film]:
+    """The film transformations of some images in the contents of adjustment.json, by image in their order."""
     places = defaultdict[str, list[tuple[float, float]]](list)
     for row in content["residuals"]:
         places[row["image"]].append((row["x_mm"], row["y_mm"]))
-    films = []
+    films = {}
     for image in images:
         stored = content["images"][image]["transformation"]
         names = film_parameter_names(stored["kind"])
         values = [math.radians(stored["angle_deg"]["value"]) if n == "angle" else stored[n]["value"] for n in names]
         low, high = np.min(places[image], axis=0), np.max(places[image], axis=0)
-        films.append(Film(stored["kind"], np.array(values, dtype=float), 0.5 * (low + high), stored["mirrored"]))
+        films[image] = Film(stored["kind"], np.array(values, dtype=float), 0.5 * (low + high), stored["mirrored"])
     return films
 
 

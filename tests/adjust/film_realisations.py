@@ -47,7 +47,7 @@ def frames(
     given = NOMINAL_MM[:marks]
     places = given + true_mm * rng.standard_normal(given.shape)
     ids = tuple(str(i + 1) for i in range(marks))
-    films = tuple(_film(kind, rng) for _ in range(count))
+    films = tuple(drawn_film(kind, rng) for _ in range(count))
     rows, values = [], dict[str, float]()
     for name, film in zip(names_of(count), films, strict=True):
         source, regular = film.comparator_from_camera(places)
@@ -56,10 +56,16 @@ def frames(
         values |= {f"T.{name}.{p}": float(v) for p, v in zip(film_parameter_names(kind), film.parameters, strict=True)}
     for id_, place in zip(ids, places, strict=True):
         values |= {f"FID.{CAMERA}.{id_}.{axis}": float(v) for axis, v in zip("xy", place, strict=True)}
-    fiducials = {i: Fiducial(Prior(x, stated_mm), Prior(y, stated_mm)) for i, (x, y) in zip(ids, given, strict=True)}
-    images = names_of(count)
+    return Frames(network_of(kind, given, stated_mm, np.array(rows)), places, films, values)
+
+
+def network_of(kind: Transformation, given_mm: Array, stated_mm: float, comparator_mm: Array) -> Network:
+    """Of marks (m, 2) as given, and as measured in n frames (n, m, 2)."""
+    count, marks = comparator_mm.shape[:2]
+    ids, images = tuple(str(i + 1) for i in range(marks)), names_of(count)
+    fiducials = {i: Fiducial(Prior(x, stated_mm), Prior(y, stated_mm)) for i, (x, y) in zip(ids, given_mm, strict=True)}
     kinds: tuple[ObservationKind, ...] = tuple("fiducial" for _ in range(count * marks))
-    network = Network(
+    return Network(
         (Camera(CAMERA, None, None, None, fiducials=fiducials),),
         tuple(Image(name, CAMERA, kind) for name in images),
         (),
@@ -67,18 +73,17 @@ def frames(
             tuple(np.repeat(images, marks).tolist()),
             ids * count,
             kinds,
-            np.concatenate(rows),
+            comparator_mm.reshape(-1, 2),
             np.tile(NOISE_MM**2 * np.eye(2), (len(kinds), 1, 1)),
         ),
     )
-    return Frames(network, places, films, values)
 
 
 def names_of(count: int) -> tuple[str, ...]:
     return tuple(f"f{i}" for i in range(count))
 
 
-def _film(kind: Transformation, rng: Generator) -> Film:
+def drawn_film(kind: Transformation, rng: Generator) -> Film:
     """One that turns, shifts, and does a little of all that its kind can."""
     turn, shift = rng.uniform(-0.03, 0.03), rng.normal(0.0, 3.0, 2)
     scale = 1.0 if kind == "congruent" else 1.0 + 1e-3 * rng.standard_normal()

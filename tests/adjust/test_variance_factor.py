@@ -11,7 +11,7 @@ from realisations import exact, realisation
 from reference_cases import load
 from scipy.stats import norm
 
-from adjust.functional_model.transformation import Film
+from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Transformation
 from adjust.problem.result import Adjustment, GivenGroup
@@ -69,7 +69,8 @@ def corrections_covariance(result: Adjustment) -> Array:
     films = [adjusted_image(result, image.name).film for image in result.network.images]
     found = corrections_to_given(films, places, given)
     assert found
-    return np.asarray(found.by_places @ (result.sigma0**2 * result.cofactor_of(names)) @ found.by_places.T)
+    names += [f"T.f0.{name}" for name in film_parameter_names(films[0].transformation)]
+    return np.asarray(found.by_unknowns @ (result.sigma0**2 * result.cofactor_of(names)) @ found.by_unknowns.T)
 
 
 def test_a_certificate_tells_sigma0_of_a_single_frame() -> None:

@@ -78,7 +78,7 @@ def form(kind: str, seed: int) -> Figure:
         ),
     )
     result = adjust(network, approximate(network))
-    films = [adjusted_image(result, name).film for name in names]
+    films = {name: adjusted_image(result, name).film for name in names}
     found = figure_of_films("K", stored(result), Known(result), films)  # type: ignore[arg-type]
     assert found is not None
     return found
