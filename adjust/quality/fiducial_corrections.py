@@ -91,11 +91,11 @@ def _comparator_by_unknowns(film: Film, xy_mm: Array) -> Array:
     center = xy_mm.mean(axis=0)
     by_film = kind.design(film.parameters, xy_mm, center, half).reshape(2 * len(xy_mm), -1)
     by_film = by_film @ np.linalg.inv(kind.by_centred(film.parameters, center, half))
-    back = _by_coordinates(np.eye(2 * len(xy_mm)), np.linalg.inv(film.gradient(xy_mm)))
+    back = _by_coordinates(np.eye(2 * len(xy_mm)), np.asarray(np.linalg.inv(film.gradient(xy_mm)), dtype=np.float64))
     return np.hstack([back, -back @ by_film])
 
 
 def _by_coordinates(matrix: Array, by_place: Array) -> Array:
     """A matrix (m, 2n) times that with the blocks (n, 2, 2) on its diagonal."""
     by_pairs = matrix.reshape(len(matrix), -1, 2)
-    return np.einsum("inj,njk->ink", by_pairs, by_place).reshape(len(matrix), -1)
+    return np.asarray(np.einsum("inj,njk->ink", by_pairs, by_place).reshape(len(matrix), -1))

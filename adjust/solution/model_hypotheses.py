@@ -131,7 +131,7 @@ def _bent_board(run: Run) -> Iterator[ModelHypothesis]:
     """All given points as a board that is bent, where they are a flat one."""
     network = run.problem.network
     places = known_places(network)
-    if network.boards or len(places) < len(network.observed_points):
+    if network.boards or not places or len(places) < len(network.observed_points):
         return
     try:
         board = Board(BOARD, places, (FREE, FREE))
