@@ -28,7 +28,7 @@ from true_marks import KIND, TrueMark, some_mark
 
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
-from measure.codes_and_boards.corners import junction
+from measure.boards.corners import junction
 from measure.frames.frame_fit import outliers
 from measure.noise.damage import _opened
 from measure.search.response_layers import peaks

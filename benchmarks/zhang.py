@@ -19,8 +19,8 @@ from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust
-from measure.codes_and_boards.board_specs import SquareGridSpec
-from measure.codes_and_boards.boards import measure_board
+from measure.boards.measure import measure_board
+from measure.boards.specs import SquareGridSpec
 from measure.scans.scan import open_scan
 
 Array = NDArray[np.float64]

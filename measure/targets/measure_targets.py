@@ -17,8 +17,7 @@ from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.status import Status
-from measure.targets.disks import SMALLEST_RADIUS_PX, UNIT_DISK, FittedDisk, fit_disk
-from measure.targets.dust import doubts
+from measure.targets.disks import SMALLEST_RADIUS_PX, UNIT_DISK, FittedDisk, doubts, fit_disk
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from measure.marks.shapes import Polarity
 from pipeline.text.tables import Table
 
 if TYPE_CHECKING:
-    from measure.codes_and_boards.board_specs import BoardSpec
+    from measure.boards.specs import BoardSpec
     from measure.targets.ring_codes import RingCode
 
 KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco", "squares")
@@ -98,7 +98,7 @@ def _polarity(table: Table) -> Polarity:
 
 
 def _board(kind: str, table: Table) -> "BoardSpec":
-    from measure.codes_and_boards.board_specs import (
+    from measure.boards.specs import (
         ArucoSpec,
         CharucoSpec,
         ChessboardSpec,

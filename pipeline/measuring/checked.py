@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NewType
 
+from measure.boards.coma import one_definition
 from measure.checks.judgement import judged
-from measure.codes_and_boards.coma import one_definition
 from measure.film import BelievedFilm
 from measure.results import FrameMeasurement
 from pipeline.files.camera_file import CameraFile

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.sheet_places import along_plane, is_flat
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate
+from measure.targets.consistency import along_plane, is_flat
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.ring_codes import read_code
 from pipeline.errors import InputError

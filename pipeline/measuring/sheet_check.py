@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.sheet_places import FLAT, SeenSheet, along_plane, sheet_points
 from measure.probabilities import SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.status import Status
-from measure.targets.consistency import ImagePoints, compared_together
+from measure.targets.consistency import FLAT, ImagePoints, SeenSheet, along_plane, compared_together, sheet_points
 from pipeline.files.project_file import Project
 from pipeline.measuring.coded_points import CodedPoints
 from pipeline.results.measured_scan import MeasuredScan

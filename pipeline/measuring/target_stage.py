@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.initial_values.resection import resect
-from measure.codes_and_boards.boards import measure_board
+from measure.boards.measure import measure_board
 from measure.reason import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan

@@ -14,21 +14,20 @@ from real_data import DATA, needs
 from scipy.io import loadmat
 from scipy.spatial import KDTree
 
-from measure.codes_and_boards.board_specs import (
+from measure.boards.coma import one_definition
+from measure.boards.find import is_even, whole_pattern
+from measure.boards.markers import ReadMarkers, off_corners
+from measure.boards.measure import BoardMeasurement, measure_board
+from measure.boards.specs import (
     ArucoSpec,
     BoardSpec,
     CharucoSpec,
     ChessboardSpec,
     CircleGridSpec,
+    FoundCorner,
     SquareGridSpec,
     aruco_dictionary,
 )
-from measure.codes_and_boards.boards import BoardMeasurement, measure_board
-from measure.codes_and_boards.chessboard_lines import is_even, whole_pattern
-from measure.codes_and_boards.coma import one_definition
-from measure.codes_and_boards.found_board import FoundCorner
-from measure.codes_and_boards.marker_boards import off_corners
-from measure.codes_and_boards.marker_reading import ReadMarkers
 from measure.covariance import Covariance
 from measure.results import MarkMeasurement
 from measure.scans.scan import open_scan

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
-from measure.codes_and_boards.corners import Corner, Surface, crossing, fit_corner, quarter
+from measure.boards.corners import Corner, Surface, crossing, fit_corner, quarter
 from measure.matching.window import ScanWindow
 
 Array = NDArray[np.float64]

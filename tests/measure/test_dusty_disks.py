@@ -7,8 +7,7 @@ from drawn import drawn, ellipse, scan_of, whitened
 from measure.covariance import Covariance
 from measure.matching.covariance import SecondPlace
 from measure.status import Status
-from measure.targets.disks import FittedDisk
-from measure.targets.dust import doubts
+from measure.targets.disks import FittedDisk, doubts
 from measure.targets.measure_targets import TargetPrediction, measure_disks
 
 CONTRAST, GROUND = 15000.0, 25000.0

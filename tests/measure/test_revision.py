@@ -13,8 +13,8 @@ from drawn import drawn, ellipse, scan_of
 from drawn_frames import NUMBERED, frame_picture, layout_of, measured, pixel_from_camera
 from scipy.ndimage import gaussian_filter
 
-from measure.codes_and_boards.board_specs import ChessboardSpec
-from measure.codes_and_boards.boards import measure_board
+from measure.boards.measure import measure_board
+from measure.boards.specs import ChessboardSpec
 from measure.fiducial_options import FiducialOptions
 from measure.marks.shapes import MarkShape, polygon, turned_part
 from measure.results import MarkMeasurement

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from measure.codes_and_boards.board_specs import ChessboardSpec, CircleGridSpec
+from measure.boards.specs import ChessboardSpec, CircleGridSpec
 from measure.marks import shapes
 from measure.scans.scan import open_scan
 from pipeline.adjusting.adjust_stage import adjust_marks

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from brute_marks import brute_picture, placed
 
-from measure.codes_and_boards.board_specs import ChessboardSpec
-from measure.codes_and_boards.boards import measure_board
+from measure.boards.measure import measure_board
+from measure.boards.specs import ChessboardSpec
 from measure.marks.shapes import MarkShape, ring_cross
 from measure.matching.match import match
 from measure.matching.window import ScanWindow

@@ -1,0 +1,274 @@
+"""Search for a calibration board in a reduced scan, to a pixel: chessboards here, other boards by their own modules."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.boards.lattice import NoSquareGridError, find_squares
+from measure.boards.markers import find_aruco, find_charuco
+from measure.boards.specs import (
+    ArucoSpec,
+    CharucoSpec,
+    ChessboardSpec,
+    FoundBoard,
+    FoundCorner,
+    SquareGridSpec,
+    corners_of_square,
+)
+from measure.reason import NO_REASON, Code, Reason
+from measure.scans.scan import Scan
+from measure.targets.sheets import robust_view
+
+Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+_UNEVEN = 0.25  # of a square, that a corner lies off an even grid: beside a line that is left out it is a half
+_INTO_SQUARE = 0.3  # of its sides: where the grey value of a square is taken
+_CROSSING = 0.25  # of the board's contrast: more between all neighbours of the four squares makes a crossing
+_SMOOTHED_PX = 10.0  # squares from this side on are looked at over 3 x 3 pixels
+_MOST_LINES = 500  # of a board, along a side
+_THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+_DRAWINGS = 3  # of the chessboard detector's random numbers for a second board: one in twenty missed one at the edge
+_LEAST = 3  # lines that a chessboard has in either direction
+_FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
+_LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
+
+
+@dataclass(frozen=True, eq=False)
+class WholePattern:
+    """The pattern that a grid belongs to: grid (rows, columns, 2), grown to where the pattern ends; is_bounded: whether
+    the picture shows its end on all four sides."""
+
+    grid: Array
+    is_bounded: bool
+
+
+def is_even(grid: Array, size_px: tuple[int, int]) -> bool:
+    """Whether the lines of corners (rows, columns, 2) lie evenly under one homography and a lens's radial distortion,
+    wherever the detector put single corners."""
+    rows, columns = grid.shape[:2]
+    places = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
+    view = robust_view(places, grid.reshape(-1, 2), size_px)
+    if view is None:
+        return False
+    off = np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / _shorter_steps(grid)
+    return all(np.median(line) < _UNEVEN for line in (*off, *off.T))
+
+
+def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:
+    """The pattern that a grid is a part of; None where the grid's own lines are not all lines of crossings."""
+    if _shorter_steps(grid).min() > _SMOOTHED_PX:
+        picture = np.asarray(cv2.blur(picture, (3, 3)), np.uint8)
+    crossings = _crossing_contrast(picture, grid)
+    contrast = float(np.median(crossings))
+    if contrast < 0:
+        crossings, contrast = -crossings, -contrast
+    seen = crossings > _CROSSING * contrast
+    if not (contrast > 0 and all(2 * line.sum() >= len(line) for line in (*seen, *seen.T))):
+        return None
+    is_bounded = True
+    for _ in range(4):
+        grid, ends = _grown(picture, grid, contrast)
+        is_bounded &= ends
+        grid = np.rot90(grid)
+    return WholePattern(grid, is_bounded)
+
+
+def _grown(picture: Bytes, grid: Array, contrast: float) -> tuple[Array, bool]:
+    """The grid with the pattern's further lines before its first row, and whether the picture shows where it ends."""
+    parity = np.sign(np.median(_crossing_contrast(picture, grid)))
+    while True:
+        line = 3 * grid[0] - 3 * grid[1] + grid[2]
+        further = np.concatenate([line[None], grid])
+        height, width = picture.shape
+        inside = np.all((line > 0) & (line < (width - 1, height - 1)), axis=1)
+        if 2 * inside.sum() < len(inside):
+            return grid, False
+        parity = -parity
+        crossings = parity * _crossing_contrast(picture, further[:3])[0]
+        if 2 * np.sum(crossings[inside] > _CROSSING * contrast) < inside.sum() or len(further) > _MOST_LINES:
+            return grid, True
+        grid = further
+
+
+def _crossing_contrast(picture: Bytes, grid: Array) -> Array:
+    """(rows, columns) the least difference in grey value between neighbours of the four squares about each corner, with
+    the sign that the first corner's has; 0 where light and dark do not alternate about it."""
+    right, down = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
+    corners = [grid + _INTO_SQUARE * (x * right + y * down) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    columns_rows = np.concatenate(corners).astype(np.float32)
+    columns, rows = columns_rows[..., 0], columns_rows[..., 1]
+    grey = cv2.remap(picture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    a, b, c, d = np.split(grey, 4)
+    between = np.stack([a - b, c - b, c - d, a - d])
+    alternating = np.maximum(between.min(axis=0), 0.0) + np.minimum(between.max(axis=0), 0.0)
+    return np.asarray(alternating * np.where(np.indices(grid.shape[:2]).sum(axis=0) % 2, -1.0, 1.0))
+
+
+def _shorter_steps(grid: Array) -> Array:
+    """(rows, columns) the shorter of the steps to the next column and the next row, px."""
+    across, down = (np.hypot(*np.moveaxis(np.gradient(grid, axis=axis), 2, 0)) for axis in (1, 0))
+    return np.asarray(np.minimum(across, down))
+
+
+def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
+    """All inner corners of a chessboard that is wholly seen, and whether it is the only one. A board of another count
+    is refused, with its count: its corners would have their neighbours' names."""
+    size_px = (picture.shape[1], picture.shape[0])
+    other_size: WholePattern | None = None
+    for grid in _grids(picture, spec):
+        pattern = whole_pattern(picture, grid) if is_even(grid, size_px) else None
+        if pattern is None:
+            continue
+        if pattern.grid.shape == grid.shape == (spec.rows, spec.columns, 2):
+            corners = {
+                f"r{row}c{column}": FoundCorner(grid[row, column], steps)
+                for (row, column), steps in np.ndenumerate(_grid_steps(grid))
+            }
+            return FoundBoard(corners, others_px=_other_chessboards(picture, grid, spec))
+        other_size = pattern
+    return FoundBoard({}, Reason(_refusal(spec, other_size), Code.NO_BOARD))
+
+
+def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
+    """Why there is no board of the count that is asked for, with the count that fits, if there is one."""
+    told = f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen"
+    if pattern is None:
+        return told
+    rows, columns = pattern.grid.shape[:2]
+    both = ((columns, rows), (rows, columns))  # nothing tells which are the rows
+    columns, rows = min(both, key=lambda one: ((one[0] - spec.columns) ** 2 + (one[1] - spec.rows) ** 2, -one[0]))
+    told += f"; one of {columns} x {rows} is"
+    if (columns, rows) == (spec.columns - 1, spec.rows - 1):
+        return f"{told}: squares may have been counted in place of inner corners, which columns and rows count"
+    if columns > spec.columns or rows > spec.rows or pattern.is_bounded:
+        return f"{told}. Set columns and rows to the count of the board's inner corners"
+    return f"{told}, and the rest may lie outside of the scan"
+
+
+def _grids(picture: Bytes, spec: ChessboardSpec) -> Iterator[Array]:
+    """(rows, columns, 2) grids of corners that may be the board, those of the most reliable detector first; the last is
+    of any count."""
+    for flags in (_THOROUGHLY, 0):
+        grid = _drawn_chessboard_grid(picture, spec, flags, drawings=1)
+        if grid is not None:
+            yield _right_handed(grid)
+    # The older detector can search for minutes in vain; its fast check refuses a picture without squares first.
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    found, corners = cv2.findChessboardCorners(picture, (spec.columns, spec.rows), flags=flags)
+    if found:
+        yield _right_handed(np.asarray(corners, float).reshape(spec.rows, spec.columns, 2))
+    cv2.setRNGSeed(1)
+    flags = _THOROUGHLY | cv2.CALIB_CB_LARGER
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, (_LEAST, _LEAST), flags)
+    if found:
+        grid = np.asarray(corners, float).reshape(*meta.shape, 2)
+        is_turned = meta.shape == (spec.columns, spec.rows)
+        yield _right_handed(grid.transpose(1, 0, 2) if is_turned else grid)
+
+
+def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, drawings: int) -> Array | None:
+    """(rows, columns, 2) as the newer detector sees them. It draws random numbers: always the same ones here, lest a
+    result depend on what was searched before it."""
+    for seed in range(1, drawings + 1):
+        cv2.setRNGSeed(seed)
+        found, corners = cv2.findChessboardCornersSB(picture, (spec.columns, spec.rows), flags=flags)
+        if found:
+            return np.asarray(corners, float).reshape(spec.rows, spec.columns, 2)
+    return None
+
+
+def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tuple[Array, ...]:
+    """The middles of the chessboards beside those that were found, each painted over before the next is sought."""
+    picture, background = picture.copy(), int(np.median(picture))
+    others: list[Array] = []
+    while True:
+        cv2.fillConvexPoly(picture, np.round(_outline(grid)).astype(np.int32), background)
+        other = _drawn_chessboard_grid(picture, spec, _THOROUGHLY, _DRAWINGS)
+        if other is None:
+            return tuple(others)
+        grid = other
+        others.append(grid.mean(axis=(0, 1)))
+
+
+def _outline(grid: Array) -> Array:
+    """(n, 2) the convex outline of a chessboard's squares: its inner corners and a step beyond them."""
+    columns = np.concatenate([2 * grid[:, :1] - grid[:, 1:2], grid, 2 * grid[:, -1:] - grid[:, -2:-1]], axis=1)
+    squares = np.concatenate([2 * columns[:1] - columns[1:2], columns, 2 * columns[-1:] - columns[-2:-1]])
+    return np.asarray(cv2.convexHull(squares.reshape(-1, 2).astype(np.float32)), float).reshape(-1, 2)
+
+
+def _right_handed(grid: Array) -> Array:
+    """A (rows, columns, 2) grid of which the columns' direction, then the rows', turn as column and row of a scan."""
+    across, down = grid[:, -1] - grid[:, 0], grid[-1] - grid[0]
+    turn = np.linalg.det(np.stack([across.mean(axis=0), down.mean(axis=0)]))
+    return grid if turn > 0 else grid[:, ::-1]
+
+
+def _grid_steps(grid: Array) -> NDArray[np.object_]:
+    """(rows, columns) of (2, 2) matrices: the grid's steps to the right and down at each of its points."""
+    steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1)
+    result = np.empty(grid.shape[:2], object)
+    for place in np.ndindex(*result.shape):
+        result[place] = steps[place]
+    return result
+
+
+def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec) -> FoundBoard:
+    """Search a board at a size that shows it whole, then finer: small boards in large scans need it."""
+    for factor in _search_factors(scan):
+        picture, reason = _searchable(scan, factor)
+        if reason:
+            return FoundBoard({}, reason)
+        if isinstance(spec, ChessboardSpec):
+            found = find_chessboard(picture, spec)
+        elif isinstance(spec, CharucoSpec):
+            found = find_charuco(picture, spec)
+        elif isinstance(spec, SquareGridSpec):
+            found = _find_squares(picture, spec)
+        else:
+            found = find_aruco(picture, spec)
+        if found.corners:
+            corners = {name: _in_scan(corner, factor) for name, corner in found.corners.items()}
+            return replace(found, corners=corners, others_px=tuple(_scan_px(one, factor) for one in found.others_px))
+    return found
+
+
+def _search_factors(scan: Scan) -> list[int]:
+    """Reductions of the scan to search, the coarsest first."""
+    longest = max(scan.width_px, scan.height_px)
+    coarse, fine = (max(round(longest / size), 1) for size in (_FIRST_SIZE_PX, _LAST_SIZE_PX))
+    return [coarse] if coarse == fine else [coarse, fine]
+
+
+def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
+    """The reduced scan stretched to 8 bits, and why there is nothing to search in it, if so."""
+    grey = scan.reduced(factor)
+    low, high = np.percentile(grey, (1, 99))
+    if high - low < _LEAST_CONTRAST * scan.full_scale_dn:
+        share = 100 * (high - low) / scan.full_scale_dn
+        told = f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
+        return np.zeros((1, 1), np.uint8), Reason(told, Code.CONTRAST)
+    return np.clip((grey - low) * (255 / (high - low)), 0, 255).astype(np.uint8), NO_REASON
+
+
+def _in_scan(corner: FoundCorner, factor: int) -> FoundCorner:
+    return FoundCorner(_scan_px(corner.center_px, factor), corner.steps_px * factor)
+
+
+def _scan_px(place_px: Array, factor: int) -> Array:
+    """Pixel (i, j) of a reduced picture has its centre at factor j + (factor - 1) / 2."""
+    return place_px * factor + (factor - 1) / 2
+
+
+def _find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:
+    """The corners of separate squares; steps are the square's sides that leave the corner."""
+    try:
+        squares, notes, others = find_squares(picture, spec)
+    except NoSquareGridError as error:
+        return FoundBoard({}, Reason(str(error), Code.NO_BOARD))
+    corners = {id: corner for name, four in squares.items() for id, corner in corners_of_square(name, four).items()}
+    return FoundBoard(corners, others_px=others, notes=notes)

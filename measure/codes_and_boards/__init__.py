@@ -1,1 +1,0 @@
-"""Targets that name themselves: ring codes, sheets of dots, calibration boards."""
