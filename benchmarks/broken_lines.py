@@ -70,12 +70,12 @@ LINES = (
     ),
     Broken("measure/marks/coverage.py", "* part.line_mm / 2\n", "* part.line_mm / 1.9\n", "measure/test_coverage.py"),
     Broken(
-        "measure/scans/radiometry.py",
+        "measure/scans/metadata.py",
         " if self.inverted else samples",
         " if False else samples",
         "measure/test_scan_formats.py",
     ),
-    Broken("measure/scans/tone.py", "** 2.4)", "** 2.2)", "measure/test_tone.py"),
+    Broken("measure/tone/curve.py", "** 2.4)", "** 2.2)", "measure/test_tone.py"),
     Broken(
         "measure/scans/compression.py",
         "/ max(abs(contrast_dn), 1e-9)) ** 2",

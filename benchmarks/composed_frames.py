@@ -25,8 +25,8 @@ from search_frames import Case
 
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from measure.special_marks.learned import cut, template_of
 

@@ -28,8 +28,8 @@ from measure.frames.frame_measurement import measure_frame
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, dot, polygon, ring_cross, ring_dot
 from measure.reason import NO_REASON
 from measure.results import FrameMeasurement, Pose
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.status import Status

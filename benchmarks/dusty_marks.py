@@ -19,8 +19,8 @@ from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.matching.match import match
 from measure.matching.window import ScanWindow
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.status import Status

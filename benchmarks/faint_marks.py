@@ -24,8 +24,8 @@ from true_marks import KINDS, Kind, TrueMark, some_mark
 from measure.fiducial_options import FiducialOptions
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.shapes import FiducialLayout
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

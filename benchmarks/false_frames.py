@@ -17,8 +17,8 @@ import numpy as np
 from search_frames import PITCH_UM, Case, draw_case
 
 from measure.fiducials import measure_fiducials
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from measure.status import Status
 

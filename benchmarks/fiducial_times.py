@@ -46,8 +46,8 @@ from measure.marks.shapes import FiducialLayout
 from measure.matching.fit import PictureFit
 from measure.scans.scan import open_scan
 from measure.scans.tiff_segments import TiffSegments
-from measure.scans.tone import LINEAR, Tone
 from measure.search.frame_search import FrameSearch
+from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 
 STAGES: dict[str, list[tuple[Any, str]]] = {

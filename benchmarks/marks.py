@@ -36,7 +36,7 @@ from true_marks import (
     whitened_rms,
 )
 
-from measure.scans.compression import rounding_step_dn
+from measure.scans.jpeg import rounding_step_dn
 
 Array = NDArray[np.float64]
 

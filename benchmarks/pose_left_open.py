@@ -24,7 +24,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polarity, polygon, turned
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.scans.tone import Tone
+from measure.tone.curve import Tone
 from synthetic_images.scene import Tones
 
 Json = dict[str, Any]

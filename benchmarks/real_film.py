@@ -24,7 +24,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.scans.scan import open_scan
-from measure.scans.tone import LINEAR, Tone
+from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path
 

@@ -24,11 +24,11 @@ from measure.covariance import Cause, Covariance
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan, open_scan
-from measure.scans.tone import LINEAR, Tone
 from measure.status import Status
+from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path
 

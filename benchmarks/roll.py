@@ -21,8 +21,8 @@ from measure.fiducials import measure_fiducials
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, WrittenPlace, ring_cross
 from measure.results import FrameMeasurement
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from pipeline.measuring.roll import known_lines
 from synthetic_images.background import scene_background

@@ -23,8 +23,8 @@ from measure.marks.shapes import (
     turned,
     turned_part,
 )
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from pipeline.rendered.scene_file import scene_mark
 from synthetic_images.film import FrameGeometry

@@ -31,8 +31,8 @@ from measure.covariance import Cause
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.results import FrameMeasurement
-from measure.scans.tone import SaidOfTone, Tone
 from measure.status import Status
+from measure.tone.curve import SaidOfTone, Tone
 
 Row = dict[str, Any]
 

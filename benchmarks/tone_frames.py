@@ -22,9 +22,9 @@ from measure.marks.shapes import (
     ring_cross,
     turned_part,
 )
-from measure.scans.compression import rounding_step_dn
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.jpeg import rounding_step_dn
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from synthetic_images.frame import frame_truth
 from synthetic_images.scene import (

@@ -24,8 +24,8 @@ from measure.frames.frame_edges import told_by_edges
 from measure.frames.frame_sighter import FrameSighter
 from measure.frames.refinement import sight
 from measure.marks.frame_border import at_border
-from measure.scans.tone import SaidOfTone, Tone
 from measure.search.constellation import Placement
+from measure.tone.curve import SaidOfTone, Tone
 from synthetic_images.tone_curve import coded
 
 Array = NDArray[np.float64]

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import FrameMeasurement
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from synthetic_images.frame import frame_truth
 from synthetic_images.scene import (

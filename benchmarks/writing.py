@@ -28,8 +28,8 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Side, WrittenPlace, ring_cross
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from synthetic_images.scene import (
     Background,

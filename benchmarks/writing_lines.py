@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from measure.annotations.detect_text import MISSING, networks
 from measure.annotations.read import read_writing
 from measure.marks.poses import POSES, pose_in_camera
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from synthetic_images.areas import coverage
 from synthetic_images.writing import FONTS, written_area

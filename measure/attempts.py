@@ -22,7 +22,7 @@ from measure.marks.shapes import FiducialLayout
 from measure.pose.pose_decision import decide_pose
 from measure.probabilities import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE
 from measure.results import Pose
-from measure.scans.addresses import Address
+from measure.scans.remote import Address
 from measure.scans.scan import Scan
 from measure.search.centred_frame import is_worth_a_look, outermost
 from measure.search.constellation import Placement

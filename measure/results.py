@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from measure.annotations.line import Line
 from measure.covariance import Covariance
 from measure.reason import NO_REASON, Code, Reason
-from measure.scans.told_tone import FrameTone
 from measure.status import Status
+from measure.tone.estimate import FrameTone
 
 Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # what is a place of the film, and no point of the object

@@ -12,7 +12,7 @@ from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement
 from measure.scans.scan import Scan
 from measure.scans.scan_part import Window
-from measure.scans.scan_window import windowed
+from measure.scans.scan_views import windowed
 from measure.status import Status
 
 Array = NDArray[np.float64]

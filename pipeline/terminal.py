@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
-from measure.scans.addresses import public_text
+from measure.scans.remote import public_text
 
 SPELLED = {
     "σ": "sigma", "µ": "u", "μ": "u", "±": "+-", "₀": "0", "²": "^2", "°": " deg", "×": "x", "′": "'", "–": "-",

@@ -9,7 +9,7 @@ import numpy as np
 
 from measure.errors import MeasurementError
 from measure.results import MarkMeasurement
-from measure.scans.addresses import scan_path
+from measure.scans.remote import scan_path
 from measure.scans.scan import Scan, open_scan
 from pipeline.archive.thumbnails import ThumbnailStore, thumbnails_path
 from pipeline.errors import InputError

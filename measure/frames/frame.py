@@ -11,10 +11,10 @@ from measure.frames.refinement import Sighting
 from measure.matching.match import Match
 from measure.probabilities import LARGE_ERROR
 from measure.reason import NO_REASON, Code, Reason
-from measure.scans.told_tone import FrameTone
-from measure.scans.tone import LINEAR
 from measure.search.constellation import Placement
 from measure.status import Status
+from measure.tone.curve import LINEAR
+from measure.tone.estimate import FrameTone
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

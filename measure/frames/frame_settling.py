@@ -29,8 +29,8 @@ from measure.matching.models import is_round
 from measure.noise.noise_model import may_be_noise
 from measure.probabilities import LARGE_ERROR
 from measure.reason import Code, Reason
-from measure.scans.told_tone import FrameTone, ToldTone
-from measure.scans.tone import SaidOfTone, Tone
+from measure.tone.curve import SaidOfTone, Tone
+from measure.tone.estimate import FrameTone, ToldTone
 
 Array = NDArray[np.float64]
 

@@ -20,10 +20,10 @@ from measure.probabilities import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
 from measure.reason import Reason
 from measure.scans.parallel import side_by_side
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
-from measure.scans.told_tone import FrameTone
 from measure.search.constellation import NARROW, Placement, sign_of
 from measure.search.correlation import CLOSE
 from measure.search.prediction import MarkPrediction
+from measure.tone.estimate import FrameTone
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

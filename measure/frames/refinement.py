@@ -15,10 +15,10 @@ from measure.noise.grain import BESIDE_PX
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.compression import covariance_of_compression, tone_variance
 from measure.scans.scan import Scan
-from measure.scans.tone import LINEAR
 from measure.search.candidates import FAINT
 from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_corner import corner_of_edges
+from measure.tone.curve import LINEAR
 
 Array = NDArray[np.float64]
 

@@ -40,7 +40,7 @@ from measure.matching.window import Coding, ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, noise_model, products
 from measure.reason import Reason
-from measure.scans.told_tone import ToldTone
+from measure.tone.estimate import ToldTone
 
 __all__ = ["Match", "MatchOptions", "match", "window_about"]
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.models import GREY
 from measure.noise.noise_model import combined, products
-from measure.scans.told_tone import ToldTone
-from measure.scans.tone import SaidOfTone, Tone
+from measure.tone.curve import SaidOfTone, Tone
+from measure.tone.estimate import ToldTone
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -12,7 +12,7 @@ from measure.marks.shapes import Mark
 from measure.matching.rounding import rounding_step
 from measure.matching.saturation import Sides, clipped_sides
 from measure.scans.scan import Scan
-from measure.scans.tone import LINEAR, Tone
+from measure.tone.curve import LINEAR, Tone
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -1,22 +1,21 @@
 """What a scan's file says of itself in its head, without any pixel of it."""
 
-import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.broken import DECODING_ERRORS, broken
-from measure.scans.jpeg_stream import picture_form
-from measure.scans.picture_scan import JPEG_START, PNG_START, jpeg_pitch, no_picture, png_pitch
-from measure.scans.resolution import Pitch
-from measure.scans.scan import first_bytes, open_scan
-from measure.scans.size_limit import check_size
-from measure.scans.tiff_scan import TIFF_STARTS, open_tiff
+from measure.scans.file_checks import DECODING_ERRORS, broken, check_size, first_bytes, no_picture
+from measure.scans.jpeg import JPEG_START, jpeg_colour_tags, jpeg_pitch, picture_form
+from measure.scans.metadata import Pitch
+from measure.scans.png import PNG_START, png_colour_tags, png_form, png_pitch
+from measure.scans.scan import open_scan
+from measure.scans.tiff import TIFF_STARTS, open_tiff, tiff_colour_tags
+from measure.tone.curve import Tone
+from measure.tone.declared import tone_of_tags
 
 _HEADERS_BYTES = 1 << 18  # of a JPEG or PNG file, before its picture: profiles and Exif blocks take less
 _END_BYTES = 1 << 16  # in which nearly every JPEG or PNG file that is whole has its end marker
-_PNG_HEADER = ">IIBB"  # width, height, bits and kind of colour (PNG specification, 11.2.2)
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 1, 6: 3}  # by that kind, without transparency; a palette has colours
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         form, marker, pitch = picture_form(data), b"\xff\xd9", jpeg_pitch(data)
         file_format = "JPEG"
     else:
-        form, marker, pitch = _png_form(data), b"IEND", png_pitch(data)
+        form, marker, pitch = png_form(data), b"IEND", png_pitch(data)
         file_format = "PNG"
     if form is None or 0 in form:
         raise broken(path, "its header is cut short")
@@ -62,6 +61,23 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
     width, height, channels, bits = form
     check_size(path, "a picture", (width, height), width * height * channels, path.stat().st_size, max_pixels)
     return ScanHead(file_format, width, height, min(channels, 3), bits, pitch)
+
+
+def declared_tone(path: Path) -> Tone | None:
+    """The tone curve that a file declares.
+
+    Returns
+    -------
+    None where the file says nothing that can be used. Nothing is raised for what it holds.
+    """
+    try:
+        with path.open("rb") as opened:
+            start = opened.read(16)
+        if start[:2] in (b"II", b"MM"):
+            return tone_of_tags(tiff_colour_tags(path))
+        return tone_of_tags(png_colour_tags(path) if start.startswith(PNG_START) else jpeg_colour_tags(path))
+    except (*DECODING_ERRORS, zlib.error):
+        return None
 
 
 def _head_and_end(path: Path) -> tuple[bytes, bytes]:
@@ -74,12 +90,3 @@ def _head_and_end(path: Path) -> tuple[bytes, bytes]:
         raise MeasurementError(
             f"{path} cannot be read: {error.strerror}; check that it is a file you may read"
         ) from error
-
-
-def _png_form(data: bytes) -> tuple[int, int, int, int] | None:
-    """Width, height, channels and bits; the header is the first chunk."""
-    try:
-        width, height, bits, kind = struct.unpack(_PNG_HEADER, data[16:26])
-        return width, height, _PNG_CHANNELS[kind], bits
-    except DECODING_ERRORS:
-        return None

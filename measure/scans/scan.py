@@ -13,18 +13,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.errors import MeasurementError, MissingError
-from measure.scans.addresses import Address, scan_path
+from measure.errors import MeasurementError
+from measure.scans.cache import LostPart, OpenedPicture, SegmentCache, Segments
 from measure.scans.compression import earlier_step_dn
+from measure.scans.file_checks import first_bytes, no_picture
+from measure.scans.jpeg import JPEG_START, open_jpeg
+from measure.scans.metadata import Pitch, Samples
 from measure.scans.parallel import side_by_side
-from measure.scans.picture_scan import open_picture
-from measure.scans.radiometry import Samples
-from measure.scans.resolution import Pitch
+from measure.scans.png import PNG_START, open_png
+from measure.scans.remote import Address, scan_path
 from measure.scans.scan_part import ScanPart
-from measure.scans.segments import LostPart, OpenedPicture, SegmentCache, Segments
-from measure.scans.tiff_scan import TIFF_STARTS, open_tiff
+from measure.scans.tiff import TIFF_STARTS, open_tiff
 from measure.scans.tiff_segments import RawRows
-from measure.scans.tone import LINEAR, Tone
+from measure.tone.curve import LINEAR, Tone
 
 Array = NDArray[np.float32]
 
@@ -366,7 +367,7 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     """Open a TIFF, BigTIFF, JPEG or PNG file, told apart by its first bytes and not by its name; path: of a file, or
     an address as `Address` has it.
 
-    max_pixels: how many a scan may have; None: as many as `size_limit` says.
+    max_pixels: how many a scan may have; None: as many as `check_size` says.
     Raises MeasurementError, with what to do, for a file that is missing, empty, truncated or no such picture,
     UnreachableError for an address that does not answer.
     """
@@ -374,7 +375,7 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     start = first_bytes(path)
     if isinstance(path, ScanPart) and (path.page or 1) > 1 and start[:4] not in TIFF_STARTS:
         raise MeasurementError(f"{path}: such a file has one page: take `page` out of images.csv")
-    opened = open_tiff(path, max_pixels) if start[:4] in TIFF_STARTS else open_picture(path, start, max_pixels)
+    opened = _opened_picture(path, start, max_pixels)
     segments = opened.segments
     is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px
     if isinstance(path, Address) and is_one:
@@ -383,24 +384,15 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     return Scan(path, segments, opened.pitch, opened)
 
 
-def first_bytes(path: Path) -> bytes:
-    """The file's first 16 bytes, or why there are none. A pipe or a device is not opened: either may never end."""
-    try:
-        if path.exists() and not (path.is_file() or path.is_dir()):
-            raise MeasurementError(f"{path} is no regular file, but a pipe or a device: give the file of a scan")
-        with path.open("rb") as file:
-            start = file.read(16)
-    except FileNotFoundError:
-        raise MissingError(
-            f"there is no scan {path} (looked for {path.absolute()}): check its name and its folder"
-        ) from None
-    except OSError as error:
-        raise MeasurementError(
-            f"{path} cannot be read: {error.strerror}; check that it is a file you may read"
-        ) from error
-    if not start:
-        raise MeasurementError(f"{path} is empty (0 bytes): copy or scan it anew")
-    return start
+def _opened_picture(path: Path, start: bytes, max_pixels: int | None) -> OpenedPicture:
+    """start: the file's first bytes, by which its format is told."""
+    if start[:4] in TIFF_STARTS:
+        return open_tiff(path, max_pixels)
+    if start.startswith(JPEG_START):
+        return open_jpeg(path, max_pixels)
+    if start.startswith(PNG_START):
+        return open_png(path, max_pixels)
+    raise no_picture(path, start)
 
 
 def weighted(samples: Samples | Array, weights: Sequence[float]) -> Array:

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from tifffile import TIFF, TiffFile, TiffPage
 from tifffile.tifffile import jpeg_decode_colorspace
 
-from measure.scans.addresses import Address
-from measure.scans.broken import DECODING_ERRORS, broken, unsupported
-from measure.scans.jpeg_stream import decoded
-from measure.scans.radiometry import Radiometry, Samples
-from measure.scans.segments import LostPart, Place
+from measure.scans.cache import LostPart, Place
+from measure.scans.file_checks import DECODING_ERRORS, broken, unsupported
+from measure.scans.jpeg import decoded
+from measure.scans.metadata import JPEG_COMPRESSIONS, Radiometry, Samples
+from measure.scans.remote import Address
 
-JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
 _PLAIN = 1
 _INTO_MEMORY = (5, 8, 32773, 32946, 34926, 50000)  # LZW, deflate, PackBits, zstd: these give bytes
 _MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time; larger tiles and strips are not copied

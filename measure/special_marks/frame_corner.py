@@ -13,10 +13,10 @@ from measure.marks.shapes import FrameCorner
 from measure.matching.match import Match
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
-from measure.scans.told_tone import ToldTone
-from measure.scans.tone import Tone
 from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_edge import Course, Edge, edge_along, said_by_edges
+from measure.tone.curve import Tone
+from measure.tone.estimate import ToldTone
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from scipy.special import erf
 
 from measure.noise.robust_estimation import gauss_newton_step, tukey_fit
 from measure.scans.scan import Scan
-from measure.scans.tone import SaidOfTone, Tone
 from measure.search.candidates import FAINT
+from measure.tone.curve import SaidOfTone, Tone
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

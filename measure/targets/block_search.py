@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from measure.scans.metadata import Samples
 from measure.scans.parallel import side_by_side
-from measure.scans.radiometry import Samples
 from measure.scans.scan import Scan, means, weighted
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from adjust.problem.result import Adjustment
 from measure.checks.lost_pixels import without_lost
 from measure.reason import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
-from measure.scans.addresses import location_of, scan_path
+from measure.scans.remote import location_of, scan_path
 from measure.scans.scan import open_scan
 from measure.status import Status
 from measure.targets.measure_targets import TargetPrediction

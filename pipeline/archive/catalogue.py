@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.addresses import Address, addresses_below
 from measure.scans.head import ScanHead, read_head
+from measure.scans.remote import Address, addresses_below
 from pipeline.archive.identity import content_hash, parts_hash
 from pipeline.errors import InputError
 from pipeline.files.scan_patterns import folders_below

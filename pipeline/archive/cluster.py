@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from measure.errors import MeasurementError
 from measure.revision import MEASURE_REVISION
-from measure.scans.addresses import is_address, scan_path
+from measure.scans.remote import is_address, scan_path
 from pipeline.errors import InputError, missing_extra
 from pipeline.workers import KILLS, WorkerKilled, processes, work_alone
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
-from measure.scans.addresses import Address, tiff_file
-from measure.scans.broken import DECODING_ERRORS
+from measure.scans.file_checks import DECODING_ERRORS
+from measure.scans.remote import Address, tiff_file
 from measure.scans.scan import Scan, open_scan
 from measure.scans.scan_part import whole_file
 from pipeline.results.fingerprints import of_scan

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.addresses import location_of
+from measure.scans.remote import location_of
 from pipeline.archive.cluster import cluster_executor
 from pipeline.archive.decision_check import tell_inapplicable
 from pipeline.archive.judging import judge_lots, latest

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Sequence
 
-from measure.scans.addresses import scan_path
+from measure.scans.remote import scan_path
 from pipeline.archive.file_state import FileStates, Identity
 from pipeline.archive.identity import content_hash, parts_hash
 from pipeline.archive.store import Store

@@ -10,7 +10,7 @@ import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
 
-from measure.scans.addresses import public_address
+from measure.scans.remote import public_address
 from pipeline.archive.digests import add_digests, row_digest
 from pipeline.errors import InputError, what_to_do_about_store
 

@@ -10,7 +10,7 @@ from importlib.metadata import version
 
 from measure.reason import Code, Reason
 from measure.revision import MEASURE_REVISION
-from measure.scans.addresses import scan_path
+from measure.scans.remote import scan_path
 from measure.status import Status
 from pipeline.archive.identity import content_hash
 from pipeline.archive.judging import JudgedScan, Lot

@@ -4,7 +4,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from measure.scans.addresses import TRAFFIC, scan_path
+from measure.scans.remote import TRAFFIC, scan_path
 from pipeline.archive.file_state import FileState, FileStates
 from pipeline.archive.identity import parts_hash
 from pipeline.measuring.measured import measured_scan

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import lru_cache
 
-from measure.scans.addresses import scan_path
+from measure.scans.remote import scan_path
 from pipeline.archive.asked import asked_of
 from pipeline.archive.decided import after_checks, before_checks, by_image, decided, decisions_hash
 from pipeline.archive.expected_time import ExpectedTime

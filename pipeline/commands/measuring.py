@@ -57,7 +57,7 @@ def init(
     as_json: AsJson = False,
 ) -> int:
     """Look at the scans; write a project of them, with each one's camera, and say what could not be told."""
-    from measure.scans.addresses import scan_path
+    from measure.scans.remote import scan_path
     from pipeline.archive.new_project import init_project, print_new_project
     from pipeline.progress import Reporter
 

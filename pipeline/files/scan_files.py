@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.addresses import found_addresses, is_address, public_text, scan_path
+from measure.scans.remote import found_addresses, is_address, public_text, scan_path
 from measure.scans.scan_part import part_text
 from pipeline.errors import InputError
 from pipeline.files.images_file import GivenImages

@@ -20,7 +20,7 @@ from measure.marks.frame_border import at_border
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.probabilities import CAMERA_BY_CHANCE
 from measure.scans.scan import Scan, open_scan
-from measure.scans.thumbnail import thumbnail
+from measure.scans.scan_views import thumbnail
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_answer import CLOSE, Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, is_whole_plate, plate_of

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
-from measure.scans.addresses import scan_path
+from measure.scans.remote import scan_path
 from measure.status import Status
 from measure.tie_points.features import TieFrame
 from measure.tie_points.joins import measure_joins

@@ -11,7 +11,7 @@ from measure.frames.camera_recognition import Answer, answer, seen
 from measure.frames.frame import Frame
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon, thinnest_mm
 from measure.scans.scan import Scan
-from measure.scans.thumbnail import thumbnail
+from measure.scans.scan_views import thumbnail
 from measure.search.pitches import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 
 _LARGEST_PX = 1600  # of what is searched: of aerial film a seventh of a millimetre, about as wide as fine lines

@@ -18,10 +18,10 @@ from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, moved_frame
-from measure.scans.addresses import public_text
+from measure.scans.remote import public_text
 from measure.scans.scan import Scan
 from measure.scans.scan_part import ScanPart, Window
-from measure.scans.scan_window import windowed
+from measure.scans.scan_views import windowed
 from measure.second_frame import second_frame
 from measure.status import Status
 from pipeline.errors import InputError, what_to_do

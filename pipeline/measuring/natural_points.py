@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.reason import Code, Reason
-from measure.scans.addresses import scan_path
+from measure.scans.remote import scan_path
 from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import measure_ties
 from pipeline.errors import InputError

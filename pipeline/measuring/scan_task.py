@@ -13,8 +13,8 @@ from measure.annotations.line import KnownLine
 from measure.errors import MissingError
 from measure.fiducial_options import FiducialOptions
 from measure.results import Pose
-from measure.scans.addresses import location_of, public_address, scan_path
-from measure.scans.tone import SaidOfTone
+from measure.scans.remote import location_of, public_address, scan_path
+from measure.tone.curve import SaidOfTone
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.results.fingerprints import canonical_json

@@ -10,8 +10,8 @@ import numpy as np
 
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, Polygon
 from measure.revision import MEASURE_REVISION
-from measure.scans.declared_tone import declared_tone
-from measure.scans.tone import SaidOfTone, Tone, power, srgb
+from measure.scans.head import declared_tone
+from measure.tone.curve import SaidOfTone, Tone, power, srgb
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.measuring.memory import Memory

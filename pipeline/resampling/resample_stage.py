@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from measure.errors import MeasurementError
-from measure.scans.addresses import scan_path
+from measure.scans.remote import scan_path
 from measure.scans.scan import open_scan
 from pipeline.archive.file_state import file_state
 from pipeline.archive.measurement import read_measurement

@@ -9,7 +9,7 @@ from itertools import chain
 from typing import Any
 
 from measure.marks.poses import POSES
-from measure.scans.addresses import location_of
+from measure.scans.remote import location_of
 from pipeline.archive.store import Store
 from pipeline.errors import InputError
 from pipeline.files.decisions_file import LEARNED, Choice, Decision, append_decisions

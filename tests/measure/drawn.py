@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from measure.scans.picture_scan import WholePicture
-from measure.scans.radiometry import Samples
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS, Samples
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

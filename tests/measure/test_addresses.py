@@ -14,9 +14,9 @@ import tifffile
 from range_server import RangeServer, range_server
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
-from measure.scans import addresses
-from measure.scans.addresses import Address, scan_path
-from measure.scans.declared_tone import declared_tone
+from measure.scans import remote
+from measure.scans.head import declared_tone
+from measure.scans.remote import Address, scan_path
 from measure.scans.scan import open_scan
 
 SIDE_PX, TILE_PX = 2304, 128
@@ -35,8 +35,8 @@ def noise(channels: tuple[int, ...] = ()) -> Any:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(addresses, "_WAITS_S", (0.01, 0.01))
-    monkeypatch.setattr(addresses, "_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(remote, "_WAITS_S", (0.01, 0.01))
+    monkeypatch.setattr(remote, "_TIMEOUT_S", 0.3)
 
 
 @pytest.fixture

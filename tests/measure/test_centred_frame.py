@@ -15,8 +15,8 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
 from measure.results import FrameMeasurement
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan, open_scan
 from measure.search.centred_frame import is_lattice, room_mm
 from measure.search.frame_search import FrameSearch

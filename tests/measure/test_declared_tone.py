@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from measure.scans.declared_tone import curve_of_profile, declared_tone
-from measure.scans.tone import Tone
+from measure.scans.head import declared_tone
+from measure.tone.curve import Tone
+from measure.tone.declared import curve_of_profile
 
 GREY = np.linspace(0, 255, 256).astype(np.uint8).reshape(16, 16)
 HALF = 0.5  # of full scale

@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter
 from measure.covariance import Cause
 from measure.frames.faint_marks import FaintMark, find_faint
 from measure.marks.shapes import Bar, MarkShape, cross, dot
-from measure.scans.tone import Tone, power
 from measure.search.prediction import MarkPrediction
+from measure.tone.curve import Tone, power
 
 CROSS = MarkShape(cross(0.5, 0.05), "dark")
 LINEAR = 36.0 * np.diag([1.0, -1.0])

@@ -11,8 +11,8 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
 from measure.results import FrameMeasurement
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan, open_scan
 from measure.status import Status
 

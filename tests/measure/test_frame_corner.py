@@ -14,10 +14,10 @@ from measure.fiducials import measure_fiducials
 from measure.frames.frame_edges import told_by_edges
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, frame_corner, polygon
 from measure.matching.match import Match
-from measure.scans.tone import Tone, power
 from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_corner import corner_of_edges
 from measure.status import Status
+from measure.tone.curve import Tone, power
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
 from measure.frames.frame_sighter import FrameSighter
 from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.status import Status

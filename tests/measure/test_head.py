@@ -8,7 +8,7 @@ import pytest
 import tifffile
 
 from measure.errors import MeasurementError
-from measure.scans import picture_scan
+from measure.scans import jpeg
 from measure.scans.head import read_head
 from measure.scans.scan import open_scan
 
@@ -72,7 +72,7 @@ def test_no_picture_is_decoded_for_its_head(tmp_path: Path, monkeypatch: pytest.
     def refuse(*_: object) -> None:
         raise AssertionError("decoded")
 
-    monkeypatch.setattr(picture_scan, "decoded", refuse)
+    monkeypatch.setattr(jpeg, "decoded", refuse)
     assert read_head(written(tmp_path / "a.jpg", GREY)).width_px == 90
 
 

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.parallel import mapped_or_lost, side_by_side
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 

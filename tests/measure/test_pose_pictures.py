@@ -10,8 +10,8 @@ from measure.marks.shapes import MarkTemplate
 from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
 from measure.pose.pose_pictures import Drawings, Shown, Site
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 
 SIDE = 61

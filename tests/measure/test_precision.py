@@ -23,9 +23,9 @@ from measure.fiducials import measure_fiducials
 from measure.frames.refinement import sight
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
 from measure.matching.match import Match
-from measure.scans.tone import Tone
 from measure.search.prediction import MarkPrediction
 from measure.targets.disks import fit_disk
+from measure.tone.curve import Tone
 
 GROUND, CONTRAST, SNR = 25000.0, 15000.0, 20.0
 

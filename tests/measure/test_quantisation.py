@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from measure.marks.shapes import MarkShape, ring_cross
 from measure.matching.match import match
 from measure.matching.window import ScanWindow
-from measure.scans.compression import UNKNOWN_DN, covariance_of_compression, rounding_step_dn
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.compression import covariance_of_compression
+from measure.scans.jpeg import UNKNOWN_DN, rounding_step_dn
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan, open_scan
 
 # Annex K of ITU-T T.81, luminance, the first 15 in zigzag order: what "quality 50" is.

@@ -7,8 +7,8 @@ import pytest
 from drawn import drawn, scan_of, transformed
 from numpy.typing import NDArray
 
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate
 from measure.targets.ring_codes import RingCode, read_code

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from measure.search.correlation import WIDE, Map
 from measure.search.scan_maps import Held, ScanMaps, Sought

@@ -11,9 +11,9 @@ import tifffile
 from numpy.typing import NDArray
 from stored_picture import HEIGHT, WIDTH, picture
 
+from measure.scans.cache import SegmentCache
 from measure.scans.parallel import side_by_side
 from measure.scans.scan import open_scan
-from measure.scans.segments import SegmentCache
 from measure.targets.block_search import Block, Patches, search_blocks
 
 
@@ -100,7 +100,7 @@ def test_threads_that_read_a_file_side_by_side_see_what_one_sees(tmp_path: Path)
 def test_the_cache_keeps_to_its_limit_and_holds_two_rows_of_tiles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("measure.scans.segments.CACHE_BYTES", 1)
+    monkeypatch.setattr("measure.scans.cache.CACHE_BYTES", 1)
     tifffile.imwrite(tmp_path / "s.tif", picture(), tile=(32, 32), compression="lzw")
     with open_scan(tmp_path / "s.tif") as scan:
         np.testing.assert_array_equal(scan.window(0, 0, WIDTH, HEIGHT), picture())

@@ -9,7 +9,7 @@ from measure.match_options import MatchOptions
 from measure.matching.match import match
 from measure.matching.window import read_window
 from measure.noise.noise_model import steadiness
-from measure.scans.tone import Tone, power
+from measure.tone.curve import Tone, power
 
 FULL = 65535.0
 

@@ -15,9 +15,9 @@ from measure.matching.match import Match, match
 from measure.matching.tone_information import told_tone
 from measure.matching.window import read_window
 from measure.noise.noise_model import NoiseModel
-from measure.scans.told_tone import FrameTone, ToldTone
-from measure.scans.tone import LINEAR, SaidOfTone, Tone, power, sampled, srgb
 from measure.search.prediction import MarkPrediction
+from measure.tone.curve import LINEAR, SaidOfTone, Tone, power, sampled, srgb
+from measure.tone.estimate import FrameTone, ToldTone
 from synthetic_images.tone_curve import coded
 
 FULL = 65535.0

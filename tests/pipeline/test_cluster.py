@@ -94,7 +94,7 @@ def test_one_scan_a_folder_is_looked_for(tmp_path: Path) -> None:
 
 
 def test_addresses_are_looked_for_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("measure.scans.addresses._WAITS_S", (0.01,))
+    monkeypatch.setattr("measure.scans.remote._WAITS_S", (0.01,))
     for name in ("a/1.tif", "a/2.tif", "closed/1.tif", "closed/2.tif"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"1")

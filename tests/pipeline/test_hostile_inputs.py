@@ -19,7 +19,7 @@ from exported_project import adjusted_project
 
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
-from measure.scans.addresses import Address
+from measure.scans.remote import Address
 from pipeline.archive.judging import latest
 from pipeline.archive.measurement import measured_scans
 from pipeline.archive.status import archive_status

@@ -15,9 +15,9 @@ from measure.annotations.line import Line, Reading
 from measure.covariance import Cause, Covariance
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
-from measure.scans.told_tone import FrameTone
-from measure.scans.tone import SaidOfTone, Tone, power, sampled, srgb
 from measure.status import Status
+from measure.tone.curve import SaidOfTone, Tone, power, sampled, srgb
+from measure.tone.estimate import FrameTone
 from pipeline.files.project_file import read_project
 from pipeline.results.measured_record import record_of, scan_of
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan

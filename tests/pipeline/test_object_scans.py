@@ -11,7 +11,7 @@ from drawn_project import PROJECT, write_project
 from moto.server import ThreadedMotoServer
 from range_server import range_server
 
-from measure.scans import addresses
+from measure.scans import remote
 from pipeline.archive.catalogue import Group
 from pipeline.archive.file_state import file_state
 from pipeline.archive.identity import parts_hash
@@ -132,7 +132,7 @@ def test_a_bucket_without_scans_and_one_that_is_not_there(store: Any, tmp_path: 
 def test_an_address_that_does_not_answer_costs_the_others_nothing(
     local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(addresses, "_WAITS_S", (0.01,))
+    monkeypatch.setattr(remote, "_WAITS_S", (0.01,))
     with range_server(local) as server:
         folder = of_scans(tmp_path, f'"{server.url}/a.tif", "{server.url}/closed/b.tif"')
         assert measured(folder, "--workers", "1") == 1
@@ -147,7 +147,7 @@ def test_credentials_and_signatures_are_used_and_told_nowhere(
     local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By two processes, which are given them. Another signature is the same scan; a wrong one is told without it."""
-    monkeypatch.setattr(addresses, "_WAITS_S", (0.01,))
+    monkeypatch.setattr(remote, "_WAITS_S", (0.01,))
     with range_server(local) as server:
         for signature, left in (("s3cr3t1", "0 of 2"), ("s3cr3t2", "2 of 2"), ("s3cr3t3", "")):
             server.signature = "s3cr3t2" if signature == "s3cr3t3" else signature
@@ -180,15 +180,15 @@ def test_credentials_and_signatures_are_used_and_told_nowhere(
     ],
 )
 def test_what_is_shown_of_an_address(address: str, shown: str) -> None:
-    assert addresses.public_address(address) == shown
-    assert addresses.location_of(addresses.scan_path(address)) == (address if "://" in address else shown)
+    assert remote.public_address(address) == shown
+    assert remote.location_of(remote.scan_path(address)) == (address if "://" in address else shown)
 
 
 def test_scans_that_a_query_tells_apart_are_two() -> None:
     one, two, again = (f"https://h.org/get?id={k}&token={token}" for k, token in ((1, "a"), (2, "a"), (1, "b")))
-    assert addresses.public_address(one) == addresses.public_address(again) != addresses.public_address(two)
+    assert remote.public_address(one) == remote.public_address(again) != remote.public_address(two)
 
 
 def test_a_text_is_shown_without_what_opens_its_addresses() -> None:
     told = "'htps://ann:pw@h.org/a.tif?token=1' finds no file: /x/htps:/ann:pw@h.org/a.tif, tcp://host:8786"
-    assert addresses.public_text(told) == "'htps://h.org/a.tif' finds no file: /x/htps:/h.org/a.tif, tcp://host:8786"
+    assert remote.public_text(told) == "'htps://h.org/a.tif' finds no file: /x/htps:/h.org/a.tif, tcp://host:8786"

@@ -14,8 +14,8 @@ from measure.boards.specs import ChessboardSpec
 from measure.marks.shapes import MarkShape, ring_cross
 from measure.matching.match import match
 from measure.matching.window import ScanWindow
-from measure.scans.picture_scan import WholePicture
-from measure.scans.resolution import NO_TAGS
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from pipeline.results.comparator_file import read_comparator
 

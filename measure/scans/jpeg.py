@@ -1,4 +1,4 @@
-"""A JPEG stream decoded, and whether it held what its header says.
+"""JPEG files and streams: decoded whole, with a check that a stream holds what its header says.
 
 A decoder goes on through a damaged stream: behind a lost or a changed byte it soon reads right codes again, but of
 blocks that belong elsewhere. At the end there are then blocks too many or too few. So the picture is decoded as if it
@@ -12,17 +12,39 @@ that are missing or left over before a marker.
 """
 
 import re
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
 
+import imagecodecs
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
+from tifffile import TiffFile
 
-from measure.scans.compression import jpeg_headers
+from measure.scans.cache import OpenedPicture, WholePicture
+from measure.scans.file_checks import DECODING_ERRORS, broken, check_size
+from measure.scans.metadata import (
+    JFIF_UNIT,
+    MOST_CHANNELS,
+    NO_TAGS,
+    Pitch,
+    Samples,
+    exif_tags,
+    grey_or_colour,
+    orientation_notes,
+    orientation_of,
+    pitch_from_density,
+    tag_pitch,
+)
+from measure.tone.declared import ColourTags
 
 Decode = Callable[[bytes], NDArray[np.generic]]
 
+JPEG_START = b"\xff\xd8\xff"
 _HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # sequential and progressive: others than lossless and arithmetic ones
 _END = b"\xff\xd9"
 _SCAN_OR_RESTART = re.compile(
@@ -33,6 +55,11 @@ _OF_DAMAGE = ("Corrupt JPEG data", "Premature end")  # how libjpeg's warnings of
 _BLEED_PX = 2  # that the decoder's interpolation of colour takes from the blocks beside
 _BELOW = 2  # rows of blocks added: a picture of one block a row has further ones below its first, too
 _TAIL = bytes(range(64, 192)) * 2  # codes of some blocks, none of them a marker
+
+
+_DQT = 0xDB
+UNKNOWN_DN = 15.0  # where a file does not say it: as at quality 50, which no scan should be below
+_COARSE = 15  # coefficients in the order of the table: up to two periods in a block of 8 px, as blurred edges have them
 
 
 @dataclass(frozen=True)
@@ -152,3 +179,119 @@ def _ends_whole(data: bytes, frame: _Frame, taller: NDArray[np.generic], rows: i
     again = decode(_of_height(longer, frame, rows + _BELOW * frame.unit_height_px))
     above = rows - _BLEED_PX
     return bool(np.array_equal(again[:above], taller[:above]))
+
+
+def jpeg_headers(data: bytes) -> list[tuple[int, bytes]]:
+    """Marker and body of the segments before the picture's data."""
+    headers, position = [], 2
+    while position + 4 <= len(data) and data[position] == 0xFF and data[position + 1] not in (0xDA, 0xD9):
+        length = int.from_bytes(data[position + 2 : position + 4], "big")
+        headers.append((data[position + 1], data[position + 4 : position + 2 + length]))
+        position += 2 + max(length, 2)
+    return headers
+
+
+def rounding_step_dn(data: bytes) -> float:
+    """The mean step to which the coarser detail of the luminance is rounded, in grey values: from a JPEG file, or its
+    beginning up to the picture's data."""
+    for marker, body in jpeg_headers(data):
+        if marker == _DQT:
+            table = _quantisation_table(body, 0)
+            if table:
+                return sum(table[:_COARSE]) / _COARSE
+    return UNKNOWN_DN
+
+
+def _quantisation_table(body: bytes, wanted: int) -> list[int]:
+    """The 64 steps of a table of that number, empty where the segment does not hold it."""
+    position = 0
+    while position < len(body):
+        size, number = 1 + (body[position] >> 4), body[position] & 15
+        steps = body[position + 1 : position + 1 + 64 * size]
+        if number == wanted and len(steps) == 64 * size:
+            return [int.from_bytes(steps[at : at + size], "big") for at in range(0, len(steps), size)]
+        position += 1 + 64 * size
+    return []
+
+
+def open_jpeg(path: Path, max_pixels: int | None = None) -> OpenedPicture:
+    """The picture of a JPEG file, decoded whole.
+
+    Parameters
+    ----------
+    max_pixels : as `check_size` takes it.
+
+    Raises
+    ------
+    MeasurementError
+        For a truncated file, and for one that claims more than such a file can hold. A damaged one is opened: its
+        pixels count as lost.
+    """
+    data = path.read_bytes()
+    samples, damage = _jpeg_samples(path, data, max_pixels)
+    orientation, picture = _jpeg_orientation(data), WholePicture(samples, rounding_step_dn(data), damage)
+    return OpenedPicture(picture, jpeg_pitch(data), orientation_notes(orientation), orientation=orientation)
+
+
+def _jpeg_samples(path: Path, data: bytes, max_pixels: int | None) -> tuple[Samples, str]:
+    """Grey or RGB, and why it cannot be trusted; a decoder that fills a truncated file with grey is not asked."""
+    size = picture_size(data)
+    if size is not None:
+        check_size(path, "a picture", size, size[0] * size[1] * MOST_CHANNELS, len(data), max_pixels)
+    picture = 2 + sum(4 + len(body) for _, body in jpeg_headers(data))
+    if b"\xff\xd9" not in data[picture:]:
+        raise broken(path, "its end marker is missing")
+    try:
+        samples, damage = decoded(data, imagecodecs.jpeg_decode)
+        return grey_or_colour(samples), damage
+    except DECODING_ERRORS as error:
+        if size is None or 0 in size:
+            raise broken(path, str(error)) from error
+        return np.zeros((size[1], size[0], 1), np.uint8), str(error)
+
+
+def jpeg_pitch(data: bytes) -> Pitch:
+    """The JFIF density, or the Exif resolution where that has no unit."""
+    pitch = NO_TAGS
+    for marker, body in jpeg_headers(data):
+        if marker == 0xE0 and body.startswith(b"JFIF\0") and len(body) >= 12:
+            unit, x, y = struct.unpack(">BHH", body[7:12])
+            pitch = pitch_from_density(x, y, JFIF_UNIT.get(unit))
+        elif marker == 0xE1 and body.startswith(b"Exif\0\0") and pitch.um is None:
+            pitch = _exif_pitch(body[6:], pitch)
+    return pitch
+
+
+def _jpeg_orientation(data: bytes) -> int:
+    """As an Exif block gives it; 1 without one."""
+    for marker, body in jpeg_headers(data):
+        if marker == 0xE1 and body.startswith(b"Exif\0\0"):
+            try:
+                with TiffFile(BytesIO(body[6:])) as file:
+                    return orientation_of(file.pages.first.aspage())
+            except DECODING_ERRORS:
+                return 1
+    return 1
+
+
+def _exif_pitch(exif: bytes, otherwise: Pitch) -> Pitch:
+    """The resolution tags of an Exif block, which is a small TIFF file without a picture."""
+    try:
+        with TiffFile(BytesIO(exif)) as file:
+            pitch = tag_pitch(file.pages.first)
+    except DECODING_ERRORS:
+        return otherwise
+    return pitch if pitch.um is not None or otherwise is NO_TAGS else otherwise
+
+
+def jpeg_colour_tags(path: Path) -> ColourTags:
+    """An ICC profile, which may be cut into several segments (ICC.1:2022, B.4), and Exif. Raises one of
+    DECODING_ERRORS."""
+    pieces, exif = dict[int, bytes](), dict[str, Any]()
+    for marker, body in jpeg_headers(path.read_bytes()):
+        if marker == 0xE2 and body.startswith(b"ICC_PROFILE\0"):
+            pieces[body[12]] = body[14:]
+        elif marker == 0xE1 and body.startswith(b"Exif\0\0"):
+            with TiffFile(BytesIO(body[6:])) as file:
+                exif = dict(exif_tags(file.pages.first.aspage()))
+    return ColourTags(b"".join(pieces[number] for number in sorted(pieces)), exif=exif)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.scans.tone import SaidOfTone, Tone
+from measure.tone.curve import SaidOfTone, Tone
 
 Array = NDArray[np.float64]
 

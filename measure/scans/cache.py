@@ -7,8 +7,12 @@ from itertools import product
 from threading import Lock
 from typing import Protocol
 
-from measure.scans.radiometry import Samples
-from measure.scans.resolution import Pitch
+import numpy as np
+
+from measure.scans.metadata import (
+    Pitch,
+    Samples,
+)
 
 Place = tuple[int, int]  # row and column in a grid of segments
 
@@ -153,3 +157,29 @@ class SegmentCache:
                 oldest, samples = next((key, own.samples) for key, own in self._kept.items() if own.samples is not None)
                 self._held -= samples.nbytes
                 del self._kept[oldest]
+
+
+class WholePicture:
+    """A picture in memory: (height, width, channels) of 8 or 16 bits, one segment. damage: why it cannot be trusted, a
+    part of a sentence, empty where it can."""
+
+    def __init__(self, samples: Samples, rounding_step_dn: float = 0.0, damage: str = "") -> None:
+        self._samples, self.rounding_step_dn = samples, rounding_step_dn
+        self.height_px, self.width_px, self.channels = samples.shape
+        self.segment_height_px, self.segment_width_px = self.height_px, self.width_px
+        self.sample_bytes = samples.itemsize
+        self.full_scale_dn = float(2 ** (8 * samples.itemsize) - 1)
+        self.lost: Sequence[LostPart] = ()
+        if damage:
+            self.lost = (LostPart(0, 0, self.width_px, self.height_px, damage),)
+            self._samples = np.full_like(samples, self.full_scale_dn // 2)
+
+    def fetched(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
+        return {}
+
+    def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
+        """All of it."""
+        return self._samples
+
+    def close(self) -> None:
+        """Nothing is open."""

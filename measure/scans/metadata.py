@@ -1,0 +1,147 @@
+"""Tags of a scan file: pixel pitch, orientation, and how stored numbers become grey values."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tifffile import TiffPage
+
+from measure.scans.file_checks import unsupported
+
+JPEG_COMPRESSIONS = (6, 7, 34892, 33007)  # of TIFF
+WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6  # PhotometricInterpretation
+_EXIF = 34665
+MOST_CHANNELS = 4  # of a pixel: colours and transparency
+_COARSEST_UM = 250.0  # about 100 dpi; 72 and 96 dpi are what programs write that know nothing
+_FINEST_UM = 1.0
+
+_METRE_UM = {"inch": 25400.0, "centimetre": 10000.0, "millimetre": 1000.0, "micrometre": 1.0, "metre": 1e6}
+TIFF_UNIT = {2: "inch", 3: "centimetre", 4: "millimetre", 5: "micrometre"}  # 4 and 5 are no standard, but are written
+JFIF_UNIT = {1: "inch", 2: "centimetre"}
+PNG_UNIT = {1: "metre"}
+Samples = NDArray[np.uint8 | np.uint16]
+
+
+@dataclass(frozen=True)
+class Pitch:
+    """um: (x, y) in µm, None where the file gives none that can be believed; note: why none, empty otherwise."""
+
+    um: tuple[float, float] | None
+    note: str = ""
+
+
+NO_TAGS = Pitch(None, "the file has no resolution tags")
+
+
+def pitch_from_density(x: float, y: float, unit: str | None) -> Pitch:
+    """The pitch of a file with x, y pixels per unit (`inch`, ..., None: the file names no unit)."""
+    if unit is None:
+        return Pitch(None, "the file's resolution tags have no unit")
+    if not (x > 0.0 and y > 0.0):
+        return Pitch(None, f"the file's resolution tags say {x:g} x {y:g} pixels per {unit}")
+    um = (_METRE_UM[unit] / x, _METRE_UM[unit] / y)
+    if max(um) > _COARSEST_UM:
+        dpi = 25400.0 / max(um)
+        return Pitch(
+            None, f"the file's resolution tags say {dpi:.0f} dpi, which is a program's default and no scanner's"
+        )
+    if min(um) < _FINEST_UM:
+        return Pitch(None, f"the file's resolution tags say {min(um):g} µm a pixel, finer than any scanner")
+    return Pitch(um)
+
+
+@dataclass(frozen=True, eq=False)
+class Radiometry:
+    """channels: 1 (grey) or 3 (red, green, blue), the first samples of a pixel; what follows them (transparency)
+    is left out; full_scale_dn: the largest value; inverted: 0 is white; palette: (entries, 3) colours.
+    """
+
+    channels: int
+    full_scale_dn: float
+    inverted: bool = False
+    palette: Samples | None = None
+
+    @classmethod
+    def of_palette(cls, colormap: NDArray[np.generic]) -> "Radiometry":
+        """colormap (3, entries) as TIFF stores it: 16 bits, in some old files 8. All grey: one channel."""
+        palette = np.asarray(colormap, np.uint16).T
+        if palette.max() < 256:
+            palette = palette * np.uint16(257)
+        if np.all(palette == palette[:, :1]):
+            palette = palette[:, :1]
+        return cls(palette.shape[1], 65535.0, palette=np.ascontiguousarray(palette))
+
+    @property
+    def sample_bytes(self) -> int:
+        return 1 if self.full_scale_dn < 256 else 2
+
+    def apply(self, stored: NDArray[np.generic]) -> Samples:
+        """(height, width, channels) values of (height, width, samples) stored numbers."""
+        if self.palette is not None:
+            indices = np.minimum(stored[..., 0].astype(np.intp), len(self.palette) - 1)
+            return self.palette[indices]
+        dtype = np.uint8 if self.sample_bytes == 1 else np.uint16
+        samples: Samples = np.ascontiguousarray(stored[..., : self.channels], dtype)
+        return dtype(self.full_scale_dn) - samples if self.inverted else samples
+
+
+def orientation_of(page: TiffPage) -> int:
+    """The tag by which a viewer turns the picture; 1 where it does not."""
+    return int(page.tags.valueof(274, default=1))
+
+
+def orientation_notes(orientation: int) -> tuple[str, ...]:
+    """A viewer may show the picture turned: whoever reads places off one must know."""
+    if orientation == 1:
+        return ()
+    return (f"the file's orientation tag ({orientation}) is not applied: columns and rows are as stored",)
+
+
+def tag_pitch(page: TiffPage) -> Pitch:
+    """From XResolution, YResolution and ResolutionUnit (inch where it is absent, as TIFF 6.0 says)."""
+    stored = [page.tags.valueof(name) for name in ("XResolution", "YResolution")]
+    if None in stored:
+        return NO_TAGS
+    try:
+        x, y = (numerator / denominator if denominator else 0.0 for numerator, denominator in stored)
+        unit = TIFF_UNIT.get(int(page.tags.valueof("ResolutionUnit", default=2)))
+    except (TypeError, ValueError):
+        return Pitch(None, "the file's resolution tags hold no resolution")
+    return pitch_from_density(x, y, unit)
+
+
+def grey_or_colour(picture: NDArray[Any]) -> Samples:
+    """One or three channels of a decoded picture; transparency is left out. Raises one of DECODING_ERRORS."""
+    if picture.size == 0:
+        raise ValueError("it holds no picture")
+    stored = picture[..., None] if picture.ndim == 2 else picture
+    channels = {1: 1, 2: 1, 3: 3, 4: 3}[stored.shape[2]]
+    return Radiometry(channels, float(np.iinfo(stored.dtype).max)).apply(stored)
+
+
+def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
+    """How the page's samples become grey or colour values."""
+    bits, kind, samples = page.bitspersample, int(page.photometric), page.samplesperpixel
+    if not isinstance(bits, int):
+        raise unsupported(path, f"samples are of {' and '.join(map(str, bits))} bits")
+    if page.sampleformat != 1 or not 1 < bits <= 16:
+        number = {1: "integers", 2: "signed integers", 3: "floating-point numbers"}.get(page.sampleformat, "numbers")
+        raise unsupported(path, f"samples are {number} of {bits} bits")
+    if page.imagedepth != 1:
+        raise unsupported(path, f"it is a volume of {page.imagedepth} slices")
+    if kind == _PALETTE and page.colormap is not None:
+        return Radiometry.of_palette(page.colormap)
+    is_colour = kind == _RGB or (kind == _YCBCR and page.compression in JPEG_COMPRESSIONS)  # its decoder gives RGB
+    if not (kind in (WHITE_IS_ZERO, _BLACK_IS_ZERO) or (is_colour and samples >= 3)):
+        name = getattr(page.photometric, "name", str(page.photometric))
+        raise unsupported(path, f"its colours are {name} with {samples} samples a pixel")
+    return Radiometry(3 if is_colour else 1, float(2**bits - 1), inverted=kind == WHITE_IS_ZERO)
+
+
+def exif_tags(page: TiffPage) -> Mapping[str, Any]:
+    """The Exif block of a page, empty without one."""
+    exif = page.tags.valueof(_EXIF)
+    return exif if isinstance(exif, dict) else {}

@@ -1,0 +1,103 @@
+"""PNG files: decoded whole, and what their chunks say."""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import imagecodecs
+
+from measure.errors import MeasurementError
+from measure.scans.cache import OpenedPicture, WholePicture
+from measure.scans.file_checks import DECODING_ERRORS, broken, check_size
+from measure.scans.metadata import (
+    MOST_CHANNELS,
+    NO_TAGS,
+    PNG_UNIT,
+    Pitch,
+    Samples,
+    grey_or_colour,
+    pitch_from_density,
+)
+from measure.tone.declared import ColourTags
+
+PNG_START = b"\x89PNG\r\n\x1a\n"
+_PNG_SIZE = slice(16, 25)  # width, height and the bits of a sample: IHDR is the first chunk (PNG specification, 11.2.2)
+_PNG_HEADER = ">IIBB"  # width, height, bits and kind of colour (PNG specification, 11.2.2)
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 1, 6: 3}  # by that kind, without transparency; a palette has colours
+
+
+def open_png(path: Path, max_pixels: int | None = None) -> OpenedPicture:
+    """The picture of a PNG file, decoded whole.
+
+    Parameters
+    ----------
+    max_pixels : as `check_size` takes it.
+
+    Raises
+    ------
+    MeasurementError
+        For a truncated or damaged file, and for one that claims more than such a file can hold.
+    """
+    data = path.read_bytes()
+    return OpenedPicture(WholePicture(_png_samples(path, data, max_pixels)), png_pitch(data))
+
+
+def _png_samples(path: Path, data: bytes, max_pixels: int | None) -> Samples:
+    """Grey or RGB, 8 or 16 bits."""
+    header = data[_PNG_SIZE]
+    if len(header) < 9:
+        raise broken(path, "its header is cut short")
+    width, height, bits = struct.unpack(">IIB", header)
+    if bits == 1:
+        raise MeasurementError(
+            f"{path} is a PNG of black and white pixels only (1 bit), and marks are measured by the grey values along "
+            "their edges: save the scan as grey or RGB with 8 or 16 bits a sample"
+        )
+    decoded_bytes = width * height * MOST_CHANNELS * -(-bits // 8)
+    check_size(path, "a picture", (width, height), decoded_bytes, len(data), max_pixels)
+    try:
+        return grey_or_colour(imagecodecs.png_decode(data))
+    except DECODING_ERRORS as error:
+        raise broken(path, str(error)) from error
+
+
+def png_pitch(data: bytes) -> Pitch:
+    """The pHYs chunk, which stands before the picture's data (PNG specification, 11.3.5.3)."""
+    physical = next((body for kind, body in _chunks(data) if kind == b"pHYs" and len(body) == 9), None)
+    if physical is None:
+        return NO_TAGS
+    x, y, unit = struct.unpack(">IIB", physical)
+    return pitch_from_density(x, y, PNG_UNIT.get(unit))
+
+
+def png_colour_tags(path: Path) -> ColourTags:
+    """The first chunk of the order of precedence (PNG specification, 4.3): iCCP, sRGB, gAMA. Raises one of
+    DECODING_ERRORS, or zlib.error."""
+    chunks = dict(_chunks(path.read_bytes()))
+    if b"iCCP" in chunks:
+        # A name, a zero, the method, and the profile, deflated.
+        return ColourTags(zlib.decompress(chunks[b"iCCP"].split(b"\0", 1)[1][1:]))
+    if b"gAMA" in chunks and b"sRGB" not in chunks:
+        return ColourTags(light_power=1e5 / struct.unpack(">I", chunks[b"gAMA"])[0])
+    return ColourTags(is_srgb=b"sRGB" in chunks)
+
+
+def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Those before the picture's data: kind and body."""
+    position = len(PNG_START)
+    while position + 8 <= len(data):
+        length, kind = struct.unpack(">I4s", data[position : position + 8])
+        if kind == b"IDAT":
+            break
+        yield kind, data[position + 8 : position + 8 + length]
+        position += 12 + length
+
+
+def png_form(data: bytes) -> tuple[int, int, int, int] | None:
+    """Width, height, channels and bits; the header is the first chunk."""
+    try:
+        width, height, bits, kind = struct.unpack(_PNG_HEADER, data[16:26])
+        return width, height, _PNG_CHANNELS[kind], bits
+    except DECODING_ERRORS:
+        return None
