@@ -57,7 +57,7 @@ def tasks(data: Path) -> Iterator[Task]:
         yield Task(f"apollo-{number}", film / "reseau" / f"apollo-{number}.jpg", reseau(), (27.4, 27.4))
     for name in ("apollo15-HFE", "apollo17-HFE"):
         yield Task(name, film / "reseau_sharpened" / f"{name}.jpg", reseau(), (22.0, 22.0))
-    coarse = layout("library:fairchild-t12-152", Path())
+    coarse = layout("library:fairchild-t12-notch-152", Path())
     yield Task("coarse", film / "coarse" / "tma2161_0293.png", coarse, (313.0, 313.0))
     for folder in sorted((data / "film_rendered").iterdir()):
         pitch_um = float(tomllib.loads((folder / "project.toml").read_text())["pitch_um"])
