@@ -30,15 +30,15 @@ class Broken(NamedTuple):
 
 
 LINES = (
-    Broken("measure/frames/mark_comparison.py", " - (len(values) - 1)", "", "measure/test_mark_comparison.py"),
+    Broken("measure/fiducials/mark_comparison.py", " - (len(values) - 1)", "", "measure/test_mark_comparison.py"),
     Broken(
-        "measure/frames/mark_comparison.py",
+        "measure/fiducials/mark_comparison.py",
         "(weights.sum() - (weights**2).sum() / weights.sum())",
         "weights.sum()",
         "measure/test_mark_comparison.py",
     ),
     Broken(
-        "measure/frames/frame_sighter.py",
+        "measure/fiducials/frame_sighter.py",
         "place_covariance.plus(cause, px2)",
         "place_covariance",
         "measure/test_frame_settling.py",
@@ -83,13 +83,13 @@ LINES = (
         "measure/test_quantisation.py",
     ),
     Broken(
-        "measure/checks/misfits.py",
+        "measure/fiducials/consistency.py",
         "(left * np.linalg.solve(spread, left)).sum() / 2",
         "(left * np.linalg.solve(spread, left)).sum()",
         "measure/test_judgement.py",
     ),
     Broken(
-        "measure/frames/frame_fit.py",
+        "measure/fiducials/interior_orientation.py",
         "prior[0, 4] = prior[1, 5] = 1 / AFFINITY_SIGMA",
         "prior[0, 4] = prior[1, 5] = 0.1 / AFFINITY_SIGMA",
         "measure/test_frame_fit.py",

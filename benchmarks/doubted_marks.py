@@ -21,17 +21,17 @@ from numpy.typing import NDArray
 from search import lines
 from true_marks import Kind, TrueMark
 
-from measure.checks.judgement import judged
 from measure.fiducial_options import FiducialOptions
-from measure.frames.fiducial_rows import present_frame
-from measure.frames.frame_measurement import measure_frame
+from measure.fiducials.across_frames import judged
+from measure.fiducials.constellation import Placement
+from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.rows import present_frame
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, dot, polygon, ring_cross, ring_dot
 from measure.reason import NO_REASON
 from measure.results import FrameMeasurement, Pose
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
-from measure.search.constellation import Placement
 from measure.status import Status
 
 Array = NDArray[np.float64]

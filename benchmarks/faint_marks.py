@@ -5,7 +5,7 @@ PYTHONPATH=tests/measure python benchmarks/faint_marks.py [FRAMES] [--kind KIND 
 FRAMES: of every cell, each with three faint marks; 40 where none is given. Eight marks of one kind stand in a frame
 of 60 mm (10 px a mm), their blurs alike to 5 %: five have 20 times the contrast of the noise, three the SNR of a cell.
 The pictures and bounds are those of `benchmarks/marks.py`, the placements those of `benchmarks/dust.py`; what measures
-is what `reseau measure` runs, `measure.frames.frame_measurement.measure_frame`. Ellipses are targets, and in no frame.
+is what `reseau measure` runs, `measure.fiducials.measure_frame.measure_frame`. Ellipses are targets, and in no frame.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from true_marks import KINDS, Kind, TrueMark, some_mark
 
 from measure.fiducial_options import FiducialOptions
-from measure.frames.frame_measurement import measure_frame
+from measure.fiducials.measure_frame import measure_frame
 from measure.marks.shapes import FiducialLayout
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS

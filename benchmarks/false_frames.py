@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from search_frames import PITCH_UM, Case, draw_case
 
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan

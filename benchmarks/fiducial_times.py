@@ -36,17 +36,17 @@ from archive_real import draw
 from drawn_frames import NUMBERED, PITCH_UM, frame_picture, pixel_from_camera
 from large_scans import FRAME_MM, Storage, rendered
 
-import measure.attempts
-import measure.fiducials
-import measure.frames.refinement
+import measure.fiducials.mark_fit
+import measure.fiducials.measurement
+import measure.fiducials.stages
 import measure.matching.match
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.search import FrameSearch
 from measure.marks.shapes import FiducialLayout
 from measure.matching.fit import PictureFit
 from measure.scans.scan import open_scan
 from measure.scans.tiff_segments import TiffSegments
-from measure.search.frame_search import FrameSearch
 from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 
@@ -54,12 +54,12 @@ STAGES: dict[str, list[tuple[Any, str]]] = {
     "decoding tiles": [(TiffSegments, "read")],
     "search: correlations": [(FrameSearch, "_about_middle")],
     "search: constellation": [(FrameSearch, "_placements")],
-    "first looks": [(measure.frames.refinement, "seen")],
+    "first looks": [(measure.fiducials.mark_fit, "seen")],
     "picture fits": [(measure.matching.match, "_fitted")],
     "borders of the ground": [(measure.matching.match, "_with_border")],
     "weights of grain": [(PictureFit, "weigh")],
     "other causes, second places, checks of a mark": [(measure.matching.match, "_result")],
-    "pose": [(measure.attempts, "named"), (measure.fiducials, "named")],
+    "pose": [(measure.fiducials.stages, "named"), (measure.fiducials.measurement, "named")],
 }
 _COMMAND = "from pipeline.main import main; main()"
 

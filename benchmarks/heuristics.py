@@ -20,7 +20,7 @@ from measured_marks import CONTRAST, GROUND, measured, start_off
 from numpy.typing import NDArray
 from true_marks import KIND, Border, over_border, some_mark
 
-import measure.frames.frame_measurement as frame_measurement
+import measure.fiducials.measure_frame as frame_measurement
 import measure.matching.match as matching
 import measure.targets.measure_targets as targets
 from adjust.linear_algebra import fronts

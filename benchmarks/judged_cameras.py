@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from test_judgement import EIGHT, FILM_MM, FOUR, PX_PER_MM, SIGMA_PX, frames_of, layout_of, moved, weak
 
-from measure.checks.judgement import Judgement, judged
+from measure.fiducials.across_frames import Judgement, judged
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement
 

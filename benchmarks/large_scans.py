@@ -23,7 +23,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout
 from measure.scans.parallel import side_by_side
 from measure.scans.scan import open_scan

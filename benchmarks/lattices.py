@@ -16,7 +16,7 @@ from drawn import scan_of
 from numpy.typing import NDArray
 from true_marks import areas_of
 
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.scans.scan import Scan
 from measure.status import Status

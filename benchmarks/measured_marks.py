@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from true_marks import ALL_MOVES, TrueMark
 
 from measure.covariance import Cause
+from measure.detection.prediction import MarkPrediction
 from measure.fiducial_options import FiducialOptions
-from measure.frames.frame import CLEAR_DAMAGE
-from measure.frames.refinement import sight
-from measure.search.prediction import MarkPrediction
+from measure.fiducials.frame import CLEAR_DAMAGE
+from measure.fiducials.mark_fit import sight
 from measure.targets.disks import fit_disk
 
 Array = NDArray[np.float64]

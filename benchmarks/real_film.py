@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from measure.checks.judgement import judged
 from measure.covariance import Covariance
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.across_frames import judged
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.scans.scan import open_scan
 from measure.tone.curve import LINEAR, Tone

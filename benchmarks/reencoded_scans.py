@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.checks.judgement import judged
 from measure.covariance import Cause, Covariance
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.across_frames import judged
+from measure.fiducials.measurement import measure_fiducials
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS

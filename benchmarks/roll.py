@@ -17,7 +17,7 @@ import numpy as np
 from writing import AT_MM, FRAME_MM, PITCH_UM, line, scene, stored
 
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, WrittenPlace, ring_cross
 from measure.results import FrameMeasurement

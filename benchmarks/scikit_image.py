@@ -29,9 +29,9 @@ from true_marks import KIND, TrueMark, some_mark
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from measure.boards.corners import junction
-from measure.frames.frame_fit import outliers
+from measure.detection.response_layers import peaks
+from measure.fiducials.interior_orientation import outliers
 from measure.noise.damage import _opened
-from measure.search.response_layers import peaks
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ import numpy as np
 from search_frames import KINDS, SYMMETRIES, Case, draw_case
 
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 

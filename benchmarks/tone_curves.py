@@ -29,7 +29,7 @@ from tone_frames import KINDS, PITCH_UM, TIPS, Case, draw_case
 
 from measure.covariance import Cause
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.results import FrameMeasurement
 from measure.status import Status
 from measure.tone.curve import SaidOfTone, Tone

@@ -19,7 +19,7 @@ import numpy as np
 from lone_frames import fiducials_of, image_of, lone_frame, painted
 from numpy.typing import NDArray
 
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import FrameMeasurement
 from measure.scans.cache import WholePicture

@@ -1,6 +1,6 @@
 from .errors import MeasurementError as MeasurementError
 from .fiducial_options import FiducialOptions as FiducialOptions
-from .fiducials import measure_fiducials as measure_fiducials
+from .fiducials.measurement import measure_fiducials as measure_fiducials
 from .marks.shapes import FiducialLayout as FiducialLayout
 from .marks.shapes import FrameCorner as FrameCorner
 from .marks.shapes import LayoutMark as LayoutMark

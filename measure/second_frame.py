@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement

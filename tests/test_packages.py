@@ -68,7 +68,7 @@ def test_package_imports_only_what_the_architecture_allows(package: str) -> None
 @pytest.mark.parametrize(
     ("package", "user", "used"),
     [
-        ("measure", "pose", "frames"),
+        ("measure", "fiducials", "detection"),
         ("adjust", "quality", "least_squares"),
         ("adjust", "validation", "problem"),
         ("pipeline", "files", "results"),

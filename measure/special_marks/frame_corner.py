@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Covariance
+from measure.detection.prediction import MarkPrediction
 from measure.marks.shapes import FrameCorner
 from measure.matching.match import Match
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
-from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_edge import Course, Edge, edge_along, said_by_edges
 from measure.tone.curve import Tone
 from measure.tone.estimate import ToldTone

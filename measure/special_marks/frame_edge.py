@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
+from measure.detection.candidates import FAINT
 from measure.noise.robust_estimation import gauss_newton_step, tukey_fit
 from measure.scans.scan import Scan
-from measure.search.candidates import FAINT
 from measure.tone.curve import SaidOfTone, Tone
 
 Array = NDArray[np.float64]

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from measure.detection.candidates import FAINT
+from measure.detection.correlation import WIDE
 from measure.scans.scan import Scan
-from measure.search.candidates import FAINT
-from measure.search.correlation import WIDE
 
 Array = NDArray[np.float64]
 Window = NDArray[np.float32]

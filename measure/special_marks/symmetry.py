@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.detection.candidates import quarter_turned
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import MarkTemplate
-from measure.search.candidates import quarter_turned
 
 Array = NDArray[np.float64]
 

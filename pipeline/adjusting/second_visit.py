@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.result import Adjustment
-from measure.checks.lost_pixels import without_lost
+from measure.fiducials.frame_checks import without_lost
 from measure.reason import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.remote import location_of, scan_path

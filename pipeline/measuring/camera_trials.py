@@ -14,8 +14,8 @@ from adjust.initial_values.fiducial_fit import fit_transformation
 from measure.annotations.detect_text import networks
 from measure.annotations.read import read_writing
 from measure.fiducial_options import FiducialOptions
-from measure.frames.camera_recognition import likeness
-from measure.frames.frame import Frame
+from measure.fiducials.camera_recognition import likeness
+from measure.fiducials.frame import Frame
 from measure.marks.frame_border import at_border
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.probabilities import CAMERA_BY_CHANCE

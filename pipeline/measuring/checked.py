@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import NewType
 
 from measure.boards.coma import one_definition
-from measure.checks.judgement import judged
+from measure.fiducials.across_frames import judged
 from measure.film import BelievedFilm
 from measure.results import FrameMeasurement
 from pipeline.files.camera_file import CameraFile

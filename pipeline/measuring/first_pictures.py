@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
-from measure.fiducials import measure_fiducials
-from measure.frames.clicked_frame import LEAST_CLICKS, on_a_line
-from measure.frames.frame_fit import fit_frame
+from measure.fiducials.clicked_frame import LEAST_CLICKS, on_a_line
+from measure.fiducials.interior_orientation import fit_frame
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks import shapes
 from measure.marks.poses import POSES, up_from_camera
 from measure.scans.parallel import mapped

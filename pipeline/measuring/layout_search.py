@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from measure.fiducial_options import FiducialOptions
-from measure.frames.camera_recognition import Answer, answer, seen
-from measure.frames.frame import Frame
+from measure.fiducials.camera_recognition import Answer, answer, seen
+from measure.fiducials.frame import Frame
+from measure.fiducials.hypotheses import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon, thinnest_mm
 from measure.scans.scan import Scan
 from measure.scans.scan_views import thumbnail
-from measure.search.pitches import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 
 _LARGEST_PX = 1600  # of what is searched: of aerial film a seventh of a millimetre, about as wide as fine lines
 _COARSE_PX = 1024  # the same while the pitch is sought: fine lines are half a pixel wide then

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from measure.annotations.detect_text import MISSING, networks
-from measure.checks.lost_pixels import with_damage
-from measure.checks.pitch_check import pitch_problem
 from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
-from measure.fiducials import measure_fiducials
+from measure.fiducials.frame_checks import pitch_problem, with_damage
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
 from measure.reason import Code, Reason

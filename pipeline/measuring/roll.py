@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from measure.annotations.line import KnownLine, Line, without_numbers
+from measure.annotations.orientation_from_text import bounded, line_score
+from measure.fiducials.scan_orientation import DECIDED, TOLD
 from measure.marks.poses import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import WrittenPlace
-from measure.pose.pose_decision import DECIDED, TOLD
-from measure.pose.written_pose import bounded, line_score
 from measure.results import FrameMeasurement, Pose
 from measure.status import Status
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, few_of

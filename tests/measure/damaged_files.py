@@ -13,7 +13,7 @@ from drawn_frames import NUMBERED, PITCH_UM, frame_picture, pixel_from_camera
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.results import FrameMeasurement
 from measure.scans.scan import open_scan
 from measure.status import Status

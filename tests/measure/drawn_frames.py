@@ -8,7 +8,7 @@ from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, Mark, MarkShape, Part, ring_cross
 from measure.results import FrameMeasurement
 from measure.status import Status

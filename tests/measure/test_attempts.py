@@ -8,14 +8,14 @@ import pytest
 from drawn import scan_of
 from drawn_frames import ALIKE
 
-from measure import attempts
-from measure.attempts import Attempt, Found, find_frame
+from measure.detection.correlation import CLOSE, GRAINY
 from measure.fiducial_options import FiducialOptions
-from measure.frames.frame import Frame
+from measure.fiducials import stages
+from measure.fiducials.frame import Frame
+from measure.fiducials.hypotheses import PitchHypothesis, pitch_hypotheses
+from measure.fiducials.search import FrameSearch
+from measure.fiducials.stages import Attempt, Found, find_frame
 from measure.probabilities import FRAMES_BY_CHANCE
-from measure.search.correlation import CLOSE, GRAINY
-from measure.search.frame_search import FrameSearch
-from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 
 GIVEN = PitchHypothesis((0.05, 0.05), 0.04, (0.05, 0.05))
 SCAN = scan_of(np.zeros((400, 400)))
@@ -48,7 +48,7 @@ def found_by(
         search = cast(FrameSearch, None)
         return Attempt(search, [GIVEN, GIVEN], look, lambda found: found.is_taken, number < given, number == at_given)
 
-    monkeypatch.setattr(attempts, "_attempts", lambda *_: [attempt(*each) for each in enumerate(expected)])
+    monkeypatch.setattr(stages, "_attempts", lambda *_: [attempt(*each) for each in enumerate(expected)])
     return find_frame(SCAN, ALIKE, [[GIVEN]], True, FiducialOptions()), judged
 
 
@@ -100,7 +100,7 @@ def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
     filling_um = 1000 * max(ALIKE.frame_mm) / SCAN.width_px
     given_um, is_given = None if times is None else (times * filling_um,) * 2, times is not None
     hypotheses = pitch_hypotheses(SCAN, ALIKE, given_um, FiducialOptions())
-    listed = attempts._attempts(FrameSearch(SCAN, ALIKE, FiducialOptions()), hypotheses, is_given)
+    listed = stages._attempts(FrameSearch(SCAN, ALIKE, FiducialOptions()), hypotheses, is_given)
     assert len(listed) == looks
     assert [each.is_given for each in listed] == [True, *[False] * (looks - 1)]
     assert [each.hypotheses for each in listed[: len(hypotheses)]] == hypotheses

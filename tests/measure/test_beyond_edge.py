@@ -6,14 +6,14 @@ from drawn import scan_of
 from drawn_frames import layout_of, paint
 from scipy.ndimage import gaussian_filter
 
+from measure.detection.correlation import CLOSE
+from measure.detection.prediction import MarkPrediction
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
-from measure.frames.refinement import sight
+from measure.fiducials.mark_fit import sight
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import MarkShape, cross, polygon
 from measure.match_options import MatchOptions
 from measure.matching.window import beyond_edge
-from measure.search.correlation import CLOSE
-from measure.search.prediction import MarkPrediction
 
 PX_PER_MM = 30.0
 GROUND, EDGE, NOISE = 55000.0, 5000.0, 600.0

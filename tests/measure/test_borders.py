@@ -5,14 +5,14 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, Border, TrueMark, grainy, over_border, some_mark, whitened_rms
 
+from measure.detection.prediction import MarkPrediction
 from measure.fiducial_options import FiducialOptions
-from measure.frames.refinement import sight
+from measure.fiducials.mark_fit import sight
 from measure.match_options import MatchOptions
 from measure.matching.border_search import likely_border
 from measure.matching.bordered_model import BorderedModel
 from measure.matching.match import Match
 from measure.matching.models import PictureModel
-from measure.search.prediction import MarkPrediction
 
 Array = np.ndarray
 GROUND, CONTRAST, SNR, BLUR_PX = 25000.0, 15000.0, 20.0, 1.0

@@ -4,8 +4,8 @@ import numpy as np
 from brute_marks import brute_picture
 from scipy import ndimage
 
+from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings
 from measure.marks.shapes import MarkShape, cross, ring_cross
-from measure.search.correlation import CLOSE, GRAINY, WIDE, Surroundings
 
 
 def test_a_faint_mark_beside_the_frames_edge_is_what_answers_most() -> None:

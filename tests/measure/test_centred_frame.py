@@ -12,15 +12,14 @@ from drawn_frames import CORNERS, NUMBERED, RING_CROSS, assert_right, frame_pict
 from range_server import range_server
 
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.hypotheses import PitchHypothesis, is_lattice, room_mm
+from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.search import FrameSearch
 from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
 from measure.results import FrameMeasurement
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan, open_scan
-from measure.search.centred_frame import is_lattice, room_mm
-from measure.search.frame_search import FrameSearch
-from measure.search.pitches import PitchHypothesis
 from measure.status import Status
 
 PITCH_UM = (50.0, 50.0)
@@ -28,7 +27,7 @@ PITCH_UM = (50.0, 50.0)
 
 @pytest.fixture(autouse=True)
 def _small_scans_count_as_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("measure.search.centred_frame._LARGE_PX", 1)
+    monkeypatch.setattr("measure.fiducials.hypotheses._LARGE_PX", 1)
 
 
 def measured(
@@ -141,7 +140,7 @@ def test_a_frame_that_the_scan_holds_is_found_by_windows_as_by_the_whole(
     with written_scan(frame_picture(NUMBERED, matrix), tmp_path) as scan:
         hypothesis = [PitchHypothesis(pitch_mm, 0.02, pitch_mm)]
         whole = FrameSearch(scan, NUMBERED, FiducialOptions()).anywhere(hypothesis)[0]
-        monkeypatch.setattr("measure.search.frame_search._WINDOWS_SHARE", np.inf)
+        monkeypatch.setattr("measure.fiducials.search._WINDOWS_SHARE", np.inf)
         monkeypatch.setattr(FrameSearch, "anywhere", None)
         search = FrameSearch(scan, NUMBERED, FiducialOptions())
         found = search.within(hypothesis)[0]

@@ -10,21 +10,21 @@ from drawn import scan_of
 from drawn_frames import layout_of, paint
 from numpy.typing import NDArray
 
-from measure import fiducials
 from measure.fiducial_options import FiducialOptions
-from measure.frames.chance import doubt
-from measure.frames.fiducial_rows import present_frame
-from measure.frames.frame import Frame
-from measure.frames.frame_measurement import measure_frame
+from measure.fiducials import measurement
+from measure.fiducials.constellation import Placement
+from measure.fiducials.frame import Frame
+from measure.fiducials.hypotheses import PitchHypothesis, pitch_hypotheses
+from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.orientation_pictures import SPOILT, Shown, Site
+from measure.fiducials.rows import present_frame
+from measure.fiducials.scan_orientation import decide_pose
+from measure.fiducials.search import FrameSearch
+from measure.fiducials.significance import doubt
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, MarkShape, dot
-from measure.pose.pose_decision import decide_pose
-from measure.pose.pose_pictures import SPOILT, Shown, Site
 from measure.results import Pose
 from measure.scans.scan import Scan
-from measure.search.constellation import Placement
-from measure.search.frame_search import FrameSearch
-from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 from measure.special_marks.learned import cut, template_of
 from measure.status import Status
 
@@ -111,8 +111,8 @@ def test_three_marks_of_the_neighbouring_frame_are_no_frame_beside_five_of_its_o
         return [replace(found[0], pixel_from_camera=shifted), *found]
 
     monkeypatch.setattr(FrameSearch, "anywhere", false_first)
-    monkeypatch.setattr(fiducials, "pitch_hypotheses", lambda *given: pitch_hypotheses(*given)[:1])
-    result = fiducials.measure_fiducials(scan_of(noisy(grey)), layout, (50.0, 50.0), replace(OPTIONS, pose="0"))
+    monkeypatch.setattr(measurement, "pitch_hypotheses", lambda *given: pitch_hypotheses(*given)[:1])
+    result = measurement.measure_fiducials(scan_of(noisy(grey)), layout, (50.0, 50.0), replace(OPTIONS, pose="0"))
     assert [mark.status is Status.MEASURED for mark in result.marks] == [index in own for index in range(8)]
     for index in own:
         assert result.marks[index].center_px == pytest.approx(true @ (*layout.marks[index].xy_mm, 1.0), abs=0.3)
@@ -150,7 +150,7 @@ def test_specks_that_lie_as_all_marks_are_doubted_too() -> None:
     as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
     free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
-    result = fiducials.measure_fiducials(
+    result = measurement.measure_fiducials(
         scan_of(strewn(np.concatenate([elsewhere[free], as_marks]))), DOTS, (50.0, 50.0)
     )
     assert Status.MEASURED not in {mark.status for mark in result.marks}

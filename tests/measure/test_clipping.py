@@ -5,11 +5,11 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, TrueMark, some_mark, whitened_rms
 
+from measure.detection.prediction import MarkPrediction
 from measure.fiducial_options import FiducialOptions
-from measure.frames.refinement import sight
+from measure.fiducials.mark_fit import sight
 from measure.matching.match import Match
 from measure.matching.saturation import censored, clipped_sides, noise_scale
-from measure.search.prediction import MarkPrediction
 
 FULL, CONTRAST = 65535.0, 20000.0
 

@@ -9,15 +9,15 @@ from brute_marks import placed
 from drawn import scan_of
 from drawn_frames import layout_of, paint
 
+from measure.detection.correlation import CLOSE, WIDE, Surroundings
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
-from measure.frames import frame_sighter
-from measure.frames.frame_sighter import FrameSighter
-from measure.frames.refinement import Sighting
+from measure.fiducials import frame_sighter
+from measure.fiducials.constellation import Placement
+from measure.fiducials.frame_sighter import FrameSighter
+from measure.fiducials.mark_fit import Sighting
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import MarkShape, polygon, turned_part
 from measure.matching.match import Match
-from measure.search.constellation import Placement
-from measure.search.correlation import CLOSE, WIDE, Surroundings
 from measure.status import Status
 
 PX_PER_MM = 20.0

@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.detection.candidates import Responses
+from measure.detection.response_layers import layers_of, peaks
+from measure.detection.scan_maps import Held
+from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import LayoutMark, MarkShape, dot
-from measure.search.candidates import Responses
-from measure.search.constellation import Bounds, Placement, PlacementSearch, same_picture
-from measure.search.response_layers import layers_of, peaks
-from measure.search.scan_maps import Held
 
 DOT = MarkShape(dot(0.3), "light")
 PLACES = ((100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0), (0.0, -103.0), (0.0, 95.0))

@@ -15,8 +15,8 @@ import tifffile
 from damaged_files import DAMAGES, measured, outcome, stored
 from numpy.typing import NDArray
 
-from measure.checks.lost_pixels import with_damage
 from measure.errors import MeasurementError
+from measure.fiducials.frame_checks import with_damage
 from measure.scans.scan import open_scan
 from measure.status import Status
 

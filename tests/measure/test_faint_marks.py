@@ -7,9 +7,9 @@ from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
 from measure.covariance import Cause
-from measure.frames.faint_marks import FaintMark, find_faint
+from measure.detection.faint_marks import FaintMark, find_faint
+from measure.detection.prediction import MarkPrediction
 from measure.marks.shapes import Bar, MarkShape, cross, dot
-from measure.search.prediction import MarkPrediction
 from measure.tone.curve import Tone, power
 
 CROSS = MarkShape(cross(0.5, 0.05), "dark")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from real_data import DATA, needs
 
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
 from measure.results import FrameMeasurement
 from measure.scans.cache import WholePicture

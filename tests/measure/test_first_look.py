@@ -6,11 +6,11 @@ from drawn import scan_of
 from scipy.ndimage import gaussian_filter
 from true_marks import KIND, some_mark
 
+from measure.detection.first_look import seen
+from measure.detection.prediction import MarkPrediction
 from measure.fiducial_options import FiducialOptions
-from measure.frames.first_look import seen
-from measure.frames.refinement import sight
+from measure.fiducials.mark_fit import sight
 from measure.marks.shapes import MarkShape, cross, polygon
-from measure.search.prediction import MarkPrediction
 
 GROUND, CONTRAST = 25000.0, 15000.0
 

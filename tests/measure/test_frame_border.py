@@ -10,7 +10,7 @@ from drawn_frames import layout_of, pixel_from_camera
 from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.frame_border import at_border, known_outline_mm
 from measure.marks.shapes import FiducialLayout, MarkShape, Point, Polygon, turned_part
 from measure.status import Status

@@ -9,12 +9,12 @@ from drawn import drawn, scan_of, transformed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from measure.detection.prediction import MarkPrediction
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
-from measure.frames.frame_edges import told_by_edges
+from measure.fiducials.frame_edges import told_by_edges
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, frame_corner, polygon
 from measure.matching.match import Match
-from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_corner import corner_of_edges
 from measure.status import Status
 from measure.tone.curve import Tone, power

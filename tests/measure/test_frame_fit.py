@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from brute_marks import Array
 
+from measure.fiducials.interior_orientation import fit_frame, outliers
 from measure.film import AFFINITY_SIGMA
-from measure.frames.frame_fit import fit_frame, outliers
 from measure.marks.poses import POSES, up_from_camera
 
 SQUARE = np.array([(100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0)])

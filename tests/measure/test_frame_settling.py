@@ -9,14 +9,14 @@ from true_marks import KIND, TrueMark, some_mark
 
 from measure.covariance import Cause, Covariance
 from measure.fiducial_options import FiducialOptions
-from measure.frames.frame import Frame
-from measure.frames.frame_measurement import measure_frame
-from measure.frames.frame_sighter import FrameSighter
+from measure.fiducials.constellation import Placement
+from measure.fiducials.frame import Frame
+from measure.fiducials.frame_sighter import FrameSighter
+from measure.fiducials.measure_frame import measure_frame
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
-from measure.search.constellation import Placement
 from measure.status import Status
 
 PX_PER_MM, SIDE_PX, AT_MM = 10.0, 600, 20.0

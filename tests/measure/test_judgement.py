@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.checks.judgement import judged
 from measure.covariance import Cause, Covariance
+from measure.fiducials.across_frames import judged
 from measure.film import BelievedFilm
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross

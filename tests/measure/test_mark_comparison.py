@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from measure.frames.mark_comparison import (
+from measure.fiducials.mark_comparison import (
     SharedBlur,
     SharedShape,
     Touch,

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from measure.checks.pitch_check import pitch_problem
 from measure.covariance import Covariance
+from measure.fiducials.frame_checks import pitch_problem
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status

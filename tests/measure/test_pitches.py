@@ -18,13 +18,13 @@ from drawn_frames import (
 )
 from scipy.ndimage import gaussian_filter
 
-from measure.attempts import _pitch_to_try
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
-from measure.frames.frame_measurement import measure_frame
+from measure.fiducials.constellation import NARROW, Placement
+from measure.fiducials.hypotheses import PitchHypothesis, slightly_longer
+from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.stages import _pitch_to_try
 from measure.marks.shapes import MarkShape
-from measure.search.constellation import NARROW, Placement
-from measure.search.pitches import PitchHypothesis, slightly_longer
 
 AERIAL = ((106.0, -106.0), (-106.0, -106.0), (-106.0, 106.0), (106.0, 106.0))
 # A frame of 14 mm with a hundredth of the usual tolerances bends as little as one of 140 mm.

@@ -11,15 +11,15 @@ from drawn import scan_of
 from drawn_frames import CORNERS, PITCH_UM, frame_picture, layout_of, measured, paint, pixel_from_camera
 from scipy.ndimage import gaussian_filter
 
+from measure.detection.first_look import seen
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
-from measure.frames import refinement
-from measure.frames.first_look import seen
-from measure.frames.frame_measurement import measure_frame, rename_frame
+from measure.fiducials import mark_fit
+from measure.fiducials.constellation import Placement
+from measure.fiducials.hypotheses import pitch_hypotheses
+from measure.fiducials.measure_frame import measure_frame, rename_frame
+from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.search import FrameSearch
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, polygon, turned_part
-from measure.search.constellation import Placement
-from measure.search.frame_search import FrameSearch
-from measure.search.pitches import pitch_hypotheses
 from measure.status import Status
 
 HALF_WEDGE = MarkShape(polygon(((0.0, 0.0), (1.4, 0.0), (1.4, 0.8))))
@@ -95,7 +95,7 @@ def test_marks_that_were_found_are_renamed_and_not_sought_again(monkeypatch: pyt
     named_rightly = measure_frame(scan, BLOCKS, start, OPTIONS)
     named_wrongly = measure_frame(scan, BLOCKS, start.posed("0", right_mm(BLOCKS)), OPTIONS)
     assert int(named_wrongly.belongs.sum()) == 4
-    monkeypatch.setattr(refinement, "seen", lambda scan, mark: seen(scan, mark) if mark.search_px < 2 else None)
+    monkeypatch.setattr(mark_fit, "seen", lambda scan, mark: seen(scan, mark) if mark.search_px < 2 else None)
     frame = rename_frame(scan, BLOCKS, named_wrongly, "180", OPTIONS)
     assert frame.placement.pose == "180"
     assert int(frame.belongs.sum()) == 4

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.fiducials.orientation_pictures import Drawings, Shown, Site
 from measure.marks.shapes import MarkTemplate
 from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
-from measure.pose.pose_pictures import Drawings, Shown, Site
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan

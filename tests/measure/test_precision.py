@@ -18,12 +18,12 @@ from true_marks import (
 )
 
 from measure.covariance import Cause
+from measure.detection.prediction import MarkPrediction
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
-from measure.frames.refinement import sight
+from measure.fiducials.mark_fit import sight
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
 from measure.matching.match import Match
-from measure.search.prediction import MarkPrediction
 from measure.targets.disks import fit_disk
 from measure.tone.curve import Tone
 

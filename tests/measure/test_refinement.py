@@ -7,11 +7,11 @@ import pytest
 from brute_marks import brute_picture
 from drawn import scan_of
 
-from measure.frames.refinement import options_for, sight, strained_px
+from measure.detection.prediction import MarkPrediction
+from measure.fiducials.mark_fit import options_for, sight, strained_px
 from measure.marks.shapes import MarkShape, cross, polygon
 from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
-from measure.search.prediction import MarkPrediction
 
 WING = MarkShape(polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35))))
 START = np.array([[36.0, 0.0, 30.3], [0.0, -36.0, 39.6]])
@@ -39,7 +39,7 @@ def test_a_slim_wedge_that_looks_like_itself_along_its_edges_is_followed_to_its_
     grey = 8000.0 + 20000.0 * brute_picture(slim, true, 201, 181, 1.2)
     scan = scan_of(grey + np.random.default_rng(2).normal(0.0, 400.0, grey.shape))
     first = true[:, 2] + (along_px, 0.0)
-    monkeypatch.setattr("measure.frames.refinement.seen", lambda *_: (first, 0.0))
+    monkeypatch.setattr("measure.fiducials.mark_fit.seen", lambda *_: (first, 0.0))
     expected = MarkPrediction(slim, true, 12.0, 1)
     fit = sight(scan, expected, MatchOptions()).fit
     assert fit is not None

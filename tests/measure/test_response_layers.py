@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from measure.search.candidates import Responses
-from measure.search.correlation import Map
-from measure.search.response_layers import Layer, Reach, layers_of
-from measure.search.scan_maps import Held
+from measure.detection.candidates import Responses
+from measure.detection.correlation import Map
+from measure.detection.response_layers import Layer, Reach, layers_of
+from measure.detection.scan_maps import Held
 
 ORIGIN = np.array([7, 3])
 MAP = np.random.default_rng(5).normal(size=(40, 50)).astype(np.float32)

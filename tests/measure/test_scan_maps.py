@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from measure.detection.correlation import WIDE, Map
+from measure.detection.scan_maps import Held, ScanMaps, Sought
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
-from measure.search.correlation import WIDE, Map
-from measure.search.scan_maps import Held, ScanMaps, Sought
 
 RNG = np.random.default_rng(4)
 SCAN = Scan(Path("noise.tif"), WholePicture(RNG.integers(0, 65535, (90, 110, 3), np.uint16)), NO_TAGS)

@@ -9,7 +9,7 @@ from brute_marks import written_scan
 from drawn_frames import ALIKE, FRAME_PX, PITCH_UM, frame_picture, pixel_from_camera
 
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.results import moved_frame
 from measure.scans.scan_views import windowed
 from measure.second_frame import second_frame

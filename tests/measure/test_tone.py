@@ -7,7 +7,8 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 
-from measure.frames.refinement import options_for, sight
+from measure.detection.prediction import MarkPrediction
+from measure.fiducials.mark_fit import options_for, sight
 from measure.marks.shapes import MarkShape, polygon
 from measure.match_options import MatchOptions
 from measure.matching.covariance import Landscape, LinearFit
@@ -15,7 +16,6 @@ from measure.matching.match import Match, match
 from measure.matching.tone_information import told_tone
 from measure.matching.window import read_window
 from measure.noise.noise_model import NoiseModel
-from measure.search.prediction import MarkPrediction
 from measure.tone.curve import LINEAR, SaidOfTone, Tone, power, sampled, srgb
 from measure.tone.estimate import FrameTone, ToldTone
 from synthetic_images.tone_curve import coded

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.checks.judgement import judged
 from measure.covariance import Covariance
+from measure.fiducials.across_frames import judged
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status

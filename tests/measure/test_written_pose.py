@@ -11,11 +11,11 @@ from brute_marks import Array, written_scan
 from drawn_frames import PITCH_UM, RING_CROSS, frame_picture, layout_of, pixel_from_camera
 
 from measure.annotations.line import KnownLine, Line, Reading, of_one_face
+from measure.annotations.orientation_from_text import main_pose, side_in_camera, writing_likelihoods
 from measure.fiducial_options import FiducialOptions, Reads
-from measure.fiducials import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials
 from measure.marks.poses import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import MarkShape, Side, WrittenPlace
-from measure.pose.written_pose import main_pose, side_in_camera, writing_likelihoods
 from measure.results import FrameMeasurement
 
 WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))

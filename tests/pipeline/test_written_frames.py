@@ -11,11 +11,11 @@ from rich.console import Console
 
 from measure.annotations import detect_text as networks_module
 from measure.annotations.line import Line, Reading
+from measure.annotations.orientation_from_text import side_in_camera, writing_likelihoods
 from measure.covariance import Cause, Covariance
 from measure.fiducial_options import FiducialOptions, Reads
 from measure.marks.poses import POSES, pose_in_camera
 from measure.marks.shapes import Side, WrittenPlace
-from measure.pose.written_pose import side_in_camera, writing_likelihoods
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
@@ -380,7 +380,7 @@ def test_a_rendered_frame_is_read_and_its_pose_decided(tmp_path: Path, monkeypat
     assert "a,run," in (tmp_path / "p" / "out" / "frames.csv").read_text(encoding="utf-8")
     assert (tmp_path / "p" / "images.csv").read_text(encoding="utf-8") == "image,run,date\na,7,1968-05-16\n"
     monkeypatch.setattr("pipeline.measuring.measured.networks", lambda: None)
-    monkeypatch.setattr("measure.fiducials.networks", lambda: None)
+    monkeypatch.setattr("measure.fiducials.measurement.networks", lambda: None)
     run(["measure", str(project)])
     (scan,) = read_measurement(tmp_path / "p" / "out" / "measurement.db")
     assert scan.frame.pose is not None

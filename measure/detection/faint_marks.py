@@ -1,0 +1,301 @@
+"""A mark that is barely there, at a place that the other marks give: its lines against the texture about it.
+
+Alone such a mark cannot be told from the many places where noise looks like it. Where the constellation is sure, only
+those as strong and as near to the predicted place are its rivals: how many the texture would give is known (Adler, The
+Geometry of Random Fields, 1981: excursions of a Gaussian field), and so is, from the same texture, how far it pulls
+the mark from its true place. How strong the texture is beside the lines depends on the tone curve: where that is not
+known, the mark is sought by two curves, and how far apart it is seen is in its covariance.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.covariance import Cause, Covariance
+from measure.detection.candidates import FAINT, detail_px
+from measure.detection.prediction import MarkPrediction
+from measure.marks.rendering import extent_px, picture
+from measure.matching.match import Match
+from measure.matching.window import Coding
+from measure.reason import NO_REASON
+from measure.scans.scan import Scan, means
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_BACKGROUND = 1.2  # times the finest detail: the standard deviation of the blur that is taken for background
+_TEXTURE = 2.0  # times that: over which the strength of the texture is averaged
+_CLIP = 3.0  # times the texture's strength: stones and edges count no more
+_RING = 30.0  # times the background's: how far about the mark the texture is asked
+_SELF = 0.1  # of the mark's own response: what is below it tells of the texture alone
+_SHOWN = 0.2  # of the mark's own weight: elsewhere the ground is too dark to tell
+_LINE = 0.25  # of the strongest: what counts as the mark's lines
+_ROUNDS = 8  # of rendering the mark anew where it was found, at most
+_SETTLED_PX = 1e-3  # a move that needs no further one: a fiftieth of what a faint mark is known to
+_STEP_PX = 0.5  # between the places by which a response's top is told
+_OWN_LINEAR = 0.01  # by so much marks are turned (rad) and larger than the frame says: a real register glass's by 0.012
+_LEAST_DISTANCE_PX = 1.0  # predictions are no better
+_LEAST_PLACES = 200  # of the texture that a covariance can be taken from
+_LEAST_NORM = 1e-6  # squared: where nothing shows of the mark nothing is divided by nothing
+_FINEST_PX = 16.0  # of a mark's lines: what is wider is sought in a picture that is reduced so far
+
+
+@dataclass(frozen=True, eq=False)
+class FaintMark:
+    """fit: the mark; its significance is in standard deviations of what the texture about it answers, and its
+    covariance comes from that texture. chance: how many answers as strong and as near the texture alone would give."""
+
+    fit: Match
+    chance: float
+
+    @property
+    def sigma_px(self) -> float:
+        """The standard deviation of where it is seen, in the direction in which that is known least."""
+        parts = self.fit.place_covariance.parts
+        seen_px2 = sum((part for cause, part in parts.items() if cause != Cause.OWN_TURN), np.zeros((2, 2)))
+        return float(np.sqrt(np.linalg.eigvalsh(seen_px2)[-1]))
+
+
+def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
+    """The strongest response to the mark within the search radius of its predicted place, None where there is no
+    contrast by any curve that the scan's may be.
+
+    extreme_dn: the lightest or darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as
+    light or as dark it does not show.
+    """
+    seen = [_found(scan.seen_through(curve), expected, extreme_dn, blur_px) for curve in scan.tone.ends]
+    both = [each for each in seen if each is not None]
+    if len(both) < len(seen):
+        return None
+    less_sure = max(both, key=lambda each: each.chance)
+    centers = np.array([each.fit.center_px for each in both])
+    half, center = (centers[0] - centers[-1]) / 2, centers.mean(axis=0)
+    fit = replace(
+        less_sure.fit,
+        center_px=center,
+        pixel_from_mark=np.column_stack([less_sure.fit.pixel_from_mark[:, :2], center]),
+        place_covariance=less_sure.fit.place_covariance.plus(Cause.TONE, np.outer(half, half)),
+    )
+    return FaintMark(fit, less_sure.chance)
+
+
+def _found(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
+    """By the scan's one curve."""
+    field = _Field(scan, expected, extreme_dn, blur_px)
+    first = field.response(field.predicted)
+    center = first.highest(field.predicted, expected.search_px / field.step)
+    if center is None:
+        return None
+    for _ in range(_ROUNDS):
+        response = field.response(center)
+        top = response.top(center)
+        if np.hypot(*(top - center)) < _SETTLED_PX:
+            return field.seen(response, center)
+        center = top
+    return field.seen(field.response(center), center)
+
+
+@dataclass(frozen=True, eq=False)
+class _Response:
+    """What a field answers to a mark whose centre is off the pixel's by fraction."""
+
+    field: "_Field"
+    fraction: Array
+
+    @cached_property
+    def template(self) -> Array:
+        """The mark as it looks so."""
+        return self.field.template(self.fraction)
+
+    @cached_property
+    def templates(self) -> Array:
+        """(3, 3, rows, columns): the same with its centre _STEP_PX less, not, and as much more off in row and column: a
+        line may be finer than the pixels are far apart, and how its picture changes between them no picture of whole
+        pixels tells."""
+        off = (-_STEP_PX, 0.0, _STEP_PX)
+        moved = [[self.field.template(self.fraction + np.array([col, row])) for col in off] for row in off]
+        return np.array(moved)
+
+    @cached_property
+    def norm(self) -> Array:
+        """Of the weighted template at every pixel."""
+        return np.sqrt(np.maximum(_correlated(self.field.room**2, self.template**2), 0.0) + _LEAST_NORM)
+
+    @cached_property
+    def value(self) -> Array:
+        """The weighted correlation at every pixel."""
+        return _correlated(self.field.weighted, self.template) / self.norm
+
+    def pixel(self, center: Array) -> tuple[int, int]:
+        """Row and column of the value for a mark at a centre."""
+        col, row = np.rint(center - self.fraction)
+        return int(row), int(col)
+
+    def patch(self, center: Array) -> tuple[slice, slice]:
+        (row, col), half = self.pixel(center), self.template.shape[0] // 2
+        return slice(row - half, row + half + 1), slice(col - half, col + half + 1)
+
+    def highest(self, center: Array, reach_px: float) -> Array | None:
+        """The pixel of the highest value within reach of the centre; None where it is no mark of that polarity."""
+        rows, cols = np.indices(self.value.shape)
+        near = np.hypot(cols + self.fraction[0] - center[0], rows + self.fraction[1] - center[1]) <= reach_px
+        row, col = np.unravel_index(int(np.where(near, self.value, -np.inf).argmax()), self.value.shape)
+        return np.array([col, row]) + self.fraction if self.value[row, col] > 0 else None
+
+    def top(self, center: Array) -> Array:
+        """Of the paraboloid through the responses about a centre, as near as it tells."""
+        gradient, hessian = self.bend(self.field.weighted, center)
+        if not np.all(np.linalg.eigvalsh(hessian) < 0):
+            return center
+        return np.asarray(center + np.clip(-np.linalg.solve(hessian, gradient), -_STEP_PX, _STEP_PX))
+
+    def bend(self, weighted: Array, center: Array) -> tuple[Array, Array]:
+        """Gradient and Hessian of what a weighted picture answers to a mark at a centre that moves."""
+        patch = self.patch(center)
+        answers = np.einsum("rcij,ij->rc", self.templates, weighted[patch])
+        norm = np.sqrt(((self.field.room[patch] * self.template) ** 2).sum() + _LEAST_NORM)
+        gradient, hessian = _paraboloid(answers / norm)
+        return gradient / _STEP_PX, hessian / _STEP_PX**2
+
+    def slopes(self) -> Array:
+        """(2, rows, cols) by column and row, of the values."""
+        by_col, by_row = (self.templates[1, 2] - self.templates[1, 0], self.templates[2, 1] - self.templates[0, 1])
+        return np.stack([_correlated(self.field.weighted, by) / (2 * _STEP_PX) / self.norm for by in (by_col, by_row)])
+
+
+class _Field:
+    """The window about a predicted place, freed of everything coarser than the mark's lines, step pixels of the scan to
+    one of its own, in which all its places are."""
+
+    def __init__(self, scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> None:
+        self.blur_px = blur_px
+        self.step = step = max(1, int(detail_px(expected.mark, expected.linear) / _FINEST_PX))
+        self.mark, self.linear, self.polarity = expected.mark, expected.linear / step, expected.polarity
+        self.coarse_px = _BACKGROUND * detail_px(self.mark, self.linear)
+        least, greatest = extent_px(self.mark, np.column_stack([self.linear, np.zeros(2)]))
+        self.half = int(np.ceil(max(-least.min(), greatest.max()) + 2 * self.coarse_px)) + 1
+        moves_px = (
+            _ROUNDS * _STEP_PX + 1.0
+        )  # between the pixels its place may come to lie farther off than was searched
+        side = self.half + int(np.ceil(max(expected.search_px / step, _RING) + moves_px))
+        first = np.floor(expected.center_px).astype(int) - side * step - step // 2
+        self.origin = first + (step - 1) / 2
+        self.predicted = (expected.center_px - self.origin) / step
+        window = (int(first[0]), int(first[1]), *((2 * side + 1) * step,) * 2)
+        light = _reduced(scan.light(*window, expected.weights), step)
+        self.coding = Coding(None, scan.tone, scan.full_scale_dn)
+        self.ground_dn = ground = np.asarray(cv2.GaussianBlur(light, (0, 0), self.coarse_px), np.float32)
+        detail = light - ground
+        spread = cv2.GaussianBlur(detail**2, (0, 0), _TEXTURE * self.coarse_px)
+        least_dn = np.abs(self.coding.light_of_step_dn(ground, FAINT * scan.full_scale_dn))
+        self.texture_dn: Array = np.sqrt(spread + least_dn**2)
+        extreme = float(scan.tone.light(np.array(extreme_dn), scan.full_scale_dn))
+        room_dn = np.maximum(self.polarity * (extreme - ground), 0.0)
+        inside = _reduced(scan.inside(*window).astype(np.float32), step) == 1.0
+        self.room_dn = np.where(inside, room_dn, 0.0).astype(np.float32)
+        self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
+        self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
+        self.weighted = self.detail * self.room
+
+    def response(self, center: Array) -> _Response:
+        """The response to the mark as it looks with its centre where given between the pixels."""
+        return _Response(self, center - np.rint(center))
+
+    def template(self, off: Array) -> Array:
+        """The mark with its centre off the middle pixel's, freed of what is coarse."""
+        size = 2 * self.half + 1
+        pixel_from_mark = np.column_stack([self.linear, off + self.half])
+        shown = picture(self.mark, pixel_from_mark, size, size, self.blur_px / self.step)
+        return np.asarray(shown - cv2.GaussianBlur(shown, (0, 0), self.coarse_px), dtype=float)
+
+    def seen(self, response: _Response, center: Array) -> FaintMark | None:
+        """What the response at the mark's place is worth, against what the texture about it answers."""
+        (row, col), patch = response.pixel(center), response.patch(center)
+        height = float(response.value[row, col])
+        amplitude = height / float(response.norm[row, col])
+        own = np.zeros_like(self.detail)
+        own[patch] = amplitude * self.room[patch] ** 2 * response.template
+        signal = _correlated(own, response.template) / response.norm
+        texture = self._texture(response, signal, (row, col))
+        bend = response.bend(own, center)[1]
+        if texture.sum() < _LEAST_PLACES or not np.all(np.linalg.eigvalsh(bend) < 0):
+            return None
+        slopes = np.asarray(np.cov(response.slopes()[:, texture]), dtype=float)
+        scatter = float(np.sqrt(np.mean(response.value[texture] ** 2)))
+        inverse, place = np.linalg.inv(bend) * self.step, center * self.step + self.origin
+        covariance = Covariance.of_noise(inverse @ slopes @ inverse)
+        distance_px = float(np.hypot(*(center - self.predicted)))
+        lines = np.abs(response.template)
+        lit = lines * self.room[patch]
+        contrast_dn = self.polarity * amplitude * float(np.average(self.room_dn[patch], weights=lit))
+        fit = Match(
+            converged=True,
+            reason=NO_REASON,
+            center_px=place,
+            place_covariance=covariance.plus(Cause.OWN_TURN, self._leaning_px2(response, center)),
+            pixel_from_mark=np.column_stack([self.linear * self.step, place]),
+            contrast_dn=contrast_dn,
+            stored_contrast_dn=self.coding.stored_contrast_dn(
+                float(np.average(self.ground_dn[patch], weights=lit)), contrast_dn
+            ),
+            noise_dn=float(np.average(self.texture_dn[patch], weights=lit)),
+            blur_px=self.blur_px,
+            damaged_fraction=max(1 - float((lit > _LINE * lit.max()).sum() / (lines > _LINE * lines.max()).sum()), 0.0),
+            lost_fraction=0.0,
+            redundancy=int((lit > 0).sum()) - 3,
+            neighbour_correlation=_neighbour_correlation(self.detail, texture),
+            covariance_is_white=False,
+            likeness=min(height / float(np.linalg.norm(self.detail[patch][lit > _LINE / 5 * lit.max()])), 1.0),
+            significance=height / scatter,
+        )
+        return FaintMark(fit, _chance(height / scatter, slopes / scatter**2, max(distance_px, _LEAST_DISTANCE_PX)))
+
+    def _leaning_px2(self, response: _Response, center: Array) -> Array:
+        """What the place of a mark whose lines lie to one side of its point takes from a turn and a size that are not
+        quite the frame's, as if its lines were all in their middle."""
+        lit = np.abs(response.template) * self.room[response.patch(center)] ** 2
+        lit /= lit.sum()
+        rows, cols = np.indices(lit.shape) - self.half
+        middle_px = self.step * (np.array([(lit * cols).sum(), (lit * rows).sum()]) - response.fraction)
+        return np.asarray(_OWN_LINEAR**2 * (middle_px @ middle_px) * np.eye(2))
+
+    def _texture(self, response: _Response, signal: Array, place: tuple[int, int]) -> Mask:
+        """Where about the mark responses are the texture's alone: on ground where the mark could show."""
+        rows, cols = np.indices(signal.shape)
+        near = np.hypot(rows - place[0], cols - place[1]) <= _RING
+        whole = np.zeros(signal.shape, dtype=bool)
+        whole[self.half : -self.half, self.half : -self.half] = True
+        alone = np.abs(signal) < _SELF * signal[place]
+        return np.asarray(near & whole & alone & (response.norm > _SHOWN * response.norm[place]))
+
+
+def _reduced(picture: NDArray[np.floating], step: int) -> NDArray[np.floating]:
+    return picture if step == 1 else np.asarray(means(picture[..., None], step)[..., 0])
+
+
+def _chance(strength: float, slopes: Array, radius_px: float) -> float:
+    """How many maxima of at least this strength a Gaussian field of unit variance has in a circle, slopes (2, 2) being
+    the covariance of its gradient: Adler's expected Euler characteristic of the excursion set."""
+    density = np.sqrt(np.linalg.det(slopes)) * (2 * np.pi) ** -1.5 * strength * np.exp(-(strength**2) / 2)
+    return float(np.pi * radius_px**2 * density)
+
+
+def _neighbour_correlation(detail: Array, texture: Mask) -> float:
+    pairs = texture[:, 1:] & texture[:, :-1]
+    return float(np.corrcoef(detail[:, 1:][pairs], detail[:, :-1][pairs])[0, 1])
+
+
+def _correlated(image: NDArray[np.floating], template: NDArray[np.floating]) -> Array:
+    return np.asarray(cv2.filter2D(np.asarray(image, np.float32), cv2.CV_32F, np.asarray(template, np.float32)), float)
+
+
+def _paraboloid(three: Array) -> tuple[Array, Array]:
+    """Gradient (2,) by (col, row) and Hessian (2, 2) of the paraboloid through 3 x 3 values, by least squares."""
+    by_col, by_row = three.mean(axis=0), three.mean(axis=1)
+    gradient = np.array([by_col[2] - by_col[0], by_row[2] - by_row[0]]) / 2
+    mixed = (three[2, 2] + three[0, 0] - three[0, 2] - three[2, 0]) / 4
+    bends = [side[2] - 2 * side[1] + side[0] for side in (by_col, by_row)]
+    return gradient, np.array([[bends[0], mixed], [mixed, bends[1]]])

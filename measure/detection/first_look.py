@@ -1,0 +1,99 @@
+"""Where near its predicted place a mark looks most like itself, at full or half resolution, and whether noise would
+look so."""
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.special import ndtr
+
+from measure.detection.candidates import FAINT, detail_px
+from measure.detection.correlation import correlation, variation
+from measure.detection.prediction import MarkPrediction
+from measure.detection.response_layers import highest
+from measure.marks.rendering import extent_px, known_picture
+from measure.matching.match import window_about
+from measure.probabilities import NOISE_LIKE_A_MARK
+from measure.scans.scan import Scan
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+
+_SURE = 1e-6  # what is less likely is the mark, however soft: there are many marks
+_HALVED_PX = 6.0  # of the finest line: from there on half the resolution shows it as well
+_SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine line seen softly is another picture
+
+
+def seen(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None:
+    """Column and row of the scan within the search radius where the mark correlates best, to a part of a pixel, and the
+    expected number of places there that noise makes answer so well; None where noise would do so. Drawn sharp or soft,
+    whichever noise is less likely to answer so: a soft faint mark, drawn sharp, is no more than its noise."""
+    looks = [_Look(scan, expected, _SHARP_PX)]
+    if looks[0].chance > _SURE:
+        looks.append(_Look(scan, expected, _SOFT_PX))
+    best = min(looks, key=lambda look: look.chance)
+    return (best.center_px, best.chance) if best.chance <= NOISE_LIKE_A_MARK else None
+
+
+def strongest(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:
+    """Column and row of the scan within the search radius where the mark correlates best, and how well."""
+    look = _Look(scan, expected, _SHARP_PX)
+    return look.center_px, look.height
+
+
+class _Look:
+    """center_px (2,): where the mark, drawn with that blur, correlates best; height: how well."""
+
+    def __init__(self, scan: Scan, expected: MarkPrediction, blur_px: float) -> None:
+        mark, surroundings = expected.mark, expected.surroundings
+        reduction = 2 if detail_px(mark, expected.linear) >= _HALVED_PX else 1
+        shift_px = (reduction - 1) / 2
+        reduced = np.column_stack([expected.linear, expected.center_px - shift_px]) / reduction
+        search_px, blur_px = expected.search_px / reduction, blur_px / reduction
+        spare = int(np.ceil(2 * blur_px))
+        col0, row0, width, tall = window_about(mark, reduced, search_px + spare + 2)
+        centred = np.column_stack([reduced[:, :2], np.zeros(2)])
+        least, greatest = extent_px(mark, centred)
+        low, high = np.floor(least).astype(int) - spare, np.ceil(greatest).astype(int) + spare
+        centred[:, 2] = -low
+        size = high - low + 1
+        finest_px = max(detail_px(mark, reduced[:, :2]), blur_px)
+        template = known_picture(mark, centred, int(size[0]), int(size[1]), blur_px)
+        # A median at the window's end would see half of what lies about it: beside the frame's edge only the border.
+        rim = surroundings.ground_reach_px(finest_px)
+        wide = (col0 - rim, row0 - rim, width + 2 * rim, tall + 2 * rim)
+        window = scan.reduced_window(reduction, *wide, expected.weights)
+        flattened = surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
+        self._flat = expected.polarity * flattened[rim:-rim, rim:-rim]
+        self._pattern, self._counts = surroundings.pattern(template, finest_px, self._flat)
+        varied = variation(self._flat, self._counts)
+        response = correlation(self._flat, self._pattern, self._counts, varied)
+        place = np.stack(np.meshgrid(*(np.arange(count, dtype=float) for count in response.shape[::-1])), axis=-1)
+        place += np.array([col0, row0]) - low
+        near = np.hypot(*np.moveaxis(place - reduced[:, 2], -1, 0)) <= search_px
+        self._best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
+        self._places = int(near.sum())
+        # A fit that begins within a part of a pixel takes a step less.
+        top = highest(response, np.array([self._best[::-1]]), 0.0)[0][0]
+        self.center_px: Array = (top + np.array([col0, row0]) - low) * reduction + shift_px
+        self.height = float(response[self._best])
+
+    @cached_property
+    def chance(self) -> float:
+        """The expected number of places that noise makes answer so well. The correlation of two rows of numbers, each
+        with its own autocorrelation, varies by the sum of the products of these over how many they are (Bartlett,
+        1935); that sum is what one answers to the other at all offsets."""
+        if self.height <= 0:
+            return float(self._places)
+        chip = self._pattern
+        noise = self._flat - self._flat.mean()
+        here = noise[self._best[0] :, self._best[1] :][: chip.shape[0], : chip.shape[1]]
+        here -= chip * np.float32((here * chip).sum() / (chip**2).sum())
+        shape = [fft.next_fast_len(sum(sides), real=True) for sides in zip(noise.shape, chip.shape, strict=True)]
+        power = np.abs(fft.rfft2(noise, s=shape) * fft.rfft2(chip, s=shape)) ** 2
+        answers = float(fft.irfft(power.sum(axis=0), n=shape[1])[0]) / shape[0]  # their squares (Parseval)
+        energy = max(float((noise**2).sum() * (chip**2).sum()), 1e-12)
+        variance = max(answers / energy, 1e-12) / float(self._counts.sum())
+        unlike = max(1 - self.height**2, 1e-12)
+        return float(self._places * ndtr(-self.height / np.sqrt(unlike * variance)))

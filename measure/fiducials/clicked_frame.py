@@ -1,0 +1,125 @@
+"""The frame where a person shows it: three or more of its marks were pointed at, by their names."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.covariance import Cause, Covariance
+from measure.fiducial_options import CLICK_SIGMA_PX, Click, FiducialOptions
+from measure.fiducials.constellation import Placement
+from measure.fiducials.frame import Frame
+from measure.fiducials.measure_frame import measure_frame
+from measure.marks.poses import POSES, up_from_camera
+from measure.marks.shapes import FiducialLayout
+from measure.reason import NO_REASON, Code, Reason
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.scans.scan import Scan
+from measure.status import Status
+
+Array = NDArray[np.float64]
+
+LEAST_CLICKS = 3  # two do not tell a mirrored frame from one that is not
+_TOLD = ("the marks that were pointed at say so.",)
+_COLLINEAR = 1e-3  # of their extent: marks nearer to a line than that do not tell it either
+
+
+def is_shown(layout: FiducialLayout, options: FiducialOptions) -> bool:
+    """Whether enough marks were pointed at to say where the frame is."""
+    return len(_shown(layout, options.clicks)[0]) >= LEAST_CLICKS
+
+
+def clicked_frame(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> tuple[Frame, Pose]:
+    """The frame measured from a similarity through the marks that were pointed at, and its pose, which they tell
+    unless they lie on a line, or the project sets it."""
+    camera, clicked = _shown(layout, options.clicks)
+    pixel_mm = np.array(pitch_um or (1.0, 1.0)) / 1000.0
+    up_mm = clicked * pixel_mm * (1.0, -1.0)
+    pose, up = _clicked_pose(camera, up_mm, POSES if options.pose == "auto" else (options.pose,))
+    if pitch_um is None:  # then it is what the marks' separations say
+        pixel_mm = pixel_mm / float(np.sqrt(abs(np.linalg.det(up[:, :2]))))
+        up = up / np.sqrt(abs(np.linalg.det(up[:, :2])))
+    matrix = np.diag([1.0, -1.0]) @ up / pixel_mm[:, None]
+    pitch_mm = (float(pixel_mm[0]), float(pixel_mm[1]))
+    polarities = (1, -1) if any(mark.mark.polarity == "auto" for mark in layout.marks) else (1,)
+    placements = [Placement(pose, matrix, 0.0, len(camera), polarity, 1, pitch_mm) for polarity in polarities]
+    frames = [measure_frame(scan, layout, placement, options) for placement in placements]
+    frame = max(frames, key=lambda one: (one.measured, int(one.belongs.sum())))
+    tells = options.pose != "auto" or not on_a_line(camera)
+    evidence = _TOLD if tells else ("the marks that were pointed at lie on a line, which has two sides.",)
+    return frame, Pose(pose, tells, evidence)
+
+
+def contradicted_pose(layout: FiducialLayout, options: FiducialOptions, pitch_um: tuple[float, float] | None) -> Reason:
+    """Why the clicks do not go with the scan orientation that is set; empty where they do, or cannot tell."""
+    camera, clicked = _shown(layout, options.clicks)
+    if options.pose == "auto" or on_a_line(camera):
+        return NO_REASON
+    pose, _ = _clicked_pose(camera, clicked * np.array(pitch_um or (1.0, 1.0)) / 1000.0 * (1.0, -1.0), POSES)
+    if pose == options.pose:
+        return NO_REASON
+    told = (
+        f"the marks that were pointed at show the scan orientation {pose}, and {options.pose} is set. A viewer that "
+        "obeys the file's orientation tag shows other columns and rows than the file has. Point at them in the picture "
+        "as it is stored, or set the right orientation"
+    )
+    return Reason(told, Code.POSE)
+
+
+def on_a_line(places: Array) -> bool:
+    """Whether places (n, 2) do not tell a mirrored frame from one that is not."""
+    singular = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+    return bool(singular[1] <= _COLLINEAR * singular[0])
+
+
+def with_clicks(frame: FrameMeasurement, clicks: Sequence[Click]) -> FrameMeasurement:
+    """Marks that were pointed at and could not be matched are where the person saw them, as well as one points."""
+    told = {click.point: click for click in clicks}
+    marks = (_placed(mark, told[mark.point]) if mark.point in told else mark for mark in frame.marks)
+    return replace(frame, marks=tuple(marks))
+
+
+def _shown(layout: FiducialLayout, clicks: Sequence[Click]) -> tuple[Array, Array]:
+    """(n, 2) camera mm of the marks that were pointed at, and (n, 2) where."""
+    places = {mark.id: mark.xy_mm for mark in layout.marks}
+    known = [click for click in clicks if click.point in places]
+    camera = np.array([places[click.point] for click in known]).reshape(-1, 2)
+    return camera, np.array([(click.col_px, click.row_px) for click in known]).reshape(-1, 2)
+
+
+def _clicked_pose(camera: Array, up_mm: Array, poses: Sequence[str]) -> tuple[str, Array]:
+    """Of the poses the one that fits the marks best, and is turned least; and its similarity (2, 3)."""
+    found = [(pose, *_similarity(camera, up_mm, pose)) for pose in poses]
+    pose, up, _ = min(found, key=lambda one: (round(one[2] / np.ptp(up_mm), 9), abs(_turn_rad(one[1], one[0]))))
+    return pose, up
+
+
+def _similarity(camera: Array, up_mm: Array, pose: str) -> tuple[Array, float]:
+    """(2, 3), camera mm to the scan's mm (right, up) through a pose and a similarity, least squares, and what is left
+    of the places, mm."""
+    turned = camera @ up_from_camera(pose).T
+    own, seen = turned @ (1.0, 1j), up_mm @ (1.0, 1j)
+    design = np.column_stack([own, np.ones(len(own))])
+    (scale, shift), *_ = np.linalg.lstsq(design, seen, rcond=None)
+    linear = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ up_from_camera(pose)
+    left = float(np.abs(design @ (scale, shift) - seen).max())
+    return np.column_stack([linear, [shift.real, shift.imag]]), left
+
+
+def _turn_rad(up_from_mm: Array, pose: str) -> float:
+    """How far the frame is turned against a pose."""
+    own = up_from_mm[:, :2] @ np.linalg.inv(up_from_camera(pose))
+    return float(np.arctan2(own[1, 0], own[0, 0]))
+
+
+def _placed(mark: MarkMeasurement, click: Click) -> MarkMeasurement:
+    if mark.status.is_observation:
+        return mark
+    place = np.array([click.col_px, click.row_px])
+    covariance = Covariance({Cause.CLICK: CLICK_SIGMA_PX**2 * np.eye(2)})
+    told = f"it is where a person pointed, for nothing could be matched there: {mark.reason}"
+    reason = Reason(told, Code.CLICKED, *mark.reason.codes)
+    return replace(mark, center_px=place, covariance=covariance, status=Status.WEAK, reason=reason)

@@ -1,0 +1,301 @@
+"""The frame's place in its scan: the small similarity, in each pose, under which most marks have a response.
+
+Places are complex numbers here, x + iy in mm of the scan's own axes (right, up), so that a similarity is `a w + b`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from measure.detection.candidates import Responses
+from measure.detection.correlation import WIDE, Surroundings
+from measure.detection.response_layers import LEAST_TOLERANCE_PX, Layer, narrowed
+from measure.marks.poses import up_from_camera
+from measure.marks.shapes import LayoutMark, Mark
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+NARROW = 0.25  # of the tolerance: marks on film that is hardly deformed agree as well
+_LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
+_PAIRS = 60  # of marks that hypotheses are made from
+_FAR = 0.4  # of the largest distance of two marks: nearer ones tell turn and scale badly
+_KEPT = 12  # placements of a pose that are refined
+_SLID = 3  # of them, in a lattice, that are moved by its steps
+_NEIGHBOURS = 4  # of a mark of a lattice
+_ALIKE = 0.5  # of the marks that a step takes to others: they are a lattice
+_SAME_PX = 10  # of the reduced scan: placements no farther apart put a mark on itself, which is some 14 px large there
+_SAME_SIZE = 0.01  # the same at the frame's edge, a thousand of these pixels off the middle
+_OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What is known of the placement: scale is 1 within scale_tolerance for the pitch at hand, and it is turned by no
+    more than rotation_rad."""
+
+    scale_tolerance: float
+    rotation_rad: float
+    misfit_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A frame in its scan. score: how much of the constellation answers; supported: how many marks do.
+
+    pixel_from_camera: (2, 3). polarity: of the marks that are not drawn with one, +1 lighter than their surroundings,
+    -1 darker. reduction: of the scan, and pitch_mm and surroundings that it was found with.
+    """
+
+    pose: str
+    pixel_from_camera: Array
+    score: float
+    supported: int
+    polarity: int
+    reduction: int
+    pitch_mm: tuple[float, float]
+    surroundings: Surroundings = WIDE
+
+    def same_place(self, other: "Placement") -> bool:
+        """Whether both put the frame at the same place and size, however its marks are named."""
+        shift = np.hypot(*(self.pixel_from_camera[:, 2] - other.pixel_from_camera[:, 2]))
+        sizes = [np.sqrt(abs(np.linalg.det(each.pixel_from_camera[:, :2]))) for each in (self, other)]
+        return bool(shift < _SAME_PX * self.reduction and abs(sizes[0] / sizes[1] - 1) < _SAME_SIZE)
+
+    def places_px(self, camera_mm: Array) -> Array:
+        """(n, 2) where it puts marks at camera_mm (n, 2)."""
+        return np.asarray(camera_mm @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2])
+
+    def names(self, places_px: Array, camera_mm: Array) -> NDArray[np.intp]:
+        """(k,) which mark lies at each of places_px (k, 2): the nearest one, -1 where it is as far as half way to the
+        next mark, or another place is nearer to it."""
+        own = self.places_px(camera_mm)
+        distance = np.hypot(*np.moveaxis(places_px[:, None] - own[None], -1, 0))
+        apart = np.hypot(*np.moveaxis(own[:, None] - own[None], -1, 0)) + np.diag(np.full(len(own), np.inf))
+        nearest = distance.argmin(axis=1)
+        within = distance.min(axis=1) < apart.min() / 2
+        is_first = distance.argmin(axis=0)[nearest] == np.arange(len(places_px))
+        return np.where(within & is_first, nearest, -1)
+
+    def posed(self, pose: str, camera_mm: Array) -> "Placement":
+        """The same place of the frame, its marks named as in another pose; moved, turned and scaled by what the given
+        coordinates (n, 2) of the marks differ that lie at the same places."""
+        turn = np.linalg.inv(up_from_camera(self.pose)) @ up_from_camera(pose)
+        linear, shift = self.pixel_from_camera[:, :2] @ turn, self.pixel_from_camera[:, 2]
+        renamed = replace(self, pose=pose, pixel_from_camera=np.column_stack([linear, shift]))
+        places = self.places_px(camera_mm)
+        names = renamed.names(places, camera_mm)
+        if np.any(names < 0):
+            return renamed
+        pitch = np.array(self.pitch_mm)
+        to, from_ = ((each * pitch) @ (1.0, 1.0j) for each in (places, renamed.places_px(camera_mm)[names]))
+        mean_to, mean_from = to.mean(), from_.mean()
+        scale = np.vdot(from_ - mean_from, to - mean_to) / np.vdot(from_ - mean_from, from_ - mean_from)
+        similarity = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]])
+        moved = np.column_stack([linear, shift]) * pitch[:, None]
+        moved = similarity @ moved
+        offset = mean_to - scale * mean_from
+        moved[:, 2] += (offset.real, offset.imag)
+        return replace(renamed, pixel_from_camera=moved / pitch[:, None])
+
+
+def same_picture(
+    marks: Sequence[LayoutMark],
+    first: tuple[str, Sequence[int]],
+    second: tuple[str, Sequence[int]],
+    within_mm: float,
+) -> bool:
+    """Whether two poses, each with the looks of its marks, put like marks in the same places."""
+    xy = np.array([mark.xy_mm for mark in marks])
+    of_first, of_second = (xy @ up_from_camera(pose).T for pose, _ in (first, second))
+    distance = np.hypot(*np.moveaxis(of_first[:, None] - of_second[None], -1, 0))
+    nearest = distance.argmin(axis=1)
+    close = bool((distance.min(axis=1) < within_mm).all())
+    alike = np.array_equal(np.asarray(first[1]), np.asarray(second[1])[nearest])
+    polarities = [mark.mark.polarity for mark in marks]
+    return close and alike and polarities == [polarities[index] for index in nearest]
+
+
+def sign_of(mark: Mark, assumed: int) -> int:
+    """+1 for a mark lighter than its surroundings, -1 for a darker one: as drawn, or else as assumed."""
+    return {"light": 1, "dark": -1, "auto": assumed}[mark.polarity]
+
+
+def signs_of(marks: Sequence[LayoutMark]) -> set[int]:
+    """Which signs the marks can have."""
+    return {sign_of(mark.mark, assumed) for mark in marks for assumed in (1, -1)}
+
+
+def _different(found: Sequence[Placement], marks: Sequence[LayoutMark], tolerance_px: float) -> list[Placement]:
+    kept: list[tuple[Placement, Array]] = []
+    xy = np.array([mark.xy_mm for mark in marks])
+    for placement in found:
+        places = xy @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
+        if all(np.hypot(*(places - other).T).max() > 2 * tolerance_px for _, other in kept):
+            kept.append((placement, places))
+    return [placement for placement, _ in kept]
+
+
+class PlacementSearch:
+    """The search for placements, in one pose after another, of a frame that bounds are known of. layers: of the
+    responses, by kind and sign."""
+
+    def __init__(
+        self,
+        marks: Sequence[LayoutMark],
+        responses: Responses,
+        pitch_mm: tuple[float, float],
+        bounds: Bounds,
+        layers: Mapping[tuple[int, int], Layer],
+    ) -> None:
+        self.marks, self.responses, self.bounds = marks, responses, bounds
+        self.pitch = np.asarray(pitch_mm)
+        self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
+        self.layers = layers
+
+    @cached_property
+    def steps_mm(self) -> Array:
+        """(n, 2) the steps from the middle mark to the nearest ones that take most marks to others."""
+        places = np.array([mark.xy_mm for mark in self.marks])
+        tree = cKDTree(places)
+        order = np.argsort(np.hypot(*(places - places.mean(axis=0)).T), kind="stable")
+        middle = places[order[0]]
+        _, near = tree.query(middle, k=min(len(places), _NEIGHBOURS + 1))
+        steps = places[np.ravel(near)[1:]] - middle
+        onto = [np.mean(tree.query(places + step)[0] < self.bounds.misfit_mm) for step in steps]
+        return np.asarray(steps[np.array(onto) > _ALIKE])
+
+    def of_pose(self, pose: str, look_of_mark: Sequence[int]) -> list[Placement]:
+        """The best placements of a pose that differ from one another, best first; none where no two marks respond.
+
+        look_of_mark: of the responses' kinds, that of each mark in this pose.
+        """
+        unsaid = any(mark.mark.polarity == "auto" for mark in self.marks)
+        found: list[Placement] = []
+        for polarity in (1, -1) if unsaid else (1,):
+            signs = [sign_of(mark.mark, polarity) for mark in self.marks]
+            layers = [self.layers[key] for key in zip(look_of_mark, signs, strict=True)]
+            found += _Constellation(self, pose, layers).placements(polarity)
+        found.sort(key=lambda placement: -placement.score)
+        return _different(found, self.marks, self.bounds.misfit_mm / float(self.pitch[0]))
+
+
+class _Constellation:
+    """The marks as one pose names them, each with the layer that answers to it."""
+
+    def __init__(self, search: PlacementSearch, pose: str, layers: Sequence[Layer]) -> None:
+        self.search, self.pose, self.layers = search, pose, layers
+        self.responses, self.bounds, self.pitch = search.responses, search.bounds, search.pitch
+        turned = np.array([mark.xy_mm for mark in search.marks]) @ up_from_camera(pose).T
+        self.camera: Complex = turned[:, 0] + 1j * turned[:, 1]
+
+    def placements(self, polarity: int) -> list[Placement]:
+        scale, offset = self._hypotheses()
+        if len(scale) == 0:
+            return []
+        scores, _ = self._scores(self.search.tolerance_px, scale, offset)
+        kept = np.argsort(-scores, kind="stable")[:_KEPT]
+        slid = self._slid(scale[kept[:_SLID]], offset[kept[:_SLID]])
+        starts = (np.concatenate(each) for each in zip((scale[kept], offset[kept]), slid, strict=True))
+        scale, offset = self._refined(*starts)
+        scores, supported = self._scores(narrowed(self.search.tolerance_px), scale, offset)
+        return [
+            Placement(
+                self.pose,
+                self._pixel_from_camera(a, b),
+                score,
+                count,
+                polarity,
+                self.responses.reduction,
+                (float(self.pitch[0]), float(self.pitch[1])),
+                self.responses.surroundings,
+            )
+            for a, b, score, count in zip(
+                scale.tolist(), offset.tolist(), scores.tolist(), supported.tolist(), strict=True
+            )
+        ]
+
+    def _slid(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
+        """Of a lattice too large for all its marks to be candidates the best hypothesis may be many steps off: these,
+        moved step by step as long as more marks answer. None where the marks are no lattice."""
+        turned = self.search.steps_mm @ up_from_camera(self.pose).T
+        steps = np.concatenate([[0.0], turned @ [1.0, 1.0j]])
+        moving = len(steps) > 1
+        while moving:
+            tried = offset[:, None] + scale[:, None] * steps
+            scores = self._scores(self.search.tolerance_px, np.repeat(scale, len(steps)), tried.ravel())[0]
+            scores = scores.reshape(tried.shape)
+            best = scores.argmax(axis=1)
+            moving = bool(best.any())
+            offset = tried[np.arange(len(best)), best]
+        return (scale, offset) if len(steps) > 1 else (scale[:0], offset[:0])
+
+    def _complex(self, scan_px: Array) -> Complex:
+        scaled = scan_px * self.pitch
+        return np.asarray(scaled[..., 0] - 1j * scaled[..., 1])
+
+    def _scan_px(self, places: Complex) -> Array:
+        return np.asarray(np.stack([places.real, -places.imag], axis=-1) / self.pitch)
+
+    def _hypotheses(self) -> tuple[Complex, Complex]:
+        """Every similarity within bounds that takes two marks to two of their candidates."""
+        candidates = {
+            layer: self._complex(self.responses.scan_px(layer.candidates)) for layer in dict.fromkeys(self.layers)
+        }
+        scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
+        upright = np.cos(self.bounds.rotation_rad)
+        for first, second in self._pairs():
+            of_first, of_second = candidates[self.layers[first]], candidates[self.layers[second]]
+            base = self.camera[second] - self.camera[first]
+            scale = (of_second[None, :] - of_first[:, None]) / base
+            size = np.abs(scale)
+            allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (scale.real > upright * size)
+            scales.append(scale[allowed])
+            offsets.append(of_first[np.nonzero(allowed)[0]] - scales[-1] * self.camera[first])
+        return np.concatenate(scales), np.concatenate(offsets)
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        """Pairs of marks far apart, spread evenly over all marks where there are too many."""
+        first, second = np.triu_indices(len(self.camera), 1)
+        length = np.abs(self.camera[first] - self.camera[second])
+        far = np.flatnonzero(length >= _FAR * length.max())
+        step = max(1.0, len(far) / _PAIRS)
+        chosen = far[(np.arange(min(len(far), _PAIRS)) * step).astype(int)]
+        return list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))
+
+    def _scores(self, radius_px: float, scale: Complex, offset: Complex) -> tuple[Array, Array]:
+        """Scores and numbers of supporting marks, which answer within the radius, of many placements at once."""
+        places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
+        nearest = np.rint(places).astype(int)
+        answers = [layer.within(radius_px).strength(nearest[:, k]) for k, layer in enumerate(self.layers)]
+        strength, inside = (np.stack(each, axis=1) for each in zip(*answers, strict=True))
+        score = strength.sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
+        return score, (strength > 0).sum(axis=1)
+
+    def _refined(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
+        """The similarities (n,) through the responses about their predictions, each weighed by its strength."""
+        widest = self.search.tolerance_px
+        scale, offset = scale.copy(), offset.copy()
+        moving = np.ones(len(scale), dtype=bool)
+        for tolerance_px in (widest, narrowed(widest)):
+            predicted = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
+            found = [layer.highest(predicted[:, k], tolerance_px) for k, layer in enumerate(self.layers)]
+            tops, heights = (np.stack(each, axis=1) for each in zip(*found, strict=True))
+            weight = np.maximum(heights - _LEAST_WEIGHED, 0.0)
+            moving &= (weight > 0).sum(axis=1) >= 2
+            weight, places = weight[moving], self._complex(self.responses.scan_px(tops[moving]))
+            total = weight.sum(axis=1)
+            mean_from, mean_to = ((weight * p).sum(axis=1) / total for p in (self.camera, places))
+            from_, to = self.camera - mean_from[:, None], places - mean_to[:, None]
+            scale[moving] = (weight * np.conj(from_) * to).sum(axis=1) / (weight * np.abs(from_) ** 2).sum(axis=1)
+            offset[moving] = mean_to - scale[moving] * mean_from
+        return scale, offset
+
+    def _pixel_from_camera(self, scale: complex, offset: complex) -> Array:
+        turn = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ up_from_camera(self.pose)
+        up = np.column_stack([turn, [offset.real, offset.imag]])
+        return np.asarray(np.diag([1.0, -1.0]) @ up / self.pitch[:, None])

@@ -1,0 +1,195 @@
+"""One mark, looked for about a predicted place at full resolution and matched."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.covariance import Cause
+from measure.detection.candidates import FAINT
+from measure.detection.first_look import seen
+from measure.detection.prediction import MarkPrediction
+from measure.marks.rendering import extent_px
+from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
+from measure.matching.match import Match, MatchOptions, match, window_about
+from measure.matching.window import beyond_edge, read_window
+from measure.noise.grain import BESIDE_PX
+from measure.reason import NO_REASON, Code, Reason
+from measure.scans.compression import covariance_of_compression, tone_variance
+from measure.scans.scan import Scan
+from measure.special_marks.frame_corner import corner_of_edges
+from measure.tone.curve import LINEAR
+
+Array = NDArray[np.float64]
+
+_DRIFT_PX = 2.0  # of a fit, from the pixel where it begins: what goes farther has found something else, dust say
+_MOST_CONTRAST = (
+    2.0  # times the scanner's range: more than that no light takes, and lines are hardly twice as wide as drawn
+)
+_SURE = 3.0  # standard deviations
+_SOLID_MARGIN_PX = 7.0  # of ground: with 6 a sharp dot loses a hundredth and a notch two, and they cost little
+_SOLID_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
+_DRAWN_SIGMA = 0.04  # of a drawing that is true in part only: its angles (rad) and sizes are as good as film shows them
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """What was seen where a mark was predicted: predicted_px (2,); fit is None where nothing could be fitted, and
+    reason says why. inside: whether the scan shows the predicted place: it lies in it, and its file gives the pixels.
+    chance: the expected number of places about it that noise makes look as much like the mark. closer: whether it was
+    seen at a closer look only, where the other marks put it."""
+
+    predicted_px: Array
+    inside: bool
+    fit: Match | None
+    reason: Reason = NO_REASON
+    chance: float = 1.0
+    closer: bool = False
+
+
+def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None) -> Sighting:
+    """Look for the mark within the search radius of its predicted place and match it there; without a radius, match it
+    at that place.
+
+    frame_sigma: standard deviation of the predicted rotation (rad), scale, stretch and shear, where a frame fitted to
+    all marks gives them.
+    """
+    predicted = expected.center_px.copy()
+    inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
+    if not inside:
+        return Sighting(predicted, False, None, Reason("its place is outside of the scan", Code.OUTSIDE))
+    fit, chance = _fitted(scan, expected, options, frame_sigma)
+    if lost := _lost(scan, expected if fit is None or not fit.converged else expected.moved(fit.center_px)):
+        return Sighting(predicted, False, None, lost)
+    if fit is None:
+        return Sighting(predicted, True, None, nothing_within(expected.search_px))
+    if not fit.converged:
+        return Sighting(predicted, True, None, fit.reason)
+    reason = _unlike(fit, expected, scan.full_scale_dn)
+    if reason:
+        return Sighting(predicted, True, None, reason)
+    loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
+    fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
+    if fit.tone is not None:
+        alike = tone_variance(scan.rounding_step_dn, fit.stored_contrast_dn)
+        fit = replace(fit, tone=replace(fit.tone, said=replace(fit.tone.said, alike=alike)))
+    return Sighting(predicted, True, fit, chance=chance)
+
+
+def nothing_within(search_px: float) -> Reason:
+    """Why a mark was not found."""
+    return Reason(f"nothing within {search_px:.0f} px of its place looks like it", Code.NOT_FOUND)
+
+
+def _lost(scan: Scan, expected: MarkPrediction) -> Reason:
+    """That the file does not give all pixels of the mark, where it is expected or was fitted; empty where it does."""
+    why = scan.lost_in(*window_about(expected.mark, expected.pixel_from_mark, 0.0))
+    return Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE) if why else NO_REASON
+
+
+def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> Reason:
+    """Why what was fitted is no such mark; empty where it may be."""
+    off_px = float(np.hypot(*(fit.center_px - expected.center_px)))
+    if off_px > expected.search_px + _DRIFT_PX:
+        return Reason(f"what lies there is {off_px:.0f} px from its place", Code.OFF_PLACE)
+    contrast = abs(fit.stored_contrast_dn) / full_scale_dn
+    if contrast < FAINT:
+        return Reason("there is no contrast at its place", Code.CONTRAST)
+    if contrast * (1 - _SURE / max(fit.significance, _SURE)) > _MOST_CONTRAST:
+        return Reason(
+            "what lies there is far wider than the mark's lines: as fine as these, it would have "
+            f"{contrast:.1f} times the contrast that a scan can show",
+            Code.SIZE,
+        )
+    if fit.contrast_dn * expected.polarity <= 0:
+        return Reason("what lies there has the other polarity", Code.POLARITY)
+    return NO_REASON
+
+
+def _fitted(
+    scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None
+) -> tuple[Match | None, float]:
+    """The mark matched where it looks most like itself, and the expected number of places that noise makes look so;
+    None where nothing looks like it."""
+    mark = expected.mark
+    if isinstance(mark, FrameCorner):
+        return corner_of_edges(scan, mark, expected), 1.0
+    look = seen(scan, expected) if expected.search_px > 0 else (expected.center_px, 0.0)
+    if look is None:
+        return None, 1.0
+    center_px, chance = look
+    fit = _matched(scan, expected, center_px, options, frame_sigma)
+    # Along its edges a slim wedge looks like itself: a fit that runs away along them begins anew from where it came to.
+    if leans_on_frame(mark) and _ran_away(fit, center_px, options) and _is_near(fit, expected):
+        fit = _matched(scan, expected, fit.center_px, options, frame_sigma)
+    return fit, chance
+
+
+def _ran_away(fit: Match, start_px: Array, options: MatchOptions) -> bool:
+    return not fit.converged and bool(np.hypot(*(fit.center_px - start_px)) > options.max_shift_px)
+
+
+def _is_near(fit: Match, expected: MarkPrediction) -> bool:
+    """Whether it is still where the mark may be."""
+    return bool(np.hypot(*(fit.center_px - expected.center_px)) <= expected.search_px)
+
+
+def _matched(
+    scan: Scan, expected: MarkPrediction, center_px: Array, options: MatchOptions, frame_sigma: float | None
+) -> Match:
+    """The mark matched from a place."""
+    mark, start = expected.mark, expected.moved(center_px).pixel_from_mark
+    seen_in = (
+        scan.seen_through(LINEAR) if isinstance(mark, MarkTemplate) else scan
+    )  # chips are cut as the file has them
+    window = read_window(seen_in, window_about(mark, start, options.margin_px + BESIDE_PX), expected.weights)
+    if expected.surroundings.robust and isinstance(mark, MarkShape):
+        inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
+        window = window.without(beyond_edge(window.grey, mark, inner))
+    return match(window, mark, start, options_for(mark, options, frame_sigma))
+
+
+def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:
+    """A solid mark gets more ground. What a mark's own picture may not tell stays as predicted, or as near it as the
+    frame knows it: rotation and scale where the mark leans on the frame, and stretch and shear where more of it lies
+    to one side."""
+    if _is_solid(mark):
+        options = replace(
+            options,
+            margin_px=max(options.margin_px, _SOLID_MARGIN_PX),
+            margin_blurs=max(options.margin_blurs, _SOLID_MARGIN_BLURS),
+        )
+    leans = leans_on_frame(mark)
+    if frame_sigma is None:
+        return replace(options, freedom="shift") if leans else options
+    if not leans and np.allclose(_one_sided_px(mark, np.eye(2)), 0.0):
+        return options
+    in_part = isinstance(mark, MarkShape) and mark.true_mm is not None
+    held = float(np.hypot(frame_sigma, _DRAWN_SIGMA if in_part else 0.0))
+    return replace(options, freedom="affine", linear_sigma=held if leans else options.linear_sigma, strain_sigma=held)
+
+
+def _is_solid(mark: Mark) -> bool:
+    """Whether the mark has an outline only and no lines, whose two edges hold it whatever the ground's slope is."""
+    return isinstance(mark, MarkShape) and all(isinstance(part, Polygon | Disk) for part in mark.parts)
+
+
+def leans_on_frame(mark: Mark) -> bool:
+    """Whether the mark's own picture may not tell its scale from its place, as a wedge's or a notch's edges do not, nor
+    a chip of them: then rotation and scale come from the other marks."""
+    return isinstance(mark, MarkTemplate) or all(isinstance(part, Polygon) for part in mark.parts)
+
+
+def strained_px(mark: Mark, fitted: Array, linear: Array, sigma: float) -> float:
+    """How far about a mark may be off because it was fitted with the stretch and shear of fitted (2, 2) instead of
+    those of linear, of that standard deviation: by as much as they move what of its drawing lies to one side."""
+    change = linear @ np.linalg.inv(fitted) - np.eye(2)
+    strain = (change + change.T) / 2 - np.trace(change) / 2 * np.eye(2)
+    one_sided = _one_sided_px(mark, linear)
+    return float(np.hypot(np.hypot(*(strain @ one_sided)), sigma * np.hypot(*one_sided)))
+
+
+def _one_sided_px(mark: Mark, linear: Array) -> Array:
+    """(2,) how much farther a mark's drawing reaches to one side than to the other."""
+    least, greatest = extent_px(mark, np.column_stack([linear, np.zeros(2)]))
+    return least + greatest

@@ -1,0 +1,192 @@
+"""Fiducial marks of one scan: found by their constellation, named by the frame's pose, measured at full resolution."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.annotations.detect_text import networks
+from measure.annotations.line import KnownLine, Line
+from measure.annotations.read import read_writing
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials.clicked_frame import clicked_frame, contradicted_pose, is_shown, with_clicks
+from measure.fiducials.constellation import Placement
+from measure.fiducials.frame import Frame
+from measure.fiducials.hypotheses import pitch_hypotheses
+from measure.fiducials.measure_frame import measure_frame, rename_frame
+from measure.fiducials.rows import absent_frame, lost_frame, present_frame
+from measure.fiducials.scan_orientation import decide_pose
+from measure.fiducials.search import FrameSearch
+from measure.fiducials.significance import doubt
+from measure.fiducials.stages import find_frame, likeliest_pose
+from measure.marks.frame_border import at_border
+from measure.marks.poses import up_from_camera
+from measure.marks.shapes import FiducialLayout
+from measure.probabilities import FRAMES_BY_CHANCE
+from measure.reason import NO_REASON, Code, Reason
+from measure.results import FrameMeasurement, Pose
+from measure.scans.scan import Scan
+from measure.status import Status
+
+Array = NDArray[np.float64]
+
+_SET = ("set in the project.",)
+_UNSURE = Reason("none of the marks is measured without blemish: the frame may lie elsewhere.", Code.CHANCE)
+_BESIDE = 0.95  # of the frame's size: a rival farther off is another photograph
+_AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
+
+
+def measure_fiducials(
+    scan: Scan,
+    layout: FiducialLayout,
+    pitch_um: tuple[float, float] | None,
+    options: FiducialOptions | None = None,
+) -> FrameMeasurement:
+    """Measure every mark of the layout in the scan: one row a mark, whatever became of it.
+
+    pitch_um: of the scan in x and y; None where it is not known: then the frame's size says about what it is.
+    The centres are in the scan's pixels, the centre of the top-left one being (0, 0). Never raises for what the
+    picture shows: statuses, reasons and problems say it.
+    """
+    options = options or FiducialOptions()
+    layout = at_border(layout)
+    if scan.is_lost:
+        return lost_frame(scan, layout)
+    if is_shown(layout, options):
+        frame, pose = clicked_frame(scan, layout, pitch_um, options)
+        lines = _read(scan, layout, frame) if options.writing == "all" else None
+        shown = with_clicks(
+            replace(present_frame(scan, layout, frame, pose, pitch_um, (), NO_REASON), writing=lines), options.clicks
+        )
+        contradiction = contradicted_pose(layout, options, pitch_um)
+        return _refused(shown, contradiction) if contradiction else shown
+    return with_clicks(_searched(scan, layout, pitch_um, options), options.clicks)
+
+
+def _refused(frame: FrameMeasurement, why: Reason) -> FrameMeasurement:
+    """The frame, none of its marks an observation."""
+    marks = (
+        replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
+        for mark in frame.marks
+    )
+    return replace(frame, marks=tuple(marks), problems=(why.told(f"{why}."), *frame.problems))
+
+
+def _searched(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> FrameMeasurement:
+    """The same where nobody shows where the frame is."""
+    hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
+    result = find_frame(scan, layout, hypotheses, pitch_um is not None, options)
+    search, frame = result.search, result.frame
+    if frame is None:
+        absent = absent_frame(scan, layout, result.misfit, options.rotation_deg)
+        return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
+    found = [placement for placement in result.placements if placement.pitch_mm == frame.placement.pitch_mm]
+    lines = _read(scan, layout, frame) if options.writing == "all" else None
+    pose, against = Pose(options.pose, True, _SET), NO_REASON
+    if options.pose == "auto":
+        pose = likeliest_pose(search, frame, lines or ())
+        if options.writing == "pose" and not pose.decided and frame.accepted:
+            lines = _read(scan, layout, frame, options.known_lines)
+            pose = likeliest_pose(search, frame, lines or ())
+        frame, pose = _rename(search, frame, pose)
+    else:
+        against = _against_the_set_pose(search, frame, lines or ())
+    chance = doubt(search, frame)
+    problems = [each.told(f"{each}.") for each in (*_rivals(search, found, frame), chance, against) if each]
+    doubts = problems if frame.measured else [_UNSURE, *problems]
+    if doubts and options.pose == "auto":
+        pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
+    return replace(present_frame(scan, layout, frame, pose, pitch_um, problems, chance), writing=lines)
+
+
+def _rename(search: FrameSearch, frame: Frame, pose: Pose) -> tuple[Frame, Pose]:
+    """The frame with its marks named as in that pose. Where fewer of them agree then, it stays as it is, its pose being
+    no more than assumed."""
+    if pose.name == frame.placement.pose:
+        return frame, pose
+    renamed = rename_frame(search.scan, search.layout, frame, pose.name, search.options)
+    if renamed is not frame:
+        return renamed, pose
+    against = f"fewer of the marks agree in pose {pose.name} than in pose {frame.placement.pose}, which is assumed."
+    return frame, replace(pose, name=frame.placement.pose, decided=False, evidence=(*pose.evidence, against), rivals=())
+
+
+def _read(
+    scan: Scan, layout: FiducialLayout, frame: Frame | None, known_lines: Sequence[KnownLine] = ()
+) -> tuple[Line, ...] | None:
+    """What is written about the frame, or along the scan's edges; None where nothing is there that reads. Where a known
+    line is read at its place, only what stands about it."""
+    nets = networks()
+    if nets is None:
+        return None
+    if frame is None:
+        return read_writing(scan, nets)
+    half = np.asarray(layout.frame_mm) / 2
+    corners_mm = half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+    matrix = frame.pixel_from_camera
+    frame_px = corners_mm @ matrix[:, :2].T + matrix[:, 2]
+    pixel_from_up = matrix[:, :2] @ up_from_camera(frame.placement.pose).T
+    for known in known_lines:
+        outline_px = np.array(known.outline_mm) @ pixel_from_up.T + matrix[:, 2]
+        lines = read_writing(scan, nets, frame_px, (known.side, outline_px))
+        if any(known.is_seen_in(line) for line in lines):
+            return lines
+    return read_writing(scan, nets, frame_px)
+
+
+def _against_the_set_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line]) -> Reason:
+    """A sentence where what is seen decides for another pose than the one that the project sets."""
+    likeliest = likeliest_pose(search, frame, lines)
+    if likeliest.name == frame.placement.pose or not frame.measured:
+        return NO_REASON
+    own = frame.fitted_placement
+    both = [own, own.posed(likeliest.name, frame.camera_mm)]
+    pose = decide_pose(search.scan, search.layout, both, frame, search.options, lines)
+    if not pose.decided or pose.name == frame.placement.pose:
+        return NO_REASON
+    evidence = " ".join(pose.evidence).rstrip(".")
+    return Reason(
+        f"pose {frame.placement.pose} is set in the project, but what is seen of this frame decides for {pose.name}, "
+        f'and then the marks have other names (pose = "auto" takes each scan as it lies): {evidence}',
+        Code.POSE,
+    )
+
+
+def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> list[Reason]:
+    """Sentences about other placements in the same pose that nearly as many marks speak for, or that show a frame."""
+    problems, best = [], frame.placement
+    for other in found:
+        if other.pose != best.pose or other.same_place(best):
+            continue
+        as_good = other.score >= _AMBIGUOUS * best.score and other.supported >= best.supported - 1
+        if as_good or _is_another_frame(search, other, frame):
+            shift = np.linalg.solve(
+                best.pixel_from_camera[:, :2], other.pixel_from_camera[:, 2] - best.pixel_from_camera[:, 2]
+            )
+            told = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
+            beside = Reason(
+                f"the scan shows another frame {told} beside this one, with {other.supported} marks where this one has "
+                f"{best.supported}: give a scan of one frame, or name both in images.csv by the column window",
+                Code.OTHER_FRAME,
+            )
+            shifted = Reason(
+                f"the constellation fits nearly as well shifted by {told}, on {other.supported} marks against "
+                f"{best.supported}: the marks' names are not certain",
+                Code.AMBIGUOUS,
+            )
+            is_beside = (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any()
+            problems.append(beside if is_beside else shifted)
+    return problems[:3]
+
+
+def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bool:
+    """Whether a placement shows another frame, of as many marks: of two photographs in a scan one may answer better."""
+    if other.supported < frame.placement.supported or not search.was_everywhere(other):
+        return False
+    if search.expected_alike(other) > FRAMES_BY_CHANCE:
+        return False
+    seen = measure_frame(search.scan, search.layout, other, search.options)
+    return seen.is_sure and not frame.has_all_of(seen)

@@ -1,0 +1,286 @@
+"""What a found mark's picture says of which of the camera's marks it is, in whichever direction a pose shows it."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from measure.detection.candidates import detail_px, quarter_turned
+from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
+from measure.marks.shapes import Mark, MarkTemplate
+from measure.matching.match import Match
+from measure.noise.robust_estimation import TukeyFit, robust_scale, tukey_fit
+from measure.scans.scan import Scan, means
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_ALIKE = 0.05  # of the contrast: pictures that differ nowhere by more are one
+_FINEST_PX = 3.0  # of the finest line on the grid
+_CUBIC_PX = 3.0  # that an interpolation asks beyond its last place
+_ABOUT_PX = 3.0  # how far about the drawings the ground tells of its grey value
+_PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbours alike
+_OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
+_ROUNDS, _LEAST_SCALE = 4, 1e-9  # of robust weights
+_FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
+_ALIGNMENTS = 3  # steps: the chip lies right to a cell before
+_FEWEST = 40  # pixels that two chips are compared by
+_CHANCE_SIGMAS = 3.0  # what chance may make of a difference
+SPOILT = 0.01  # probability that writing, dust or a neighbour beside a mark feigns or hides what tells marks apart
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A mark as a pose shows it at a site: turn (2, 2), from its x and y to right and up. None: bare ground."""
+
+    mark: Mark | None
+    turn: Array
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A mark's picture on the drawings' grid, (size, size) with its origin in the middle. told: where it tells the grey
+    values: a learned chip has the landscape of other scans beside its mark. reached: the chip, which tells nothing
+    beyond its edge; of a drawn mark everything. noise: of the chip's own pixels, in shares of the contrast, inf where
+    it is not known."""
+
+    grey: Array
+    told: Mask
+    reached: Mask
+    noise: float = 0.0
+
+    def turned(self, turn: Array) -> "View":
+        return replace(
+            self,
+            grey=quarter_turned(self.grey, turn),
+            told=quarter_turned(self.told, turn),
+            reached=quarter_turned(self.reached, turn),
+        )
+
+    def wider(self, spare: int) -> "View":
+        """On a larger grid. A drawing's edge goes on; beyond a chip's there is nothing."""
+        return replace(
+            self,
+            grey=np.pad(self.grey, spare, mode="edge"),
+            told=np.pad(self.told, spare, mode="edge"),
+            reached=np.pad(self.reached, spare, mode="edge"),
+        )
+
+    def moved(self, cells: tuple[int, int]) -> "View":
+        """Down and right by so many cells, which must be spare about a chip."""
+        return replace(
+            self,
+            grey=np.roll(self.grey, cells, (0, 1)),
+            told=np.roll(self.told, cells, (0, 1)),
+            reached=np.roll(self.reached, cells, (0, 1)),
+        )
+
+    def aligned(self, window: Array) -> "View":
+        """Moved by the part of a cell that makes it most like a window (size, size), which it lies on to a cell."""
+        used, moved, shift = self.told & self.reached, self, np.zeros(2)
+        for _ in range(_ALIGNMENTS):
+            factors = moved.fitted(window, used).factors
+            if factors[1] == 0.0:
+                return self
+            shift = np.clip(shift - factors[2:] / factors[1], -1.0, 1.0)
+            moved = replace(self, grey=np.asarray(ndimage.shift(self.grey, shift, order=3, mode="nearest")))
+        return moved
+
+    def unlike(self, other: "View", contrast: float) -> float:
+        """The sum of the squares by which two chips differ wherever both tell something, one moved as it is most like
+        the other, beyond what their noise makes of a pixel. contrast: of the picture, in standard deviations of its
+        noise: what is an outlier there counts as one."""
+        used = self.told & other.told & self.reached & other.reached
+        if used.sum() < _FEWEST:
+            return 0.0
+        moved = replace(self, told=used, reached=used).aligned(other.grey)
+        residuals = moved.fitted(other.grey, used).residuals
+        noise = min(robust_scale(residuals), float(np.hypot(self.noise, other.noise)))
+        alike = max(_OUTLIER * noise, _ALIKE)
+        return float(((residuals**2 - alike**2) * contrast**2).clip(0.0, _OUTLIER**2).sum())
+
+    def fitted(self, window: Array, used: Mask) -> TukeyFit:
+        """The fit to a window in the pixels used, robust against writing and dust in it. Factors: offset, gain, by row
+        and by column."""
+        slopes = [np.asarray(np.gradient(self.grey, axis=axis))[used] for axis in (0, 1)]
+        return tukey_fit(
+            np.stack([np.ones(int(used.sum())), self.grey[used], *slopes]), window[used], _ROUNDS, _LEAST_SCALE
+        )
+
+    @property
+    def is_chip(self) -> bool:
+        return not bool(self.reached.all())
+
+
+_EVERYWHERE = np.ones((1, 1), dtype=bool)
+_BARE = View(np.zeros((1, 1)), _EVERYWHERE, _EVERYWHERE)
+
+
+class Drawings:
+    """A camera's marks on a grid that lies upright in the frame, where poses turn and mirror them by whole quarters: so
+    each is drawn once. The grid is coarser than the scan, as far as the finest line of the marks allows: what tells
+    them apart is coarser."""
+
+    def __init__(self, marks: Collection[Mark], scan_from_up: Array, blur_px: float) -> None:
+        """scan_from_up (2, 2): px of the scan from mm right and up in the frame; blur_px: of the scan."""
+        finest_px = min(detail_px(mark, scan_from_up) for mark in marks)
+        self.reduction = max(1, int(finest_px / _FINEST_PX))
+        per_mm = float(np.sqrt(abs(np.linalg.det(scan_from_up)))) / self.reduction
+        grid_from_up = per_mm * _FLIP
+        self.scan_from_grid = scan_from_up @ np.linalg.inv(grid_from_up)
+        self._drawn = {mark: _drawn(mark, grid_from_up, blur_px / self.reduction) for mark in set(marks)}
+
+    def seen(self, shown: Sequence[Shown], spare: int) -> list[View]:
+        """What each pose shows at a place, which is in the middle, on grids of one size, so many cells larger on every
+        side than the largest picture."""
+        drawn = [_BARE if each.mark is None else self._drawn[each.mark] for each in shown]
+        half = max(len(each.grey) // 2 for each in drawn) + spare
+        turns = [_FLIP @ each.turn @ _FLIP for each in shown]
+        return [each.turned(turn).wider(half - len(each.grey) // 2) for each, turn in zip(drawn, turns, strict=True)]
+
+
+class Site:
+    """A place where a mark was found, or where it should be and was not: then like is the fit of another mark.
+
+    reach_px: how far off a chip may lie in another pose than the one it was found in. A drawn mark's origin is its
+    middle in every pose; a chip's is where somebody clicked, and one that shows an edge is found anywhere along it."""
+
+    def __init__(
+        self,
+        scan: Scan,
+        like: Match,
+        center_px: Array,
+        weights: Sequence[float] | None,
+        drawings: Drawings,
+        reach_px: float,
+    ) -> None:
+        self.scan, self.center_px, self.weights, self.drawings = scan, center_px, weights, drawings
+        self.reach_px = reach_px
+        self.contrast_dn = like.contrast_dn
+        self.sign = np.sign(like.contrast_dn)
+        self.noise_dn = like.noise_dn / drawings.reduction
+
+    def likelihoods(self, shown: Sequence[Shown]) -> Array:
+        """The log-likelihood of the picture under what each pose shows here, up to a constant: 0 for the best, and no
+        less than the probability that something else spoils the picture."""
+        chips = any(isinstance(each.mark, MarkTemplate) for each in shown)
+        spare = int(np.ceil(self.reach_px / self.drawings.reduction)) if chips else 0
+        views, view_of = _distinct(self.drawings.seen(shown, spare))
+        if len(views) == 1:
+            return np.zeros(len(shown))
+        window = self._window(len(views[0].grey))
+        views = [self._placed(window, view, spare) for view in views]
+        area = _area([view.grey for view in views])
+        residuals = [self._residuals(window, view.grey, area & view.told) for view in views]
+        # Where even the best picture leaves much, what is left is no noise, and tells the pictures apart less surely.
+        scale = max(self.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
+        misfits = np.full((len(views), *window.shape), _OUTLIER**2)  # what a chip does not tell it misses
+        for misfit, view, residual in zip(misfits, views, residuals, strict=True):
+            misfit[area & view.told] = np.minimum(np.abs(residual) / scale, _OUTLIER) ** 2
+        excess = _excess(misfits, np.stack([area & view.reached for view in views]))
+        best = views[int(excess.argmin())]
+        if best.is_chip:
+            excess = np.minimum(excess, [self._most_excess(best, view, scale) for view in views])
+        relative = np.exp(-excess / 2 / _PIXELS_PER_DEGREE)
+        return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[view_of]
+
+    def _most_excess(self, best: View, view: View, scale_dn: float) -> float:
+        """By how much more than the best chip another one can miss the picture for being another mark, chance included:
+        the more the two differ. The rest comes of the chips' own noise, or of a place that is not quite right."""
+        if view is best or not view.is_chip:
+            return 0.0 if view is best else np.inf
+        squares = view.unlike(best, abs(self.contrast_dn) / scale_dn)
+        return squares + 2 * _CHANCE_SIGMAS * float(np.sqrt(squares))
+
+    def _placed(self, window: Array, view: View, spare: int) -> View:
+        """A chip moved to where the window is most like it."""
+        if not view.is_chip or not view.told.any():
+            return view
+        core = slice(spare, len(window) - spare)
+        grey, told = (np.asarray(each[core, core], np.float32) for each in (view.grey, view.told))
+        likeness = cv2.matchTemplate(np.asarray(window, np.float32), grey, cv2.TM_CCOEFF_NORMED, mask=told)
+        likeness = np.where(np.isfinite(likeness), self.sign * likeness, -1.0)
+        row, col = np.unravel_index(int(likeness.argmax()), likeness.shape)
+        return view.moved((int(row) - spare, int(col) - spare)).aligned(window)
+
+    def _window(self, size: int) -> Array:
+        """(size, size) grey values of the scan on the drawings' grid, the site in the middle."""
+        reduction = self.drawings.reduction
+        fine = size * reduction
+        scan_from_fine = self.drawings.scan_from_grid / reduction
+        reach = np.abs(scan_from_fine).sum(axis=1) * fine / 2 + _CUBIC_PX
+        low, high = np.floor(self.center_px - reach).astype(int), np.ceil(self.center_px + reach).astype(int)
+        width, height = (high - low + 1).tolist()
+        window = self.scan.window(int(low[0]), int(low[1]), width, height, self.weights)
+        first = self.center_px - low - scan_from_fine @ np.full(2, (fine - 1) / 2)
+        scan_from_fine = np.column_stack([scan_from_fine, first])
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        upright = cv2.warpAffine(window, scan_from_fine, (fine, fine), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(means(np.asarray(upright, np.float32)[..., None], reduction)[..., 0], np.float64)
+
+    def _residuals(self, window: Array, shown: Array, area: Mask) -> Array:
+        """What the picture on a plane ground leaves, the mark being light or dark as the one that was found; its place
+        may be off by a little, for it was fitted with another drawing."""
+        grey = window[area]
+        row, col = np.nonzero(area)
+        ground = [np.ones_like(grey), col / len(window), row / len(window)]
+        if shown.any():
+            by_row, by_col = (np.asarray(np.gradient(shown, axis=axis)) for axis in (0, 1))
+            columns = [*ground, shown[area], by_row[area], by_col[area]]
+            fit = tukey_fit(np.stack(columns), grey, _ROUNDS, _LEAST_SCALE)
+            if fit.factors[len(ground)] * self.sign > 0:
+                return fit.residuals
+        return tukey_fit(np.stack(ground), grey, _ROUNDS, _LEAST_SCALE).residuals
+
+
+def _drawn(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
+    """The mark's picture about its origin."""
+    place = np.column_stack([grid_from_mark, np.zeros(2)])
+    half = int(np.ceil(np.abs(extent_px(mark, place)).max() + 2 * _ABOUT_PX))
+    place[:, 2] = half
+    size = 2 * half + 1
+    told = reached = np.ones((size, size), dtype=bool)
+    if isinstance(mark, MarkTemplate):
+        told = chip_mask(mark, place, size, size)
+        reached = chip_mask(replace(mark, steady=None), place, size, size)
+    return View(picture(mark, place, size, size, blur_px, ROUGH_CELLS), told, reached, _noise(mark))
+
+
+def _noise(mark: Mark) -> float:
+    """Of a chip's pixels, in shares of its contrast; inf where nobody knows it."""
+    if not isinstance(mark, MarkTemplate):
+        return 0.0
+    if mark.noise_dn == 0.0:
+        return np.inf
+    of_mean = float(np.sqrt(sum(share**2 for share in mark.shares.values())))
+    return mark.noise_dn * of_mean / max(float(np.ptp(mark.image)), 1e-9)
+
+
+def _distinct(views: Sequence[View]) -> tuple[list[View], list[int]]:
+    """The views whose pictures differ, and which of them each is."""
+    kinds: list[View] = []
+    index = []
+    for each in views:
+        alike = [number for number, kind in enumerate(kinds) if np.abs(kind.grey - each.grey).max() < _ALIKE]
+        index.append(alike[0] if alike else len(kinds))
+        if not alike:
+            kinds.append(each)
+    return kinds, index
+
+
+def _excess(misfits: Array, areas: Mask) -> Array:
+    """(n,) by how much each picture's misfit exceeds the least one, over the area of both: a chip is neither better for
+    being smaller nor for what lies beyond another's edge. misfits, areas: (n, size, size)."""
+    counts = areas.sum(axis=(1, 2)).clip(min=1)
+    best = int(((misfits * areas).sum(axis=(1, 2)) / counts).argmin())
+    excess = ((misfits - misfits[best]) * (areas & areas[best])).sum(axis=(1, 2))
+    return np.asarray(excess - excess.min())
+
+
+def _area(pictures: Sequence[Array]) -> Mask:
+    """The pixels about all drawings: farther off lies what no mark explains."""
+    outside = (np.max(pictures, axis=0) - np.min(pictures, axis=0).clip(max=0.0) < _ALIKE).astype(np.uint8)
+    return np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, 5) <= _ABOUT_PX)

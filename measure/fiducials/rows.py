@@ -1,0 +1,152 @@
+"""What is handed on of a scan's fiducials: a row for each mark, with its status, reason and figures, and the frame's
+problems."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from measure.fiducials.frame import Frame
+from measure.film import AFFINITY_SIGMA
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate
+from measure.matching.covariance import SecondPlace
+from measure.reason import NO_REASON, Code, Reason
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.scans.scan import Scan
+from measure.special_marks.learned import honest_covariance
+from measure.status import Status
+
+_FAINT = Reason(
+    "the frame was found at a closer look only, its marks being faint beside what surrounds them", Code.FAINT_FRAME
+)
+_ASSUMED = Reason(
+    "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
+)
+_OWN = Reason("its template is its own picture: nothing checks its place", Code.OWN_PICTURE)
+
+
+def lost_frame(scan: Scan, layout: FiducialLayout) -> FrameMeasurement:
+    """Of a scan whose file gives none of its pixels."""
+    reason = Reason(f"not found: {scan.damage}", Code.DAMAGED_FILE)
+    marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, reason) for mark in layout.marks)
+    return FrameMeasurement(scan.name, marks)
+
+
+def absent_frame(scan: Scan, layout: FiducialLayout, reason: str, rotation_deg: float) -> FrameMeasurement:
+    """Of a scan in which no frame was found; reason: why, a part of a sentence; rotation_deg: by how much turned it was
+    sought."""
+    also = "; parts of the scan's file are damaged" if scan.damage else ""
+    codes = (Code.NO_FRAME, Code.DAMAGED_FILE) if scan.damage else (Code.NO_FRAME,)
+    why = Reason(f"not found: {reason}{also}", *codes)
+    marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, why) for mark in layout.marks)
+    problem = Reason(
+        f"no fiducial was measured: {reason}; look whether the camera is that of the scan, the pitch right, and the "
+        f"film laid within {rotation_deg:g} degrees of upright or of a quarter turn.",
+        Code.NO_FRAME,
+    )
+    return FrameMeasurement(scan.name, marks, None, None, (problem,))
+
+
+def present_frame(
+    scan: Scan,
+    layout: FiducialLayout,
+    frame: Frame,
+    pose: Pose,
+    pitch_um: tuple[float, float] | None,
+    problems: Sequence[Reason],
+    chance: Reason,
+) -> FrameMeasurement:
+    """Of a frame that was found. pitch_um: as given; None: pixels are taken as square. problems: why it may lie
+    elsewhere, sentences, beside those that its marks show; chance: why it may be none at all: then none of its marks is
+    certain, nor if it was found at a closer look. Where chance is likelier to have made it than not, it gives no
+    observation."""
+    if Code.NO_FRAME in chance.codes:
+        return replace(_predicted_frame(scan, layout, frame, chance), pose=pose, problems=tuple(problems))
+    marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
+    marks = tuple(_of_assumed_name(row, mark, pose) for row, mark in zip(marks, layout.marks, strict=True))
+    weak = chance or (_FAINT if frame.placement.surroundings.robust else NO_REASON)
+    if weak:
+        marks = tuple(
+            replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
+        )
+    problems = (*problems, *_problems(frame, pitch_um))
+    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, frame.tone)
+
+
+def _predicted_frame(scan: Scan, layout: FiducialLayout, frame: Frame, why: Reason) -> FrameMeasurement:
+    """Of a frame that may well be none: its marks where they would lie."""
+    marks = tuple(
+        MarkMeasurement(mark.id, "fiducial", place, None, Status.PREDICTED, why)
+        if sighting.inside
+        else MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, sighting.reason)
+        for mark, sighting, place in zip(
+            layout.marks, frame.sightings, frame.fitted_placement.places_px(frame.camera_mm), strict=True
+        )
+    )
+    return FrameMeasurement(scan.name, marks, weights=frame.weights)
+
+
+def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
+    """What the user should look at in the frame itself."""
+    problems = []
+    per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
+    given = pitch_um or (1.0, 1.0)
+    if abs(per_mm[0] * given[0] / (per_mm[1] * given[1]) - 1) > 2 * AFFINITY_SIGMA:
+        told = (
+            f"by the marks a pixel is {1000 / per_mm[0]:.1f} um wide and {1000 / per_mm[1]:.1f} um tall: film is never "
+            "stretched so much. Look whether the scanner, or the camera file, is to blame."
+        )
+        problems.append(Reason(told, Code.PITCH))
+    used = int(frame.belongs.sum())
+    if used <= 3:
+        told = f"an affine transformation on {used} fiducials has no redundancy: no check."
+        problems.append(Reason(told, Code.NO_CHECK))
+    return problems
+
+
+def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasurement:
+    sighting = frame.sightings[index]
+    fit = sighting.fit
+    if not sighting.inside:
+        return MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, sighting.reason)
+    if fit is None:
+        return MarkMeasurement(mark.id, "fiducial", sighting.predicted_px, None, Status.PREDICTED, sighting.reason)
+    quality = {
+        "snr": fit.snr,
+        "contrast_dn": fit.contrast_dn,
+        "noise_dn": fit.noise_dn,
+        "blur_px": fit.blur_px,
+        "damaged_fraction": fit.damaged_fraction,
+        "likeness": fit.likeness,
+        "significance": fit.significance,
+        "redundancy": float(fit.redundancy),
+        "neighbour_correlation": fit.neighbour_correlation,
+        **_by_edges(fit.edges),
+    }
+    status, reason = frame.verdict(index)
+    covariance = fit.place_covariance
+    if isinstance(mark.mark, MarkTemplate):
+        covariance = honest_covariance(mark.mark, scan, fit)
+        if status is Status.MEASURED and scan in mark.mark.shares and len(mark.mark.shares) == 1:
+            status, reason = Status.WEAK, _OWN
+    return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
+
+
+def _of_assumed_name(row: MarkMeasurement, mark: LayoutMark, pose: Pose) -> MarkMeasurement:
+    """A drawn mark is the same place under every name. A learned one's origin is where somebody clicked: at another
+    mark that looks like it, it lies elsewhere, but where the marks' symmetry leaves it the same."""
+    if not isinstance(mark.mark, MarkTemplate) or mark.mark.learned_mm == 0 or pose.is_decided_but_for(mark.mark.alike):
+        return row
+    return replace(row, status=Status.WEAK, reason=_ASSUMED) if row.status is Status.MEASURED else row
+
+
+def _by_edges(edges: SecondPlace | None) -> dict[str, float]:
+    """How far from the matched place the second method puts the mark, and in standard deviations of that."""
+    if edges is None:
+        return {}
+    col, row = edges.offset_px
+    return {
+        "second_method_col_px": float(col),
+        "second_method_row_px": float(row),
+        "second_method_sigmas": edges.sigmas,
+    }

@@ -1,0 +1,272 @@
+"""Which of the eight poses a frame has: decided by what breaks its symmetry, or said to be undecided.
+
+Every pose gives the marks found other names. Under the right one their pictures fit (identification dots, unlike
+marks), their coordinates fit (asymmetries larger than their standard deviations), and what is written beside the frame
+reads as it should, where the camera has it. All are summed as log-likelihoods; a pose is decided only where it beats
+every other by odds of a thousand to one. Of poses that nothing tells apart an unmirrored one is the likelier.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.annotations.line import Line
+from measure.annotations.orientation_from_text import line_score, main_pose, writing_likelihoods
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials.constellation import Placement
+from measure.fiducials.frame import Frame
+from measure.fiducials.frame_sighter import first_search_px
+from measure.fiducials.interior_orientation import FrameFit, fit_frame
+from measure.fiducials.orientation_pictures import Drawings, Shown, Site
+from measure.film import SCATTER_DEGREES
+from measure.marks.poses import pose_in_camera, up_from_camera
+from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
+from measure.matching.match import Match
+from measure.results import Pose
+from measure.scans.parallel import side_by_side
+from measure.scans.scan import Scan
+
+Array = NDArray[np.float64]
+
+DECIDED = 7.0  # log-odds: a thousand to one
+TOLD = 1.0  # log-odds: less than e to one is no evidence worth a sentence
+_NAMED = 4.0  # times the gate: how far from where a pose's placement puts a mark it still has its name
+_UNMIRRORED = 2.3  # log-odds before anything is seen: ten to one; of 16 scans of archives none was mirrored
+_QUOTED = 3  # lines of writing that are told
+_FREE_MM = 1e3  # the standard deviation of a place that is not given
+
+
+@dataclass(frozen=True, eq=False)
+class _Verdict:
+    """One pose's log-likelihoods, of the pictures (sites,), of the coordinates and of the writing; names: of each
+    site's mark, -1 for none; chi_square: of the coordinates; by_chance: likelihood of all pictures if what they differ
+    in does not belong to the marks."""
+
+    pose: str
+    names: tuple[int, ...]
+    pictures: Array
+    coordinates: float
+    chi_square: float
+    by_chance: float
+    writing: float = 0.0
+
+    @property
+    def of_pictures(self) -> float:
+        return float(np.logaddexp(self.pictures.sum(), self.by_chance))
+
+    @property
+    def seen(self) -> float:
+        """What is seen of it."""
+        return self.of_pictures + self.coordinates + self.writing
+
+    @property
+    def total(self) -> float:
+        """And what was to be expected before, which tells what is assumed, and never decides."""
+        return self.seen + (0.0 if self.pose.endswith("m") else _UNMIRRORED)
+
+
+def decide_pose(
+    scan: Scan,
+    layout: FiducialLayout,
+    placements: Sequence[Placement],
+    frame: Frame,
+    options: FiducialOptions,
+    lines: Sequence[Line] = (),
+) -> Pose:
+    """The pose, from a placement for each (at the place of the frame that was measured in one of them). lines: what is
+    written about the frame, as far as it was read."""
+    seen = [fit for fit in frame.fits if fit is not None]
+    missed = frame.missed_px
+    named = [
+        each
+        for each in (_Named.of(placement, layout, seen, missed, options) for placement in placements)
+        if each is not None
+    ]
+    if not named:
+        return _decision([], layout, len(seen))
+    scan_from_up = frame.pixel_from_camera[:, :2] @ np.linalg.inv(up_from_camera(frame.placement.pose))
+    blur_px = float(np.median([fit.blur_px for fit in seen]))
+    drawings = Drawings([mark.mark for mark in layout.marks], scan_from_up, blur_px)
+    reach_px = first_search_px(frame.placement, layout, options)
+    sites = [Site(scan, fit, fit.center_px, frame.weights, drawings, reach_px) for fit in seen]
+    # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
+    usual = sorted(seen, key=lambda fit: abs(fit.contrast_dn))[len(seen) // 2]
+    sites += [Site(scan, usual, place, frame.weights, drawings, reach_px) for place in missed]
+
+    def of_site(index: int) -> Array:
+        return sites[index].likelihoods([each.shown(index, layout) for each in named])
+
+    pictures = np.array(side_by_side(of_site, range(len(sites)))).reshape(len(sites), len(named))
+    by_chance = _by_chance(pictures) if any(_is_bare_chip(mark.mark) for mark in layout.marks) else -np.inf
+    verdicts = [each.verdict(pictures[:, index], by_chance) for index, each in enumerate(named)]
+    if not lines or not frame.accepted:
+        return _decision(verdicts, layout, len(seen))
+    written = writing_likelihoods(lines, layout.writing, [verdict.pose for verdict in verdicts])
+    verdicts = [replace(each, writing=own) for each, own in zip(verdicts, written.tolist(), strict=True)]
+    return _decision(verdicts, layout, len(seen), lines)
+
+
+def _is_bare_chip(mark: Mark) -> bool:
+    """Whether it is cut from one scan alone: then nobody knows what in it is the mark, and what a landscape or a stamp
+    beside it."""
+    return isinstance(mark, MarkTemplate) and mark.steadiness is None
+
+
+def _by_chance(pictures: Array) -> float:
+    """The log-likelihood of pictures (sites, poses) in which something else than the marks looks most like one pose or
+    another, like each as often: then as many sites agree on a pose as chance lets."""
+    return float((np.logaddexp.reduce(pictures, axis=1) - np.log(pictures.shape[1])).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Named:
+    """The places of marks, found or missed, by the names that a pose gives them (-1: none), and the frame through those
+    found, if there are two."""
+
+    pose: str
+    names: tuple[int, ...]
+    fit: FrameFit | None
+
+    @classmethod
+    def of(
+        cls,
+        placement: Placement,
+        layout: FiducialLayout,
+        seen: Sequence[Match],
+        missed: Sequence[Array],
+        options: FiducialOptions,
+    ) -> "_Named | None":
+        """None where the pose names fewer than two of the marks found, having two, or gives two the same name."""
+        pitch, camera = np.asarray(placement.pitch_mm), np.array([mark.xy_mm for mark in layout.marks])
+        predicted = camera @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
+        centers = np.array([*(fit.center_px for fit in seen), *missed])
+        distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
+        nearest = distance.argmin(axis=0)
+        near = distance.min(axis=0) < _NAMED * options.gate_mm
+        names = np.where(near, nearest, -1)
+        if len(np.unique(names[near])) < near.sum():
+            return None
+        near, centers = near[: len(seen)], centers[: len(seen)]
+        if near.sum() < 2:
+            alone = cls(placement.pose, tuple(names.tolist()), None)
+            return alone if len(seen) < 2 else None
+        own = names[: len(seen)][near]
+        given = np.array([_given_sigma_mm(layout.marks[name]) for name in own])
+        measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in seen])[near] * pitch.mean()
+        sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
+        up = centers[near] * pitch * (1.0, -1.0)
+        fit = fit_frame(camera[own], up, sigma, up_from_camera(placement.pose))
+        return cls(placement.pose, tuple(names.tolist()), fit)
+
+    def shown(self, site: int, layout: FiducialLayout) -> Shown:
+        name = self.names[site]
+        return Shown(None if name < 0 else layout.marks[name].mark, up_from_camera(self.pose))
+
+    def verdict(self, pictures: Array, by_chance: float) -> _Verdict:
+        """The coordinates' likelihood is Student's: nobody knows the film's standard deviation well."""
+        if self.fit is None:
+            return _Verdict(self.pose, self.names, pictures, 0.0, 0.0, by_chance)
+        degrees = SCATTER_DEGREES + max(self.fit.redundancy, 0)
+        coordinates = -degrees / 2 * float(np.log1p(self.fit.chi_square / SCATTER_DEGREES))
+        return _Verdict(self.pose, self.names, pictures, coordinates, self.fit.chi_square, by_chance)
+
+
+def _given_sigma_mm(mark: LayoutMark) -> float:
+    """What was found under one name has that learned mark's origin; under another one it would lie elsewhere."""
+    origin_mm = LEARNED_ORIGIN * mark.mark.learned_mm if isinstance(mark.mark, MarkTemplate) else 0.0
+    return float(np.hypot(min(max(mark.sigma_mm), _FREE_MM), origin_mm))
+
+
+def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, lines: Sequence[Line] = ()) -> Pose:
+    """The likeliest pose, and what speaks for it; of those that are as likely the one in which most of the writing is
+    upright, so that a roll's frames are named alike. found: marks, beside which the places of missed ones count too."""
+    if not verdicts:
+        return Pose("0", False, ("no pose names the marks that were found.",))
+    seen = max(verdict.seen for verdict in verdicts)
+    alike = [verdict for verdict in verdicts if seen - verdict.seen < DECIDED]
+    best = max(alike, key=lambda verdict: verdict.total)
+    others = sorted((v for v in verdicts if v not in alike), key=lambda verdict: -verdict.total)
+    against = _against(best, others[0], layout, lines) if others else ()
+    written = {verdict.pose: verdict.writing for verdict in verdicts} if lines else {}
+    main = main_pose(lines)
+    if len(alike) == 1:
+        reasons = against or (f"no other pose explains the {found} marks found.",)
+        return Pose(best.pose, True, reasons, written, main)
+    names = ", ".join(verdict.pose for verdict in alike)
+    lead = best.total - alike[0].total
+    near = [verdict for verdict in alike if best.total - verdict.total < TOLD]
+    upright = next((verdict.pose for verdict in near if main and pose_in_camera(main, verdict.pose) == "0"), "")
+    like_writing = ", in which most of what is written is upright" if upright else ""
+    if lead > TOLD:
+        assumed = upright or best.pose
+        equal = [verdict.pose for verdict in near if verdict.pose != assumed]
+        as_likely = f"as likely as {', '.join(equal)} and " if equal else ""
+        told = (
+            f"the {found} marks found do not tell the poses {names} apart with certainty: {assumed} is assumed"
+            f"{like_writing}, {as_likely}likelier than {alike[0].pose} by log-odds of only {lead:.1f}."
+        )
+    else:
+        assumed = upright or alike[0].pose
+        told = (
+            f"nothing in the {found} marks found tells the poses {names} apart: their pictures and given coordinates "
+            f"are alike; {assumed} is assumed{like_writing}."
+        )
+    rivals = tuple(pose_in_camera(verdict.pose, assumed) for verdict in alike if verdict.pose != assumed)
+    return Pose(assumed, False, (told, *against), written, main, rivals=rivals)
+
+
+def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:
+    """What speaks for the best pose against the likeliest of those that it rules out, a sentence each."""
+    sentences = []
+    by_site, lead = best.pictures - rival.pictures, best.of_pictures - rival.of_pictures
+    if lead > TOLD:
+        telling = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > TOLD]
+        kinds = sorted({_difference(best.names[site], rival.names[site], layout) for site in telling})
+        sentences.append(
+            f"{' and '.join(kinds)} at {len(telling)} of {len(by_site)} marks speak against the next best pose "
+            f"{rival.pose} with log-odds {lead:.1f}."
+        )
+    asymmetry = float(np.sqrt(max(rival.chi_square - best.chi_square, 0.0)))
+    if abs(best.coordinates - rival.coordinates) > TOLD:
+        word = "against" if best.coordinates > rival.coordinates else "for"
+        sentences.append(
+            f"the asymmetry of the marks' given coordinates, {asymmetry:.1f} sigmas, speaks {word} pose {rival.pose} "
+            f"with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
+        )
+    if abs(best.writing - rival.writing) > TOLD:
+        sentences.append(_of_writing(best, rival, layout, lines))
+    return tuple(sentences)
+
+
+def _of_writing(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> str:
+    """What the writing says of two poses, and the lines that say most of it."""
+    lead = best.writing - rival.writing
+    by_line = [
+        (line_score(line, layout.writing, best.pose) - line_score(line, layout.writing, rival.pose)) * np.sign(lead)
+        for line in lines
+    ]
+    telling = [index for index in np.argsort(-np.array(by_line), kind="stable").tolist() if by_line[index] > 0]
+    quoted = ", ".join(f'"{lines[index].text}"' for index in telling[:_QUOTED])
+    word = "against" if lead > 0 else "for"
+    return f"of {len(lines)} lines of writing {quoted} speak most {word} pose {rival.pose}: log-odds {abs(lead):.1f}."
+
+
+def _difference(one: int, other: int, layout: FiducialLayout) -> str:
+    """What two marks of the camera are told apart by."""
+    if one < 0 or other < 0:
+        return "marks where the other pose has none"
+    (core, dots), (other_core, other_dots) = (_drawn(layout.marks[index].mark) for index in (one, other))
+    if core != other_core:
+        return "unlike marks"
+    return "identification dots" if dots != other_dots else "the marks' directions"
+
+
+def _drawn(mark: Mark) -> tuple[object, int]:
+    """A mark's figure, whichever way it is turned, and how many dots stand beside it."""
+    if not isinstance(mark, MarkShape):
+        return mark, 0
+    dots = [part for part in mark.parts if isinstance(part, Disk) and part.center_mm != (0.0, 0.0)]
+    rest = [part for part in mark.parts if part not in dots]
+    return sorted(type(part).__name__ for part in rest), len(dots)

@@ -1,0 +1,149 @@
+"""Whether a frame that shows only some of its marks may be chance: how often places beside the marks look like marks.
+
+A dot on a rough ground is like many a speck, a ring-cross like nothing else; no threshold holds for both. So the marks
+are sought, in the same way, where they are not, and the share of those places that answer as strongly as the weakest of
+the marks found says what these are worth.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtrc
+
+from measure.detection.first_look import strongest
+from measure.detection.prediction import MarkPrediction
+from measure.fiducials.constellation import sign_of
+from measure.fiducials.frame import CLEAR_LIKENESS, Frame
+from measure.fiducials.frame_sighter import first_search_px
+from measure.fiducials.search import FrameSearch
+from measure.probabilities import FRAME_BY_CHANCE, NO_FRAME
+from measure.reason import NO_REASON, Code, Reason
+from measure.scans.scan import Scan
+
+Array = NDArray[np.float64]
+
+_SELDOM, _HOPELESS = 1e-3, 1e6  # expected frames: fewer are no question, and of more nothing becomes a frame
+_COUNTED = 3  # marks that at least are no chance
+_PLACES = 64  # that are looked at beside the marks: enough to tell three marks of four from chance
+_BESIDE = (2.5, 4.5)  # search radii off: beyond what the mark itself answers
+_FREE = 2  # marks that a similarity goes through wherever they lie
+_SURE = 12  # marks that agree: no speck feigns so many
+_FITTED_PX = 3.0  # the fitted place is no farther from the one that answers
+_REDUCED_PX = 1.5  # of the reduced scan: so near to where it answers there a mark answers in the scan
+_APART = 2.0  # search radii off: beyond what a mark itself answers
+
+
+def doubt(search: FrameSearch, frame: Frame) -> Reason:
+    """A sentence where chance may have made the frame, with the code no-frame where it is likelier to than not; empty
+    where it is unlikely to. One that was found at a closer look is taken only where chance hardly makes it, though none
+    of its marks may be clear."""
+    if frame.placement.surroundings.robust:
+        return NO_REASON
+    inside = [index for index, sighting in enumerate(frame.sightings) if sighting.inside]
+    clear = {
+        index: fit.center_px
+        for index, fit in enumerate(frame.fits)
+        if fit
+        and fit.likeness >= CLEAR_LIKENESS
+        and not frame.sightings[index].closer  # those were seen for the others
+    }
+    if frame.belongs.sum() >= _SURE:
+        return NO_REASON
+    if len(clear) == len(inside):
+        return _by_the_scan(search, frame, clear)
+    return _by_places_beside(search, frame, inside, clear)
+
+
+def expected_as_good(search: FrameSearch, frame: Frame) -> float:
+    """How many frames as good chance would make in the scan, only marks without blemish counting as seen."""
+    seen = {index: frame.fits[index] for index in frame.unblemished}
+    return expected_where_seen(search, frame, {index: fit.center_px for index, fit in seen.items() if fit})
+
+
+def expected_where_seen(search: FrameSearch, frame: Frame, seen_px: dict[int, Array]) -> float:
+    """The same with the marks that count as seen, by index, and where. Chance finds places that answer as strongly at
+    reduced size; few of them look so in the scan itself."""
+    expected = search.expected_where_seen(frame.placement, frame.inside, seen_px)
+    if frame.placement.reduction == 1 or not _SELDOM < expected < _HOPELESS:
+        return expected
+    return expected * _as_good_in_full(search, frame, seen_px) ** min(_COUNTED, len(seen_px))
+
+
+def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> Reason:
+    """Where every mark was found: whether the scan has many places that answer as strongly. A frame that was looked for
+    in the middle of its scan is not doubted: the windows about its marks tell of no other places."""
+    if len(clear) <= _FREE or not search.was_everywhere(frame.placement):
+        return NO_REASON
+    expected = expected_where_seen(search, frame, clear)
+    if expected <= FRAME_BY_CHANCE:
+        return NO_REASON
+    return Reason(
+        f"so much of the scan looks like the {len(clear)} marks found that chance would make {expected:.2g} such "
+        "frames in it, and the frame may lie elsewhere",
+        Code.CHANCE,
+    )
+
+
+def _as_good_in_full(search: FrameSearch, frame: Frame, seen_px: dict[int, Array]) -> float:
+    """Of the places that answer as strongly as the marks at reduced size, the share that does so in the scan itself."""
+    marks_px, apart_px = (
+        np.array([*seen_px.values()]),
+        _APART * first_search_px(frame.placement, search.layout, search.options),
+    )
+    others = [
+        (index, place)
+        for index, seen in seen_px.items()
+        for place in search.places_as_good(frame.placement, index, seen)[: _PLACES // len(seen_px)]
+        if np.hypot(*(marks_px - place).T).min() > apart_px
+    ]
+    weakest = min(_response(search, frame, index, place, _FITTED_PX) for index, place in seen_px.items())
+    radius = _REDUCED_PX * frame.placement.reduction
+    hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in others)
+    return _share(hits, len(others))
+
+
+def _by_places_beside(search: FrameSearch, frame: Frame, inside: Sequence[int], clear: dict[int, Array]) -> Reason:
+    """Where some marks were not found: whether places beside them look as much like marks as those that were."""
+    found, radius = len(clear), first_search_px(frame.placement, search.layout, search.options)
+    places = _beside(search.scan, frame, inside, radius)
+    weakest = min((_response(search, frame, index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
+    hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in places)
+    chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, len(places))))
+    if chance <= FRAME_BY_CHANCE:
+        return NO_REASON
+    return Reason(
+        f"only {found} of {len(inside)} marks were clearly found, and {hits} of {len(places)} places beside them look "
+        f"as much like marks: chance finds as many with a probability of {chance:.2f}, and the frame may lie elsewhere",
+        *((Code.CHANCE, Code.NO_FRAME) if chance > NO_FRAME else (Code.CHANCE,)),
+    )
+
+
+def _response(search: FrameSearch, frame: Frame, index: int, place: Array, radius_px: float) -> float:
+    """How strongly a mark, by index, answers at most within a radius of a place in the scan."""
+    mark = search.layout.marks[index].mark
+    start = np.column_stack([frame.pixel_from_camera[:, :2], place])
+    sign = sign_of(mark, frame.placement.polarity)
+    expected = MarkPrediction(mark, start, radius_px, sign, frame.weights, frame.placement.surroundings)
+    return strongest(search.scan, expected)[1]
+
+
+def _share(hits: int, places: int) -> float:
+    """Laplace: none of sixty does not mean never."""
+    return (hits + 1) / (places + 2)
+
+
+def _beside(scan: Scan, frame: Frame, inside: Sequence[int], radius_px: float) -> list[tuple[int, Array]]:
+    """Places about the marks in the scan, in eight directions, each with the mark that is sought there."""
+    angles = np.arange(8) * np.pi / 4
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    size = np.array([scan.width_px, scan.height_px])
+    every = [
+        (index, np.asarray(frame.pixel_from_camera @ (*frame.camera_mm[index], 1.0) + off * radius_px * direction))
+        for off in _BESIDE
+        for direction in directions
+        for index in inside
+    ]
+    within = [(index, place) for index, place in every if np.all(place >= 0) and np.all(place < size)]
+    step = max(1, len(within) // _PLACES)
+    return within[::step][:_PLACES]

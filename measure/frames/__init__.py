@@ -1,1 +1,0 @@
-"""The marks of a frame sighted at full resolution, and the frame fitted to those that agree."""

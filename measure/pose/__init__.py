@@ -1,1 +1,0 @@
-"""Which of the eight ways a frame lies in its scan."""

@@ -1,1 +1,0 @@
-"""Where in its scan a camera's frame lies."""
