@@ -301,6 +301,7 @@ class Adjustment:
     slips: sentences on given points so far off that the observations do not agree, or have no solution, for them.
     left_out: by name, the images for which no orientation was found, and why; the network is that of the others.
     misread: sentences on images that are mirrored; what else there seems to be is theirs.
+    unused: notes on what was given and has no part, the first of the notes.
     """
 
     network: Network
@@ -324,6 +325,7 @@ class Adjustment:
     slips: tuple[str, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
     misread: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
 
     @property
     def residuals(self) -> Residuals:
@@ -373,7 +375,7 @@ class Adjustment:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is worth knowing and needs no action."""
-        return self.assessment.notes
+        return (*self.unused, *self.assessment.notes)
 
     @property
     def converged(self) -> bool:

@@ -11,7 +11,8 @@ from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import Network
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
-from pipeline.adjusting.network import build_network, unmeasured_points
+from measure.results import ON_FILM
+from pipeline.adjusting.network import build_network
 from pipeline.adjusting.scanners import with_scanners
 from pipeline.files.project_file import Project
 from pipeline.measuring.perspective_disks import across, disk_normals, eccentricity_mm, plane_normal
@@ -42,10 +43,9 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
         *left_out,
         *untold,
         *_misnamed(project, marks),
-        *_unmeasured(project, network),
         *_not_corrected(network, uncorrected),
     )
-    return replace(adjustment, remarks=(*adjustment.remarks, *warnings))
+    return replace(adjustment, remarks=(*adjustment.remarks, *warnings), unused=_unmeasured(project, marks))
 
 
 def adjustment_options(project: Project) -> Options:
@@ -138,13 +138,15 @@ def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, 
     )
 
 
-def _unmeasured(project: Project, network: Network) -> tuple[str, ...]:
-    lost = unmeasured_points(project, network)
-    if not lost:
+def _unmeasured(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
+    """A note on given points that no image shows: large patterns have many, and a wrong point number makes one."""
+    observed = {mark.point for mark in marks if mark.status.is_observation and mark.kind not in ON_FILM}
+    lost = [id for id in project.object_points if id not in observed]
+    if project.given_points is None or not lost:
         return ()
     return (
         f"Given but measured in no image: {'point' if len(lost) == 1 else f'{len(lost)} points,'} {listed(lost)}. "
-        "Look for a wrong point number; a point that no image shows has no part in the adjustment.",
+        "They have no part in the adjustment; if an image shows one, look for a wrong point number or coordinate.",
     )
 
 

@@ -86,13 +86,6 @@ def check_transformation(project: Project) -> None:
         _transformation(project, camera)
 
 
-def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
-    """Points that are given but that no image shows."""
-    if project.given_points is None:
-        return ()
-    return tuple(point.id for point in project.given_points.points if point.id not in network.point_by_id)
-
-
 def _frame(project: Project, image: str) -> str:
     """The name of the frame that an image is a scan of."""
     return project.part_of(image) or image
@@ -116,9 +109,11 @@ def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list
     seen = {(mark.point, _frame(project, mark.image)) for mark in marks if mark.kind not in ON_FILM}
     images = Counter(point for point, _ in seen)
     lonely = {point for point, count in images.items() if count < 2 and point not in given}
+    image_of = {point: image for point, image in seen if point in lonely}
+    named = [f"{point} ({image_of[point]})" for point in sorted(lonely)]
     sentence = (
-        f"Unknown and shown by one image only, and so left out: {listed(sorted(lonely))}. Measure each such point in a "
-        "second image, or give its coordinates."
+        f"Without coordinates and measured in one image only, and so left out: {listed(named)}. Two images are needed to "
+        "locate a point. Measure each in a second image, or give its coordinates."
     )
     kept = [mark for mark in marks if mark.kind in ON_FILM or mark.point not in lonely]
     return kept, (sentence,) if lonely else ()

@@ -133,3 +133,21 @@ def test_a_lens_known_in_the_middle_alone_needs_a_look(frame_mm: float, level: i
     assert known["corner_sigma_um"] > known["sigma_um"] > 0.0
     assert run(["report", str(project)]) in (0, level)
     assert "of the way to the corner of the picture" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_points_that_no_image_shows_are_a_note_and_one_without_coordinates_in_one_image_is_named(tmp_path: Path) -> None:
+    """A pattern is often larger than what the images show; one ray does not locate a point."""
+    network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 40))
+    project = write_network(network, tmp_path)
+    points, marks = tmp_path / "points.csv", tmp_path / "comparator.csv"
+    points.write_text(points.read_text(encoding="utf-8") + "u1,5,5,0,0,0,0\nu2,6,6,0,0,0,0\n", encoding="utf-8")
+    assert run(["adjust", str(project)]) == 0
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    assert [note for note in result["notes"] if "measured in no image: 2 points, u1, u2" in note]
+    points.write_text(points.read_text(encoding="utf-8") + "single,,,,,,\n", encoding="utf-8")
+    marks.write_text(marks.read_text(encoding="utf-8") + "f2,single,target,10,10,0.005,0.005\n", encoding="utf-8")
+    assert run(["adjust", str(project)]) == 1
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    (warning,) = [warning for warning in result["warnings"] if "single" in warning]
+    assert "measured in one image only, and so left out: single (f2). Two images are needed" in warning
+    assert not any("single" in note for note in result["notes"])
