@@ -112,8 +112,8 @@ def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list
     image_of = {point: image for point, image in seen if point in lonely}
     named = [f"{point} ({image_of[point]})" for point in sorted(lonely)]
     sentence = (
-        f"Without coordinates and measured in one image only, and so left out: {listed(named)}. Two images are needed to "
-        "locate a point. Measure each in a second image, or give its coordinates."
+        f"Without coordinates and measured in one image only, and so left out: {listed(named)}. Two images are needed "
+        "to locate a point. Measure each in a second image, or give its coordinates."
     )
     kept = [mark for mark in marks if mark.kind in ON_FILM or mark.point not in lonely]
     return kept, (sentence,) if lonely else ()

@@ -135,7 +135,7 @@ def test_a_lens_known_in_the_middle_alone_needs_a_look(frame_mm: float, level: i
     assert "of the way to the corner of the picture" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
-def test_points_that_no_image_shows_are_a_note_and_one_without_coordinates_in_one_image_is_named(tmp_path: Path) -> None:
+def test_points_that_no_image_shows_are_a_note_and_an_unknown_one_in_one_image_is_named(tmp_path: Path) -> None:
     """A pattern is often larger than what the images show; one ray does not locate a point."""
     network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 40))
     project = write_network(network, tmp_path)
