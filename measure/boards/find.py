@@ -66,8 +66,8 @@ def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:
     contrast = float(np.median(crossings))
     if contrast < 0:
         crossings, contrast = -crossings, -contrast
-    seen = crossings > _CROSSING * contrast
-    if not (contrast > 0 and all(2 * line.sum() >= len(line) for line in (*seen, *seen.T))):
+    is_crossing = crossings > _CROSSING * contrast
+    if not (contrast > 0 and all(2 * line.sum() >= len(line) for line in (*is_crossing, *is_crossing.T))):
         return None
     is_bounded = True
     for _ in range(4):
@@ -135,18 +135,18 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
 
 def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
     """Why there is no board of the count that is asked for, with the count that fits, if there is one."""
-    told = f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen"
+    message = f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen"
     if pattern is None:
-        return told
+        return message
     rows, columns = pattern.grid.shape[:2]
     both = ((columns, rows), (rows, columns))  # nothing tells which are the rows
     columns, rows = min(both, key=lambda one: ((one[0] - spec.columns) ** 2 + (one[1] - spec.rows) ** 2, -one[0]))
-    told += f"; one of {columns} x {rows} is"
+    message += f"; one of {columns} x {rows} is"
     if (columns, rows) == (spec.columns - 1, spec.rows - 1):
-        return f"{told}: squares may have been counted in place of inner corners, which columns and rows count"
+        return f"{message}: squares may have been counted in place of inner corners, which columns and rows count"
     if columns > spec.columns or rows > spec.rows or pattern.is_bounded:
-        return f"{told}. Set columns and rows to the count of the board's inner corners"
-    return f"{told}, and the rest may lie outside of the scan"
+        return f"{message}. Set columns and rows to the count of the board's inner corners"
+    return f"{message}, and the rest may lie outside of the scan"
 
 
 def _grids(picture: Bytes, spec: ChessboardSpec) -> Iterator[Array]:
@@ -232,7 +232,7 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | Squa
         else:
             found = find_aruco(picture, spec)
         if found.corners:
-            corners = {name: _in_scan(corner, factor) for name, corner in found.corners.items()}
+            corners = {name: _scan_corner(corner, factor) for name, corner in found.corners.items()}
             return replace(found, corners=corners, others_px=tuple(_scan_px(one, factor) for one in found.others_px))
     return found
 
@@ -250,12 +250,12 @@ def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
     low, high = np.percentile(grey, (1, 99))
     if high - low < _LEAST_CONTRAST * scan.full_scale_dn:
         share = 100 * (high - low) / scan.full_scale_dn
-        told = f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
-        return np.zeros((1, 1), np.uint8), Reason(told, Code.CONTRAST)
+        message = f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
+        return np.zeros((1, 1), np.uint8), Reason(message, Code.CONTRAST)
     return np.clip((grey - low) * (255 / (high - low)), 0, 255).astype(np.uint8), NO_REASON
 
 
-def _in_scan(corner: FoundCorner, factor: int) -> FoundCorner:
+def _scan_corner(corner: FoundCorner, factor: int) -> FoundCorner:
     return FoundCorner(_scan_px(corner.center_px, factor), corner.steps_px * factor)
 
 

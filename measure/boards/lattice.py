@@ -14,14 +14,13 @@ from measure.boards.specs import SquareGridSpec
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Place = tuple[int, int]
+Bytes = NDArray[np.uint8]
 
 _NEIGHBOURS = 8  # of a point: those that touch its square
 _STEP_TOLERANCE = 0.3  # of a step, between where a neighbour is expected and where it is
 _SEEDS = 12  # points to begin at, spread over all
 _LIKENESS = 0.4  # of the logarithms of size and contrast
 _LEAST_SHARE = 0.8  # of the grid's places that must be seen
-Bytes = NDArray[np.uint8]
-
 _BLOCKS = (1 / 4, 1 / 8, 1 / 16)  # of the picture's shorter side: about so far the ground of a square is looked at
 _DARKER = 12  # grey values of 255 that a square is darker by than the mean about it
 _SMALLEST_SIDE_PX = 6.0
@@ -30,17 +29,17 @@ _STRAIGHT = 0.06  # of its outline: how far a quadrangle's sides may leave it
 _FILLED = 0.8  # of the quadrangle that the outline holds
 
 
-def grid_places(points_px: Array, looks: Array, places: list[Place]) -> list[dict[Place, int]]:
+def grid_places(points_px: Array, appearances: Array, places: list[Place]) -> list[dict[Place, int]]:
     """Assignments of points to the places (row, column) of a grid: {place: index of the point}. The first explains most
     points; further ones are ways to turn the grid, or to lay it on other points of a larger lattice, that explain as
     many but for half a line of the grid. A lattice as large as the grid goes before a larger one. Empty where no
     outline fits; the grid is never mirrored.
 
-    points_px (n, 2) may hold others, too; looks (n, k): figures of a point's looks, in which neighbours differ little,
+    points_px (n, 2) may hold others, too; appearances (n, k): what points look like, in which neighbours differ little,
     logarithms of size and contrast. The grid's outline must be seen, a fifth of its places may be missing.
     """
     best: list[dict[Place, int]] = []
-    for lattice in _lattices(points_px, looks):
+    for lattice in _lattices(points_px, appearances):
         found = _outlines(lattice, places)
         if found and (not best or _rank(found) > _rank(best)):
             best = found
@@ -58,14 +57,16 @@ def is_whole(assignments: list[dict[Place, int]]) -> bool:
     return len({frozenset(assignment.values()) for assignment in assignments}) == 1
 
 
-def other_grids(centers: Array, looks: Array, assignment: dict[Place, int], places: list[Place]) -> tuple[Array, ...]:
+def other_grids(
+    centers: Array, appearances: Array, assignment: dict[Place, int], places: list[Place]
+) -> tuple[Array, ...]:
     """The middles of the grids that the points make beside the one that was found."""
     others: list[Array] = []
     left = np.arange(len(centers))
     found = list(assignment.values())
     while True:
         left = np.delete(left, found)
-        further = grid_places(centers[left], looks[left], places)
+        further = grid_places(centers[left], appearances[left], places)
         if not is_whole(further):
             return tuple(others)
         found = list(further[0].values())
@@ -79,18 +80,19 @@ def upright(assignment: dict[Place, int], centers: Array) -> float:
     return float(np.cov(columns, right)[0, 1])
 
 
-def _lattices(points_px: Array, looks: Array) -> list[dict[Place, int]]:
+def _lattices(points_px: Array, appearances: Array) -> list[dict[Place, int]]:
     """Lattices that the points form, {(i, j): index}, the largest first; i to j turns as column to row of a scan."""
     if len(points_px) < 4:
         return []
     tree = cKDTree(points_px)
     found = [
-        _grown(points_px, looks, tree, int(seed)) for seed in np.linspace(0, len(points_px) - 1, _SEEDS).astype(int)
+        _grown(points_px, appearances, tree, int(seed))
+        for seed in np.linspace(0, len(points_px) - 1, _SEEDS).astype(int)
     ]
     return [lattice for lattice in sorted(found, key=len, reverse=True)[:3] if lattice]
 
 
-def _grown(points_px: Array, looks: Array, tree: cKDTree, seed: int) -> dict[Place, int]:
+def _grown(points_px: Array, appearances: Array, tree: cKDTree, seed: int) -> dict[Place, int]:
     """The lattice about a point, grown from neighbour to neighbour; each step is expected to be like the last."""
     basis = _seed_basis(points_px, tree, seed)
     if basis is None:
@@ -107,14 +109,14 @@ def _grown(points_px: Array, looks: Array, tree: cKDTree, seed: int) -> dict[Pla
             if place in lattice:
                 continue
             distance, index = tree.query(here + sign * step[along])
-            unlike = np.abs(looks[index] - looks[lattice[i, j]]).max() > _LIKENESS
+            unlike = np.abs(appearances[index] - appearances[lattice[i, j]]).max() > _LIKENESS
             if unlike or distance > _STEP_TOLERANCE * np.hypot(*step[along]) or int(index) in taken:
                 continue
             lattice[place] = int(index)
             taken.add(int(index))
-            seen = step.copy()
-            seen[along] = sign * (points_px[index] - here)
-            steps[place] = 0.5 * (step + seen)
+            refined = step.copy()
+            refined[along] = sign * (points_px[index] - here)
+            steps[place] = 0.5 * (step + refined)
             waiting.append(place)
     return lattice
 
@@ -189,12 +191,12 @@ def find_squares(picture: Bytes, spec: SquareGridSpec) -> tuple[dict[str, Array]
 
     Raises NoSquareGridError where not nearly all of a grid of this size is seen.
     """
-    told = ""
+    message = ""
     for share in _BLOCKS:
         quads = list(_dark_quads(picture, share))
         centers = np.array([quad.mean(axis=0) for quad in quads]).reshape(-1, 2)
-        looks = np.log([[cv2.contourArea(quad.astype(np.float32))] for quad in quads] or np.ones((0, 1)))
-        assignments = grid_places(centers, looks, spec.places())
+        appearances = np.log([[cv2.contourArea(quad.astype(np.float32))] for quad in quads] or np.ones((0, 1)))
+        assignments = grid_places(centers, appearances, spec.places())
         if is_whole(assignments):
             assignment = max(assignments, key=lambda found: upright(found, centers))
             notes = ("the grid looks the same when turned: it was taken as upright in the scan",)
@@ -202,11 +204,15 @@ def find_squares(picture: Bytes, spec: SquareGridSpec) -> tuple[dict[str, Array]
                 spec.name_of(place): _ordered(quads[index], _steps(assignment, centers, place))
                 for place, index in assignment.items()
             }
-            return corners, notes[: len(assignments) - 1], other_grids(centers, looks, assignment, spec.places())
-        told = f"no grid of {spec.columns} x {spec.rows} squares is wholly seen; {len(quads)} spots look like squares"
+            return corners, notes[: len(assignments) - 1], other_grids(centers, appearances, assignment, spec.places())
+        message = (
+            f"no grid of {spec.columns} x {spec.rows} squares is wholly seen; {len(quads)} spots look like squares"
+        )
         if assignments:
-            told = f"a grid of more than {spec.columns} x {spec.rows} squares is seen, or one with a line of it hidden"
-    raise NoSquareGridError(told)
+            message = (
+                f"a grid of more than {spec.columns} x {spec.rows} squares is seen, or one with a line of it hidden"
+            )
+    raise NoSquareGridError(message)
 
 
 def _dark_quads(picture: Bytes, share: float) -> Iterator[Array]:

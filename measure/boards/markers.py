@@ -75,8 +75,8 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
                 Code.AMBIGUOUS,
             )
         else:
-            told = f"marker {number} was read where the board's other markers do not have it"
-            refused[number] = Reason(told, Code.OFF_PLACE)
+            message = f"marker {number} was read where the board's other markers do not have it"
+            refused[number] = Reason(message, Code.OFF_PLACE)
     return ReadMarkers(corners, refused, agreeing)
 
 
@@ -126,22 +126,22 @@ def _view(
     return view if 2 * agreeing > len(readings) and np.median(misfits) < half_module else None
 
 
-def _misfit(view: SheetView, corners: Array, seen_px: Array) -> float:
+def _misfit(view: SheetView, corners: Array, image_px: Array) -> float:
     """How far a marker's corners lie from where the board has them, rms in its sides."""
-    return float(np.sqrt(np.mean(np.sum((view.places_px(corners) - seen_px) ** 2, axis=1)))) / _side_px(seen_px)
+    return float(np.sqrt(np.mean(np.sum((view.places_px(corners) - image_px) ** 2, axis=1)))) / _side_px(image_px)
 
 
-def _off(view: SheetView | None, corners: Array, seen_px: Array) -> float:
+def _off(view: SheetView | None, corners: Array, image_px: Array) -> float:
     """How far a marker lies from where the board has it, in its sides: another one cannot be nearer than one. nan where
     that is not known."""
     if view is None:
         return np.nan
-    return float(np.hypot(*(view.places_px(corners) - seen_px).mean(axis=0))) / _side_px(seen_px)
+    return float(np.hypot(*(view.places_px(corners) - image_px).mean(axis=0))) / _side_px(image_px)
 
 
-def _side_px(seen_px: Array) -> float:
+def _side_px(image_px: Array) -> float:
     """The longest side of a marker (4, 2) as it is seen."""
-    return float(np.hypot(*(np.roll(seen_px, 1, axis=0) - seen_px).T).max())
+    return float(np.hypot(*(np.roll(image_px, 1, axis=0) - image_px).T).max())
 
 
 # The corners of boards with markers in a picture, to a pixel: ArUco grids and ChArUco boards.
@@ -156,7 +156,7 @@ def find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
     read = placed_markers(readings, _aruco_markers(spec))
     better = better_layout(readings, read, ((other, _aruco_markers(other)) for other in _other_arucos(spec, readings)))
     if better:
-        return _of_other_layout(spec, better[0])
+        return _other_layout_board(spec, better[0])
     found: dict[str, FoundCorner] = {}
     for number, corners in read.corners_px.items():
         found |= corners_of_square(f"{number}", corners)
@@ -172,7 +172,7 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     others = ((other, _charuco_markers(other)) for other in _other_charucos(spec, readings))
     better = better_layout(readings, read, others)
     if better and (spec.legacy is not None or better[0] != replace(spec, legacy=True)):
-        return _of_other_layout(spec, better[0])
+        return _other_layout_board(spec, better[0])
     if better:
         spec, read = better
     outlines = [outline[None].astype(np.float32) for outline in read.corners_px.values()]
@@ -208,15 +208,15 @@ def _other_charucos(spec: CharucoSpec, read: MarkerReadings) -> Iterator[Charuco
                 yield replace(board, legacy=legacy)
 
 
-def _of_other_layout(spec: ArucoSpec | CharucoSpec, other: ArucoSpec | CharucoSpec) -> FoundBoard:
+def _other_layout_board(spec: ArucoSpec | CharucoSpec, other: ArucoSpec | CharucoSpec) -> FoundBoard:
     """No corners, and what of the description does not fit the markers."""
     keys = ("columns", "rows", "first_marker", "first_id", "legacy")
     differing = [key for key in keys if getattr(spec, key, None) != getattr(other, key, None)]
     if not getattr(other, "legacy", None):
         differing = [key for key in differing if key != "legacy" or getattr(spec, key)]
     fitting = ", ".join(f"{key} = {str(getattr(other, key)).lower()}" for key in differing)
-    told = f"the markers that were read do not lie as on the board that is described, but as with {fitting}"
-    return FoundBoard({}, Reason(f"{told}. Set that, if it is the board's", Code.NO_BOARD))
+    message = f"the markers that were read do not lie as on the board that is described, but as with {fitting}"
+    return FoundBoard({}, Reason(f"{message}. Set that, if it is the board's", Code.NO_BOARD))
 
 
 def _too_few(spec: ArucoSpec | CharucoSpec, read: ReadMarkers) -> Reason:
@@ -224,11 +224,11 @@ def _too_few(spec: ArucoSpec | CharucoSpec, read: ReadMarkers) -> Reason:
     if read.refused:
         return next(iter(read.refused.values()))
     if isinstance(spec, CharucoSpec):
-        told = f"{len(read.corners_px)} markers of {spec.dictionary} were read, too few to place the board's corners"
+        message = f"{len(read.corners_px)} markers of {spec.dictionary} were read, too few to place the board's corners"
     else:
         last = spec.first_marker + spec.columns * spec.rows - 1
-        told = f"no marker {spec.first_marker} to {last} of {spec.dictionary} was read"
-    return Reason(told, Code.NO_BOARD)
+        message = f"no marker {spec.first_marker} to {last} of {spec.dictionary} was read"
+    return Reason(message, Code.NO_BOARD)
 
 
 def _aruco_markers(spec: ArucoSpec) -> Markers:
@@ -274,15 +274,15 @@ def off_corners(found: Mapping[str, FoundCorner], spec: CharucoSpec, read: ReadM
     for name, corner in found.items():
         row, column = divmod(int(name[1:]), spec.columns - 1)
         place = np.array([column + 1.0, row + 1.0])
-        beside = [number for number, middle in middles.items() if np.abs(middle - place).max() < 1.0]
-        if not beside:
+        touching = [number for number, middle in middles.items() if np.abs(middle - place).max() < 1.0]
+        if not touching:
             continue
-        squares = np.concatenate([on_board[number] for number in beside]) / spec.square_mm
-        seen = np.concatenate([read.corners_px[number] for number in beside])
-        homography = np.asarray(cv2.findHomography(squares, seen)[0], float)
+        squares = np.concatenate([on_board[number] for number in touching]) / spec.square_mm
+        image_px = np.concatenate([read.corners_px[number] for number in touching])
+        homography = np.asarray(cv2.findHomography(squares, image_px)[0], float)
         x, y, w = homography @ (*place, 1.0)
         squares_off = np.linalg.solve(_homography_steps(homography, place), corner.center_px - (x / w, y / w))
         if np.hypot(*squares_off) > _OFF_SQUARES:
-            told = f"it lies {np.hypot(*squares_off):.1f} squares off where the markers beside it put it"
-            off[name] = Reason(told, Code.OFF_PLACE)
+            message = f"it lies {np.hypot(*squares_off):.1f} squares off where the markers beside it put it"
+            off[name] = Reason(message, Code.OFF_PLACE)
     return off

@@ -61,31 +61,33 @@ def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> CircleGridMeasureme
     names = {place: f"r{place[0]}c{place[1]}" for place in spec.places()}
     patches = disk_candidates(scan, DiskSearch((_SMALLEST_DOT_PX, _largest_dot_px(scan, spec))))
     centers = np.array([patch.center_px for patch in patches]).reshape(-1, 2)
-    looks = _looks(patches)
-    assignments = grid_places(centers, looks, spec.places())
+    appearances = _appearances(patches)
+    assignments = grid_places(centers, appearances, spec.places())
     if not is_whole(assignments):
-        told = f"no grid of {spec.columns} x {spec.rows} dots is wholly seen; {len(patches)} spots look like dots"
+        message = f"no grid of {spec.columns} x {spec.rows} dots is wholly seen; {len(patches)} spots look like dots"
         if assignments:
-            told = f"a grid of more than {spec.columns} x {spec.rows} dots is seen, or one with a line of it hidden"
-        reason = Reason(told, Code.NO_BOARD)
+            message = f"a grid of more than {spec.columns} x {spec.rows} dots is seen, or one with a line of it hidden"
+        reason = Reason(message, Code.NO_BOARD)
         absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, reason) for name in names.values())
         return CircleGridMeasurement(tuple(absent), reason)
     assignment = max(assignments, key=lambda found: upright(found, centers))
     notes = (
         ("the grid looks the same when turned: it was taken as upright in the scan",) if len(assignments) > 1 else ()
     )
-    seen = {place: (patches[index].center_px, patches[index].pixel_from_disk) for place, index in assignment.items()}
+    detected = {
+        place: (patches[index].center_px, patches[index].pixel_from_disk) for place, index in assignment.items()
+    }
     gap = 1 - spec.diameter_mm / spec.shortest_distance_mm
     marks = []
     for place, name in names.items():
-        center, shape = seen[place] if place in seen else _predicted(place, seen)
+        center, shape = detected[place] if place in detected else _predicted(place, detected)
         margin = gap / (1 - gap) * 2 * float(np.linalg.svd(shape, compute_uv=False)[1])
-        marks.append(_dot_mark(name, fit_disk(scan, center, shape, longest_margin_px=margin), place in seen))
-    others = other_grids(centers, looks, assignment, spec.places())
+        marks.append(_dot_mark(name, fit_disk(scan, center, shape, longest_margin_px=margin), place in detected))
+    others = other_grids(centers, appearances, assignment, spec.places())
     return CircleGridMeasurement(tuple(marks), NO_REASON, notes, others)
 
 
-def _looks(patches: list[Candidate]) -> Array:
+def _appearances(patches: list[Candidate]) -> Array:
     """(n, 3) logarithms of size and contrast, and which of both, light or dark."""
     return np.array(
         [(np.log(patch.radius_px), np.log(abs(patch.contrast_dn)), np.sign(patch.contrast_dn)) for patch in patches]
@@ -99,20 +101,20 @@ def _largest_dot_px(scan: Scan, spec: CircleGridSpec) -> float:
     return max(2 * _SMALLEST_DOT_PX, share * max(scan.width_px, scan.height_px) / places)
 
 
-def _predicted(place: Place, seen: dict[Place, tuple[Array, Array]]) -> tuple[Array, Array]:
+def _predicted(place: Place, detected: dict[Place, tuple[Array, Array]]) -> tuple[Array, Array]:
     """Centre and shape of a dot by a homography of its nearest neighbours; the shape is their mean one."""
-    others = sorted(seen, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
+    others = sorted(detected, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
     nearest = others[: max(_NEAREST_DOTS, len(others) // 3)]
-    homography, _ = cv2.findHomography(np.array(nearest, float), np.array([seen[other][0] for other in nearest]))
+    homography, _ = cv2.findHomography(np.array(nearest, float), np.array([detected[other][0] for other in nearest]))
     x, y, w = np.asarray(homography, float) @ (*place, 1.0)
-    squares = [seen[other][1] @ seen[other][1].T for other in nearest[:_NEAREST_DOTS]]
+    squares = [detected[other][1] @ detected[other][1].T for other in nearest[:_NEAREST_DOTS]]
     return np.array([x / w, y / w]), np.linalg.cholesky(np.mean(squares, axis=0))
 
 
-def _dot_mark(name: str, disk: FittedDisk, was_seen: bool) -> MarkMeasurement:
+def _dot_mark(name: str, disk: FittedDisk, is_detected: bool) -> MarkMeasurement:
     """The row of a dot."""
     if disk.reason:
-        status = Status.REJECTED if was_seen else Status.PREDICTED
+        status = Status.REJECTED if is_detected else Status.PREDICTED
         reason = disk.reason.told(f"not fitted: {disk.reason}")
         return MarkMeasurement(name, "target", disk.center_px, None, status, reason)
     weakness = disk.weakness or disk.lone_doubt
@@ -160,8 +162,8 @@ def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Arr
         return measured
     middle = np.mean([mark.center_px for mark in measured.marks if mark.center_px is not None], axis=0)
     places = " and ".join(f"({column:.0f}, {row:.0f})" for column, row in (middle, *others_px))
-    told = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing tells which is meant"
-    why = Reason(told, Code.AMBIGUOUS)
+    message = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing tells which is meant"
+    why = Reason(message, Code.AMBIGUOUS)
     marks = tuple(
         replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
         for mark in measured.marks
@@ -289,8 +291,8 @@ def _corner_mark(name: str, fitted: FittedCorner | None, missing: Reason) -> Mar
     if corner.junction_px is not None:
         quality |= {"junction_col_px": corner.junction_px[0], "junction_row_px": corner.junction_px[1]}
     weak = corner.damaged_fraction > _WEAK_DAMAGE
-    told = f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit"
-    reason = Reason(told, Code.COVERED) if weak else NO_REASON
+    message = f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit"
+    reason = Reason(message, Code.COVERED) if weak else NO_REASON
     status = Status.WEAK if weak else Status.MEASURED
     return MarkMeasurement(
         name, "target", corner.center_px, Covariance.of_noise(corner.covariance_px2), status, reason, quality
