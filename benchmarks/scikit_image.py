@@ -155,17 +155,17 @@ def _outliers_told(frames: int, marks_mm: Array, off: int) -> str:
 
 
 def corners(count: int) -> str:
-    """Crossings of a chessboard, a blur of 1 px: by corner_subpix, and by the own junction, from a whole pixel."""
+    """Crossings of a chessboard, a blur of 1 px: by corner_subpix, and by OpenCV, from a whole pixel."""
     rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
     for _number in range(4 * count):
         center = np.full(2, (CORNER_PX - 1) / 2) + rng.uniform(-0.5, 0.5, 2)
         grey = square_picture(center, board_steps(rng), 1.0, False)
         grey = grey + CORNER_NOISE * rng.standard_normal(grey.shape)
         start = np.rint(center)
-        ours.append(junction(grey, start, 3.5, np.ones_like(grey)) - center)
+        ours.append(junction(grey, start, 7.0) - center)
         theirs.append(corner_subpix(grey, start[None, ::-1].astype(int), window_size=13)[0, ::-1] - center)
     lost = int(np.isnan(np.array(theirs)).any(axis=1).sum())
-    return f"{_rms(theirs)} px, none for {lost} of {4 * count} | junction {_rms(ours)} px"
+    return f"{_rms(theirs)} px, none for {lost} of {4 * count} | OpenCV {_rms(ours)} px"
 
 
 def morphology(count: int) -> str:

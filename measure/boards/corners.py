@@ -10,31 +10,33 @@ curve, so its place does not depend on it; a quarter's does, by as much as the e
 Beside it stands the junction: the place that the lines along the grey values' gradients miss least (Förstner and Gülch,
 1987, A fast operator for detection and precise location of distinct points, corners and centres of circular features).
 A lens with coma blurs edges to one side, and then a crossing has no one place: match and junction differ by tenths of a
-pixel, growing towards the picture's corners. There the junction is the place that `cv2.cornerSubPix`, and with it most
-published calibrations, measure.
+pixel, growing towards the picture's corners. There the junction, found by `cv2.cornerSubPix`, is what most published
+calibrations measure.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.special import erf, ndtr, owens_t
 
+from measure.covariance import Covariance
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow
 from measure.noise.noise_model import correlated, noise_model, products
 from measure.noise.robust_estimation import gauss_newton_step, robust_scale, tukey_weights
 from measure.reason import NO_REASON, Code, Reason
+from measure.results import MarkMeasurement
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Surface = Callable[[Array, Array, float], tuple[Array, Array, Array, Array]]
 
 _SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
-_MAX_ITERATIONS = 30  # of a stage, or of the junction
-_LARGEST_WINDOW_PX = 3.5  # the standard deviation of the gradients' window about a crossing
+_MAX_ITERATIONS = 30  # of a stage
 _UNDAMAGED = 0.05  # the robust weight below which a pixel shows something else
 # Plain, then thrice robust: the scale of the residuals is taken once before each, so that it settles.
 _STAGES_TOLERANCE_PX = (0.05, 0.05, 0.01, 0.001)
@@ -44,10 +46,13 @@ _MOST_TURN_RAD = 0.35  # of an edge: twenty degrees, which no approximate place 
 _START_BLUR_PX, _LEAST_BLUR_PX = 0.8, 0.3  # the pixel's share included
 _DAMPING = 1e-9  # of a step: what hardly shows does not run away
 _LONGEST_TURN_RAD = 0.15  # of an edge in a step: its picture is no longer linear in more
-_GRADIENT_PX = 1.0  # the Gaussian under the derivatives: pixel noise has gone, the edges are still apart
-_REACH_SIGMAS = 4.0  # of that Gaussian's filter
-_TOLERANCE_PX = 1e-4  # of the last step
-_WORST_CONDITION = 1e6  # of the normal matrix: beyond it the gradients have one direction only
+_LARGEST_HALF_WINDOW_PX = 6  # about a junction: more shows what the lens does to longer edges
+_HALF_WINDOW = 0.85  # of the reach: the weight is 0.37 in the middle of the window's sides and 0.14 in its corners
+_SMOOTHING_PX = 1.0  # pixel noise has gone, the edges are still apart
+_SUBPIX_BORDER_PX = 5  # what OpenCV wants of a picture beyond twice half a window
+_SUBPIX_END = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-4)  # iterations, px of the last step
+_NEIGHBOURS = 4  # crossings: the next ones along the rows and columns
+_FEWEST_CROSSINGS = 30  # with fewer nobody can tell coma from noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,11 +177,10 @@ class _CornerFit:
 
     def _junction(self, residuals: Array) -> Array | None:
         """Where the gradients' lines meet. Damage is painted over with what was fitted."""
-        area = self._area()
-        damaged = self.weights < _UNDAMAGED * area
-        window_px = min(_LARGEST_WINDOW_PX, float(self.reach.min()) / 2)
-        meeting = junction(self.grey - np.where(damaged, residuals, 0.0), self.center, window_px, area)
-        return meeting if np.hypot(*(meeting - self.center)) < window_px else None
+        damaged = self.weights < _UNDAMAGED * self._area()
+        reach_px = float(self.reach.min())
+        meeting = junction(self.grey - np.where(damaged, residuals, 0.0), self.center, reach_px)
+        return meeting if np.hypot(*(meeting - self.center)) < reach_px / 2 else None
 
     def _adjust(self, tolerance_px: float) -> None:
         for _ in range(_MAX_ITERATIONS):
@@ -247,40 +251,84 @@ class _CornerFit:
         return float(np.hypot(*step[:2]))
 
 
-def junction(grey: Array, start_px: Array, window_px: float, area: Array) -> Array:
-    """The junction (2,) as col, row near start_px in grey values (height, width).
+def junction(grey: Array, start_px: Array, reach_px: float) -> Array:
+    """Refine the junction near a place by `cv2.cornerSubPix`.
 
-    window_px: the standard deviation of the Gaussian window about the junction; area (height, width): 0 where a
-    gradient has no part. Not a number where the gradients have one direction only.
+    OpenCV's equations are Förstner's: sum of w g g' (x - x0) = 0 over a window, with the gradients g and the weight w =
+    exp(-(dx² + dy²) / half²), where half is half the window's size. There is no zero zone. OpenCV takes differences of
+    neighbouring pixels for gradients; smoothed before, they have half the noise.
+
+    Parameters
+    ----------
+    grey
+        Grey values (height, width).
+    start_px
+        (2,) column and row.
+    reach_px
+        How far about the place the picture shows its edges and nothing else.
+
+    Returns
+    -------
+    Array
+        (2,) column and row; not a number where OpenCV finds no place within its window.
     """
-    along_x, along_y = _derivative(grey, 0), _derivative(grey, 1)
-    row, col = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(float)
-    center = np.array(start_px, float)
-    for _ in range(_MAX_ITERATIONS):
-        dx, dy = col - center[0], row - center[1]
-        weights = area * np.exp(-(dx**2 + dy**2) / (2 * window_px**2))
-        normal = _normal(along_x, along_y, weights)
-        if np.linalg.cond(normal) > _WORST_CONDITION:
-            return np.full(2, np.nan)
-        distance = along_x * dx + along_y * dy
-        step = np.linalg.solve(normal, [(weights * along * distance).sum() for along in (along_x, along_y)])
-        center += step
-        if np.hypot(*step) < _TOLERANCE_PX:
-            break
-    return center
+    half = min(_LARGEST_HALF_WINDOW_PX, round(_HALF_WINDOW * reach_px), (min(grey.shape) - _SUBPIX_BORDER_PX) // 2)
+    if half < 1:
+        return np.full(2, np.nan)
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SMOOTHING_PX)
+    start = np.asarray(start_px, np.float32)
+    found = cv2.cornerSubPix(smooth, start.reshape(1, 1, 2).copy(), (half, half), (-1, -1), _SUBPIX_END)
+    place = np.asarray(found, float).ravel()
+    return np.full(2, np.nan) if np.array_equal(place, start) else place
 
 
-def _normal(along_x: Array, along_y: Array, weights: Array) -> Array:
-    mixed = (weights * along_x * along_y).sum()
-    return np.array([[(weights * along_x**2).sum(), mixed], [mixed, (weights * along_y**2).sum()]])
+def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple[MarkMeasurement, ...], ...]:
+    """The marks of a camera's pictures as they are, or all its crossings at their junctions where the lens has coma.
+
+    Where a symmetric blur describes the edges, match and junction differ by noise alone, of which the match has less.
+    Coma blurs edges to one side, the more so the farther from the axis. It moves match and junction apart alike in
+    neighbouring crossings, so that the mean product of neighbours' differences is its share of their mean square.
+    Beyond one half it is larger than what the junction's noise adds. Then the junctions are taken, which most published
+    calibrations measure too. Their error is made by the lens and not by noise: all have the standard deviation of a
+    place known to within the rms distance of match and junction, over the root of three (JCGM 100:2008, Guide to the
+    expression of uncertainty in measurement, 4.3.7).
+
+    Parameters
+    ----------
+    pictures
+        The marks of each picture of one camera.
+
+    Returns
+    -------
+    tuple of tuples
+        The same marks; those with a junction moved there, with its covariance, where the lens has coma.
+    """
+    apart, alike = [], []
+    for marks in pictures:
+        crossings = [mark for mark in marks if _has_junction(mark)]
+        if len(crossings) > _NEIGHBOURS:
+            centers = np.array([mark.center_px for mark in crossings])
+            differences = np.array([_junction_px(mark) for mark in crossings]) - centers
+            near = np.asarray(KDTree(centers).query(centers, _NEIGHBOURS + 1)[1])[:, 1:]
+            apart.append(differences)
+            alike.append((differences[:, None, :] * differences[near]).mean(axis=1))
+    if sum(map(len, apart)) < _FEWEST_CROSSINGS:
+        return tuple(tuple(marks) for marks in pictures)
+    variance = float((np.concatenate(apart) ** 2).mean())
+    if float(np.concatenate(alike).mean()) <= variance / 2:
+        return tuple(tuple(marks) for marks in pictures)
+    return tuple(tuple(_moved_to_junction(mark, variance / 3) for mark in marks) for marks in pictures)
 
 
-def _derivative(image: Array, axis: int) -> Array:
-    """The derivative of the image smoothed by a Gaussian, along columns (0) or rows (1)."""
-    reach = int(np.ceil(_REACH_SIGMAS * _GRADIENT_PX))
-    place = np.arange(-reach, reach + 1.0)
-    smooth = np.exp(-(place**2) / (2 * _GRADIENT_PX**2))
-    smooth /= smooth.sum()
-    slope = place * smooth / (place**2 * smooth).sum()
-    along, down = (slope, smooth) if axis == 0 else (smooth, slope)
-    return np.asarray(cv2.sepFilter2D(image, cv2.CV_64F, along, down, borderType=cv2.BORDER_REPLICATE))
+def _has_junction(mark: MarkMeasurement) -> bool:
+    return mark.status.is_observation and "junction_col_px" in mark.quality
+
+
+def _junction_px(mark: MarkMeasurement) -> Array:
+    return np.array([mark.quality["junction_col_px"], mark.quality["junction_row_px"]])
+
+
+def _moved_to_junction(mark: MarkMeasurement, variance_px2: float) -> MarkMeasurement:
+    if not _has_junction(mark):
+        return mark
+    return replace(mark, center_px=_junction_px(mark), covariance=Covariance.of_noise(variance_px2 * np.eye(2)))

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NewType
 
-from measure.boards.coma import one_definition
+from measure.boards.corners import one_definition
 from measure.fiducials.across_frames import judged
 from measure.film import BelievedFilm
 from measure.results import FrameMeasurement

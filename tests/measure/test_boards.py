@@ -14,7 +14,7 @@ from real_data import DATA, needs
 from scipy.io import loadmat
 from scipy.spatial import KDTree
 
-from measure.boards.coma import one_definition
+from measure.boards.corners import one_definition
 from measure.boards.find import is_even, whole_pattern
 from measure.boards.markers import ReadMarkers, off_corners
 from measure.boards.measure import BoardMeasurement, measure_board

@@ -76,7 +76,7 @@ def test_the_junction_lies_where_the_squares_meet(blur_px: float) -> None:
         center, steps = SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
         corner = fitted(square_picture(center, steps, blur_px, False), center, steps, False)
         assert corner.junction_px is not None
-        assert np.abs(corner.junction_px - center).max() < 0.01
+        assert np.abs(corner.junction_px - center).max() < 0.03
 
 
 def test_trap_pixel_locking() -> None:
