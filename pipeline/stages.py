@@ -20,6 +20,7 @@ from pipeline.archive.measurement import (
     decisions_by,
     fingerprints_of,
     measured_scans,
+    picture_sizes_mm,
     pitches,
     read_measurement,
     tell_place,
@@ -280,8 +281,18 @@ def _fill_images(project: Project, scans: Iterable[MeasuredScan]) -> None:
 
 def _write_adjustment(project: Project, adjustment: Adjustment, new: Unpublished) -> None:
     made_from = adjusted_from(project, _given_marks(project, new))
-    frames_mm = {each.name: each.frame_mm for each in project.cameras.values() if each.frame_mm is not None}
-    write_adjustment(adjustment, new.place(project.adjustment_path), made_from, frames_mm)
+    write_adjustment(adjustment, new.place(project.adjustment_path), made_from, _frames_mm(project, new))
+
+
+def _frames_mm(project: Project, new: Unpublished) -> dict[str, tuple[float, float]]:
+    """By camera the size of its frame: of a camera without fiducials that of its pictures where its file has none."""
+    sizes = picture_sizes_mm(project.measurement_path, measurement_of(new.at(project.comparator)))
+    largest: dict[str, tuple[float, float]] = {}
+    for image, size in sizes.items():
+        camera = project.camera_of(image)
+        if not camera.fiducials:
+            largest[camera.name] = max(largest.get(camera.name, size), size)
+    return largest | {each.name: each.frame_mm for each in project.cameras.values() if each.frame_mm is not None}
 
 
 def _check_adjusted(project: Project, marks: Sequence[ComparatorPoint]) -> None:

@@ -24,12 +24,14 @@ class LensReach:
     """radius_mm: from the principal point to the outermost target; corner_mm: to the farthest corner of the frame, nan
     where its size is not known. sigma_um, corner_sigma_um: the largest standard deviations of the distortion within the
     radius and at that of the corner; nan where the lens shows nothing there.
+    frame_mm: two opposite corners of the frame, the lower left one first; None where its size is not known.
     """
 
     radius_mm: float
     corner_mm: float
     sigma_um: float
     corner_sigma_um: float
+    frame_mm: tuple[tuple[float, float], tuple[float, float]] | None
 
     @property
     def share(self) -> float:
@@ -53,15 +55,15 @@ def lens_reach(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, fl
     radius_mm = max(farthest)
     if radius_mm == 0.0:
         return None
-    corner_mm = np.nan
+    corner_mm, corners = np.nan, None
     if frame_mm is not None:
         width, height = frame_mm
         left, top = (-width / 2.0, height / 2.0) if camera.fiducials else (0.0, 0.0)
-        corners = np.array([(x, y) for x in (left, left + width) for y in (top, top - height)])
-        corner_mm = float(np.linalg.norm(corners - principal_point, axis=1).max())
+        corners = (left, top - height), (left + width, top)
+        corner_mm = float(np.linalg.norm(np.abs(np.array(corners) - principal_point).max(axis=0)))
     within = max(_sigma_um(adjustment, camera, radius) for radius in np.linspace(0.0, radius_mm, RADII + 1)[1:])
     beyond = _sigma_um(adjustment, camera, corner_mm) if np.isfinite(corner_mm) else np.nan
-    return LensReach(radius_mm, corner_mm, within, beyond)
+    return LensReach(radius_mm, corner_mm, within, beyond, corners)
 
 
 def _sigma_um(adjustment: Adjustment, camera: Camera, radius_mm: float) -> float:

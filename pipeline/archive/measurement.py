@@ -46,6 +46,20 @@ def pitches(store: Store, digest: str) -> dict[str, tuple[float, float]]:
     return {name: unknown if across is None else (across, down) for name, across, down in rows}
 
 
+def picture_sizes_mm(path: Path, digest: str) -> dict[str, tuple[float, float]]:
+    """By image width and height of its scan; without those of which nobody knows a pitch."""
+    if not digest or not path.exists():
+        return {}
+    query = (
+        "select judged_frame.name, width_px * result.pitch_x_um / 1000.0, height_px * result.pitch_y_um / 1000.0 "
+        "from judged_frame join scan on scan.id = judged_frame.scan join result on result.id = judged_frame.result "
+        "join judging on judging.id = judging where judging.digest = ?"
+    )
+    with Store(path) as store:
+        rows = store.connection.execute(query, (digest,)).fetchall()
+    return {name: (width, height) for name, width, height in rows if width and height}
+
+
 def decisions_by(store: Store, digest: str) -> dict[DecidedBy, int]:
     """How many decisions of whom stand behind a judging, by camera."""
     counts = Counter[DecidedBy]()

@@ -19,6 +19,7 @@ from pipeline.publishing.made_from import adjusted_from, differing
 from pipeline.resampling.frame_chain import FrameChain, Lens, image_chain
 from pipeline.results.adjustment_reader import Covariance, calibrated_lens, read_adjustment, read_own_covariance
 from pipeline.results.comparator_file import ComparatorPoint, pitches_of, pixel_from_comparator, read_comparator
+from pipeline.results.lens_known import estimated_lenses, reach_sentence
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -161,6 +162,12 @@ class Block:
         """Adjusted coordinates (3,) of the object points, in the user's unit."""
         adjusted = self.adjustment["points"] if self.adjustment else {}
         return {id: np.array([point[axis]["value"] for axis in "XYZ"]) for id, point in adjusted.items()}
+
+    @cached_property
+    def lens_reach(self) -> dict[str, str]:
+        """By camera a sentence on how far out its lens is known: what lies beyond goes out extrapolated."""
+        lenses = estimated_lenses(self.adjustment) if self.adjustment else ()
+        return {name: reach_sentence(name, known) for name, known in lenses if known["share"] < 1.0}
 
     def camera_file(self, name: str) -> CameraFile:
         """The file of a camera, by the camera's name."""

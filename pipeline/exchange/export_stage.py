@@ -47,7 +47,7 @@ def run_export(project: Project, format: str, folder: Path, options: ExportOptio
     convention: Convention = module.CONVENTION
     written = write(block, options)
     decided = decisions_told(decisions_of(project.comparator))
-    written = replace(written, notes=(*written.notes, decided)) if decided else written
+    written = replace(written, notes=tuple(filter(None, [*written.notes, *block.lens_reach.values(), decided])))
     told = readme(format, convention, written)
     publish(folder, {**written.files, README: told})
     return Exported(folder, tuple(written.files), written, told)

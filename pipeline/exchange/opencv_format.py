@@ -36,14 +36,15 @@ def write(block: Block, options: ExportOptions) -> Written:
     """NAME.yml an image, for cv2.FileStorage."""
     frames, left_out = pinhole_frames(block, options, (BROWN, PRISMS, NAMES[4:]), "opencv", knows_fisheye=True)
     return Written(
-        {f"{frame.frame.image}.yml": _yaml(frame) for frame in frames},
+        {f"{frame.frame.image}.yml": _yaml(frame, block.lens_reach.get(frame.frame.camera)) for frame in frames},
         ("the film transformation (it is that of the resampled frames)", "all standard deviations", "the marks"),
         (misfit_note(frames),) if frames else (),
         tuple(left_out),
     )
 
 
-def _yaml(frame: PinholeFrame) -> str:
+def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
+    """lens_reach: a comment on how far out the lens is known."""
     fx, fy, cx, cy = frame.interior_px + np.array([0.0, 0.0, *CONVENTION.first_pixel_px])
     used = np.flatnonzero(frame.lens.values[4:])
     count = next(size for size in (5, 8, 12, 14) if size > (used.max() if used.size else 0))
@@ -53,6 +54,8 @@ def _yaml(frame: PinholeFrame) -> str:
     storage.write("image_width", frame.canvas.width_px)
     storage.write("image_height", frame.canvas.height_px)
     storage.write("camera_matrix", np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
+    if lens_reach:
+        storage.writeComment(lens_reach)
     if frame.lens.fisheye:
         storage.write("distortion_model", FISHEYE)
         storage.write("distortion_coefficients", np.array([frame.lens.fisheye]))

@@ -115,7 +115,7 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
         trade_offs=_trade_offs(name, stored),
         curves=lens.curves_plot(curve, radius_mm) if curve else None,
         effect_where="in the frame" if lens.lens(name, camera).is_of_frame else f"at {fixed(radius_mm, 0)} mm",
-        lens_map=_lens_map(name, camera, covariance, rows, frame_mm) if covariance else None,
+        lens_map=_lens_map(name, camera, covariance, rows, radius_mm, frame_mm) if covariance else None,
         curve_rows=_curve_rows(curve) if curve else [],
         certificate=certificate_view(lens.lens(name, camera), covariance, _reach_mm(curve, radius_mm))
         if curve and covariance
@@ -175,8 +175,8 @@ def _curves(
 
     Of a family that is defined over the frame: on circles that lie in it.
     """
-    corner_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
-    largest = max(radius_mm, corner_mm)
+    half_diagonal_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
+    largest = max(radius_mm, camera.get("lens_known", {}).get("corner_mm") or half_diagonal_mm)
     if not parameter_names(camera["distortion"]["family"]) or largest == 0.0:
         return None
     of = lens.lens(name, camera)
@@ -189,11 +189,18 @@ def _reach_mm(curve: lens.Curves, observed_mm: float) -> float:
 
 
 def _lens_map(
-    name: str, camera: Json, covariance: Covariance, rows: list[Json], frame_mm: tuple[float, float] | None
+    name: str,
+    camera: Json,
+    covariance: Covariance,
+    rows: list[Json],
+    radius_mm: float,
+    frame_mm: tuple[float, float] | None,
 ) -> LensMap | None:
     if not parameter_names(camera["distortion"]["family"]) or not rows:
         return None
-    return lens_map(lens.lens(name, camera), covariance, vectors.plane(rows, frame_mm, PLOT_PX))
+    corners_mm = camera.get("lens_known", {}).get("frame_mm")
+    on = vectors.plane_about(*np.array(corners_mm), PLOT_PX) if corners_mm else vectors.plane(rows, frame_mm, PLOT_PX)
+    return lens_map(lens.lens(name, camera), covariance, on, radius_mm)
 
 
 def _curve_rows(curve: lens.Curves) -> list[CurveRow]:

@@ -16,18 +16,22 @@ Array = NDArray[np.float64]
 
 GRID = 15  # vectors along the longer side
 LONGEST = 1.5  # of the grid's mesh
+ARCS = 180  # of the circle about what was observed
 
 
 @dataclass(frozen=True)
 class LensMap:
-    """The drawing, and the largest displacement in it with its sigma, ready to print."""
+    """The drawing, and the largest displacement in it with its sigma, ready to print; extrapolated: whether some of it
+    lies beyond the outermost target."""
 
     plot: Markup
+    extrapolated: bool
     largest_um: tuple[str, str]
 
 
-def lens_map(of: Lens, covariance: Covariance, on: Plane) -> LensMap:
-    """The displacement at a grid of observed points over a plane, from the ideal to the observed place."""
+def lens_map(of: Lens, covariance: Covariance, on: Plane, observed_radius_mm: float = np.inf) -> LensMap:
+    """The displacement at a grid of observed points over a plane, from the ideal to the observed place; grey beyond the
+    outermost target, where it is extrapolated."""
     xy = _grid(on)
     xy = xy[displacement(of, xy - of.interior[1:]).imaged]  # a fisheye's image does not fill the corners
     moved = displacement(of, xy - of.interior[1:])
@@ -35,7 +39,20 @@ def lens_map(of: Lens, covariance: Covariance, on: Plane) -> LensMap:
     at = int(size.argmax())
     by = (moved.value_um[at] / max(float(size[at]), 1e-12)) @ moved.by_unknowns_um[at]
     sigma = float(np.sqrt(max(by @ covariance.of(of.unknowns) @ by, 0.0)))
-    return LensMap(_drawn(xy, moved.value_um, on), value_and_sigma(float(size[at]), sigma))
+    beyond = np.hypot(*(xy - of.interior[1:]).T) > observed_radius_mm
+    edge = _circle(of.interior[1:], observed_radius_mm, on) if beyond.any() else Markup("")
+    drawn = _drawn(xy, moved.value_um, beyond, edge, on)
+    return LensMap(drawn, bool(beyond.any()), value_and_sigma(float(size[at]), sigma))
+
+
+def _circle(center_mm: Array, radius_mm: float, on: Plane) -> Markup:
+    """What of a circle lies on the plane."""
+    angles = np.linspace(0.0, 2.0 * np.pi, ARCS + 1)
+    points = center_mm + radius_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    low, high = on.corners_mm
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    shown = inside[:-1] & inside[1:]
+    return svg.strokes(on.page(points[:-1][shown]), on.page(points[1:][shown]), "reach")
 
 
 def _grid(on: Plane) -> Array:
@@ -50,7 +67,7 @@ def _grid(on: Plane) -> Array:
     return np.stack([each.ravel() for each in np.meshgrid(x, y)], axis=1)
 
 
-def _drawn(xy_mm: Array, value_um: Array, on: Plane) -> Markup:
+def _drawn(xy_mm: Array, value_um: Array, beyond: NDArray[np.bool_], edge: Markup, on: Plane) -> Markup:
     longest_um = float(np.hypot(*value_um.T).max())
     mesh_px = on.px_per_mm * float((on.corners_mm[1] - on.corners_mm[0]).max()) / GRID
     px_per_um = svg.round_step(LONGEST * mesh_px / longest_um) if longest_um > 0.0 else 1.0
@@ -61,7 +78,12 @@ def _drawn(xy_mm: Array, value_um: Array, on: Plane) -> Markup:
         on.height_px + FOOT_PX,
         "Distortion vectors over the camera frame",
         on.drawn(),
-        svg.strokes(starts, ends, "vector target"),
-        svg.strokes(ends, ends, "dot target"),
+        edge,
+        *(
+            svg.strokes(from_[rows], ends[rows], f"{what} {kind}")
+            for rows, kind in ((~beyond, "target"), (beyond, "extrapolated"))
+            for from_, what in ((starts, "vector"), (ends, "dot"))
+            if rows.any()
+        ),
         scale_bar(on, px_per_um),
     )

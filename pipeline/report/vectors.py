@@ -49,6 +49,11 @@ def plane(residuals: list[Json], frame_mm: tuple[float, float] | None, width_px:
     half = 0.5 * np.array(frame_mm) if frame_mm is not None else np.zeros(2)
     if np.all(np.abs([low, high]) <= half):
         low, high = -half, half
+    return plane_about(low, high, width_px)
+
+
+def plane_about(low: Array, high: Array, width_px: float) -> Plane:
+    """The rectangle between two corners (2,), with a little room about it."""
     # A single point, or points in a row, still need a plane to stand in.
     room = 0.02 * max(float(np.max(high - low)), 1.0)
     return Plane(np.stack([low - room, high + room]), width_px)

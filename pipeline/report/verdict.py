@@ -15,6 +15,7 @@ from pipeline.report.frame_problems import assumed_poses, frame_problems, pixel_
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import spoken_name
+from pipeline.results.lens_known import estimated_lenses, reach_sentence
 from pipeline.text.wording import counted, listed
 
 Level = Literal["good", "look", "failed"]
@@ -243,38 +244,18 @@ def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
 def _lens_problems(adjustment: Json) -> Iterator[Problem]:
     """Lenses that were estimated in less than half of the picture: from half the radius to the corner the seventh power
     of k3 grows by 128, so that a hundredth of a pixel inside is more than a pixel there."""
-    for name, camera in _estimated_lenses(adjustment):
-        if camera["lens_known"]["share"] < LEAST_SHARE:
+    for name, known in estimated_lenses(adjustment):
+        if known["share"] < LEAST_SHARE:
             yield Problem(
-                f"{_lens_known(name, camera['lens_known'])}.",
+                reach_sentence(name, known),
                 "Observe targets out to the corners of the picture, or use the lens within that radius only.",
             )
 
 
 def _lens_notes(adjustment: Json) -> Iterator[str]:
-    for name, camera in _estimated_lenses(adjustment):
-        if camera["lens_known"]["share"] >= LEAST_SHARE:
-            yield f"{_lens_known(name, camera['lens_known'])}."
-
-
-def _estimated_lenses(adjustment: Json) -> Iterator[tuple[str, Json]]:
-    """Cameras with a distortion parameter that was estimated, whose frame's size is known."""
-    for name, camera in adjustment["cameras"].items():
-        parameters = (each for each in camera["distortion"].values() if isinstance(each, dict))
-        known = camera.get("lens_known")
-        if known and known["corner_mm"] is not None and any(each["sigma"] for each in parameters):
-            yield name, camera
-
-
-def _lens_known(name: str, known: Json) -> str:
-    """How far out, and how well there and beyond."""
-    corner = known["corner_sigma_um"]
-    beyond = "the lens shows nothing there" if corner is None else f"there its standard deviation is {corner:.2g} µm"
-    inside = "" if known["sigma_um"] is None else f", with a standard deviation of up to {known['sigma_um']:.2g} µm"
-    return (
-        f"The distortion of {name} is known up to {known['radius_mm']:.3g} mm from the principal point{inside}, "
-        f"{100.0 * known['share']:.0f} % of the way to the corner of the picture; beyond it is extrapolated, {beyond}"
-    )
+    for name, known in estimated_lenses(adjustment):
+        if known["share"] >= LEAST_SHARE:
+            yield reach_sentence(name, known)
 
 
 def _check_problems(check: Json) -> Iterator[Problem]:

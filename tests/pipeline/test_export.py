@@ -25,11 +25,12 @@ from exported_project import (
     camera_mm,
     frame_px,
     ideal_mm,
+    project_of,
     scan_px,
 )
 from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_affine, micmac_px, opencv_px, values
 from numpy.typing import NDArray
-from simulated import affine, rotation
+from simulated import affine, rotation, simulated
 
 from adjust.functional_model.line_of_sight import LineOfSight
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
@@ -390,6 +391,23 @@ def test_a_digital_camera_goes_out_as_its_pictures_are(tmp_path: Path, monkeypat
     assert not (folder / "Ori-InterneScan").exists()
     off = np.linalg.norm(micmac_px(folder, "f3", POINTS, "") - pixels[3], axis=1)
     assert off.max() < 1.05 * told_misfit_px(folder) + SAME_PX
+
+
+def test_how_far_out_an_estimated_lens_is_known_goes_out(tmp_path: Path) -> None:
+    """In every README, and in OpenCV's files as a comment that its reader passes over."""
+    network, _ = simulated(np.random.default_rng(1), TRUTH, points=POINTS, noise=False, free={"k3": np.inf})
+    project = project_of(network, tmp_path)
+    known = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))["cameras"]["K"]["lens_known"]
+    words = f"The distortion of K is known up to {known['radius_mm']:.3g} mm from the principal point"
+    for format in ("opencv", "asp", "micmac", "bingo"):
+        folder = exported(project, format, tmp_path)
+        readme = (folder / "README.txt").read_text(encoding="utf-8")
+        assert words in readme
+        assert f"{100.0 * known['share']:.0f} % of the way to the corner of the picture; beyond it" in readme
+    text = (tmp_path / "opencv" / "f1.yml").read_text(encoding="utf-8")
+    assert f"# {words}" in text
+    storage: Any = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    assert storage.getNode("distortion_coefficients").mat().size == 5
 
 
 def test_a_bent_sight_is_told(project: Path) -> None:

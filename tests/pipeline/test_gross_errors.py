@@ -12,9 +12,11 @@ from simulated import field_points, simulated
 from simulated_project import write_project as write_network
 from test_cases import write_project
 
+from adjust.problem.parameter import Parameter
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
+from pipeline.results.adjustment_reader import read_own_covariance
 
 CASE = "i_five_images_affine_reduced"
 POINT = "7"
@@ -131,6 +133,12 @@ def test_a_lens_known_in_the_middle_alone_needs_a_look(frame_mm: float, level: i
     known = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))["cameras"]["K"]["lens_known"]
     assert (known["share"] < 0.5) is bool(level)
     assert known["corner_sigma_um"] > known["sigma_um"] > 0.0
+    # By dr = k3 r³ + k5 r⁵ and the covariance that stands in adjustment.npz.
+    covariance = read_own_covariance(tmp_path / "out" / "adjustment.json")
+    of_terms = covariance.of([Parameter.interior("K", each) for each in ("k3", "k5")])
+    for radius, sigma in (("radius_mm", "sigma_um"), ("corner_mm", "corner_sigma_um")):
+        by_terms = 1e3 * known[radius] ** np.array([3.0, 5.0])
+        assert known[sigma] == pytest.approx(float(np.sqrt(by_terms @ of_terms @ by_terms)), rel=1e-6)
     assert run(["report", str(project)]) in (0, level)
     assert "of the way to the corner of the picture" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 

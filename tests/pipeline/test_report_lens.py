@@ -1,5 +1,6 @@
 """Distortion curves and their sigmas against closed forms and OpenCV; fiducial figures against their invariances."""
 
+import re
 from typing import Any
 
 import cv2
@@ -105,6 +106,17 @@ def test_the_map_shows_the_longest_vector_with_its_sigma() -> None:
     r = np.hypot(70.3, 70.2)
     assert drawn.largest_um == value_and_sigma(1e3 * 1e-7 * r**3, 1e3 * 1e-9 * r**3)
     assert drawn.plot.count("M") == 2 * 15**2 + drawn.plot.count('class="bar"')
+
+
+def test_the_map_shows_what_lies_beyond_the_outermost_target() -> None:
+    """Of 15 x 15 squares of 10 mm about (0.3, -0.2) the middles of 37 lie within 35 mm."""
+    of, plane = lens("A", camera("torlegard", k3=1e-7)), Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
+    drawn = lens_map(of, covariance("A", ("k3",), np.array([[1e-18]])), plane, 35.0)
+    dots = {kind: re.search(f'd="([^"]*)" class="dot {kind}"', drawn.plot) for kind in ("target", "extrapolated")}
+    counts = {kind: found[1].count("M") for kind, found in dots.items() if found}
+    assert counts == {"target": 37, "extrapolated": 15**2 - 37}
+    assert drawn.extrapolated
+    assert not lens_map(of, covariance("A", ("k3",), np.array([[1e-18]])), plane, 110.0).extrapolated
 
 
 def test_of_a_set_over_the_frame_the_effect_is_the_largest_within_it() -> None:
