@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import map_in_threads
 from measure.scans.scan import open_scan
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.disks import fit_disk
@@ -149,7 +149,7 @@ def windows(path: Path, marks_px: NDArray[np.float64]) -> None:
     with open_scan(path) as scan:
         side = round(WINDOW_MM / FRAME_MM * scan.width_px)
         corners = np.round(marks_px - side / 2).astype(int).tolist()
-        side_by_side(lambda corner: scan.window(corner[0], corner[1], side, side), corners)
+        map_in_threads(lambda corner: scan.window(corner[0], corner[1], side, side), corners)
 
 
 def reduced(path: Path) -> None:

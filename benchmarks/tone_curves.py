@@ -32,7 +32,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
 from measure.results import FrameMeasurement
 from measure.status import Status
-from measure.tone.curve import SaidOfTone, Tone
+from measure.tone.curve import Tone, ToneInformation
 
 Row = dict[str, Any]
 
@@ -40,10 +40,10 @@ _GROSS, _SAMPLES = 5.0, 8
 _NOISES = (8.0, 15.0, 30.0, 60.0, 101.0)
 
 
-def rows_of(case: Case, index: int, said: Sequence[SaidOfTone] = ()) -> list[Row]:
+def rows_of(case: Case, index: int, said: Sequence[ToneInformation] = ()) -> list[Row]:
     """One for each mark of a frame; said: by other scans of its scanner."""
     start = time.process_time()
-    frame = measured(case, Tone.unknown().hearing(said))
+    frame = measured(case, Tone.unknown().with_information(said))
     seconds = time.process_time() - start
     rows = []
     for mark in frame.marks:
@@ -70,16 +70,18 @@ def rows_of(case: Case, index: int, said: Sequence[SaidOfTone] = ()) -> list[Row
 
 
 def measured(case: Case, tone: Tone) -> FrameMeasurement:
-    scan = case.scan.seen_through(tone)
+    scan = case.scan.with_tone(tone)
     return measure_fiducials(scan, case.layout, (PITCH_UM, PITCH_UM), FiducialOptions(pose=case.pose))
 
 
 @cache
-def said_in_folder(seed: int, folder: int, scans: int) -> dict[int, SaidOfTone]:
+def said_in_folder(seed: int, folder: int, scans: int) -> dict[int, ToneInformation]:
     """By frame, what some of a folder's scans say of its curve."""
     some = range(folder * scans, folder * scans + min(scans, _SAMPLES))
     tones = {index: measured(draw_case(seed, index, scans, TIPS), Tone.unknown()).tone for index in some}
-    return {index: tone.said for index, tone in tones.items() if tone is not None and tone.said is not None}
+    return {
+        index: tone.information for index, tone in tones.items() if tone is not None and tone.information is not None
+    }
 
 
 def told(name: str, rows: Iterable[Row]) -> str:

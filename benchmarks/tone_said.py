@@ -25,11 +25,13 @@ from measure.fiducials.frame_edges import told_by_edges
 from measure.fiducials.frame_sighter import FrameSighter
 from measure.fiducials.mark_fit import sight
 from measure.marks.frame_border import at_border
-from measure.tone.curve import SaidOfTone, Tone
+from measure.tone.curve import Tone, ToneInformation
 from synthetic_images.tone_curve import coded
 
 Array = NDArray[np.float64]
-Said = tuple[list[SaidOfTone], Array, Array]  # marks and edges; (k,) px outwards for each departure of 1; of the truth
+Said = tuple[
+    list[ToneInformation], Array, Array
+]  # marks and edges; (k,) px outwards for each departure of 1; of the truth
 
 _SEARCH_PX, _FRAME_SIGMA, _SURE_PX = 1.5, 1e-4, 0.2
 
@@ -40,7 +42,7 @@ def said_by_scan(case: Case) -> Said | None:
     codes = np.linspace(0.0, 1.0, len(Tone().base))
     curve = np.interp(codes, coded(light.astype(np.float32), case.curve), light)
     layout = at_border(case.layout)
-    scan = case.scan.seen_through(Tone(curve, covariance=1e-12 * np.eye(5)))
+    scan = case.scan.with_tone(Tone(curve, covariance=1e-12 * np.eye(5)))
     places = np.array([case.centers_px[mark.id] for mark in layout.marks])
     design = np.array([[*mark.xy_mm, 1.0] for mark in layout.marks])
     frame = np.linalg.lstsq(design, places, rcond=None)[0].T
@@ -49,8 +51,8 @@ def said_by_scan(case: Case) -> Said | None:
     said, outwards, codes_seen = [], [], []
     for index, mark in enumerate(layout.marks):
         fit = sight(scan, sighter.expected(index, _SEARCH_PX), sighter.options.match, _FRAME_SIGMA).fit
-        if fit is not None and fit.tone is not None and fit.tone.said.count:
-            said.append(fit.tone.said)
+        if fit is not None and fit.tone is not None and fit.tone.information.count:
+            said.append(fit.tone.information)
             outwards.append(-case.inward[mark.id] @ fit.tone.on_place)
             codes_seen += [fit.tone.least, fit.tone.greatest]
     if not said:
@@ -63,7 +65,7 @@ def said_by_scan(case: Case) -> Said | None:
 def departures(codes: Array, light: Array) -> Array:
     """(k,) of a curve, the least ones, from that of which nothing is said, by the logarithms of both slopes."""
     unknown = Tone.unknown()
-    slope = [np.log(np.gradient(unknown.at(mean).light(codes, 1.0).astype(float), codes))
+    slope = [np.log(np.gradient(unknown.with_departures(mean).light(codes, 1.0).astype(float), codes))
              for mean in (np.zeros(5), *np.eye(5))]  # fmt: skip
     design = np.column_stack([*(one - slope[0] for one in slope[1:]), np.ones(len(codes))])
     wanted = np.log(np.maximum(np.gradient(light, codes), 1e-9)) - slope[0]
@@ -71,21 +73,21 @@ def departures(codes: Array, light: Array) -> Array:
     return np.asarray(np.linalg.solve(normal, design.T @ wanted / 0.1**2)[:5])
 
 
-def pull(each: Sequence[SaidOfTone], outwards: Array, truth: Array) -> float | None:
+def pull(each: Sequence[ToneInformation], outwards: Array, truth: Array) -> float | None:
     """How far what is believed beforehand moves the tips of a scan, px outwards; None where they are not known well."""
-    said, prior = SaidOfTone.together(each).of_scanner, np.linalg.inv(Tone.unknown().covariance)
-    covariance = np.linalg.inv(prior + said.information)
+    said, prior = ToneInformation.pooled(each).scanner_information, np.linalg.inv(Tone.unknown().covariance)
+    covariance = np.linalg.inv(prior + said.matrix)
     if outwards @ covariance @ outwards > _SURE_PX**2:
         return None
     return -float(outwards @ covariance @ prior @ truth)
 
 
-def over_claim(each: Sequence[SaidOfTone], outwards: Array) -> float:
+def over_claim(each: Sequence[ToneInformation], outwards: Array) -> float:
     """How far the curve that they want moves the tips, over its standard deviation by what is wrong with what they
     say: that of their prior has no part in it."""
-    said = SaidOfTone.together(each).of_scanner
-    estimate = outwards @ np.linalg.inv(np.eye(len(outwards)) + said.information)
-    return float(estimate @ said.right / np.sqrt(estimate @ said.information @ estimate))
+    said = ToneInformation.pooled(each).scanner_information
+    estimate = outwards @ np.linalg.inv(np.eye(len(outwards)) + said.matrix)
+    return float(estimate @ said.right_side / np.sqrt(estimate @ said.matrix @ estimate))
 
 
 def print_table(scans: Mapping[str, list[float]], folders: Mapping[str, list[float]]) -> None:

@@ -12,7 +12,7 @@ from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement
 from measure.scans.scan import Scan
 from measure.scans.scan_part import Window
-from measure.scans.scan_views import windowed
+from measure.scans.scan_views import crop_scan
 from measure.status import Status
 
 Array = NDArray[np.float64]
@@ -32,7 +32,7 @@ def second_frame(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, op
     pitch_um = 1000.0 / frame.px_per_mm
     alone = replace(options, clicks=(), writing="none", known_lines=())
     for rest in _rests(scan, first):
-        found = measure_fiducials(windowed(scan, rest), layout, (pitch_um, pitch_um), alone)
+        found = measure_fiducials(crop_scan(scan, rest), layout, (pitch_um, pitch_um), alone)
         measured = sum(mark.status is Status.MEASURED for mark in found.marks)
         if measured >= max(_FEWEST_MARKS, _MOST_MARKS * len(layout.marks)) and found.pixel_from_camera is not None:
             second = _outline(found, layout) + np.array(rest[:2] * 2)

@@ -14,7 +14,7 @@ from measure.detection.correlation import WIDE, Map, Surroundings
 from measure.detection.scan_maps import Held, ScanMaps, Sought
 from measure.marks.rendering import extent_px, known_picture
 from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import map_in_threads
 from measure.scans.scan import SINGLE_CHANNELS, Scan
 
 Array = NDArray[np.float64]
@@ -137,7 +137,7 @@ def respond_about(
         maps = sought.maps([shape for own, shape in kinds if own == corner], greys)
         return {(kinds.index((corner, shape)), sign): map_ for (shape, sign), map_ in maps.items()}
 
-    every = {key: map_ for maps in side_by_side(at_corner, range(len(corners))) for key, map_ in maps.items()}
+    every = {key: map_ for maps in map_in_threads(at_corner, range(len(corners))) for key, map_ in maps.items()}
     index = tuple(kinds.index(pair) for pair in zip(corner_of.tolist(), shape_of, strict=True))
     return Responses(every, reduction, origins[[corner for corner, _ in kinds]]), index
 

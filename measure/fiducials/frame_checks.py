@@ -73,7 +73,7 @@ def _told(scan: Scan, mark: MarkMeasurement) -> MarkMeasurement:
         return mark
     half = int(np.ceil(mark.quality.get("size_px", 2 * _REACH_PX) / 2))
     col, row = np.rint(mark.center_px).astype(int)
-    why = scan.lost_in(int(col) - half, int(row) - half, 2 * half + 1, 2 * half + 1)
+    why = scan.loss_reason(int(col) - half, int(row) - half, 2 * half + 1, 2 * half + 1)
     if not why:
         return mark
     reason = Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE)

@@ -13,7 +13,7 @@ from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout, FrameCorner, LayoutMark
 from measure.scans.scan import Scan
 from measure.special_marks.frame_edge import Course, edge_along, said_by_edges
-from measure.tone.curve import SaidOfTone
+from measure.tone.curve import ToneInformation
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ _SHARE_PX, _FEWEST = 8.0, 5  # of an edge that a profile is of, and how many an 
 
 def told_by_edges(
     scan: Scan, layout: FiducialLayout, pixel_from_camera: Array, weights: Sequence[float] | None
-) -> list[SaidOfTone]:
+) -> list[ToneInformation]:
     """None or one, of all pieces of edge that are seen as straight lines; pixel_from_camera (2, 3): of the frame."""
     linear = pixel_from_camera[:, :2]
     px_per_mm = float(np.sqrt(abs(np.linalg.det(linear))))

@@ -21,7 +21,7 @@ from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.matching.match import Match
 from measure.probabilities import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
 from measure.reason import Reason
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import map_in_threads
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 from measure.tone.estimate import FrameTone
 
@@ -110,7 +110,7 @@ class FrameSighter:
         # From below upwards: the search of windows ended there, and what it read last is still decoded.
         rows = self._predicted_px()[:, 1]
         upwards = sorted(indices, key=lambda index: -rows[index])
-        sighted = side_by_side(lambda index: self._sight(index, search_px), upwards)
+        sighted = map_in_threads(lambda index: self._sight(index, search_px), upwards)
         for index, sighting in zip(upwards, sighted, strict=True):
             self.sightings[index] = sighting
 

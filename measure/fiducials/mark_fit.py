@@ -72,7 +72,7 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     if fit.tone is not None:
         alike = tone_variance(scan.rounding_step_dn, fit.stored_contrast_dn)
-        fit = replace(fit, tone=replace(fit.tone, said=replace(fit.tone.said, alike=alike)))
+        fit = replace(fit, tone=replace(fit.tone, information=replace(fit.tone.information, common_variance=alike)))
     return Sighting(predicted, True, fit, chance=chance)
 
 
@@ -83,7 +83,7 @@ def nothing_within(search_px: float) -> Reason:
 
 def _lost(scan: Scan, expected: MarkPrediction) -> Reason:
     """That the file does not give all pixels of the mark, where it is expected or was fitted; empty where it does."""
-    why = scan.lost_in(*window_about(expected.mark, expected.pixel_from_mark, 0.0))
+    why = scan.loss_reason(*window_about(expected.mark, expected.pixel_from_mark, 0.0))
     return Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE) if why else NO_REASON
 
 
@@ -139,9 +139,7 @@ def _matched(
 ) -> Match:
     """The mark matched from a place."""
     mark, start = expected.mark, expected.moved(center_px).pixel_from_mark
-    seen_in = (
-        scan.seen_through(LINEAR) if isinstance(mark, MarkTemplate) else scan
-    )  # chips are cut as the file has them
+    seen_in = scan.with_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # chips are cut as the file has them
     window = read_window(seen_in, window_about(mark, start, options.margin_px + BESIDE_PX), expected.weights)
     if expected.surroundings.robust and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])

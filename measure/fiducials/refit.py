@@ -29,8 +29,8 @@ from measure.matching.models import is_round
 from measure.noise.noise_model import may_be_noise
 from measure.probabilities import LARGE_ERROR
 from measure.reason import Code, Reason
-from measure.tone.curve import SaidOfTone, Tone
-from measure.tone.estimate import FrameTone, ToldTone
+from measure.tone.curve import Tone, ToneInformation
+from measure.tone.estimate import FrameTone, MarkTone
 
 Array = NDArray[np.float64]
 
@@ -49,10 +49,10 @@ def settle(sighter: FrameSighter) -> None:
     if sighter.belongs.sum() < 2:
         return
     _settle_from(sighter, sighter.scan.tone)
-    for power in _OTHER_STARTS if sighter.tone.unsettled > _AGREED and _leans_on_tone(sighter) else ():
+    for power in _OTHER_STARTS if sighter.tone.disagreement > _AGREED and _leans_on_tone(sighter) else ():
         before = sighter.tone, sighter.scan, list(sighter.sightings)
-        _settle_from(sighter, sighter.prior_tone.like_power(power))
-        if sighter.tone.unsettled >= before[0].unsettled:
+        _settle_from(sighter, sighter.prior_tone.with_power(power))
+        if sighter.tone.disagreement >= before[0].disagreement:
             sighter.tone, sighter.scan, sighter.sightings = before
             sighter.judge()
 
@@ -61,7 +61,7 @@ def _settle_from(sighter: FrameSighter, tone: Tone) -> None:
     """From where the marks were seen, beginning with a tone curve."""
     unsettled = {index for index, fit in _clear(sighter).items() if _leans_or_is_strained(sighter, index, fit)}
     if tone is not sighter.scan.tone:
-        sighter.scan, unsettled = sighter.scan.seen_through(tone), set(_told_of_tone(sighter))
+        sighter.scan, unsettled = sighter.scan.with_tone(tone), set(_told_of_tone(sighter))
     edges = _told_by_edges(sighter)
     for _ in range(_TONE_ROUNDS):
         unsettled |= _moved_by_tone(sighter, _frame_tone(sighter, edges))
@@ -85,18 +85,18 @@ def _moved_by_tone(sighter: FrameSighter, found: FrameTone) -> set[int]:
     """The marks that say something of the curve, if what was found moves any; the scan is then seen through that."""
     told, before = _told_of_tone(sighter), sighter.scan.tone
     clear = _clear(sighter)
-    if not any(found.moves_px(one, before) > _MOVED * clear[index].sigma_px for index, one in told.items()):
+    if not any(found.shift_px(one, before) > _MOVED * clear[index].sigma_px for index, one in told.items()):
         return set()
-    sighter.scan = sighter.scan.seen_through(found.step_from(before))
+    sighter.scan = sighter.scan.with_tone(found.next_curve(before))
     return set(told)
 
 
-def _frame_tone(sighter: FrameSighter, edges: Sequence[SaidOfTone]) -> FrameTone:
+def _frame_tone(sighter: FrameSighter, edges: Sequence[ToneInformation]) -> FrameTone:
     """By the marks and the frame's edges."""
-    return FrameTone.of(sighter.prior_tone, _told_of_tone(sighter), sighter.scan.tone, edges)
+    return FrameTone.from_marks(sighter.prior_tone, _told_of_tone(sighter), sighter.scan.tone, edges)
 
 
-def _told_by_edges(sighter: FrameSighter) -> list[SaidOfTone]:
+def _told_by_edges(sighter: FrameSighter) -> list[ToneInformation]:
     """By the frame's edges beside the marks, where one of these leans on the curve. What lossy compression rounds away
     is alike all along an edge, and looks like a curve."""
     if sighter.scan.is_lossy or not _leans_on_tone(sighter):
@@ -107,10 +107,10 @@ def _told_by_edges(sighter: FrameSighter) -> list[SaidOfTone]:
 def _leans_on_tone(sighter: FrameSighter) -> bool:
     """Whether what is not known of any curve moves a mark by more than its standard deviation."""
     fits = _clear(sighter)
-    return any(one.leans_px > fits[index].sigma_px for index, one in _told_of_tone(sighter).items())
+    return any(one.sensitivity_px > fits[index].sigma_px for index, one in _told_of_tone(sighter).items())
 
 
-def _told_of_tone(sighter: FrameSighter) -> dict[int, ToldTone]:
+def _told_of_tone(sighter: FrameSighter) -> dict[int, MarkTone]:
     return {index: fit.tone for index, fit in _clear(sighter).items() if fit.tone is not None}
 
 

@@ -25,7 +25,7 @@ from measure.marks.poses import pose_in_camera, up_from_camera
 from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
 from measure.matching.match import Match
 from measure.results import Pose
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ def decide_pose(
     def of_site(index: int) -> Array:
         return sites[index].likelihoods([each.shown(index, layout) for each in named])
 
-    pictures = np.array(side_by_side(of_site, range(len(sites)))).reshape(len(sites), len(named))
+    pictures = np.array(map_in_threads(of_site, range(len(sites)))).reshape(len(sites), len(named))
     by_chance = _by_chance(pictures) if any(_is_bare_chip(mark.mark) for mark in layout.marks) else -np.inf
     verdicts = [each.verdict(pictures[:, index], by_chance) for index, each in enumerate(named)]
     if not lines or not frame.accepted:

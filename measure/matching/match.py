@@ -40,7 +40,7 @@ from measure.matching.window import Coding, ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, noise_model, products
 from measure.reason import Reason
-from measure.tone.estimate import ToldTone
+from measure.tone.estimate import MarkTone
 
 __all__ = ["Match", "MatchOptions", "match", "window_about"]
 
@@ -91,7 +91,7 @@ class Match:
     edges: SecondPlace | None = None
     sloping: SecondPlace | None = None
     own_shape: OwnShape | None = None
-    tone: ToldTone | None = None
+    tone: MarkTone | None = None
     covariance: Array | None = None
 
     @property
@@ -354,7 +354,7 @@ class _Precision(NamedTuple):
     edges: SecondPlace | None = None
     sloping: SecondPlace | None = None
     own_shape: OwnShape | None = None
-    tone: ToldTone | None = None
+    tone: MarkTone | None = None
 
 
 def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surroundings) -> _Precision:
@@ -393,7 +393,7 @@ def _landscape(model: PictureModel, about: _Surroundings) -> Landscape:
     return Landscape(about.grey, about.frame, model.design[-GREY])
 
 
-def _tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, about: _Surroundings) -> ToldTone | None:
+def _tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, about: _Surroundings) -> MarkTone | None:
     """What the picture says of the tone curve, None where that is known, or the mark is a chip, cut from scans of the
     same curve."""
     model, coding = fit.model, fit.coding

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.models import GREY
 from measure.noise.noise_model import combined, products
-from measure.tone.curve import SaidOfTone, Tone
-from measure.tone.estimate import ToldTone
+from measure.tone.curve import Tone, ToneInformation
+from measure.tone.estimate import MarkTone
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,7 +34,7 @@ def told_tone(
     tone: Tone,
     full_scale_dn: float,
     landscape: Landscape,
-) -> ToldTone:
+) -> MarkTone:
     """Beside the unknowns of a linearised fit. drawn, grey (height, width): the light that it draws, and that it was
     fitted to; clear, alike: where that is not near an end of the scanner's range, where noise is cut off, which bends
     an edge as a curve does; priors_dn2 (unknowns,): weights of what was known of the unknowns before, and departures
@@ -50,11 +50,11 @@ def told_tone(
 
     What another curve moves the mark by follows from the observed light, with all that the drawing leaves unexplained.
     """
-    told = _told(fit, SaidOfTone.nothing(), tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
+    told = _told(fit, ToneInformation.empty(), tone.derivatives(grey, full_scale_dn), tone, drawn, full_scale_dn)
     if np.ptp(drawn) <= _LEAST_CONTRAST * np.abs(drawn).max():  # nothing is drawn: there are no edges
         return told
     counts = fit.used & clear
-    changes = tone.changes(drawn, full_scale_dn) * counts * fit.steadiness
+    changes = tone.derivatives(drawn, full_scale_dn) * counts * fit.steadiness
     uneven = _uneven(fit.design[-GREY], fit.steadiness)
     known, priors = np.concatenate([fit.design, uneven]) * counts, np.diag(np.append(priors_dn2, np.zeros(len(uneven))))
     inverse = _inverse(products(known, known) + priors)
@@ -72,7 +72,7 @@ def told_tone(
     by_piece = told.on_place @ estimate @ _by_piece(left * (residuals + combined(estimate @ score, left)))
     by_noise = np.trace(told.on_place @ estimate @ covariance @ estimate.T @ told.on_place.T)
     worse = max(float(np.sum(by_piece**2) / max(by_noise, 1e-30)), 1.0)
-    return replace(told, said=SaidOfTone.by_score(normal, score + normal @ tone.mean, worse * covariance))
+    return replace(told, information=ToneInformation.from_score(normal, score + normal @ tone.mean, worse * covariance))
 
 
 def _inverse(normal: Array) -> Array:
@@ -92,17 +92,19 @@ def _by_piece(images: Array) -> Array:
 
 def untold_tone(
     fit: LinearFit, light: Array, detail: Callable[[Array], Array], tone: Tone, full_scale_dn: float
-) -> ToldTone:
+) -> MarkTone:
     """Of a mark whose detail alone was fitted: the curve moves it all the same, but its picture says nothing of the
     curve, for its surroundings are not drawn. light (height, width): with these; detail: takes them away."""
-    changes = np.stack([detail(each) for each in tone.changes(light, full_scale_dn)])
-    return _told(fit, SaidOfTone.nothing(), changes, tone, light, full_scale_dn)
+    changes = np.stack([detail(each) for each in tone.derivatives(light, full_scale_dn)])
+    return _told(fit, ToneInformation.empty(), changes, tone, light, full_scale_dn)
 
 
-def _told(fit: LinearFit, said: SaidOfTone, changes: Array, tone: Tone, light: Array, full_scale_dn: float) -> ToldTone:
+def _told(
+    fit: LinearFit, said: ToneInformation, changes: Array, tone: Tone, light: Array, full_scale_dn: float
+) -> MarkTone:
     """changes (k, height, width): of what was fitted, by the departures; light (height, width): of the picture."""
     codes = tone.code(np.quantile(light[fit.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
-    return ToldTone(
+    return MarkTone(
         said, products(fit.by_grey[:2], changes * fit.used * fit.steadiness), float(codes[0]), float(codes[1])
     )
 

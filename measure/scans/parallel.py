@@ -18,7 +18,7 @@ def mapped(
     return map(function, items) if workers is None else workers.map(function, items, chunksize=chunk)
 
 
-def mapped_or_lost(
+def map_or_replace(
     workers: Executor | None,
     function: Callable[[Item], Made],
     items: Sequence[Item],
@@ -39,7 +39,7 @@ def mapped_or_lost(
             if len(part) == 1:
                 yield lost(part[0], str(error))
             else:  # one of them did it
-                yield from mapped_or_lost(workers, function, part, lost)
+                yield from map_or_replace(workers, function, part, lost)
 
 
 def _submitted(workers: Executor, function: Callable[[Item], Made], part: Sequence[Item]) -> "Future[list[Made]]":
@@ -55,7 +55,7 @@ def _each(function: Callable[[Item], Made], part: Sequence[Item]) -> list[Made]:
     return [function(item) for item in part]
 
 
-def side_by_side(function: Callable[[Item], Made], items: Iterable[Item]) -> list[Made]:
+def map_in_threads(function: Callable[[Item], Made], items: Iterable[Item]) -> list[Made]:
     """The function of every item, in their order, by as many threads as OpenCV may use. OpenCV's own threads rest
     meanwhile: they would only take turns with these."""
     threads = cv2.getNumThreads()

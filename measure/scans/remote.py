@@ -181,7 +181,7 @@ def is_address(text: str) -> bool:
     return bool(colon) and scheme.lower() in _EXTRAS
 
 
-def found_addresses(pattern: str) -> list[Path]:
+def find_addresses(pattern: str) -> list[Path]:
     """The one address, or the objects that a pattern finds, `**` being any number of folders. Servers list no files:
     each address on one is named. Raises as `Address` does."""
     address = Address(pattern)
@@ -192,7 +192,7 @@ def found_addresses(pattern: str) -> list[Path]:
     return [Address(f"s3://{name}") for name in sorted(names)]
 
 
-def addresses_below(address: Address) -> list[Path]:
+def list_addresses(address: Address) -> list[Path]:
     """Every object of a store below an address, at any depth, or every file that the pages of a server list there.
     Raises as `Address` does."""
     system = _file_system(address)

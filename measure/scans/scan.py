@@ -19,7 +19,7 @@ from measure.scans.compression import earlier_step_dn
 from measure.scans.file_checks import first_bytes, no_picture
 from measure.scans.jpeg import JPEG_START, open_jpeg
 from measure.scans.metadata import Pitch, Samples
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import map_in_threads
 from measure.scans.png import PNG_START, open_png
 from measure.scans.remote import Address, scan_path
 from measure.scans.scan_part import ScanPart
@@ -119,7 +119,7 @@ class Scan:
         scan.name = name
         return scan
 
-    def seen_through(self, tone: Tone) -> "Scan":
+    def with_tone(self, tone: Tone) -> "Scan":
         """The same scan with another belief about its tone curve."""
         scan = copy(self)
         scan.tone = tone
@@ -175,7 +175,7 @@ class Scan:
             known[top : part.row0 + part.height - row0, left : part.col0 + part.width - col0] = False
         return known
 
-    def lost_in(self, col0: int, row0: int, width: int, height: int) -> str:
+    def loss_reason(self, col0: int, row0: int, width: int, height: int) -> str:
         """Why the file does not give some pixels of a window, a part of a sentence; empty where it gives all."""
         return next((part.why for part in self._lost_of(col0, row0, width, height)), "")
 
@@ -220,7 +220,7 @@ class Scan:
         return weighted(self._reduced[factor], self._weights(weights))
 
     @property
-    def seen_whole(self) -> tuple[int, Array] | None:
+    def last_reduction(self) -> tuple[int, Array] | None:
         """The factor and the grey values of the whole scan as it was reduced last; None where nobody asked for it."""
         return next(((f, weighted(grey, self._grey_weights)) for f, grey in self._reduced.items()), None)
 
@@ -283,7 +283,7 @@ class Scan:
             own_rows, own_cols = own.shape[:2]
             own[:] = means(self.samples(col0 * factor, row0 * factor, own_cols * factor, own_rows * factor), factor)
 
-        side_by_side(fill, product(range(0, height, rows), range(0, width, cols)))
+        map_in_threads(fill, product(range(0, height, rows), range(0, width, cols)))
         return result
 
     def _overview(self, factor: int) -> "Scan | None":

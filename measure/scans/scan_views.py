@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from measure.scans.cache import LostPart, OpenedPicture, Place, WholePicture
 from measure.scans.metadata import Pitch, Samples
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan
 from measure.scans.scan_part import Window
 
@@ -17,7 +17,7 @@ _FULL_SCALE_DN = 65535.0
 _GREY_BAND_PX = 1 << 20  # of the scan that is held in grey at a time, about
 
 
-def windowed(scan: Scan, window: Window) -> Scan:
+def crop_scan(scan: Scan, window: Window) -> Scan:
     """The window's pixels count from its own first one; the scan stays open as long as it is read. Raises ValueError
     for a window that the scan does not have."""
     col, row, width, height = window
@@ -28,7 +28,7 @@ def windowed(scan: Scan, window: Window) -> Scan:
     pitch, segments = Pitch(scan.pitch_um, scan.pitch_note), WindowSegments(scan, window)
     opened = OpenedPicture(segments, pitch, scan.notes, scan.problems, orientation=scan.orientation)
     seen = Scan(scan.path, segments, pitch, opened).named(scan.name)
-    return seen.seen_through(scan.tone)
+    return seen.with_tone(scan.tone)
 
 
 class WindowSegments:
@@ -87,5 +87,5 @@ def _reduced(scan: Scan, factor: int) -> NDArray[np.uint16]:
         band = grey[row : row + rows]
         band[:] = np.rint(unit * scan.reduced_window(factor, 0, row, grey.shape[1], len(band)))
 
-    side_by_side(fill, range(0, len(grey), rows))
+    map_in_threads(fill, range(0, len(grey), rows))
     return grey

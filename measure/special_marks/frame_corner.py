@@ -16,7 +16,7 @@ from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.special_marks.frame_edge import Course, Edge, edge_along, said_by_edges
 from measure.tone.curve import Tone
-from measure.tone.estimate import ToldTone
+from measure.tone.estimate import MarkTone
 
 Array = NDArray[np.float64]
 
@@ -76,11 +76,11 @@ def _met(edges: Sequence[Edge], unit: Array, pixel_from_mark: Array, tone: Tone)
     )
 
 
-def _told(first: Edge, second: Edge, by_first: Array, by_second: Array, tone: Tone) -> ToldTone | None:
+def _told(first: Edge, second: Edge, by_first: Array, by_second: Array, tone: Tone) -> MarkTone | None:
     """by_first, by_second (2, 2): derivatives of the corner's column and row by an edge's offset and slope."""
     if first.tone is None or second.tone is None:
         return None
-    return ToldTone(
+    return MarkTone(
         said_by_edges([first.tone, second.tone], tone),
         by_first @ first.tone.on_line + by_second @ second.tone.on_line,
         min(first.tone.least, second.tone.least),

@@ -19,7 +19,7 @@ from scipy.special import erf
 from measure.detection.candidates import FAINT
 from measure.noise.robust_estimation import gauss_newton_step, tukey_fit
 from measure.scans.scan import Scan
-from measure.tone.curve import SaidOfTone, Tone
+from measure.tone.curve import Tone, ToneInformation
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -44,8 +44,8 @@ _DRAWN = 0.005  # of a step: what is left of it below that may be the drawing's 
 
 @dataclass(frozen=True, eq=False)
 class EdgeTone:
-    """What an edge says of the tone curve. Of each profile: scores (n, k), as `SaidOfTone.by_score` takes them, normal
-    (n, k, k), by which these grow with the departures, and floor (n, k, k), the covariance that they have at least.
+    """What an edge says of the tone curve. Of each profile: scores (n, k), as `ToneInformation.from_score` takes them,
+    normal (n, k, k), by which these grow with the departures, and floor (n, k, k), the least covariance that they have.
     on_line (2, k): by how much the offset and slope change for each departure of 1. least, greatest: the codes between
     which it steps, shares of full scale."""
 
@@ -132,7 +132,7 @@ def edge_along(
     return _line(course.scan, middle[good], place, steps, good, len(middle))
 
 
-def said_by_edges(edges: Sequence[EdgeTone], tone: Tone) -> SaidOfTone:
+def said_by_edges(edges: Sequence[EdgeTone], tone: Tone) -> ToneInformation:
     """What several of them say of the curve by which they were fitted, known as well as the scatter of their profiles
     says, and that from edge to edge: what is alike along an edge, a landscape or what JPEG made of it, counts once."""
     scores, normal, floor = (
@@ -144,7 +144,7 @@ def said_by_edges(edges: Sequence[EdgeTone], tone: Tone) -> SaidOfTone:
     square = float(np.sum(off * np.linalg.solve(by_profile, off.T).T))
     more = max(square / (scores.shape[1] * max(len(edges) - 1, 1)), 1.0)
     total = normal.sum(axis=0)
-    return SaidOfTone.by_score(total, scores.sum(axis=0) + total @ tone.mean, more * len(scores) * by_profile)
+    return ToneInformation.from_score(total, scores.sum(axis=0) + total @ tone.mean, more * len(scores) * by_profile)
 
 
 def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
@@ -257,7 +257,7 @@ def _told(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) ->
     drawn, design = steps.drawn[kept], steps.design[kept]
     z = ((np.arange(drawn.shape[1]) - (drawn.shape[1] - 1) / 2) * _STEP_PX - steps.place[kept, None])[..., None]
     z = z / steps.blur[kept, None, None]
-    changes = np.moveaxis(scan.tone.changes(drawn, scan.full_scale_dn), 0, -1)
+    changes = np.moveaxis(scan.tone.derivatives(drawn, scan.full_scale_dn), 0, -1)
     s = np.linspace(-1.0, 1.0, drawn.shape[1])[:, None]
     step, slope = design[:, :, 2:3], design[:, :, :1]
     by_shape = [slope * z**3, slope * z**5]

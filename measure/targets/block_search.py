@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.scans.metadata import Samples
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan, means, weighted
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | 
         return found
 
     corners = product(range(0, scan.height_px, height), range(0, scan.width_px, width))
-    return _separate(joined(*side_by_side(in_block, corners))).candidates()
+    return _separate(joined(*map_in_threads(in_block, corners))).candidates()
 
 
 def _block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:

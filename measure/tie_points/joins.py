@@ -20,7 +20,7 @@ from measure.errors import MeasurementError
 from measure.probabilities import POINT_REFUSED
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
-from measure.scans.parallel import mapped_or_lost
+from measure.scans.parallel import map_or_replace
 from measure.status import Status
 from measure.tie_points.features import Features, TieFrame, find_features, in_turn, shared_features
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
@@ -64,7 +64,7 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
     Raises nothing for what the pictures show, nor for a scan that cannot be read: a problem says why it has none. The
     result does not depend on the number of workers.
     """
-    found_or_not = list(mapped_or_lost(workers, _features, parts, lambda _, why: _out_of_reach(why)))
+    found_or_not = list(map_or_replace(workers, _features, parts, lambda _, why: _out_of_reach(why)))
     unreadable = {part.image: each for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Reason)}
     readable = [(part, each) for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Features)]
     parts, features = [part for part, _ in readable], [each for _, each in readable]
@@ -146,7 +146,7 @@ def _joined(
         pieces = list(zip(*(_pieces(part, of) for part, of in zip(both, places, strict=True)), strict=True))
     except MeasurementError as error:
         return [], Counter([str(error)])
-    matched = list(mapped_or_lost(workers, _match, pieces, lambda *_: (), _CHUNK))
+    matched = list(map_or_replace(workers, _match, pieces, lambda *_: (), _CHUNK))
     refused = Counter(str(_refused(pair)) for pair in matched if _refused(pair))
     good = [pair for pair in matched if not _refused(pair)]
     if good:

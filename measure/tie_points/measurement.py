@@ -19,7 +19,7 @@ from measure.errors import MeasurementError
 from measure.noise.robust_estimation import robust_scale
 from measure.probabilities import POINT_REFUSED
 from measure.reason import Code, Reason
-from measure.scans.parallel import mapped_or_lost
+from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import TieFrame
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Bending, Matched, Piece, bending_variance, match_pieces
 from measure.tie_points.tracks import TieCandidate, candidates_with_radius, unreachable
@@ -106,7 +106,7 @@ def measure_points(
             chosen, left = _apart(left, [point.candidate for point in matched if point.matched], missing)
             windows = _windows(frames, chosen, workers)
             with_windows = list(zip(chosen, windows, strict=True))
-            matched += mapped_or_lost(workers, partial(_point, fewest), with_windows, _lost_point, _CHUNK)
+            matched += map_or_replace(workers, partial(_point, fewest), with_windows, _lost_point, _CHUNK)
             points = _straightened(matched)
             _judge(frames, points)
             sharp = np.array([sum(map(point.is_sharp, point.standing)) >= fewest for point in points], dtype=bool)
@@ -165,7 +165,7 @@ def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate], wor
         (frame, [(candidates[k].maps[i], candidates[k].radius_px) for k in own])
         for i, (frame, own) in enumerate(zip(frames, shown, strict=True))
     ]
-    for i, found in enumerate(mapped_or_lost(workers, _windows_of, task, lambda _, why: unreachable(why))):
+    for i, found in enumerate(map_or_replace(workers, _windows_of, task, lambda _, why: unreachable(why))):
         for number, k in enumerate(shown[i]):
             windows[k][i] = found if isinstance(found, Reason) else found[number]
     return windows

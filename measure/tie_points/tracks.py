@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from measure.errors import MeasurementError
 from measure.noise.robust_estimation import least_distances
 from measure.reason import Code, Reason
-from measure.scans.parallel import mapped_or_lost
+from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import Features, TieFrame, find_features, in_turn, shared_features
 from measure.tie_points.multi_image import RADIUS_PX
 from measure.tie_points.verification import epipolar_inliers
@@ -101,7 +101,7 @@ class TieCandidate:
 
 def find_all_features(frames: Sequence[TieFrame], wanted: int, workers: Executor | None) -> Iterator[Features | Reason]:
     """The features of every scan from which so many natural points are to come; or why it has none."""
-    return mapped_or_lost(workers, partial(_features, wanted), frames, lambda _, why: unreachable(why))
+    return map_or_replace(workers, partial(_features, wanted), frames, lambda _, why: unreachable(why))
 
 
 def _features(wanted: int, frame: TieFrame) -> Features | Reason:
@@ -127,7 +127,7 @@ def verify_pairs(
     shared = {}
     both = [(i, j) for i, j in combinations(range(len(frames)), 2) if frames[i].frame != frames[j].frame]
     pairs_of = [(features[i], features[j]) for i, j in both]
-    found = mapped_or_lost(workers, _shared, pairs_of, lambda *_: np.zeros((0, 2), np.intp))
+    found = map_or_replace(workers, _shared, pairs_of, lambda *_: np.zeros((0, 2), np.intp))
     for (i, j), pairs in zip(both, found, strict=True):
         first = frames[i].camera_px(features[i].places_px[pairs[:, 0]])
         second = frames[j].camera_px(features[j].places_px[pairs[:, 1]])

@@ -2,7 +2,7 @@
 
 Film, lens and scanner blur light; only then is it coded. A fit in light needs the curve from code to light, and light
 may be anything that grows linearly with it: gain and offset are in every fit. So a curve is known by the logarithm of
-its slope, up to a constant. What is believed of it is a base curve and a normal distribution of departures from it: of
+its slope, up to a constant. Its distribution has a base curve and normal departures from it: of
 the logarithm of the slope, a power's share and a few smooth waves over the range of codes.
 """
 
@@ -20,17 +20,17 @@ _PIECES = 1024  # of the range of codes, in which a curve is straight
 _NODES = np.linspace(0.0, 1.0, _PIECES + 1)
 _MIDDLES = (_NODES[1:] + _NODES[:-1]) / 2
 _TOE = 0.005  # of full scale: the slope of a power has no logarithm at black
-# What is believed of a curve of which nothing is said: between linear and sRGB, and a scanner may bend it further. The
-# waves are Legendre's polynomials; their standard deviations let S-curves be that a scanner's "contrast" makes.
+# The prior of a curve that no file declares: between linear and sRGB, and a scanner may bend it further. The waves are
+# Legendre's polynomials; their standard deviations let S-curves be that a scanner's "contrast" makes.
 _POWER, _POWER_SIGMA = 1.6, 0.6
 _WAVE_SIGMAS = (0.3, 0.5, 0.2, 0.15)
 _SIGMAS = np.array([_POWER_SIGMA, *_WAVE_SIGMAS])
 _COUNT = len(_SIGMAS)
-# What is believed of a curve that the file says: programs round it, and a scanner's light and dark are not exactly its.
+# The prior of a curve that the file declares: programs round it, and a scanner's light and dark are not exactly its.
 _DECLARED_SIGMA = 0.1  # of the standard deviations above
 # By how much pictures' own curves may differ from the scanner's: variances of each departure that are tried.
 _SCATTERS = (0.0, *np.geomspace(0.003, 30.0, 17))
-_CONTRADICTED = np.log(1000.0)  # log-odds, at which a picture is believed against what its file says
+_CONTRADICTED = np.log(1000.0)  # log-odds, at which the pictures outweigh the curve that the file declares
 
 
 def power(exponent: float) -> Array:
@@ -43,7 +43,7 @@ def srgb() -> Array:
     return np.where(_NODES <= 0.04045, _NODES / 12.92, ((_NODES + 0.055) / 1.055) ** 2.4)
 
 
-def sampled(light: Array) -> Array:
+def sampled_curve(light: Array) -> Array:
     """(nodes,) light of a curve that is given by values (n,) at evenly spaced codes; it has to grow."""
     even = np.interp(_NODES, np.linspace(0.0, 1.0, len(light)), light)
     low, high = float(even[0]), float(even[-1])
@@ -53,59 +53,64 @@ def sampled(light: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class SaidOfTone:
-    """What pictures say of the departures of a curve: information (k, k), right (k,), the information times the most
-    likely departures, and square, the sum of squares of departures of none in units of their standard deviations;
-    count: of independent figures. alike: the variance of each departure by which all of them speak of another curve
-    than the scanner's in the same way, as JPEG's rounding makes them: it is not in the information, and no number of
-    pictures averages it."""
+class ToneInformation:
+    """Information of pictures on the departures of a curve, as a normal equation.
 
-    information: Array
-    right: Array
-    square: float
+    matrix (k, k): the information; right_side (k,): the matrix times the most likely departures; sum_of_squares: of the
+    misfit without departures, in units of its standard deviations; count: of independent figures. common_variance: of
+    each departure by which all pictures deviate from the scanner's curve in the same way, as JPEG's rounding makes
+    them: it is not in the matrix, and no number of pictures averages it.
+    """
+
+    matrix: Array
+    right_side: Array
+    sum_of_squares: float
     count: int
-    alike: float = 0.0
+    common_variance: float = 0.0
 
     @classmethod
-    def nothing(cls) -> "SaidOfTone":
+    def empty(cls) -> "ToneInformation":
         return cls(np.zeros((_COUNT, _COUNT)), np.zeros(_COUNT), 0.0, 0)
 
     @classmethod
-    def by_score(cls, normal: Array, score: Array, covariance: Array) -> "SaidOfTone":
-        """Of a score (k,) of that covariance (k, k) that grows with the departures by a normal matrix (k, k)."""
+    def from_score(cls, normal: Array, score: Array, covariance: Array) -> "ToneInformation":
+        """Information of a score (k,) with that covariance (k, k), which grows with the departures by normal (k, k)."""
         weighted = np.linalg.solve(covariance, np.column_stack([normal, score])).T
-        information = weighted[:-1] @ normal
-        return cls((information + information.T) / 2, weighted[-1] @ normal, float(weighted[-1] @ score), len(score))
+        matrix = weighted[:-1] @ normal
+        return cls((matrix + matrix.T) / 2, weighted[-1] @ normal, float(weighted[-1] @ score), len(score))
 
     @classmethod
-    def together(cls, each: Sequence["SaidOfTone"], scatter: float = 0.0) -> "SaidOfTone":
-        """What several pictures say, each of them of a curve of its own, each departure of which differs from the
-        scanner's with the variance scatter. What they have alike counts by how much each says."""
-        information, right = (
-            np.array([one.information for one in each]),
-            np.array([one.right for one in each])[..., None],
-        )
-        says, alike = np.trace(information, axis1=1, axis2=2), np.array([one.alike for one in each])
-        taken = scatter * np.linalg.inv(np.eye(_COUNT) + scatter * information)
-        less = (information - information @ taken @ information).sum(axis=0)
+    def pooled(cls, each: Sequence["ToneInformation"], scatter: float = 0.0) -> "ToneInformation":
+        """Information of several pictures on the scanner's curve.
+
+        Parameters
+        ----------
+        each : of the pictures. What they have in common counts by the trace of their matrices.
+        scatter : variance by which each departure of a picture's own curve differs from the scanner's.
+        """
+        matrices = np.array([one.matrix for one in each])
+        right_sides = np.array([one.right_side for one in each])[..., None]
+        traces, common = np.trace(matrices, axis1=1, axis2=2), np.array([one.common_variance for one in each])
+        own_covariances = scatter * np.linalg.inv(np.eye(_COUNT) + scatter * matrices)
+        matrix = (matrices - matrices @ own_covariances @ matrices).sum(axis=0)
         return cls(
-            (less + less.T) / 2,
-            (right - information @ taken @ right).sum(axis=(0, 2)),
-            sum(one.square for one in each) - float((right.swapaxes(1, 2) @ taken @ right).sum()),
+            (matrix + matrix.T) / 2,
+            (right_sides - matrices @ own_covariances @ right_sides).sum(axis=(0, 2)),
+            sum(one.sum_of_squares for one in each)
+            - float((right_sides.swapaxes(1, 2) @ own_covariances @ right_sides).sum()),
             sum(one.count for one in each),
-            float(says @ alike / max(says.sum(), 1e-30)),
+            float(traces @ common / max(traces.sum(), 1e-30)),
         )
 
     @property
-    def of_scanner(self) -> "SaidOfTone":
-        """The same of the scanner's curve."""
-        return replace(SaidOfTone.together([self], self.alike), alike=0.0)
+    def scanner_information(self) -> "ToneInformation":
+        """With the common variance taken into the matrix."""
+        return replace(ToneInformation.pooled([self], self.common_variance), common_variance=0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Believed:
-    """A tone curve after pictures have said something. scatter: the variance of each departure of their own curves
-    from it."""
+class ToneEstimate:
+    """A tone curve estimated from pictures. scatter: the variance of each departure of their own curves from it."""
 
     tone: "Tone"
     scatter: float = 0.0
@@ -113,12 +118,12 @@ class Believed:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tone:
-    """What is believed of a scan's curve.
+    """The tone curve of a scan, with its uncertainty.
 
     base (nodes,): light, 0 to 1, at evenly spaced codes. mean (k,), covariance (k, k): of the departures from it, each
     in units of the standard deviation that it has where nothing is known. source: where the curve is from, a part of a
-    sentence; is_declared: whether the file says it, which the picture may contradict. heard: what was believed before
-    other scans said something, and what they said; None where none did.
+    sentence; is_declared: by the file, which the pictures may contradict. other_scans: the curve before other scans of
+    the scanner gave information, and that information; None where none did.
     """
 
     base: Array = field(default_factory=lambda: power(1.0))
@@ -126,7 +131,7 @@ class Tone:
     covariance: Array = field(default_factory=lambda: np.zeros((_COUNT, _COUNT)))
     source: str = "grey values are taken as light"
     is_declared: bool = False
-    heard: "tuple[Tone, tuple[SaidOfTone, ...]] | None" = field(default=None, compare=False)
+    other_scans: "tuple[Tone, tuple[ToneInformation, ...]] | None" = field(default=None, compare=False)
 
     @classmethod
     def unknown(cls) -> "Tone":
@@ -134,7 +139,7 @@ class Tone:
 
     @classmethod
     def declared(cls, base: Array, source: str) -> "Tone":
-        """A curve that the file says."""
+        """A curve that the file declares."""
         return cls(base, covariance=_DECLARED_SIGMA**2 * np.eye(_COUNT), source=source, is_declared=True)
 
     @property
@@ -145,70 +150,77 @@ class Tone:
     def is_known(self) -> bool:
         return not self.covariance.any()
 
-    def forgetting(self) -> "Tone":
-        """The same base, of whose departures nothing is known but that the curve lies between linear and sRGB."""
+    def with_vague_prior(self) -> "Tone":
+        """The base with departures of which only the prior is known: the curve lies between linear and sRGB."""
         mean = np.zeros(_COUNT)
         mean[0] = (_POWER - self._base_power) / _POWER_SIGMA
         return replace(self, mean=mean, covariance=np.eye(_COUNT))
 
-    def like_power(self, value: float) -> "Tone":
-        """The same with the departure that makes it most like a power."""
+    def with_power(self, value: float) -> "Tone":
+        """The curve with the departure that makes it most like a power."""
         mean = self.mean.copy()
-        mean[0] += (value - self.power_between(0.1, 0.9)[0]) / _POWER_SIGMA
-        return self.at(mean)
+        mean[0] += (value - self.equivalent_power(0.1, 0.9)[0]) / _POWER_SIGMA
+        return self.with_departures(mean)
 
-    def at(self, mean: Array) -> "Tone":
-        """The same with other departures."""
+    def with_departures(self, mean: Array) -> "Tone":
         return replace(self, mean=mean)
 
     @property
-    def ends(self) -> tuple["Tone", ...]:
-        """The curves that it may be: itself where it is known, else one standard deviation of power to either side."""
+    def plausible_curves(self) -> tuple["Tone", ...]:
+        """The curve itself where it is known, else those one standard deviation of power to either side."""
         if self.is_known:
             return (self,)
         sigma = np.sqrt(self.covariance[0, 0]) * np.eye(_COUNT)[0]
-        return self.at(self.mean - sigma), self.at(self.mean + sigma)
+        return self.with_departures(self.mean - sigma), self.with_departures(self.mean + sigma)
 
-    def hearing(self, others: Sequence[SaidOfTone]) -> "Tone":
-        """What is believed where other scans of the scanner have said something: it is put together anew with what a
-        scan says itself, for what is wrong alike in all of them does not average."""
-        return replace(self.told(others).tone, heard=(self, tuple(others))) if others else self
+    def with_information(self, others: Sequence[ToneInformation]) -> "Tone":
+        """The curve after information from other scans of the scanner.
 
-    def told(self, each: Sequence[SaidOfTone]) -> "Believed":
-        """What is believed when pictures have said something, too. What the file says they may contradict, where they
-        agree."""
-        if self.heard is not None:
-            before, others = self.heard
-            return before.told([*others, *each])
+        It is kept, and pooled anew with that of the scan itself: what is wrong alike in all scans does not average.
+        """
+        return replace(self.estimate(others).tone, other_scans=(self, tuple(others))) if others else self
+
+    def estimate(self, each: Sequence[ToneInformation]) -> ToneEstimate:
+        """The curve after information from pictures.
+
+        Parameters
+        ----------
+        each : information of each picture. Pictures that agree may contradict a curve that the file declares.
+        """
+        if self.other_scans is not None:
+            before, others = self.other_scans
+            return before.estimate([*others, *each])
         if self.is_known or not each:
-            return Believed(self)
-        believed, odds = self._told(each)
+            return ToneEstimate(self)
+        declared, log_likelihood = self._most_likely(each)
         if not self.is_declared:
-            return believed
-        free, free_odds = self.forgetting()._told(each)
-        if free_odds - odds < _CONTRADICTED:
-            return believed
+            return declared
+        free, free_log_likelihood = self.with_vague_prior()._most_likely(each)
+        if free_log_likelihood - log_likelihood < _CONTRADICTED:
+            return declared
         source = f"{self.source}, but the pictures contradict it"
         return replace(free, tone=replace(free.tone, source=source, is_declared=False))
 
-    def _told(self, each: Sequence[SaidOfTone]) -> tuple["Believed", float]:
-        """And the logarithm of how likely the prior makes what was said.
+    def _most_likely(self, each: Sequence[ToneInformation]) -> tuple[ToneEstimate, float]:
+        """The estimate by its most likely scatter, and the logarithm of its marginal likelihood.
 
         Pictures that contradict one another or the prior beyond chance have edges that are not as they are drawn: of
         sharpened pictures, of film developed unevenly. So each speaks of a curve of its own, and how far these scatter
         about the scanner's is estimated with it, as the most likely variance of random effects. Beforehand its root
         has a half-Cauchy distribution (Gelman, 2006, Prior distributions for variance parameters)."""
-        return max((self._scattered(each, scatter) for scatter in _SCATTERS), key=itemgetter(1))
+        return max((self._with_scatter(each, scatter) for scatter in _SCATTERS), key=itemgetter(1))
 
-    def _scattered(self, each: Sequence[SaidOfTone], scatter: float) -> tuple["Believed", float]:
-        together = SaidOfTone.together(each, scatter)
-        said, prior = together.of_scanner, np.linalg.inv(self.covariance)
-        covariance = np.linalg.inv(prior + said.information)
-        right = prior @ self.mean + said.right
-        mean = covariance @ right
-        chance = np.linalg.slogdet(prior @ covariance)[1] + right @ mean - self.mean @ prior @ self.mean - said.square
-        chance -= _spread(scatter, each) + _spread(together.alike, [together]) + 2 * np.log1p(scatter)
-        return Believed(replace(self, mean=mean, covariance=(covariance + covariance.T) / 2), scatter), chance / 2
+    def _with_scatter(self, each: Sequence[ToneInformation], scatter: float) -> tuple[ToneEstimate, float]:
+        pooled = ToneInformation.pooled(each, scatter)
+        information, prior = pooled.scanner_information, np.linalg.inv(self.covariance)
+        covariance = np.linalg.inv(prior + information.matrix)
+        right_side = prior @ self.mean + information.right_side
+        mean = covariance @ right_side
+        log_likelihood = np.linalg.slogdet(prior @ covariance)[1] + right_side @ mean - self.mean @ prior @ self.mean
+        log_likelihood -= information.sum_of_squares + 2 * np.log1p(scatter)
+        log_likelihood -= _log_determinant(scatter, each) + _log_determinant(pooled.common_variance, [pooled])
+        tone = replace(self, mean=mean, covariance=(covariance + covariance.T) / 2)
+        return ToneEstimate(tone, scatter), log_likelihood / 2
 
     def light(self, code: NDArray[np.floating] | NDArray[np.integer], full_scale: float) -> NDArray[np.float32]:
         """Light of grey values of a file whose largest is full_scale, on the same scale: 0 stays 0, and white white."""
@@ -216,19 +228,19 @@ class Tone:
             return np.asarray(code, np.float32)
         share = np.asarray(code, np.float32) * np.float32(_PIECES / full_scale)
         whole = np.minimum(share.astype(np.int32), _PIECES - 1)
-        table, steps = self._fast
+        table, steps = self._float32_table
         return np.asarray(np.float32(full_scale) * (table[whole] + steps[whole] * (share - whole)), np.float32)
 
     def code(self, light: NDArray[np.floating], full_scale: float) -> Array:
         """The grey value that such light is stored as."""
         return np.asarray(full_scale * np.interp(np.asarray(light) / full_scale, self._table, _NODES))
 
-    def changes(self, light: NDArray[np.floating], full_scale: float) -> Array:
-        """(k, ...) what light becomes more of for each departure of 1, at codes that stand for this light."""
+    def derivatives(self, light: NDArray[np.floating], full_scale: float) -> Array:
+        """(k, ...) derivatives of light by the departures, at the codes that stand for this light."""
         share = self.code(light, full_scale) / full_scale
-        return full_scale * np.stack([np.interp(share, _NODES, each) for each in self._by_departure])
+        return full_scale * np.stack([np.interp(share, _NODES, each) for each in self._departure_derivatives])
 
-    def power_between(self, low: float, high: float) -> tuple[float, float]:
+    def equivalent_power(self, low: float, high: float) -> tuple[float, float]:
         """The power that the curve is most like between two codes, shares of full scale, and its standard deviation."""
         codes = np.linspace(max(low, 0.02), max(high, low + 0.02), 50)
         at = np.clip((codes * _PIECES).astype(int), 0, _PIECES - 1)
@@ -240,7 +252,7 @@ class Tone:
 
     @cached_property
     def _base_power(self) -> float:
-        return Tone(self.base).power_between(0.1, 0.9)[0]
+        return Tone(self.base).equivalent_power(0.1, 0.9)[0]
 
     @cached_property
     def _steps(self) -> Array:
@@ -255,24 +267,24 @@ class Tone:
         return np.asarray(sums / sums[-1])
 
     @cached_property
-    def _by_departure(self) -> Array:
+    def _departure_derivatives(self) -> Array:
         """(k, nodes) derivatives of the table, but for a constant share of light: a fit's gain takes that."""
         sums = np.cumsum(self._steps * _WAVES, axis=1) / self._steps.sum()
         return np.concatenate([np.zeros((_COUNT, 1)), sums], axis=1)
 
     @cached_property
-    def _fast(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _float32_table(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         return self._table.astype(np.float32), np.diff(self._table).astype(np.float32)
 
     def __repr__(self) -> str:
-        value, sigma = self.power_between(0.1, 0.9)
+        value, sigma = self.equivalent_power(0.1, 0.9)
         return f"Tone(like a power of {value:.2f} +- {sigma:.2f}: {self.source})"
 
 
-def _spread(variance: float, each: Sequence[SaidOfTone]) -> float:
-    """The logarithm of the determinant by which the covariance of what pictures say grows with that variance."""
-    information = np.array([one.information for one in each])
-    return float(np.linalg.slogdet(np.eye(_COUNT) + variance * information)[1].sum())
+def _log_determinant(variance: float, each: Sequence[ToneInformation]) -> float:
+    """The logarithm of the determinant by which the covariance of the pictures' estimates grows with that variance."""
+    matrices = np.array([one.matrix for one in each])
+    return float(np.linalg.slogdet(np.eye(_COUNT) + variance * matrices)[1].sum())
 
 
 def _waves(code: Array) -> Array:

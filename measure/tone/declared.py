@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.tone.curve import Tone, power, sampled, srgb
+from measure.tone.curve import Tone, power, sampled_curve, srgb
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def tone_of_tags(tags: ColourTags) -> Tone | None:
     if tags.icc_profile and (curve := curve_of_profile(tags.icc_profile)) is not None:
         return Tone.declared(curve, "the file's ICC profile says it")
     if tags.transfer_function is not None:
-        return Tone.declared(sampled(tags.transfer_function), "the file's TransferFunction says it")
+        return Tone.declared(sampled_curve(tags.transfer_function), "the file's TransferFunction says it")
     if tags.is_srgb:
         return Tone.declared(srgb(), "the file says sRGB")
     if tags.light_power is not None:
@@ -79,7 +79,7 @@ def _curve(data: bytes) -> Array | None:
             return power(1.0)
         if count == 1:
             return power(struct.unpack_from(">H", data, 12)[0] / 256)
-        return sampled(np.frombuffer(data, ">u2", count, 12).astype(float))
+        return sampled_curve(np.frombuffer(data, ">u2", count, 12).astype(float))
     if data[:4] != b"para":
         return None
     (kind,) = struct.unpack_from(">H", data, 8)
@@ -91,4 +91,4 @@ def _curve(data: bytes) -> Array | None:
     else:
         limit, above = (d, e) if kind > 2 else (0.0, 0.0)
         low = c * _SAMPLES + f
-    return sampled(np.where(limit <= _SAMPLES, np.maximum(a * _SAMPLES + b, 0.0) ** g + above, low))
+    return sampled_curve(np.where(limit <= _SAMPLES, np.maximum(a * _SAMPLES + b, 0.0) ** g + above, low))

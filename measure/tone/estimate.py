@@ -1,4 +1,4 @@
-"""What marks say of the tone curve of their scan, and what is not known of it in their places."""
+"""The tone curve of a scan estimated from its marks, and what its uncertainty adds to their places."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.tone.curve import SaidOfTone, Tone
+from measure.tone.curve import Tone, ToneInformation
 
 Array = NDArray[np.float64]
 
@@ -14,75 +14,82 @@ _LONGEST = 1.0  # departure that is changed at a time, in its standard deviation
 
 
 @dataclass(frozen=True, eq=False)
-class ToldTone:
-    """said: of the departures of the curve. on_place (2, k): px by which the mark moves for each departure of 1. least,
-    greatest: the codes that the mark's picture has, shares of full scale."""
+class MarkTone:
+    """A mark and the tone curve. information: on the departures of the curve. on_place (2, k): px by which the mark
+    moves for each departure of 1. least, greatest: the codes of the mark's picture, shares of full scale."""
 
-    said: SaidOfTone
+    information: ToneInformation
     on_place: Array
     least: float
     greatest: float
 
     @property
-    def leans_px(self) -> float:
-        """How far what is not known of any curve moves the mark."""
+    def sensitivity_px(self) -> float:
+        """The standard deviation of the mark's place for a curve of which only the prior is known."""
         return float(np.hypot(*self.on_place[:, 0]))
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTone:
-    """tone: what is believed of the curve after all marks. said: what these say of it alone, None where nothing; least,
-    greatest: the codes between which they do, shares of full scale; scatter: the variance by which each departure of
-    their own curves differs from it; apart: the square of how far they were matched by another one."""
+    """The curve estimated from all marks of a frame.
+
+    tone: the curve; information: of the marks alone, None where they give none; least, greatest: the codes between
+    which they lie, shares of full scale; scatter: the variance by which each departure of their own curves differs from
+    it; apart: the squared distance of the curve from the one by which they were matched.
+    """
 
     tone: Tone
-    said: SaidOfTone | None = None
+    information: ToneInformation | None = None
     least: float = 0.0
     greatest: float = 1.0
     scatter: float = 0.0
     apart: float = 0.0
 
     @classmethod
-    def of(
-        cls,
-        prior: Tone,
-        told: Mapping[int, ToldTone],
-        matched_by: Tone,
-        edges: Sequence[SaidOfTone] = (),
+    def from_marks(
+        cls, prior: Tone, marks: Mapping[int, MarkTone], matched_by: Tone, edges: Sequence[ToneInformation] = ()
     ) -> "FrameTone":
-        """By what each mark says, and edges that are no marks."""
-        if not told:
+        """Estimates the curve.
+
+        Parameters
+        ----------
+        prior : the curve before this frame.
+        marks : what each mark gives.
+        matched_by : the curve by which they were matched.
+        edges : information of edges that are no marks.
+        """
+        if not marks:
             return cls(prior)
-        each = [*(one.said for one in told.values()), *edges]
-        found = prior.told(each)
-        least, greatest = min(one.least for one in told.values()), max(one.greatest for one in told.values())
-        apart = found.tone.mean - matched_by.mean
-        said = None if prior.is_known else SaidOfTone.together(each, found.scatter)
-        return cls(found.tone, said, least, greatest, found.scatter, float(apart @ apart))
+        each = [*(mark.information for mark in marks.values()), *edges]
+        estimate = prior.estimate(each)
+        least, greatest = min(mark.least for mark in marks.values()), max(mark.greatest for mark in marks.values())
+        step = estimate.tone.mean - matched_by.mean
+        information = None if prior.is_known else ToneInformation.pooled(each, estimate.scatter)
+        return cls(estimate.tone, information, least, greatest, estimate.scatter, float(step @ step))
 
     @property
-    def unsettled(self) -> float:
-        """How little the marks agree on the curve that they were matched by."""
+    def disagreement(self) -> float:
+        """Of the marks with one another and with the curve that they were matched by, a variance of departures."""
         return self.scatter + self.apart
 
     @property
     def note(self) -> str:
         """A sentence: which curve, and whence."""
-        value, sigma = self.tone.power_between(self.least, self.greatest)
+        value, sigma = self.tone.equivalent_power(self.least, self.greatest)
         exact = f"{value:.2f}" if self.tone.is_known else f"{value:.2f} (σ {sigma:.2f})"
         return f"Light was taken to grow as the grey value to the power of {exact}: {self.tone.source}."
 
-    def moves_px(self, told: ToldTone, before: Tone) -> float:
-        """How far a mark lies elsewhere by this curve than by the one before."""
-        return float(np.hypot(*(told.on_place @ (self.tone.mean - before.mean))))
+    def shift_px(self, mark: MarkTone, before: Tone) -> float:
+        """The distance of a mark's place by this curve from that by another one."""
+        return float(np.hypot(*(mark.on_place @ (self.tone.mean - before.mean))))
 
-    def covariance_px2(self, told: ToldTone) -> Array:
-        """(2, 2) of a mark's place, for what is not known of the curve, and for how far the marks' own curves differ
-        from it: as much moves them that is no curve, up to what nobody knows of any."""
+    def covariance_px2(self, mark: MarkTone) -> Array:
+        """(2, 2) of a mark's place: the uncertainty of the curve, and the scatter of the marks' own curves about it.
+        The scatter may have another cause than a curve: it counts at most as much as the prior of a curve."""
         covariance = self.tone.covariance + self.scatter / (1 + self.scatter) * np.eye(len(self.tone.covariance))
-        return np.asarray(told.on_place @ covariance @ told.on_place.T)
+        return np.asarray(mark.on_place @ covariance @ mark.on_place.T)
 
-    def step_from(self, before: Tone) -> Tone:
+    def next_curve(self, before: Tone) -> Tone:
         """The curve to match with next: no farther from the one before than what was linearised there holds."""
         step = self.tone.mean - before.mean
-        return self.tone.at(before.mean + step / max(float(np.abs(step).max()) / _LONGEST, 1.0))
+        return self.tone.with_departures(before.mean + step / max(float(np.abs(step).max()) / _LONGEST, 1.0))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from measure.errors import MeasurementError
 from measure.scans.head import ScanHead, read_head
-from measure.scans.remote import Address, addresses_below
+from measure.scans.remote import Address, list_addresses
 from pipeline.archive.identity import content_hash, parts_hash
 from pipeline.errors import InputError
 from pipeline.files.scan_patterns import folders_below
@@ -79,7 +79,7 @@ def _files(given: Sequence[Path]) -> tuple[list[Path], Counter[str]]:
     files, endings = dict[Path, None](), Counter[str]()
     for path in given:
         if isinstance(path, Address) and path.suffix.lower() not in SCAN_ENDINGS:
-            for below in addresses_below(path):
+            for below in list_addresses(path):
                 if below.suffix.lower() in SCAN_ENDINGS:
                     files[below] = None
                 else:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.remote import found_addresses, is_address, public_text, scan_path
+from measure.scans.remote import find_addresses, is_address, public_text, scan_path
 from measure.scans.scan_part import part_text
 from pipeline.errors import InputError
 from pipeline.files.images_file import GivenImages
@@ -115,7 +115,7 @@ def _found(pattern: str, folder: Path) -> Sequence[Named]:
     """The file of that very name, brackets and all, or those that the pattern finds in the folder, also links
     that lead nowhere: a scan that is named is opened or refused. `**` is any number of folders."""
     if is_address(pattern):
-        return found_addresses(pattern)
+        return find_addresses(pattern)
     if (folder / pattern).is_file():
         return [str(folder / pattern)]
     return _without_folders(_below(folder, sorted(found_names(pattern, folder))))

@@ -20,7 +20,7 @@ from measure.results import FrameMeasurement, MarkMeasurement, moved_frame
 from measure.scans.remote import public_text
 from measure.scans.scan import Scan
 from measure.scans.scan_part import ScanPart, Window
-from measure.scans.scan_views import windowed
+from measure.scans.scan_views import crop_scan
 from measure.second_frame import second_frame
 from measure.status import Status
 from pipeline.errors import InputError, what_to_do
@@ -120,7 +120,7 @@ def _opened_and_measured(task: ScanTask, look: Look | None) -> MeasuredScan:
 def _in_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
     """The scan with what a window of it shows, all places in pixels of the whole scan."""
     try:
-        seen = windowed(scan, window)
+        seen = crop_scan(scan, window)
     except ValueError as error:
         raise MeasurementError(f"{scan.path}: {error}: correct images.csv") from None
     first = np.array(window[:2], float)
@@ -136,7 +136,7 @@ def _measured(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     """What a scan shows, whole or in a window."""
     # Fiducials are seen through the curve; targets have edges all round, and are measured as they are.
     tone = tone_before(options.tone, options.said, scan.path)
-    frame = replace(_fiducials(options, scan.seen_through(tone)), image=task.name)
+    frame = replace(_fiducials(options, scan.with_tone(tone)), image=task.name)
     pitch, problems, notes = _pitch(options, scan, frame)
     of_file = (Reason(f"{told[0].upper()}{told[1:]}.", Code.SECOND_PICTURE) for told in scan.problems)
     frame = replace(frame, problems=(*of_file, *frame.problems, *problems))

@@ -14,7 +14,7 @@ from measure.errors import MissingError
 from measure.fiducial_options import FiducialOptions
 from measure.results import Pose
 from measure.scans.remote import location_of, public_address, scan_path
-from measure.tone.curve import SaidOfTone
+from measure.tone.curve import ToneInformation
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.results.fingerprints import canonical_json
@@ -42,7 +42,7 @@ class ScanOptions:
     fiducials: FiducialOptions
     known_pose: Pose | None = None
     tone: float | str = "auto"
-    said: tuple[SaidOfTone, ...] = ()
+    said: tuple[ToneInformation, ...] = ()
     targets: "SoughtTargets | None" = None
     exterior: Exterior | None = None
 
@@ -103,7 +103,7 @@ Measure = Callable[[Iterable[ScanTask]], Iterator[MeasuredScan]]  # how tasks ge
 
 
 def scan_tasks(
-    project: Project, names: Sequence[str], said: Mapping[str, tuple[SaidOfTone, ...]] | None = None
+    project: Project, names: Sequence[str], said: Mapping[str, tuple[ToneInformation, ...]] | None = None
 ) -> tuple[ScanTask, ...]:
     """Tasks of these images, in their order; scans that have all in common share their options. said: by image what
     other scans say of its scanner's curve. Raises InputError for marks that cannot be sought."""
@@ -115,7 +115,7 @@ def scan_tasks(
     )
 
 
-def options_of(project: Project, said: Mapping[str, tuple[SaidOfTone, ...]]) -> Callable[[str], ScanOptions]:
+def options_of(project: Project, said: Mapping[str, tuple[ToneInformation, ...]]) -> Callable[[str], ScanOptions]:
     """How each image is to be measured, by its name; as `scan_tasks` has it."""
     cameras = {name: _sought(project, camera) for name, camera in project.cameras.items()}
     key_of = {id(camera): name for name, camera in project.cameras.items()}

@@ -11,7 +11,7 @@ import numpy as np
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, Polygon
 from measure.revision import MEASURE_REVISION
 from measure.scans.head import declared_tone
-from measure.tone.curve import SaidOfTone, Tone, power, srgb
+from measure.tone.curve import Tone, ToneInformation, power, srgb
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.measuring.memory import Memory
@@ -24,15 +24,15 @@ _SAMPLES = 8  # scans of a scanner that tell its curve to the others
 _SET = "it is set in the project"
 
 
-def tone_before(setting: float | str, said: Sequence[SaidOfTone], scan: Path) -> Tone:
+def tone_before(setting: float | str, said: Sequence[ToneInformation], scan: Path) -> Tone:
     """What is believed of the curve of a scan before it is measured, as the project, the file and other scans say: what
     it says itself is not in it yet. setting: as the project has it; said: by the others."""
-    return _prior(setting, scan).hearing(said)
+    return _prior(setting, scan).with_information(said)
 
 
 def said_of_tones(
     project: Project, reporter: Reporter, measure: Measure, memory: Memory
-) -> Mapping[str, tuple[SaidOfTone, ...]]:
+) -> Mapping[str, tuple[ToneInformation, ...]]:
     """By image what others of its scanner say of the curve: some scans of each, where marks of the camera lean on it. A
     scan that cannot be measured says nothing. What was said once stays, whatever scans come or go."""
     names = [name for name in project.scans if _leans_on_tone(project.camera_of(name))]
@@ -49,11 +49,11 @@ def said_of_tones(
     with reporter.stage("tone curve looked for in") as tell:
         for done, scan in enumerate(measure(tasks), 1):
             tell(scan.frame.image, done, len(tasks))
-            if scan.frame.tone is not None and scan.frame.tone.said is not None:
-                said[scan.frame.image] = scan.frame.tone.said
+            if scan.frame.tone is not None and scan.frame.tone.information is not None:
+                said[scan.frame.image] = scan.frame.tone.information
     for kind, names_of in samples.items():
         memory.tell(keys[kind], {name: said_record(said[name]) for name in names_of if name in said})
-    told = dict[str, tuple[SaidOfTone, ...]]()
+    told = dict[str, tuple[ToneInformation, ...]]()
     for kind, kept in before.items():
         of_kind = samples[kind] if kept is None else list(kept)
         by_others = {name: tuple(said[one] for one in of_kind if one in said and one != name) for name in of_kind}

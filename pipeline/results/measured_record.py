@@ -16,7 +16,7 @@ from measure.covariance import Cause, Covariance
 from measure.reason import Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
-from measure.tone.curve import SaidOfTone, Tone, power, srgb
+from measure.tone.curve import Tone, ToneInformation, power, srgb
 from measure.tone.estimate import FrameTone
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
@@ -170,7 +170,7 @@ def _frame_tone(tone: FrameTone) -> Json:
         "covariance": _numbers(believed.covariance),
         "source": believed.source,
         "is_declared": believed.is_declared,
-        "said": tone.said and said_record(tone.said),
+        "said": tone.information and said_record(tone.information),
         "least": _numbers(tone.least),
         "greatest": _numbers(tone.greatest),
         "scatter": _numbers(tone.scatter),
@@ -201,16 +201,16 @@ def _read_base(base: Any) -> Array:
     return _some(base) if isinstance(base, list) else power(float(base))
 
 
-def said_record(said: SaidOfTone) -> Json:
+def said_record(said: ToneInformation) -> Json:
     return {
-        "information": _numbers(said.information),
-        "right": _numbers(said.right),
-        "square": _numbers(said.square),
+        "information": _numbers(said.matrix),
+        "right": _numbers(said.right_side),
+        "square": _numbers(said.sum_of_squares),
         "count": said.count,
-        "alike": _numbers(said.alike),
+        "alike": _numbers(said.common_variance),
     }
 
 
-def said_of(said: Mapping[str, Any]) -> SaidOfTone:
+def said_of(said: Mapping[str, Any]) -> ToneInformation:
     information, right = _some(said["information"]), _some(said["right"])
-    return SaidOfTone(information, right, float(said["square"]), int(said["count"]), float(said["alike"]))
+    return ToneInformation(information, right, float(said["square"]), int(said["count"]), float(said["alike"]))

@@ -109,7 +109,7 @@ def _half_px(mark: MarkMeasurement) -> int:
 
 
 def _whole(scan: Scan) -> Iterator[Thumbnail]:
-    seen = scan.seen_whole
+    seen = scan.last_reduction
     if seen is not None:
         factor, grey = seen
         step = max(1, -(-max(grey.shape) // _WHOLE_PX))

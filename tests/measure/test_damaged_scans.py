@@ -13,7 +13,7 @@ import tifffile
 from stored_picture import HEIGHT, WIDTH, picture
 
 from measure.errors import MeasurementError
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import map_in_threads
 from measure.scans.scan import open_scan
 
 
@@ -86,11 +86,11 @@ def test_a_damaged_tile_is_unknown_and_costs_none_of_the_others(tmp_path: Path, 
     (tmp_path / "s.tif").write_bytes(bytes(data))
     with open_scan(tmp_path / "s.tif") as scan:
         for _ in range(2):
-            seen = side_by_side(lambda row: scan.window(0, row, WIDTH, 1)[0], range(HEIGHT))
+            seen = map_in_threads(lambda row: scan.window(0, row, WIDTH, 1)[0], range(HEIGHT))
             known = scan.inside(0, 0, WIDTH, HEIGHT)
         assert "tile 7" in scan.damage
-        assert "tile 7" in scan.lost_in(120, 120, 10, 10)
-        assert scan.lost_in(0, 0, 64, 200) == ""
+        assert "tile 7" in scan.loss_reason(120, 120, 10, 10)
+        assert scan.loss_reason(0, 0, 64, 200) == ""
     lost = np.zeros((HEIGHT, WIDTH), bool)
     lost[64:128, 128:192] = True
     np.testing.assert_array_equal(known, ~lost)

@@ -12,7 +12,7 @@ import pytest
 
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
-from measure.scans.parallel import mapped_or_lost, side_by_side
+from measure.scans.parallel import map_in_threads, map_or_replace
 from measure.scans.scan import Scan
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 
@@ -34,7 +34,7 @@ def test_every_item_is_worked_on_in_its_order_while_opencvs_threads_rest(threads
         all_there.wait(60.0)
         return item, threading.get_ident(), cv2.getNumThreads()
 
-    found = side_by_side(seen, range(6))
+    found = map_in_threads(seen, range(6))
     assert [item for item, _, _ in found] == list(range(6))
     assert len({thread for _, thread, _ in found}) == threads
     assert {own for _, _, own in found} == {1}
@@ -44,7 +44,7 @@ def test_every_item_is_worked_on_in_its_order_while_opencvs_threads_rest(threads
 def test_what_fails_leaves_opencvs_threads_as_they_were() -> None:
     cv2.setNumThreads(2)
     with pytest.raises(ZeroDivisionError):
-        side_by_side(lambda item: 1 // item, [1, 0, 2])
+        map_in_threads(lambda item: 1 // item, [1, 0, 2])
     assert cv2.getNumThreads() == 2
 
 
@@ -80,5 +80,5 @@ def test_an_item_that_its_worker_is_ended_over_costs_none_of_the_others(chunk: i
         return f"{item}: {why}"
 
     with EndedOver(2) as workers:
-        found = list(mapped_or_lost(workers, str, range(9), lost, chunk))
+        found = list(map_or_replace(workers, str, range(9), lost, chunk))
     assert found == ["0", "1", "2", "3", "4", "5: its process was ended", "6", "7", "8"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stored_picture import HEIGHT, WIDTH, picture
 
 from measure.scans.cache import SegmentCache
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import map_in_threads
 from measure.scans.scan import open_scan
 from measure.targets.block_search import Block, Patches, search_blocks
 
@@ -91,7 +91,7 @@ def test_threads_that_read_a_file_side_by_side_see_what_one_sees(tmp_path: Path)
     places = [(col, row) for row in range(0, HEIGHT, 9) for col in range(0, WIDTH, 11)]
     with open_scan(tmp_path / "s.tif") as scan:
         scan._cache._limit = 10 * 32 * 32 * 2  # ten tiles: they are decoded over and over
-        windows = side_by_side(lambda place: scan.window(*place, 40, 30), places)
+        windows = map_in_threads(lambda place: scan.window(*place, 40, 30), places)
     with open_scan(tmp_path / "s.tif") as scan:
         for window, place in zip(windows, places, strict=True):
             np.testing.assert_array_equal(window, scan.window(*place, 40, 30))

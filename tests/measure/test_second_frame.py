@@ -11,7 +11,7 @@ from drawn_frames import ALIKE, FRAME_PX, PITCH_UM, frame_picture, pixel_from_ca
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
 from measure.results import moved_frame
-from measure.scans.scan_views import windowed
+from measure.scans.scan_views import crop_scan
 from measure.second_frame import second_frame
 
 
@@ -23,7 +23,7 @@ def test_a_second_frame_is_named_with_the_windows_of_both(second: str | None, is
     options = FiducialOptions()
     with written_scan(np.vstack([other, first]), tmp_path) as scan:
         window = (0, FRAME_PX, FRAME_PX, FRAME_PX)
-        frame = measure_fiducials(windowed(scan, window), ALIKE, (PITCH_UM, PITCH_UM), options)
+        frame = measure_fiducials(crop_scan(scan, window), ALIKE, (PITCH_UM, PITCH_UM), options)
         told = second_frame(scan, ALIKE, moved_frame(frame, np.array([0.0, FRAME_PX])), options)
     assert bool(told) == is_named
     if is_named:

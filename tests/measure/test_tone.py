@@ -16,8 +16,8 @@ from measure.matching.match import Match, match
 from measure.matching.tone_information import told_tone
 from measure.matching.window import read_window
 from measure.noise.noise_model import NoiseModel
-from measure.tone.curve import LINEAR, SaidOfTone, Tone, power, sampled, srgb
-from measure.tone.estimate import FrameTone, ToldTone
+from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
+from measure.tone.estimate import FrameTone, MarkTone
 from synthetic_images.tone_curve import coded
 
 FULL = 65535.0
@@ -36,7 +36,7 @@ def code_of(mark: TrueMark, curve: float | str, snr: float, rng: np.random.Gener
 
 
 def fitted(mark: TrueMark, code: np.ndarray, tone: Tone) -> Match:
-    scan = scan_of(code).seen_through(tone)
+    scan = scan_of(code).with_tone(tone)
     options = options_for(mark.kind.shape, MatchOptions(linear_sigma=0.05), mark.kind.known)
     return match(read_window(scan, (0, 0, mark.size, mark.size)), mark.kind.shape, mark.place, options)
 
@@ -44,11 +44,11 @@ def fitted(mark: TrueMark, code: np.ndarray, tone: Tone) -> Match:
 def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tuple[list[Match], FrameTone]:
     """From the first start at which the marks agree on the curve that they were matched by, or the best."""
     tried = []
-    for start in (prior, prior.like_power(1.0), prior.like_power(2.2)):
+    for start in (prior, prior.with_power(1.0), prior.with_power(2.2)):
         tried.append(settled_from(start, marks, codes, prior))
-        if tried[-1][1].unsettled < SETTLED:
+        if tried[-1][1].disagreement < SETTLED:
             break
-    return min(tried, key=lambda each: each[1].unsettled)
+    return min(tried, key=lambda each: each[1].disagreement)
 
 
 def settled_from(
@@ -57,10 +57,10 @@ def settled_from(
     for _ in range(5):
         fits = [fitted(mark, code, tone) for mark, code in zip(marks, codes, strict=True)]
         told = {n: fit.tone for n, fit in enumerate(fits) if fit.tone is not None}
-        found = FrameTone.of(prior, told, tone)
+        found = FrameTone.from_marks(prior, told, tone)
         if found.apart < SETTLED:
             break
-        tone = found.step_from(tone)
+        tone = found.next_curve(tone)
     return fits, found
 
 
@@ -74,13 +74,13 @@ def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the
     clear[5, 6:9] = True
     used, landscape = np.ones(shape, bool), Landscape(drawn, np.zeros(shape, bool), design[3])
     fit = LinearFit(rng.normal(size=shape), used, design, design / 576.0, noise, np.ones(shape))
-    said = told_tone(fit, drawn, drawn, clear, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape).said
-    assert np.abs(said.information).max() < 1e-3
+    said = told_tone(fit, drawn, drawn, clear, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape).information
+    assert np.abs(said.matrix).max() < 1e-3
     blank = replace(fit, residuals=np.zeros(shape), noise=NoiseModel(4e-35, np.full((1, 1), 4e-35), 0.0))
     even = np.full(shape, 87.8)
     assert not told_tone(
         blank, even, even, used, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape
-    ).said.information.any()
+    ).information.matrix.any()
 
 
 def test_noise_that_is_none_is_raised_to_a_floor() -> None:
@@ -92,7 +92,7 @@ def test_noise_that_is_none_is_raised_to_a_floor() -> None:
     (LINEAR, 1000.0, 1000.0),
     (Tone(power(2.2)), FULL / 2, FULL * 0.5**2.2),
     (Tone(srgb()), 0.5 * FULL, FULL * 0.21404),  # IEC 61966-2-1
-    (Tone(sampled(np.linspace(0, 1, 9) ** 2)), FULL * 0.5, FULL * 0.25),
+    (Tone(sampled_curve(np.linspace(0, 1, 9) ** 2)), FULL * 0.5, FULL * 0.25),
 ])  # fmt: skip
 def test_light_of_a_code_and_back(tone: Tone, code: float, light: float) -> None:
     assert tone.light(np.array([code]), FULL)[0] == pytest.approx(light, rel=1e-3)
@@ -101,30 +101,30 @@ def test_light_of_a_code_and_back(tone: Tone, code: float, light: float) -> None
 
 def test_a_curve_that_does_not_grow_is_refused() -> None:
     with pytest.raises(ValueError, match="grows"):
-        sampled(np.array([0.0, 0.5, 0.4, 1.0]))
+        sampled_curve(np.array([0.0, 0.5, 0.4, 1.0]))
 
 
 def test_departures_change_light_as_their_derivatives_say() -> None:
     tone, codes = Tone.unknown(), np.linspace(0.1, 0.9, 9) * FULL
     for k in range(5):
         step = np.eye(5)[k] * 1e-3
-        more, less = (tone.at(way * step).light(codes, FULL).astype(float) for way in (1, -1))
+        more, less = (tone.with_departures(way * step).light(codes, FULL).astype(float) for way in (1, -1))
         by_departure = (more - less) / 2e-3
-        told = tone.changes(tone.light(codes, FULL), FULL)[k]
+        told = tone.derivatives(tone.light(codes, FULL), FULL)[k]
         gain = np.polyfit(tone.light(codes, FULL).astype(float), by_departure - told, 1)  # but for gain and offset
         assert np.allclose(np.polyval(gain, tone.light(codes, FULL)), by_departure - told, atol=1e-3 * np.ptp(told) + 1)
 
 
 def test_a_declared_curve_holds_until_pictures_contradict_it() -> None:
     declared = Tone.declared(power(2.2), "the file says so")
-    assert declared.power_between(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.01)
+    assert declared.equivalent_power(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.01)
     linear = -1.2 / 0.6 * np.eye(5)[0]  # departures that make a power of 1 of it
     strong, faint = (said_of(linear, w) for w in (400.0, 0.1))
-    believed = declared.told([faint]).tone
-    assert believed.power_between(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.05)
+    believed = declared.estimate([faint]).tone
+    assert believed.equivalent_power(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.05)
     assert "contradict" not in believed.source
-    believed = declared.told([strong] * 3).tone
-    assert believed.power_between(0.1, 0.9)[0] == pytest.approx(1.0, abs=0.1)
+    believed = declared.estimate([strong] * 3).tone
+    assert believed.equivalent_power(0.1, 0.9)[0] == pytest.approx(1.0, abs=0.1)
     assert "contradict" in believed.source
 
 
@@ -152,8 +152,8 @@ def test_a_mark_says_no_more_of_the_curve_where_its_frame_is_known_without_error
     mark = some_mark(TIP, 1.0, rng)
     code = code_of(mark, 2.2, 80.0, rng)
     alike = [replace(mark, kind=replace(TIP, known=known)) for known in (1e-4, 1e-6)]
-    told = [fitted(each, code, Tone.unknown().like_power(2.2)).tone for each in alike]
-    information = [one.said.information for one in told if one is not None]
+    told = [fitted(each, code, Tone.unknown().with_power(2.2)).tone for each in alike]
+    information = [one.information.matrix for one in told if one is not None]
     np.testing.assert_allclose(information[1], information[0], rtol=0.1, atol=0.1)
 
 
@@ -165,7 +165,7 @@ def test_the_linearised_effect_of_a_curve_is_that_of_a_fit_at_another_one() -> N
     assert told is not None
     for k in range(3):
         step = 0.1 * np.eye(5)[k]
-        more, less = (fitted(mark, code, tone.at(way * step)).center_px for way in (1, -1))
+        more, less = (fitted(mark, code, tone.with_departures(way * step)).center_px for way in (1, -1))
         np.testing.assert_allclose((more - less) / 0.2, told.on_place[:, k], atol=0.03)
 
 
@@ -200,16 +200,17 @@ def test_what_the_marks_contradict_one_another_by_is_in_the_covariance_of_each()
     agreed = {n: told_of(np.zeros(5)) for n in range(4)}
     prior = Tone.unknown()
     sigma, sigma_agreed = (
-        float(np.sqrt(FrameTone.of(prior, each, prior).covariance_px2(each[0])[0, 0])) for each in (told, agreed)
+        float(np.sqrt(FrameTone.from_marks(prior, each, prior).covariance_px2(each[0])[0, 0]))
+        for each in (told, agreed)
     )
     assert sigma_agreed < 0.06  # four marks, each 0.1 px
     assert sigma > 0.5  # they are 1 px from what they agree on
 
 
 def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
-    agreed = [told_of(np.eye(5)[0]).said] * 4
-    alone, prior = told_of(-3 * np.ones(5)).said, Tone.unknown()
-    together, without = prior.told([*agreed, alone]), prior.told(agreed)
+    agreed = [told_of(np.eye(5)[0]).information] * 4
+    alone, prior = told_of(-3 * np.ones(5)).information, Tone.unknown()
+    together, without = prior.estimate([*agreed, alone]), prior.estimate(agreed)
     assert without.scatter == 0.0
     assert together.scatter > 0.3
     off = together.tone.mean - np.eye(5)[0]
@@ -217,11 +218,11 @@ def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
 
 
 def test_what_a_picture_says_of_a_curve_of_its_own_has_the_variance_of_that_beside_its_own() -> None:
-    said = told_of(np.arange(5.0)).said
-    loose = SaidOfTone.together([said], 0.5)
-    np.testing.assert_allclose(np.linalg.inv(loose.information), np.linalg.inv(said.information) + 0.5 * np.eye(5))
-    np.testing.assert_allclose(np.linalg.solve(loose.information, loose.right), np.arange(5.0), atol=1e-9)
-    assert loose.square == pytest.approx(float(np.arange(5.0) @ loose.information @ np.arange(5.0)))
+    said = told_of(np.arange(5.0)).information
+    loose = ToneInformation.pooled([said], 0.5)
+    np.testing.assert_allclose(np.linalg.inv(loose.matrix), np.linalg.inv(said.matrix) + 0.5 * np.eye(5))
+    np.testing.assert_allclose(np.linalg.solve(loose.matrix, loose.right_side), np.arange(5.0), atol=1e-9)
+    assert loose.sum_of_squares == pytest.approx(float(np.arange(5.0) @ loose.matrix @ np.arange(5.0)))
 
 
 def test_what_is_wrong_alike_in_all_pictures_of_a_scanner_does_not_average() -> None:
@@ -232,9 +233,13 @@ def test_what_is_wrong_alike_in_all_pictures_of_a_scanner_does_not_average() -> 
     for _ in range(60):
         truth, wrong = rng.standard_normal(5), np.sqrt(variance) * rng.standard_normal(5)
         each = [
-            replace(said_of(truth + wrong + 0.1 * rng.standard_normal(5), 100.0), alike=variance) for _ in range(20)
+            replace(said_of(truth + wrong + 0.1 * rng.standard_normal(5), 100.0), common_variance=variance)
+            for _ in range(20)
         ]
-        at_once, in_turn = Tone.unknown().told(each).tone, Tone.unknown().hearing(each[5:]).told(each[:5]).tone
+        at_once, in_turn = (
+            Tone.unknown().estimate(each).tone,
+            Tone.unknown().with_information(each[5:]).estimate(each[:5]).tone,
+        )
         np.testing.assert_allclose(in_turn.mean, at_once.mean, atol=1e-9)
         error = at_once.mean - truth
         squares.append(error @ np.linalg.solve(at_once.covariance, error) / 5)
@@ -249,13 +254,13 @@ def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -
     code = code_of(mark, 2.2, 80.0, rng) / 257
     known = []
     for step_dn in (0.0, 12.0):
-        scan = scan_of(code, 255, step_dn).seen_through(Tone.unknown())
+        scan = scan_of(code, 255, step_dn).with_tone(Tone.unknown())
         expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
         fit = sight(scan, expected, MatchOptions(linear_sigma=0.05), mark.kind.known).fit
         assert fit is not None
         assert fit.tone is not None
-        told = [SaidOfTone.together([fit.tone.said] * count).of_scanner for count in (1, 16)]
-        known.append([np.linalg.norm(said.information, 2) for said in told])
+        told = [ToneInformation.pooled([fit.tone.information] * count).scanner_information for count in (1, 16)]
+        known.append([np.linalg.norm(said.matrix, 2) for said in told])
     (one, many), (one_rounded, many_rounded) = known
     assert many == pytest.approx(16 * one)
     assert many_rounded < 4 * one_rounded
@@ -271,19 +276,19 @@ def test_noise_that_is_cut_off_at_black_feigns_no_curve() -> None:
         light = 0.02 + 0.5 * (mark.picture + rng.standard_normal(mark.picture.shape) / 12)
         told = fitted(mark, FULL * np.clip(light, 0.0, 1.0), linear).tone
         assert told is not None
-        found = linear.told([told.said]).tone
+        found = linear.estimate([told.information]).tone
         moved.append(float(mark.place[:, 1] @ told.on_place @ found.mean / np.hypot(*mark.place[:, 1])))
     assert abs(np.mean(moved)) < 4 * np.std(moved) / np.sqrt(len(moved))
 
 
-def told_of(departures: np.ndarray) -> ToldTone:
+def told_of(departures: np.ndarray) -> MarkTone:
     """A mark that says them with a standard deviation of 0.1, and moves by 1 px for each."""
-    return ToldTone(said_of(departures, 100.0), np.eye(2, 5), 0.1, 0.7)
+    return MarkTone(said_of(departures, 100.0), np.eye(2, 5), 0.1, 0.7)
 
 
-def said_of(departures: np.ndarray, weight: float) -> SaidOfTone:
+def said_of(departures: np.ndarray, weight: float) -> ToneInformation:
     """Each of them known to 1 / sqrt(weight)."""
-    return SaidOfTone(weight * np.eye(5), weight * departures, weight * float(departures @ departures), 5)
+    return ToneInformation(weight * np.eye(5), weight * departures, weight * float(departures @ departures), 5)
 
 
 def test_a_mark_whose_detail_alone_was_fitted_moves_with_the_curve_and_says_nothing_of_it() -> None:
@@ -293,8 +298,8 @@ def test_a_mark_whose_detail_alone_was_fitted_moves_with_the_curve_and_says_noth
     landscape = 1 + 0.15 * (np.sin(col / 5) * np.sin(row / 5) - 1)
     told = fitted(mark, landscape * code_of(mark, 2.2, 100.0, rng), prior).tone
     assert told is not None
-    assert told.said.count == 0
-    found = FrameTone.of(prior, {0: told}, prior)
+    assert told.information.count == 0
+    found = FrameTone.from_marks(prior, {0: told}, prior)
     assert found.scatter == 0.0
     assert np.array_equal(found.tone.covariance, prior.covariance)
     assert 0.005 < np.sqrt(np.trace(found.covariance_px2(told))) < 0.1
@@ -313,5 +318,5 @@ def test_what_a_mark_says_of_the_curve_is_the_same_however_closely_the_fit_held_
         fit = LinearFit(residuals - change * design[2], everywhere, design, by_grey, noise, np.ones(shape))
         priors, departures = np.array([0, 0, 50.0, 0, 0, 0, 0]), np.array([0, 0, 0.002 + change, 0, 0, 0, 0])
         told = told_tone(fit, drawn, drawn, everywhere, priors, departures, Tone.unknown(), FULL, landscape)
-        rights.append(told.said.right)
+        rights.append(told.information.right_side_side)
     np.testing.assert_allclose(rights[1], rights[0], rtol=1e-6)

@@ -16,15 +16,15 @@ from measure.covariance import Cause, Covariance
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
-from measure.tone.curve import SaidOfTone, Tone, power, sampled, srgb
+from measure.tone.curve import Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone
 from pipeline.files.project_file import read_project
 from pipeline.results.measured_record import record_of, scan_of
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
 RNG = np.random.default_rng(5)
-SAID = SaidOfTone(RNG.normal(size=(5, 5)), RNG.normal(size=5), 3.3, 17, 0.2)
-CURVE = sampled(np.linspace(0.0, 1.0, 50) ** 1.7 + 0.01 * np.linspace(0.0, 1.0, 50))
+SAID = ToneInformation(RNG.normal(size=(5, 5)), RNG.normal(size=5), 3.3, 17, 0.2)
+CURVE = sampled_curve(np.linspace(0.0, 1.0, 50) ** 1.7 + 0.01 * np.linspace(0.0, 1.0, 50))
 TONE = FrameTone(
     Tone(CURVE, RNG.normal(size=5), RNG.normal(size=(5, 5)), "its profile", True), SAID, 0.1, 0.7, 1.9, 0.4
 )
