@@ -318,5 +318,5 @@ def test_what_a_mark_says_of_the_curve_is_the_same_however_closely_the_fit_held_
         fit = LinearFit(residuals - change * design[2], everywhere, design, by_grey, noise, np.ones(shape))
         priors, departures = np.array([0, 0, 50.0, 0, 0, 0, 0]), np.array([0, 0, 0.002 + change, 0, 0, 0, 0])
         told = told_tone(fit, drawn, drawn, everywhere, priors, departures, Tone.unknown(), FULL, landscape)
-        rights.append(told.information.right_side_side)
+        rights.append(told.information.right_side)
     np.testing.assert_allclose(rights[1], rights[0], rtol=1e-6)
