@@ -52,13 +52,13 @@ class Segments(Protocol):
     @property
     def lost(self) -> Sequence[LostPart]: ...
 
-    def fetched(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
+    def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
         """What the file has stored of segments (row, column), where asking for all together is quicker than for one
         after the other; else nothing."""
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         """Segment (row, column) of the grid: (height, width, channels), values that grow with light. stored: as
-        `fetched` gives it."""
+        `fetch` gives it."""
 
     def close(self) -> None: ...
 
@@ -122,16 +122,16 @@ class SegmentCache:
 
         others: list[tuple[tuple[int, int], _Segment]] = []
         wanted = {key: self._segment(key) for key in product(rows, cols)}
-        stored = self._segments.fetched(
+        stored = self._segments.fetch(
             [key for key, segment in wanted.items() if segment.samples is None and not segment.lock.locked()]
         )
         for key, segment in wanted.items():
             if segment.samples is None and segment.lock.locked():
                 others.append((key, segment))
             else:
-                take(*key, self._decoded(key, segment, stored.get(key, ())))
+                take(*key, self._decode(key, segment, stored.get(key, ())))
         for key, segment in others:
-            take(*key, self._decoded(key, segment))
+            take(*key, self._decode(key, segment))
 
     def _segment(self, key: tuple[int, int]) -> _Segment:
         """Of the grid, by row and column."""
@@ -140,7 +140,7 @@ class SegmentCache:
             self._kept.move_to_end(key)
         return segment
 
-    def _decoded(self, key: tuple[int, int], segment: _Segment, stored: Sequence[bytes] = ()) -> Samples:
+    def _decode(self, key: tuple[int, int], segment: _Segment, stored: Sequence[bytes] = ()) -> Samples:
         """Decoded here unless another thread has begun to."""
         with segment.lock:
             samples = segment.samples
@@ -174,7 +174,7 @@ class WholePicture:
             self.lost = (LostPart(0, 0, self.width_px, self.height_px, damage),)
             self._samples = np.full_like(samples, self.full_scale_dn // 2)
 
-    def fetched(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
+    def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
         return {}
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:

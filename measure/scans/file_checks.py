@@ -29,14 +29,14 @@ MOST_PER_BYTE = 1000  # bytes of a picture for each of its file: deflate cannot 
 ALWAYS_BYTES = 128 << 20  # of a picture: a drawn one without any grain may be stored in next to nothing
 
 
-def broken(path: Path, what: str) -> MeasurementError:
+def damage_error(path: Path, what: str) -> MeasurementError:
     """what: a part of a sentence."""
     return MeasurementError(
         f"{path} is damaged or truncated ({what.rstrip('.')}): copy it anew from the original, or rescan"
     )
 
 
-def unsupported(path: Path, what: str) -> MeasurementError:
+def unsupported_error(path: Path, what: str) -> MeasurementError:
     """what: a part of a sentence."""
     return MeasurementError(
         f"{path} is a TIFF of a kind that is not read ({what}): save it as grey or RGB with 8 or 16 bits a sample"
@@ -70,7 +70,7 @@ def check_size(
     )
 
 
-def no_picture(path: Path, start: bytes) -> MeasurementError:
+def no_picture_error(path: Path, start: bytes) -> MeasurementError:
     """Of a file that begins so."""
     return MeasurementError(
         f"{path} is no TIFF, JPEG or PNG picture (it begins with {start[:8]!r}): give the scan itself, or convert it"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.file_checks import DECODING_ERRORS, broken, check_size, first_bytes, no_picture
+from measure.scans.file_checks import DECODING_ERRORS, check_size, damage_error, first_bytes, no_picture_error
 from measure.scans.jpeg import JPEG_START, jpeg_colour_tags, jpeg_pitch, picture_form
 from measure.scans.metadata import Pitch
 from measure.scans.png import PNG_START, png_colour_tags, png_form, png_pitch
@@ -46,7 +46,7 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         bits = int(segments.full_scale_dn + 1).bit_length() - 1
         return ScanHead("TIFF", segments.width_px, segments.height_px, segments.channels, bits, opened.pitch, notes)
     if not start.startswith((JPEG_START, PNG_START)):
-        raise no_picture(path, start)
+        raise no_picture_error(path, start)
     data, end = _head_and_end(path)
     if start.startswith(JPEG_START):
         form, marker, pitch = picture_form(data), b"\xff\xd9", jpeg_pitch(data)
@@ -55,7 +55,7 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         form, marker, pitch = png_form(data), b"IEND", png_pitch(data)
         file_format = "PNG"
     if form is None or 0 in form:
-        raise broken(path, "its header is cut short")
+        raise damage_error(path, "its header is cut short")
     if marker not in end:
         open_scan(path, max_pixels).close()  # which says whether it stands before something else
     width, height, channels, bits = form

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tifffile import TiffFile
 
 from measure.scans.cache import OpenedPicture, WholePicture
-from measure.scans.file_checks import DECODING_ERRORS, broken, check_size
+from measure.scans.file_checks import DECODING_ERRORS, check_size, damage_error
 from measure.scans.metadata import (
     JFIF_UNIT,
     MOST_CHANNELS,
@@ -36,7 +36,7 @@ from measure.scans.metadata import (
     exif_tags,
     grey_or_colour,
     orientation_notes,
-    orientation_of,
+    orientation_tag,
     pitch_from_density,
     tag_pitch,
 )
@@ -76,7 +76,7 @@ class _Frame:
     interpolates_rows: bool
 
 
-def decoded(data: bytes, decode: Decode, tables: bytes | None = None) -> tuple[NDArray[np.generic], str]:
+def decode_checked(data: bytes, decode: Decode, tables: bytes | None = None) -> tuple[NDArray[np.generic], str]:
     """The samples (height, width) or (height, width, channels) that a stream holds, and why they are not to be trusted;
     empty where they are. decode: a decoder of streams, which may raise what it will. tables: a stream of those tables
     that the other leaves to its file."""
@@ -84,11 +84,11 @@ def decoded(data: bytes, decode: Decode, tables: bytes | None = None) -> tuple[N
     if frame is None:
         return decode(data), ""
     rows = -(-frame.height_px // frame.unit_height_px) * frame.unit_height_px
-    taller = decode(_of_height(data, frame, rows + _BELOW * frame.unit_height_px))
+    taller = decode(_stream_with_height(data, frame, rows + _BELOW * frame.unit_height_px))
     if _has_one_end(data):
-        why = _why_damaged(data, frame, taller, rows, decode)
+        why = _stream_damage(data, frame, taller, rows, decode)
     else:
-        why = _what_libjpeg_warns_of(data, tables) or (_MORE if _goes_on(taller, frame, rows) else "")
+        why = _libjpeg_warning(data, tables) or (_MORE if _has_more_blocks(taller, frame, rows) else "")
     samples = decode(data) if frame.interpolates_rows else taller[: frame.height_px]
     return samples, why
 
@@ -99,14 +99,14 @@ def _has_one_end(data: bytes) -> bool:
     return len(_SCAN_OR_RESTART.findall(data, start, data.find(_END, start))) == 1
 
 
-def _what_libjpeg_warns_of(data: bytes, tables: bytes | None) -> str:
+def _libjpeg_warning(data: bytes, tables: bytes | None) -> str:
     whole = data if tables is None else data[:2] + tables[2 : tables.rfind(_END)] + data[2:]
     try:
         simplejpeg.decode_jpeg(whole, "GRAY", min_factor=8, strict=True)
     except ValueError as error:
         # What else it raises is of streams that it does not know: CMYK, say.
-        told = str(error)
-        return f"its decoder says: {told}" if told.startswith(_OF_DAMAGE) else ""
+        message = str(error)
+        return f"its decoder says: {message}" if message.startswith(_OF_DAMAGE) else ""
     return ""
 
 
@@ -141,13 +141,13 @@ def _frame(data: bytes) -> _Frame | None:
     return None
 
 
-def _of_height(data: bytes, frame: _Frame, height_px: int) -> bytes:
+def _stream_with_height(data: bytes, frame: _Frame, height_px: int) -> bytes:
     return data[: frame.height_at] + height_px.to_bytes(2, "big") + data[frame.height_at + 2 :]
 
 
-def _why_damaged(data: bytes, frame: _Frame, taller: NDArray[np.generic], rows: int, decode: Decode) -> str:
+def _stream_damage(data: bytes, frame: _Frame, taller: NDArray[np.generic], rows: int, decode: Decode) -> str:
     """What the blocks below the picture say of the stream: nothing, or a part of a sentence."""
-    if _goes_on(taller, frame, rows):
+    if _has_more_blocks(taller, frame, rows):
         return _MORE
     grey = 2 ** (frame.bits - 1)
     first = taller[rows + _BLEED_PX :][: frame.unit_height_px - 2 * _BLEED_PX, : frame.unit_width_px - _BLEED_PX]
@@ -158,7 +158,7 @@ def _why_damaged(data: bytes, frame: _Frame, taller: NDArray[np.generic], rows: 
     return ""
 
 
-def _goes_on(taller: NDArray[np.generic], frame: _Frame, rows: int) -> bool:
+def _has_more_blocks(taller: NDArray[np.generic], frame: _Frame, rows: int) -> bool:
     """Whether there are further blocks below the picture than the first."""
     below = taller[rows + _BLEED_PX :] != 2 ** (frame.bits - 1)
     return bool(below[:, frame.unit_width_px + _BLEED_PX :].any() or below[frame.unit_height_px :].any())
@@ -176,7 +176,7 @@ def _ends_whole(data: bytes, frame: _Frame, taller: NDArray[np.generic], rows: i
     be taken for these."""
     end = data.rfind(_END)
     longer = data[:end] + _TAIL + data[end:]
-    again = decode(_of_height(longer, frame, rows + _BELOW * frame.unit_height_px))
+    again = decode(_stream_with_height(longer, frame, rows + _BELOW * frame.unit_height_px))
     above = rows - _BLEED_PX
     return bool(np.array_equal(again[:above], taller[:above]))
 
@@ -240,13 +240,13 @@ def _jpeg_samples(path: Path, data: bytes, max_pixels: int | None) -> tuple[Samp
         check_size(path, "a picture", size, size[0] * size[1] * MOST_CHANNELS, len(data), max_pixels)
     picture = 2 + sum(4 + len(body) for _, body in jpeg_headers(data))
     if b"\xff\xd9" not in data[picture:]:
-        raise broken(path, "its end marker is missing")
+        raise damage_error(path, "its end marker is missing")
     try:
-        samples, damage = decoded(data, imagecodecs.jpeg_decode)
+        samples, damage = decode_checked(data, imagecodecs.jpeg_decode)
         return grey_or_colour(samples), damage
     except DECODING_ERRORS as error:
         if size is None or 0 in size:
-            raise broken(path, str(error)) from error
+            raise damage_error(path, str(error)) from error
         return np.zeros((size[1], size[0], 1), np.uint8), str(error)
 
 
@@ -268,7 +268,7 @@ def _jpeg_orientation(data: bytes) -> int:
         if marker == 0xE1 and body.startswith(b"Exif\0\0"):
             try:
                 with TiffFile(BytesIO(body[6:])) as file:
-                    return orientation_of(file.pages.first.aspage())
+                    return orientation_tag(file.pages.first.aspage())
             except DECODING_ERRORS:
                 return 1
     return 1

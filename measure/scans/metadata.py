@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tifffile import TiffPage
 
-from measure.scans.file_checks import unsupported
+from measure.scans.file_checks import unsupported_error
 
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)  # of TIFF
 WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6  # PhotometricInterpretation
@@ -65,7 +65,7 @@ class Radiometry:
     palette: Samples | None = None
 
     @classmethod
-    def of_palette(cls, colormap: NDArray[np.generic]) -> "Radiometry":
+    def from_palette(cls, colormap: NDArray[np.generic]) -> "Radiometry":
         """colormap (3, entries) as TIFF stores it: 16 bits, in some old files 8. All grey: one channel."""
         palette = np.asarray(colormap, np.uint16).T
         if palette.max() < 256:
@@ -88,7 +88,7 @@ class Radiometry:
         return dtype(self.full_scale_dn) - samples if self.inverted else samples
 
 
-def orientation_of(page: TiffPage) -> int:
+def orientation_tag(page: TiffPage) -> int:
     """The tag by which a viewer turns the picture; 1 where it does not."""
     return int(page.tags.valueof(274, default=1))
 
@@ -126,18 +126,18 @@ def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
     """How the page's samples become grey or colour values."""
     bits, kind, samples = page.bitspersample, int(page.photometric), page.samplesperpixel
     if not isinstance(bits, int):
-        raise unsupported(path, f"samples are of {' and '.join(map(str, bits))} bits")
+        raise unsupported_error(path, f"samples are of {' and '.join(map(str, bits))} bits")
     if page.sampleformat != 1 or not 1 < bits <= 16:
         number = {1: "integers", 2: "signed integers", 3: "floating-point numbers"}.get(page.sampleformat, "numbers")
-        raise unsupported(path, f"samples are {number} of {bits} bits")
+        raise unsupported_error(path, f"samples are {number} of {bits} bits")
     if page.imagedepth != 1:
-        raise unsupported(path, f"it is a volume of {page.imagedepth} slices")
+        raise unsupported_error(path, f"it is a volume of {page.imagedepth} slices")
     if kind == _PALETTE and page.colormap is not None:
-        return Radiometry.of_palette(page.colormap)
+        return Radiometry.from_palette(page.colormap)
     is_colour = kind == _RGB or (kind == _YCBCR and page.compression in JPEG_COMPRESSIONS)  # its decoder gives RGB
     if not (kind in (WHITE_IS_ZERO, _BLACK_IS_ZERO) or (is_colour and samples >= 3)):
         name = getattr(page.photometric, "name", str(page.photometric))
-        raise unsupported(path, f"its colours are {name} with {samples} samples a pixel")
+        raise unsupported_error(path, f"its colours are {name} with {samples} samples a pixel")
     return Radiometry(3 if is_colour else 1, float(2**bits - 1), inverted=kind == WHITE_IS_ZERO)
 
 

@@ -11,7 +11,7 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 
-def mapped(
+def map_items(
     workers: Executor | None, function: Callable[[Item], Made], items: Sequence[Item], chunk: int = 1
 ) -> Iterator[Made]:
     """The function of every item, in their order. chunk: how many items a worker gets at a time."""

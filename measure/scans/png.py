@@ -9,7 +9,7 @@ import imagecodecs
 
 from measure.errors import MeasurementError
 from measure.scans.cache import OpenedPicture, WholePicture
-from measure.scans.file_checks import DECODING_ERRORS, broken, check_size
+from measure.scans.file_checks import DECODING_ERRORS, check_size, damage_error
 from measure.scans.metadata import (
     MOST_CHANNELS,
     NO_TAGS,
@@ -47,7 +47,7 @@ def _png_samples(path: Path, data: bytes, max_pixels: int | None) -> Samples:
     """Grey or RGB, 8 or 16 bits."""
     header = data[_PNG_SIZE]
     if len(header) < 9:
-        raise broken(path, "its header is cut short")
+        raise damage_error(path, "its header is cut short")
     width, height, bits = struct.unpack(">IIB", header)
     if bits == 1:
         raise MeasurementError(
@@ -59,7 +59,7 @@ def _png_samples(path: Path, data: bytes, max_pixels: int | None) -> Samples:
     try:
         return grey_or_colour(imagecodecs.png_decode(data))
     except DECODING_ERRORS as error:
-        raise broken(path, str(error)) from error
+        raise damage_error(path, str(error)) from error
 
 
 def png_pitch(data: bytes) -> Pitch:

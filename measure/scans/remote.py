@@ -53,8 +53,8 @@ def public_address(text: str) -> str:
     rest, _, query = rest.partition("#")[0].partition("?")
     host, slash, path = rest.partition("/")
     own = [part for part in query.split("&") if part and not _SECRET.fullmatch(part.partition("=")[0])]
-    told = f"?query={hashlib.sha256('&'.join(sorted(own)).encode()).hexdigest()[:12]}" if own else ""
-    return f"{scheme.lower()}://{host.rpartition('@')[2]}{slash}{path}{told}"
+    query_hash = f"?query={hashlib.sha256('&'.join(sorted(own)).encode()).hexdigest()[:12]}" if own else ""
+    return f"{scheme.lower()}://{host.rpartition('@')[2]}{slash}{path}{query_hash}"
 
 
 def public_text(text: str) -> str:
@@ -62,7 +62,7 @@ def public_text(text: str) -> str:
     return _ADDRESS.sub(r"\1\3", text) if ":/" in text else text
 
 
-def _registered(segment: Any) -> Any:
+def _register(segment: Any) -> Any:
     """What is shown of an address; where it is fetched from is remembered."""
     if not isinstance(segment, str) or not is_address(segment):
         return segment
@@ -82,12 +82,12 @@ class Address(PosixPath):
     """
 
     def __new__(cls, *segments: Any) -> "Address":
-        return super().__new__(cls, *map(_registered, segments))
+        return super().__new__(cls, *map(_register, segments))
 
     if sys.version_info >= (3, 12):
 
         def __init__(self, *segments: Any) -> None:
-            super().__init__(*map(_registered, segments))
+            super().__init__(*map(_register, segments))
 
     @property
     def location(self) -> str:
@@ -106,15 +106,15 @@ class Address(PosixPath):
     @property
     def etag(self) -> str:
         """What the store calls this content of it; "" where it says nothing. Asked for anew."""
-        return _asked(self).etag
+        return _query_object(self).etag
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
         """Its size, asked for anew; nothing else of it is known."""
-        return os.stat_result((stat.S_IFREG, 0, 0, 0, 0, 0, _asked(self).size, 0, 0, 0))
+        return os.stat_result((stat.S_IFREG, 0, 0, 0, 0, 0, _query_object(self).size, 0, 0, 0))
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:
         try:
-            _asked(self)
+            _query_object(self)
         except MissingError:
             return False
         return True
@@ -133,19 +133,19 @@ class Address(PosixPath):
 
     def open(self, *args: Any, **kwargs: Any) -> Any:  # whose modes are those of files
         """As a file opened with "rb", for reading bytes: of heads, tags and tables, for what is read is held."""
-        return _Opened(self)
+        return _RemoteFile(self)
 
     def read_bytes(self) -> bytes:
         """All of it, by one request."""
-        (data,) = self.ranges([(0, _known(self).size)])
+        (data,) = self.ranges([(0, _remote_object(self).size)])
         return data
 
     def ranges(self, extents: Sequence[Extent]) -> list[bytes]:
         """The bytes of several places, asked for together."""
         system = _file_system(self)
         starts, ends = [first for first, _ in extents], [after for _, after in extents]
-        parts = _persistently(self, lambda: _whole(self, system.cat_ranges, starts, ends))
-        _count(len(parts), sum(map(len, parts)))
+        parts = _retry(self, lambda: _fetch_ranges(self, system.cat_ranges, starts, ends))
+        _count_traffic(len(parts), sum(map(len, parts)))
         return parts
 
 
@@ -170,7 +170,7 @@ def scan_path(text: str | Path) -> Path:
     return Address(text) if is_address(text) else Path(text)
 
 
-def location_of(path: str | Path) -> str:
+def fetch_location(path: str | Path) -> str:
     """A text by which a file or an address can be opened, in another process, too. It is not to be shown or kept."""
     known = scan_path(path)
     return known.location if isinstance(known, Address) else str(path)
@@ -188,7 +188,7 @@ def find_addresses(pattern: str) -> list[Path]:
     system = _file_system(address)
     if _scheme(address) != "s3" or not any(sign in pattern for sign in "*?["):
         return [address]
-    names = _persistently(address, lambda: list(system.glob(pattern)))
+    names = _retry(address, lambda: list(system.glob(pattern)))
     return [Address(f"s3://{name}") for name in sorted(names)]
 
 
@@ -197,14 +197,14 @@ def list_addresses(address: Address) -> list[Path]:
     Raises as `Address` does."""
     system = _file_system(address)
     if _scheme(address) == "s3":
-        names = _persistently(address, lambda: list(system.find(address.location)))
+        names = _retry(address, lambda: list(system.find(address.location)))
         return [Address(f"s3://{name}") for name in sorted(names)]
-    files, seen, folders = set[str](), set[str](), [f"{address}/"]
+    files, visited, folders = set[str](), set[str](), [f"{address}/"]
     while folders:
         folder = folders.pop()
-        seen.add(folder)
-        listed = {str(entry["name"]) for entry in _persistently(address, partial(system.ls, folder, detail=True))}
-        below = {name for name in listed if name.startswith(folder) and "?" not in name and "#" not in name} - seen
+        visited.add(folder)
+        listed = {str(entry["name"]) for entry in _retry(address, partial(system.ls, folder, detail=True))}
+        below = {name for name in listed if name.startswith(folder) and "?" not in name and "#" not in name} - visited
         folders += sorted(name for name in below if name.endswith("/"))
         files |= {name for name in below if not name.endswith("/")}
     return [Address(name) for name in sorted(files)]
@@ -218,7 +218,7 @@ def tiff_file(path: Path) -> "TiffFile":
 
 
 @dataclass
-class _Object:
+class _RemoteObject:
     """What is known of an object: its size, what the store calls its content, and blocks of it by their numbers."""
 
     size: int
@@ -226,15 +226,15 @@ class _Object:
     blocks: dict[int, bytes] = field(default_factory=dict)
 
 
-_objects: OrderedDict[str, _Object] = OrderedDict()
+_objects: OrderedDict[str, _RemoteObject] = OrderedDict()
 _holding = Lock()
 
 
-class _Opened(BufferedIOBase):
+class _RemoteFile(BufferedIOBase):
     """An address as a file that is read by blocks."""
 
     def __init__(self, address: Address) -> None:
-        self.name, self._address, self._object, self._place = str(address), address, _known(address), 0
+        self.name, self._address, self._object, self._place = str(address), address, _remote_object(address), 0
 
     def readable(self) -> bool:
         return True
@@ -274,24 +274,24 @@ class _Opened(BufferedIOBase):
         return [blocks[number] or b"" for number in numbers]
 
 
-def _known(address: Address) -> _Object:
+def _remote_object(address: Address) -> _RemoteObject:
     """As it was when its size was last asked for."""
     with _holding:
         known = _objects.get(str(address))
-    return _asked(address) if known is None else known
+    return _query_object(address) if known is None else known
 
 
-def _asked(address: Address) -> _Object:
+def _query_object(address: Address) -> _RemoteObject:
     """Asked for anew; blocks of the same content are kept."""
     system = _file_system(address)
-    info = _persistently(address, lambda: _info(system, address.location))
+    info = _retry(address, lambda: _info(system, address.location))
     size, etag = info.get("size"), next((str(info[key]) for key in _CHECKSUMS if info.get(key)), "")
     if size is None:
         raise UnreachableError(f"{address}: its server does not say how large it is. Download it, and name the file.")
     with _holding:
         known = _objects.get(str(address))
         if known is None or (known.size, known.etag) != (size, etag):
-            known = _objects[str(address)] = _Object(int(size), etag)
+            known = _objects[str(address)] = _RemoteObject(int(size), etag)
         _objects.move_to_end(str(address))
         while len(_objects) > _KEPT_OBJECTS:
             _objects.popitem(last=False)
@@ -310,7 +310,7 @@ def _info(system: Any, address: str) -> Mapping[str, Any]:
     return info
 
 
-def _whole(address: Address, cat_ranges: Any, starts: list[int], ends: list[int]) -> list[bytes]:
+def _fetch_ranges(address: Address, cat_ranges: Any, starts: list[int], ends: list[int]) -> list[bytes]:
     parts: list[bytes] = cat_ranges([address.location] * len(starts), starts, ends, on_error="raise")
     for part, start, end in zip(parts, starts, ends, strict=True):
         if len(part) > end - start:
@@ -322,7 +322,7 @@ def _whole(address: Address, cat_ranges: Any, starts: list[int], ends: list[int]
     return parts
 
 
-def _persistently(address: Address, ask: Callable[[], Made]) -> Made:
+def _retry(address: Address, ask: Callable[[], Made]) -> Made:
     """What is asked for, after some tries: also of what is forbidden, as a busy store says now and then."""
     for wait_s in (*_WAITS_S, None):
         try:
@@ -333,12 +333,12 @@ def _persistently(address: Address, ask: Callable[[], Made]) -> Made:
             raise MissingError(f"there is no {address}: check its name, and that its store or server has it") from None
         except Exception as error:  # each of fsspec's libraries has its own
             if wait_s is None:
-                raise UnreachableError(f"{address}: {_told(error)}. Tried {len(_WAITS_S) + 1} times.") from error
+                raise UnreachableError(f"{address}: {_explanation(error)}. Tried {len(_WAITS_S) + 1} times.") from error
             time.sleep(wait_s)
     raise AssertionError
 
 
-def _told(error: Exception) -> str:
+def _explanation(error: Exception) -> str:
     if isinstance(error, PermissionError) or _status(error) in (401, 403):
         return "its store or server forbids to read it (403): check your credentials and its permissions"
     if isinstance(error, TimeoutError):
@@ -372,7 +372,7 @@ def _file_system(address: Address) -> Any:
         ) from None
 
 
-def _count(ranges: int, size: int) -> None:
+def _count_traffic(ranges: int, size: int) -> None:
     with _counting:
         TRAFFIC.ranges += ranges
         TRAFFIC.bytes += size

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from measure.errors import MeasurementError
 from measure.scans.cache import LostPart, OpenedPicture, SegmentCache, Segments
 from measure.scans.compression import earlier_step_dn
-from measure.scans.file_checks import first_bytes, no_picture
+from measure.scans.file_checks import first_bytes, no_picture_error
 from measure.scans.jpeg import JPEG_START, open_jpeg
 from measure.scans.metadata import Pitch, Samples
 from measure.scans.parallel import map_in_threads
@@ -113,7 +113,7 @@ class Scan:
         """Height and width of what the file has in one piece."""
         return self._segments.segment_height_px, self._segments.segment_width_px
 
-    def named(self, name: str) -> "Scan":
+    def with_name(self, name: str) -> "Scan":
         """The same under the name that a project has for it: files of several folders may be called alike."""
         scan = copy(self)
         scan.name = name
@@ -125,7 +125,7 @@ class Scan:
         scan.tone = tone
         return scan
 
-    def green(self) -> "Scan":
+    def green_channel(self) -> "Scan":
         """The same scan with its green for grey value, if it has colours. A lens draws red and blue at scales of their
         own, some 1e-4 off; a mark in a mixture of all has no one place."""
         scan = copy(self)
@@ -170,14 +170,14 @@ class Scan:
         cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
         in_rows = (rows >= 0) & (rows < self.height_px)
         known = np.asarray(in_rows[:, None] & (cols >= 0) & (cols < self.width_px))
-        for part in self._lost_of(col0, row0, width, height):
+        for part in self._window_losses(col0, row0, width, height):
             top, left = max(part.row0 - row0, 0), max(part.col0 - col0, 0)
             known[top : part.row0 + part.height - row0, left : part.col0 + part.width - col0] = False
         return known
 
     def loss_reason(self, col0: int, row0: int, width: int, height: int) -> str:
         """Why the file does not give some pixels of a window, a part of a sentence; empty where it gives all."""
-        return next((part.why for part in self._lost_of(col0, row0, width, height)), "")
+        return next((part.why for part in self._window_losses(col0, row0, width, height)), "")
 
     @property
     def lost(self) -> Sequence[LostPart]:
@@ -242,7 +242,7 @@ class Scan:
     ) -> None:
         self.close()
 
-    def _lost_of(self, col0: int, row0: int, width: int, height: int) -> list[LostPart]:
+    def _window_losses(self, col0: int, row0: int, width: int, height: int) -> list[LostPart]:
         """The parts of a window that the file does not give. What a file has in pieces is known once it is read."""
         if self._source is self._cache:
             self.samples(col0, row0, width, height)
@@ -349,17 +349,17 @@ def means(samples: Samples | Array, factor: int) -> Array:
     rows = max(_BAND_PIXELS // (width * factor), 1)
     for row in range(0, len(result), rows):
         band = samples[row * factor : (row + rows) * factor].astype(np.float32)
-        for step in _steps_of(factor):
+        for step in _reduction_steps(factor):
             size = band.shape[1] // step, band.shape[0] // step
             band = np.asarray(cv2.resize(band, size, interpolation=cv2.INTER_AREA), np.float32)
         result[row : row + rows] = band.reshape(-1, width // factor, channels)
     return result
 
 
-def _steps_of(factor: int) -> tuple[int, ...]:
+def _reduction_steps(factor: int) -> tuple[int, ...]:
     """Twos, which OpenCV averages fastest, and what is left."""
     if factor % 2 == 0:
-        return 2, *_steps_of(factor // 2)
+        return 2, *_reduction_steps(factor // 2)
     return (factor,) if factor > 1 else ()
 
 
@@ -392,7 +392,7 @@ def _opened_picture(path: Path, start: bytes, max_pixels: int | None) -> OpenedP
         return open_jpeg(path, max_pixels)
     if start.startswith(PNG_START):
         return open_png(path, max_pixels)
-    raise no_picture(path, start)
+    raise no_picture_error(path, start)
 
 
 def weighted(samples: Samples | Array, weights: Sequence[float]) -> Array:

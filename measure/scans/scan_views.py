@@ -27,8 +27,8 @@ def crop_scan(scan: Scan, window: Window) -> Scan:
         )
     pitch, segments = Pitch(scan.pitch_um, scan.pitch_note), WindowSegments(scan, window)
     opened = OpenedPicture(segments, pitch, scan.notes, scan.problems, orientation=scan.orientation)
-    seen = Scan(scan.path, segments, pitch, opened).named(scan.name)
-    return seen.with_tone(scan.tone)
+    view = Scan(scan.path, segments, pitch, opened).with_name(scan.name)
+    return view.with_tone(scan.tone)
 
 
 class WindowSegments:
@@ -51,7 +51,7 @@ class WindowSegments:
             for part in self._scan.lost
         )
 
-    def fetched(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
+    def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
         return {}
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:

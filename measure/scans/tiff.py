@@ -17,7 +17,7 @@ from tifffile import TiffFile, TiffPage
 
 from measure.errors import MeasurementError
 from measure.scans.cache import OpenedPicture, Segments
-from measure.scans.file_checks import DECODING_ERRORS, broken, check_size
+from measure.scans.file_checks import DECODING_ERRORS, check_size, damage_error
 from measure.scans.jpeg import rounding_step_dn
 from measure.scans.metadata import (
     JPEG_COMPRESSIONS,
@@ -25,7 +25,7 @@ from measure.scans.metadata import (
     Radiometry,
     exif_tags,
     orientation_notes,
-    orientation_of,
+    orientation_tag,
     page_radiometry,
     tag_pitch,
 )
@@ -234,7 +234,7 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
         taken = check_directories(path)
         file = tiff_file(path)
     except (BadDirectory, *DECODING_ERRORS) as error:
-        raise broken(path, str(error)) from error
+        raise damage_error(path, str(error)) from error
     try:
         page, problems = _main_page(file, path)
         _check_original(page, path)
@@ -244,12 +244,12 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
         kind = RawRows if _is_raw(page) else TiffSegments
         segments: Segments = kind(file, page, path, radiometry, _page_rounding_step_dn(file, page))
         overviews = _overviews(file, page, path) if isinstance(path, Address) else ()
-        orientation = orientation_of(page)
+        orientation = orientation_tag(page)
         notes = (*orientation_notes(orientation), *_band_notes(page, radiometry))
         return OpenedPicture(segments, tag_pitch(page), notes, problems, overviews, orientation)
     except DECODING_ERRORS as error:
         file.close()
-        raise broken(path, str(error)) from error
+        raise damage_error(path, str(error)) from error
     except BaseException:
         file.close()
         raise
@@ -259,7 +259,7 @@ def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
     """The page that the path names, or else the first one that is a picture; and what it leaves out."""
     pictures = _full_pictures(file)
     if not pictures:
-        raise broken(path, "it holds no picture")
+        raise damage_error(path, "it holds no picture")
     pages = ", ".join(map(str, pictures))
     if isinstance(path, ScanPart) and path.page:
         if path.page not in pictures:
@@ -270,8 +270,8 @@ def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
     first, page = next(iter(pictures.items()))
     if len(pictures) == 1:
         return page, ()
-    told = f"the file holds {len(pictures)} pictures of full size (pages {pages}), and page {first} was measured"
-    return page, (f"{told}: name those that are frames in images.csv, by the column page",)
+    message = f"the file holds {len(pictures)} pictures of full size (pages {pages}), and page {first} was measured"
+    return page, (f"{message}: name those that are frames in images.csv, by the column page",)
 
 
 def _full_pictures(file: TiffFile) -> dict[int, TiffPage]:
@@ -361,10 +361,10 @@ def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
     ]
     part = "tiles" if page.is_tiled else "strips"
     if not stored:
-        raise broken(path, "it says nowhere in the file where the picture's data are")
+        raise damage_error(path, "it says nowhere in the file where the picture's data are")
     missing = sum(end > size for _, end in stored)
     if missing:
-        raise broken(path, f"{missing} of {len(stored)} {part} lie beyond its end of {size} bytes")
+        raise damage_error(path, f"{missing} of {len(stored)} {part} lie beyond its end of {size} bytes")
     if page.compression != _UNCOMPRESSED:
         return
     starts, ends = np.array(sorted(set(stored))).T
@@ -373,14 +373,16 @@ def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
         beyond = int(np.searchsorted(ends, first, "right"))
         lies_over |= beyond < len(starts) and starts[beyond] < after
     if lies_over:
-        raise broken(path, f"its {part} lie over one another or over its tags")
+        raise damage_error(path, f"its {part} lie over one another or over its tags")
     if any(other.offset >= ends[-1] for other in page.parent.pages):
         return  # another picture's tags stand behind the pixels, where they are said to: nothing was put in before them
     with path.open("rb") as file:
         last = max(end for _, end in taken)
         file.seek(last)
         if any(file.read(_LOOKED_AT_BYTES)):
-            raise broken(path, f"its last {size - last} bytes belong to nothing, as if some had been put in before")
+            raise damage_error(
+                path, f"its last {size - last} bytes belong to nothing, as if some had been put in before"
+            )
 
 
 def _is_raw(page: TiffPage) -> bool:

@@ -12,8 +12,8 @@ from tifffile import TIFF, TiffFile, TiffPage
 from tifffile.tifffile import jpeg_decode_colorspace
 
 from measure.scans.cache import LostPart, Place
-from measure.scans.file_checks import DECODING_ERRORS, broken, unsupported
-from measure.scans.jpeg import decoded
+from measure.scans.file_checks import DECODING_ERRORS, damage_error, unsupported_error
+from measure.scans.jpeg import decode_checked
 from measure.scans.metadata import JPEG_COMPRESSIONS, Radiometry, Samples
 from measure.scans.remote import Address
 
@@ -45,11 +45,11 @@ class TiffSegments:
         self._lost: dict[tuple[int, int], LostPart] = {}
         wanted = self._planes * self._grid[0] * self._grid[1]
         if min(len(page.dataoffsets), len(page.databytecounts)) < wanted:
-            raise broken(path, f"{len(page.dataoffsets)} of {wanted} tiles or strips are listed")
+            raise damage_error(path, f"{len(page.dataoffsets)} of {wanted} tiles or strips are listed")
         if not (page.compression == _PLAIN or page.compression in TIFF.DECOMPRESSORS):
-            raise unsupported(path, f"compression {int(page.compression)}")
+            raise unsupported_error(path, f"compression {int(page.compression)}")
         if page.predictor not in (1, 2) and page.compression in (_PLAIN, *_INTO_MEMORY):
-            raise unsupported(path, f"predictor {int(page.predictor)}")
+            raise unsupported_error(path, f"predictor {int(page.predictor)}")
         if page.compression == _PLAIN:
             self._check_bytes()
 
@@ -61,14 +61,14 @@ class TiffSegments:
         stored = sum(count or tall * wide for count in self._page.databytecounts)
         padded = self._grid[1] * self._planes * self._grid[0] * tall * wide
         if not rows * wide <= stored < (rows + 1) * wide and stored != padded:
-            raise broken(self._path, f"its tiles or strips hold {stored} bytes, and should {rows * wide}")
+            raise damage_error(self._path, f"its tiles or strips hold {stored} bytes, and should {rows * wide}")
 
     @property
     def lost(self) -> Sequence[LostPart]:
         """The tiles and strips that could not be decoded."""
         return tuple(self._lost.values())
 
-    def fetched(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
+    def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
         """Of an address, by one request for all; a local file is read as each segment is decoded."""
         if self._address is None or not places:
             return {}
@@ -90,12 +90,12 @@ class TiffSegments:
         indices = self._indices(row, column)
         given: Sequence[bytes | None] = stored or [None] * len(indices)
         try:
-            planes = [self._decoded(*own, height, width) for own in zip(indices, given, strict=True)]
+            planes = [self._decode(*own, height, width) for own in zip(indices, given, strict=True)]
             samples = planes[0] if len(planes) == 1 else np.concatenate(planes, axis=-1)
             if samples.shape[0] < height or samples.shape[1] < width:
                 raise ValueError("it is cut short")
         except NotImplementedError as error:
-            raise unsupported(self._path, str(error)) from error
+            raise unsupported_error(self._path, str(error)) from error
         except DECODING_ERRORS as error:
             place = column * self.segment_width_px, row * self.segment_height_px
             part = "tile" if self._page.is_tiled else "strip"
@@ -104,24 +104,24 @@ class TiffSegments:
             return np.full((height, width, self.channels), self.full_scale_dn // 2, dtype)
         return self._radiometry.apply(samples[:height, :width])
 
-    def _decoded(self, index: int, given: bytes | None, height_px: int, width_px: int) -> NDArray[np.generic]:
+    def _decode(self, index: int, given: bytes | None, height_px: int, width_px: int) -> NDArray[np.generic]:
         """(height, width, samples) of the stored numbers, height_px by width_px or more of them; a tile that was left
         out of the file is all zeros. given: what is stored of it, None where it is still to be read. Raises one of
         DECODING_ERRORS."""
         page = self._page
         if not page.databytecounts[index]:
             return np.zeros((height_px, self.segment_width_px, self._samples), page.dtype)
-        data = self._stored(index) if given is None else given
+        data = self._stored_bytes(index) if given is None else given
         if page.compression in JPEG_COMPRESSIONS:
-            return self._of_jpeg(bytes(data), height_px, width_px)
+            return self._decode_jpeg(bytes(data), height_px, width_px)
         if page.compression == _PLAIN or page.compression in _INTO_MEMORY:
-            return self._of_bytes(data, height_px)
+            return self._decode_bytes(data, height_px)
         samples, _, _ = page.decode(bytes(data), index)
         if samples is None:
             raise ValueError("it holds nothing")
         return np.asarray(samples[0])
 
-    def _of_jpeg(self, data: bytes, height_px: int, width_px: int) -> NDArray[np.generic]:
+    def _decode_jpeg(self, data: bytes, height_px: int, width_px: int) -> NDArray[np.generic]:
         page = self._page
         colours = jpeg_decode_colorspace(page.photometric, page.planarconfig, page.extrasamples, page.is_jfif)
 
@@ -138,7 +138,7 @@ class TiffSegments:
                 )
             )
 
-        samples, damage = decoded(data, decode, page.jpegtables)
+        samples, damage = decode_checked(data, decode, page.jpegtables)
         if damage:
             raise ValueError(damage)
         right = (height_px, width_px), (self.segment_height_px, self.segment_width_px)
@@ -146,7 +146,7 @@ class TiffSegments:
             raise ValueError(f"it holds {samples.shape[1]} x {samples.shape[0]} px")
         return samples.reshape(*samples.shape[:2], self._samples)
 
-    def _of_bytes(self, data: bytes | memoryview, height_px: int) -> NDArray[np.generic]:
+    def _decode_bytes(self, data: bytes | memoryview, height_px: int) -> NDArray[np.generic]:
         """Of a tile or strip that holds rows of bytes. The last strip may be as tall as the others."""
         page = self._page
         if page.fillorder == 2:
@@ -163,9 +163,9 @@ class TiffSegments:
         if len(stored) not in right:
             more = "more" if len(stored) > full else len(stored)
             raise ValueError(f"it holds {more} bytes, and should {right[-1]}")
-        return self._unpacked(stored)
+        return self._unpack(stored)
 
-    def _unpacked(self, stored: NDArray[np.uint8]) -> NDArray[np.generic]:
+    def _unpack(self, stored: NDArray[np.uint8]) -> NDArray[np.generic]:
         """The numbers of whole rows, each of which begins with a byte of its own, as the machine has them."""
         page, shape = self._page, (-1, self.segment_width_px, self._samples)
         if page.bitspersample in (8, 16):
@@ -179,7 +179,7 @@ class TiffSegments:
             return np.asarray(numbers)
         return np.asarray(TIFF.UNPREDICTORS[page.predictor](numbers, axis=-2))
 
-    def _stored(self, index: int) -> bytes | memoryview:
+    def _stored_bytes(self, index: int) -> bytes | memoryview:
         """A tile or strip as the file has it: mapped where it is so large that a copy would take long, for a mapping
         takes longer than the copy of a small one."""
         offset, size = self._page.dataoffsets[index], self._page.databytecounts[index]
@@ -236,4 +236,4 @@ class RawRows(TiffSegments):
                 samples[:] = self._radiometry.apply(rows[:, col0 : col0 + width])
                 del rows
         except (ValueError, OSError) as error:
-            raise broken(self._path, f"rows {row0} to {row0 + height - 1} lie beyond its end") from error
+            raise damage_error(self._path, f"rows {row0} to {row0 + height - 1} lie beyond its end") from error

@@ -12,7 +12,7 @@ from adjust.problem.result import Adjustment
 from measure.fiducials.frame_checks import without_lost
 from measure.reason import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
-from measure.scans.remote import location_of, scan_path
+from measure.scans.remote import fetch_location, scan_path
 from measure.scans.scan import open_scan
 from measure.status import Status
 from measure.targets.measure_targets import TargetPrediction
@@ -57,7 +57,7 @@ def measure_again(
     field = _with_adjusted_points(target_field(project), adjustment)
     sought = {scan.frame.image: _missed(field, scan, adjustment, settings) for scan in scans}
     visits = [
-        Visit(scan.frame.image, location_of(scan.scan), missed, settings, project.max_pixels)
+        Visit(scan.frame.image, fetch_location(scan.scan), missed, settings, project.max_pixels)
         for scan in scans
         if (missed := sought[scan.frame.image])
     ]
@@ -76,7 +76,7 @@ def looked_again(visit: Visit) -> tuple[MarkMeasurement, ...] | str:
     """What is seen there of what is sought, or why the scan cannot be looked at: this raises nothing but interrupts."""
     try:
         with open_scan(scan_path(visit.scan), visit.max_pixels) as opened:
-            grey = opened if visit.settings.code is None else opened.green()
+            grey = opened if visit.settings.code is None else opened.green_channel()
             marks = without_lost(opened, measure_single_targets(grey, visit.sought, visit.settings))
     except Exception as error:
         return " ".join(str(error).split()) or type(error).__name__

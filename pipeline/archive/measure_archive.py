@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.remote import location_of
+from measure.scans.remote import fetch_location
 from pipeline.archive.cluster import cluster_executor
 from pipeline.archive.decision_check import tell_inapplicable
 from pipeline.archive.judging import judge_lots, latest
@@ -87,7 +87,7 @@ def executor_of(project: Project, options: WorkOptions) -> AbstractContextManage
     """What works on the project's scans: processes here, or the workers of a cluster."""
     if options.cluster is not None:
         return cluster_executor(
-            options.cluster, [location_of(path) for path in project.scans.values()], options.workers
+            options.cluster, [fetch_location(path) for path in project.scans.values()], options.workers
         )
     return worker_pool(len(project.scans), options.workers)
 

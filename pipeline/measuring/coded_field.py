@@ -32,7 +32,7 @@ def measure_coded_field(
     scan: Scan, points: CodedPoints, field: Field, camera: CameraFile, measured: MeasuredScan
 ) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
     """A mark for every point of the field, and what is to be said of the whole."""
-    scan = scan.green()
+    scan = scan.green_channel()
     found = coded_candidates(scan, points)
     numbers = read_numbers(scan, found, points, _is_mirrored(measured))
     read = points_read(numbers, points)

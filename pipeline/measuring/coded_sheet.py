@@ -26,7 +26,7 @@ _FOUND_WITHIN_PX = 2.0  # how far the fit may move from where the search has a d
 
 def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
     """A mark for every point of the sheet, and what is to be said of the whole."""
-    scan = scan.green()
+    scan = scan.green_channel()
     found = coded_candidates(scan, sheet)
     numbers = read_numbers(scan, found, sheet)
     coded, notes = named_by_code(points_read(numbers, sheet), sheet)

@@ -18,7 +18,7 @@ from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.measurement import measure_fiducials
 from measure.marks import shapes
 from measure.marks.poses import POSES, up_from_camera
-from measure.scans.parallel import mapped
+from measure.scans.parallel import map_items
 from measure.scans.scan import Scan
 from measure.special_marks.learned import cut, template_of
 from measure.special_marks.recurring import Recurrence, Window, about, recurrence
@@ -109,7 +109,7 @@ def _in_common(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor 
             '"..." and a table [clicks.px] of column and row by fiducial.'
         )
     compared = [tasks[round(k)] for k in np.linspace(0, len(tasks) - 1, min(len(tasks), _COMPARED))]
-    views = list(mapped(workers, _view, compared))
+    views = list(map_items(workers, _view, compared))
     seen = [(task, view) for task, view in zip(compared, views, strict=True) if view is not None]
     if len(seen) < 2:
         raise MeasurementError(f"{camera.path}: {_NOT_COMMON} the drawn marks were found in {len(seen)} of its scans.")
@@ -117,7 +117,7 @@ def _in_common(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor 
         (seen[0][1].windows[one.id], [view.windows[one.id] for _, view in seen[1:]], one.learned_mm)
         for one in camera.learned
     ]
-    found = list(mapped(workers, _recurrence, jobs))
+    found = list(map_items(workers, _recurrence, jobs))
     lost = [one.id for one, each in zip(camera.learned, found, strict=True) if each.excess < _LEAST_EXCESS]
     if lost:
         raise MeasurementError(

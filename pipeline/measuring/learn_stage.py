@@ -16,7 +16,7 @@ import numpy as np
 from measure.marks.shapes import LearnedMark, Mark, MarkTemplate
 from measure.results import FrameMeasurement
 from measure.revision import MEASURE_REVISION
-from measure.scans.parallel import mapped
+from measure.scans.parallel import map_items
 from measure.special_marks.learned import Chip, cut, template_of
 from measure.special_marks.symmetry import with_common_origins
 from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
@@ -149,7 +149,7 @@ def _chips(
     frames = {scan.frame.image: scan.frame for scan in measure(tasks)}
     named = [(task, frames[task.name]) for task in tasks if _is_named(frames[task.name], start)]
     chips = dict[str, list[Chip]]()
-    for of_scan in mapped(workers, partial(_chips_of, learned), named):
+    for of_scan in map_items(workers, partial(_chips_of, learned), named):
         for id, chip in of_scan.items():
             chips.setdefault(id, []).append(chip)
     return chips, {rival for frame in frames.values() if frame.pose for rival in frame.pose.rivals}
@@ -183,7 +183,7 @@ def _averaged(
     start: CameraFile, learned: Sequence[GivenFiducial], chips: Mapping[str, list[Chip]], workers: Executor | None
 ) -> CameraFile:
     found = [one for one in learned if one.id in chips]
-    templates = mapped(workers, _template, [(chips[one.id], one.learned_mm) for one in found])
+    templates = map_items(workers, _template, [(chips[one.id], one.learned_mm) for one in found])
     mean = {one.id: template for one, template in zip(found, templates, strict=True)}
     camera = replace(start, fiducials=tuple(replace(one, mark=mean.get(one.id, one.mark)) for one in start.fiducials))
     alike = {pose for one in start.fiducials if isinstance(one.mark, MarkTemplate) for pose in one.mark.alike}

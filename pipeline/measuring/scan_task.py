@@ -13,7 +13,7 @@ from measure.annotations.line import KnownLine
 from measure.errors import MissingError
 from measure.fiducial_options import FiducialOptions
 from measure.results import Pose
-from measure.scans.remote import location_of, public_address, scan_path
+from measure.scans.remote import fetch_location, public_address, scan_path
 from measure.tone.curve import ToneInformation
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -85,7 +85,7 @@ class ScanTask:
             raise MissingError(_NO_SCAN)
         from measure.scans.scan import open_scan
 
-        return open_scan(scan_path(self.scan), self.max_pixels).named(self.name)
+        return open_scan(scan_path(self.scan), self.max_pixels).with_name(self.name)
 
     def posed(self, pose: str) -> "ScanTask":
         """The same scan in a pose that is known, nothing read in it."""
@@ -110,7 +110,7 @@ def scan_tasks(
     options = options_of(project, said or {})
     scans = {name: project.scans.get(name) for name in names}
     return tuple(
-        ScanTask(name, "" if scan is None else location_of(scan), options(name), project.max_pixels)
+        ScanTask(name, "" if scan is None else fetch_location(scan), options(name), project.max_pixels)
         for name, scan in scans.items()
     )
 

@@ -9,7 +9,7 @@ from itertools import chain
 from typing import Any
 
 from measure.marks.poses import POSES
-from measure.scans.remote import location_of
+from measure.scans.remote import fetch_location
 from pipeline.archive.store import Store
 from pipeline.errors import InputError
 from pipeline.files.decisions_file import LEARNED, Choice, Decision, append_decisions
@@ -180,7 +180,7 @@ class Session:
     def scan_of(self, image: str) -> str:
         """The path or the address of its file. Raises KeyError where no such image is known."""
         given = self.project.scans.get(image)
-        return self.looking.at(image).scan.scan if given is None else location_of(given)
+        return self.looking.at(image).scan.scan if given is None else fetch_location(given)
 
     def decided_in(self, image: str) -> list[Json]:
         """All that stands decided in a frame."""

@@ -91,10 +91,10 @@ def test_green_alone_is_the_grey_value_of_a_scan_asked_for_it() -> None:
     colours = np.random.default_rng(8).integers(0, 65535, (20, 30, 3)).astype(np.uint16)
     scan = Scan(Path("colours.tif"), WholePicture(colours), NO_TAGS)
     before = scan.window(2, 3, 10, 8)
-    np.testing.assert_array_equal(scan.green().window(2, 3, 10, 8), colours[3:11, 2:12, 1])
+    np.testing.assert_array_equal(scan.green_channel().window(2, 3, 10, 8), colours[3:11, 2:12, 1])
     np.testing.assert_array_equal(scan.window(2, 3, 10, 8), before)
     grey = scan_of(colours[..., 0].astype(float))
-    np.testing.assert_array_equal(grey.green().window(0, 0, 30, 20), colours[..., 0])
+    np.testing.assert_array_equal(grey.green_channel().window(0, 0, 30, 20), colours[..., 0])
 
 
 def test_the_published_choice_of_numbers() -> None:

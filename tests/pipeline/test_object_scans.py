@@ -181,7 +181,7 @@ def test_credentials_and_signatures_are_used_and_told_nowhere(
 )
 def test_what_is_shown_of_an_address(address: str, shown: str) -> None:
     assert remote.public_address(address) == shown
-    assert remote.location_of(remote.scan_path(address)) == (address if "://" in address else shown)
+    assert remote.fetch_location(remote.scan_path(address)) == (address if "://" in address else shown)
 
 
 def test_scans_that_a_query_tells_apart_are_two() -> None:
