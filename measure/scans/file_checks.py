@@ -3,13 +3,9 @@
 import struct
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from tifffile import TiffFileError
 
 from measure.errors import MeasurementError, MissingError, TooLargeError
-
-Array = NDArray[np.float32]
 
 # What libraries raise of a file that is not as it should be.
 DECODING_ERRORS = (
