@@ -31,7 +31,8 @@ def pitch_problem(
     """
     found = {mark.point for mark in frame.marks if mark.kind == "fiducial" and mark.status.is_observation}
     marks = [mark for mark in layout.marks if mark.id in found]
-    if frame.pixel_from_camera is None or len(marks) < _LEAST_MARKS:
+    is_told = any(Code.PITCH in problem.codes for problem in frame.problems)  # of pixels longer one way
+    if frame.pixel_from_camera is None or len(marks) < _LEAST_MARKS or is_told:
         return None
     seen_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film mm for each pixel, across and down
     places = np.array([mark.xy_mm for mark in marks])

@@ -69,7 +69,7 @@ def present_frame(
         marks = tuple(
             replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
         )
-    problems = (*problems, *_problems(frame, pitch_um))
+    problems = (*problems, *_problems(scan, frame, pitch_um))
     return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, frame.tone)
 
 
@@ -86,22 +86,35 @@ def _predicted_frame(scan: Scan, layout: FiducialLayout, frame: Frame, why: Reas
     return FrameMeasurement(scan.name, marks, weights=frame.weights)
 
 
-def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
+def _problems(scan: Scan, frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
     """What the user should look at in the frame itself."""
     problems = []
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
     given = pitch_um or (1.0, 1.0)
     if abs(per_mm[0] * given[0] / (per_mm[1] * given[1]) - 1) > 2 * AFFINITY_SIGMA:
-        told = (
-            f"by the marks a pixel is {1000 / per_mm[0]:.1f} um wide and {1000 / per_mm[1]:.1f} um tall: film is never "
-            "stretched so much. Look whether the scanner, or the camera file, is to blame."
-        )
+        told = _stretch(scan, 1000 / per_mm[0], 1000 / per_mm[1], pitch_um)
         problems.append(Reason(told, Code.PITCH))
     used = int(frame.belongs.sum())
     if used <= 3:
         told = f"an affine transformation on {used} fiducials has no redundancy: no check."
         problems.append(Reason(told, Code.NO_CHECK))
     return problems
+
+
+def _stretch(scan: Scan, wide_um: float, tall_um: float, pitch_um: tuple[float, float] | None) -> str:
+    """A sentence on pixels that are longer one way than they are given, with who gives them so."""
+    if pitch_um is None:
+        given, cause = "no pitch is given, so that pixels are taken as square", "pixels that are not square"
+    elif pitch_um == scan.pitch_um:
+        given = f"the file's resolution tags say {pitch_um[0]:.1f} x {pitch_um[1]:.1f} µm"
+        cause = "wrong resolution tags"
+    else:
+        given, cause = f"{pitch_um[0]:.1f} x {pitch_um[1]:.1f} µm is given", "a wrong pitch"
+    return (
+        f"by the marks a pixel is {wide_um:.1f} µm wide and {tall_um:.1f} µm tall, but {given}: film is never "
+        f"stretched so much. The likely cause is {cause}: set pitch_um = [{wide_um:.2f}, {tall_um:.2f}] in the "
+        "project. If a pixel is as given, look at the scanner and at the coordinates in the camera file."
+    )
 
 
 def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasurement:

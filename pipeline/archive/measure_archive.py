@@ -26,7 +26,7 @@ from pipeline.measuring.scan_task import scan_tasks
 from pipeline.measuring.tied import tied
 from pipeline.measuring.tone_stage import said_of_tones
 from pipeline.progress import Reporter
-from pipeline.text.wording import counted
+from pipeline.text.wording import counted, gathered
 from pipeline.workers import worker_pool
 
 
@@ -96,4 +96,4 @@ def _check_any(store: Store) -> None:
     """Raises MeasurementError where no scan at all could be measured, with all that was said of them."""
     failures = store.failures()
     if failures is not None:
-        raise MeasurementError("\n".join(dict.fromkeys(failures)))
+        raise MeasurementError("\n".join(gathered(failures)))

@@ -190,17 +190,18 @@ class Store:
             self._db.execute(seal("scan"))
             return self._db.execute(f"delete from result where id in ({failed})").rowcount
 
-    def failures(self) -> list[str] | None:
-        """Of every scan of the project why it failed; None where one was measured."""
+    def failures(self) -> list[tuple[str, str, str]] | None:
+        """Of every scan of the project its name, its file and why it failed; None where one was measured."""
         rows = self._db.execute(
-            "select verdict, detail from scan join result on result.id = scan.result where is_current "
+            "select verdict, name, detail from scan join result on result.id = scan.result where is_current "
             f"order by verdict = '{Verdict.FAILED}', name"
         )
         failures = []
-        for verdict, detail in rows:
+        for verdict, name, detail in rows:
             if verdict != Verdict.FAILED:
                 return None
-            failures.append(str(json.loads(detail)["failure"]["sentence"]))
+            record = json.loads(detail)
+            failures.append((str(name), str(record["scan"]), str(record["failure"]["sentence"])))
         return failures
 
     # --- the content of whole files

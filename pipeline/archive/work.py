@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import lru_cache
@@ -25,6 +26,7 @@ from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 from pipeline.results.measured_record import record_of, scan_of
 from pipeline.results.measured_scan import MeasuredScan
+from pipeline.text.wording import counted, listed, without_file
 
 _SAID_EVERY_S = 30.0
 _hash_of = lru_cache(maxsize=4096)(options_hash)
@@ -73,12 +75,14 @@ class Work:
         known = {task.name: row for task in tasks if (row := self._row(task)) is not None}
         missing = [task for task in tasks if task.name not in known]
         self.results |= known
-        earlier = sum(row not in self._now for row in known.values())
+        now = sum(row in self._now for row in known.values())  # for what they tell the others
+        earlier = len(known) - now
         self._store.set_current({row: self._asked(name) for name, row in known.items()})
         if earlier or len(missing) > 1:
-            reporter.say(f"{earlier} of {len(tasks)} scans are measured already; {len(missing)} to measure")
+            before = f", {now} more in the steps before" if now else ""
+            reporter.say(f"{earlier} of {len(tasks)} scans are measured already{before}; {len(missing)} to measure")
         if missing:
-            self._complete(missing, reporter)
+            self._complete(missing, len(tasks), reporter)
 
     def read(self, name: str) -> MeasuredScan:
         """What was asked for last of an image, without the marks that are none by decision."""
@@ -127,23 +131,31 @@ class Work:
             self._states[task.scan] = state_of(task, self._files)
         return self._states[task.scan]
 
-    def _complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
+    def _complete(self, tasks: Sequence[ScanTask], scans: int, reporter: Reporter) -> None:
+        """Measure these, the last of so many scans: those that are measured already count as done."""
         cameras = [self._project.camera_of(task.name).path.stem for task in tasks]
         expected = ExpectedTime(tasks, cameras, self._at_a_time)
-        said_s, failed = time.monotonic(), list[str]()
+        said_s, failed = time.monotonic(), defaultdict[str, list[str]](list)
         with reporter.stage("measured") as count:
             for done, (task, row, kept) in enumerate(self._measured(tasks, as_scans=True), 1):
+                measured = scans - len(tasks) + done
                 self.results[task.name] = row
                 expected.is_done(task.name, kept.seconds, kept.bytes_read)
                 if kept.record["failure"]:
-                    failed.append(task.name)
-                    reporter.say(f"failed: {task.name}: {kept.record['failure']['sentence']}")
-                left = f"{done} of {len(tasks)}{f', {len(failed)} failed' if failed else ''}"
-                count(left if reporter.is_terminal or len(tasks) <= TASKS_A_CORE else "", done, len(tasks))
+                    same = without_file(kept.record["failure"]["sentence"], task.shown_scan)
+                    if same not in failed:  # that of many others would be the same
+                        reporter.say(f"failed: {task.name}: {same}")
+                    failed[same].append(task.name)
+                failures = sum(map(len, failed.values()))
+                left = f"{measured} of {scans}{f', {failures} failed' if failures else ''}"
+                count(left if reporter.is_terminal or len(tasks) <= TASKS_A_CORE else "", measured, scans)
                 now_s = time.monotonic()
                 if done < len(tasks) and (done == self._at_a_time or now_s - said_s > _SAID_EVERY_S):
                     said_s = now_s
                     reporter.say(f"{left}; {expected.sentence}")
+        for first, *others in failed.values():
+            if others:
+                reporter.say(f"failed as {first} did: {counted(len(others), 'scan')} more, {listed(others)}")
 
     def _decided(self, task: ScanTask) -> ScanTask:
         """The task as decisions about its scan have it."""

@@ -158,8 +158,8 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
     pitch, layout = options.pitch_um or scan.pitch_um, options.camera.layout()
     if pitch is None and options.fiducials.part:
         raise InputError(
-            f"pitch_um is missing in the project, and {scan.path.name} does not say it ({scan.pitch_note}). A scan of "
-            "a part of a frame needs it, for its size says nothing of the pitch."
+            f"{scan.path}: pitch_um is missing in the project, and {scan.pitch_note}. A scan of a part of a frame "
+            "needs it, for its size says nothing of the pitch."
         )
     measured = measure_fiducials(scan, layout, pitch, options.fiducials)
     second = second_frame(scan, layout, measured, options.fiducials)
@@ -222,6 +222,6 @@ def _pitch(
         note = f"The pitch is not known ({scan.pitch_note}); {pitch:.1f} um is taken, as if the frame filled the scan."
         return (pitch, pitch), (Reason(note, Code.PITCH),), ()
     raise InputError(
-        f"pitch_um is missing in the project, and {scan.path.name} does not say it ({scan.pitch_note}). Give the size "
-        "of a pixel in um; for a digital camera that of the sensor's, or any, with the principal distance to match."
+        f"{scan.path}: pitch_um is missing in the project, and {scan.pitch_note}. Give the size of a "
+        "pixel in µm; for a digital camera that of the sensor's, or any, with the principal distance to match."
     )

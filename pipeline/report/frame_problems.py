@@ -8,7 +8,7 @@ from pipeline.report.data import Problem
 from pipeline.report.fractions import Array, fraction_test
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
-from pipeline.text.wording import LISTED, counted, listed
+from pipeline.text.wording import LISTED, counted, listed, without_file
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -69,7 +69,9 @@ def _problems_of(frame: Frame) -> Iterator[Problem]:
     measured = frame.scan.frame if frame.scan else None
     pose = measured.pose if measured else None
     said = pose.evidence if pose and not pose.decided else ()
-    yield from (Problem(problem) for problem in (measured.problems if measured else ()) if problem not in said)
+    for problem in measured.problems if measured else ():
+        if problem not in said:
+            yield Problem(without_file(problem, frame.scan.scan) if frame.scan else problem)
     lost = [mark for mark in frame.marks if mark.is_fiducial and mark.is_open]
     found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
     if lost and (found or pose):  # a frame that was not found at all has said so

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from brute_marks import written_scan
 from drawn_frames import (
     ALIKE,
@@ -20,11 +21,13 @@ from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials.constellation import NARROW, Placement
+from measure.fiducials.frame_checks import pitch_problem
 from measure.fiducials.hypotheses import PitchHypothesis, slightly_longer
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.stages import _pitch_to_try
 from measure.marks.shapes import MarkShape
+from measure.scans.scan import open_scan
 
 AERIAL = ((106.0, -106.0), (-106.0, -106.0), (-106.0, 106.0), (106.0, 106.0))
 # A frame of 14 mm with a hundredth of the usual tolerances bends as little as one of 140 mm.
@@ -36,7 +39,28 @@ def test_pixels_longer_one_way_are_found_out(tmp_path: Path) -> None:
     matrix[:, :2] = np.diag([1.012, 0.988]) @ matrix[:, :2]
     result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, STIFF)
     assert_right(result, ALIKE, matrix)
-    assert any("film is never stretched so much" in problem for problem in result.problems)
+    (stretched,) = [problem for problem in result.problems if "film is never stretched so much" in problem]
+    assert "a pixel is 49.4 µm wide and 50.6 µm tall, but 50.0 x 50.0 µm is given" in stretched  # 50 / 1.012, / 0.988
+
+
+def test_wrong_resolution_tags_are_named_with_the_pitch_of_the_marks(tmp_path: Path) -> None:
+    """Tags that say pixels of 50 x 50 µm, and of 50 x 52 µm, where they are of 50 x 51 µm."""
+    matrix = pixel_from_camera("0", turn_rad=0.0)
+    matrix[:, :2] = np.diag([1.0, 50 / 51]) @ matrix[:, :2]
+    stored = np.clip(np.rint(frame_picture(ALIKE, matrix)), 0, 65535).astype(np.uint16)
+    for down_um in (50.0, 52.0):
+        density = (10000 / 50.0, 10000 / down_um)
+        tifffile.imwrite(tmp_path / "tags.tif", stored, resolution=density, resolutionunit="CENTIMETER")
+        with open_scan(tmp_path / "tags.tif") as scan:
+            pitch_um = scan.pitch_um
+            assert pitch_um is not None
+            result = measure_fiducials(scan, ALIKE, pitch_um, STIFF)
+        (problem,) = [problem for problem in result.problems if "stretched so much" in problem]
+        assert f"the file's resolution tags say 50.0 x {down_um:.1f} µm" in problem
+        assert "The likely cause is wrong resolution tags: set pitch_um = [" in problem
+        wide, tall = map(float, problem.partition("pitch_um = [")[2].partition("]")[0].split(","))
+        assert (wide, tall) == pytest.approx((50.0, 51.0), abs=0.1)
+        assert pitch_problem(result, ALIKE, pitch_um, "the scan's file") is None  # once is enough
 
 
 def test_pixels_given_as_longer_one_way_need_no_look(tmp_path: Path) -> None:

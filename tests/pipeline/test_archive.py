@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
@@ -442,3 +443,24 @@ def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, caps
     (folder / "a.tif").unlink()
     measure(folder)
     assert measured == ["d"]
+
+
+def test_scans_that_fail_alike_are_told_once_and_all_scans_are_counted(tmp_path: Path, capsys: SAID) -> None:
+    """No pitch in project and files: one sentence with the number and the names, not one a scan."""
+    (tmp_path / "camera.toml").write_text('name = "c"\nprincipal_distance_mm = 10.0\n', encoding="utf-8")
+    (tmp_path / "points.csv").write_text("point,X,Y,Z\n1,0,0,0\n2,9,0,0\n3,0,9,0\n4,9,9,1\n", encoding="utf-8")
+    for number in range(6):
+        pixels = np.full((40, 40), 90 + number, np.uint8)
+        tifffile.imwrite(tmp_path / f"s{number}.tif", pixels, metadata=None)
+    (tmp_path / "project.toml").write_text(
+        'camera = "camera.toml"\nscans = ["*.tif"]\n[object]\npoints = "points.csv"\n'
+        '[targets]\nkind = "disk"\ndiameter_mm = 1.0\n[adjust]\ntransformation = "none"\n',
+        encoding="utf-8",
+    )
+    assert run(["measure", str(tmp_path / "project.toml")]) == 2
+    said = capsys.readouterr().err
+    (last,) = [line for line in said.splitlines() if line.startswith("reseau: ")]
+    assert last.startswith("reseau: 6 scans (s0, s1, s2, s3, s4, s5): pitch_um is missing in the project, and the file")
+    assert said.count("pitch_um is missing") == 2  # at the first that fails, and at the end
+    assert re.findall(r"measured (\d) of 6", said)[-1] == "6"
+    assert "1 of 1" not in said
