@@ -60,9 +60,6 @@ LINES = (
     Broken("measure/matching/covariance.py", " @ turning) / 2", " @ turning)", "measure/test_second_order.py"),
     Broken("measure/matching/saturation.py", "sides * sigma_dn * size", "sides * size", "measure/test_clipping.py"),
     Broken(
-        "measure/matching/rounding.py", "- 0.5) / sigma\n    log", "- 0.4) / sigma\n    log", "measure/test_rounding.py"
-    ),
-    Broken(
         "measure/matching/covariance.py",
         "2 * slopes[0] * slopes[1]",
         "slopes[0] * slopes[1]",

@@ -56,7 +56,6 @@ STAGES: dict[str, list[tuple[Any, str]]] = {
     "search: constellation": [(FrameSearch, "_placements")],
     "first looks": [(measure.fiducials.mark_fit, "seen")],
     "picture fits": [(measure.matching.match, "_fitted")],
-    "borders of the ground": [(measure.matching.match, "_with_border")],
     "weights of grain": [(PictureFit, "weigh")],
     "other causes, second places, checks of a mark": [(measure.matching.match, "_result")],
     "pose": [(measure.fiducials.stages, "named"), (measure.fiducials.measurement, "named")],

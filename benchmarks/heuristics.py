@@ -16,35 +16,18 @@ import numpy as np
 from dusty_marks import frame_of_disks
 from faint_marks import drawn_frame, measured_faint
 from large_networks import strip
-from measured_marks import CONTRAST, GROUND, measured, start_off
 from numpy.typing import NDArray
-from true_marks import KIND, Border, over_border, some_mark
+from true_marks import KIND
 
 import measure.fiducials.measure_frame as frame_measurement
-import measure.matching.match as matching
 import measure.targets.measure_targets as targets
 from adjust.linear_algebra import fronts
 from adjust.solution.adjustment import adjust
-from measure.matching.fit import PictureFit
 from measure.reason import NO_REASON
 
 Array = NDArray[np.float64]
 
 SEED, SNR, LARGE_PX = 5, 20.0, 0.5
-
-
-def borders(count: int) -> str:
-    """Marks over an edge of the ground of 0.8 of their contrast: rms error, and how many were flagged or lost."""
-    rng, errors, lost = np.random.default_rng(SEED), [], 0
-    for _number in range(count):
-        mark, sign = some_mark(KIND["ring-cross"], 1.0, rng), int(rng.choice((-1, 1)))
-        border = Border(rng.uniform(-8, 8), rng.uniform(-np.pi, np.pi), rng.uniform(-0.01, 0.01))
-        light = over_border(mark, 0.8 * int(rng.choice((-1, 1))), border, False, sign)
-        noise = rng.standard_normal(light.shape) / SNR
-        found = measured(mark, GROUND + CONTRAST * (1 + light + noise), rng, off=start_off(mark, rng))
-        lost += found is None or bool(found.flagged)
-        errors += [] if found is None or found.flagged else [found.center_px - mark.place[:, 2]]
-    return f"{_rms(errors)} px, {lost} of {count} not measured"
 
 
 def faint(count: int) -> str:
@@ -68,17 +51,6 @@ def dusty_disks(count: int) -> str:
             wrong += not each.flagged and float(np.hypot(*each.error_px)) > LARGE_PX
             doubted += each.flagged and dust == 0.0
     return f"{wrong} of {of} wrong and called measured, {doubted} clean ones doubted"
-
-
-def rounding(count: int) -> str:
-    """Marks of ten grey values' contrast, with less noise than a step: rms error."""
-    rng, errors = np.random.default_rng(SEED), []
-    for _number in range(count):
-        mark = some_mark(KIND["ring-cross"], 1.0, rng)
-        grey = np.rint(60 + 10 * mark.picture + 0.1 * rng.standard_normal(mark.picture.shape))
-        found = measured(mark, grey, rng, 255, off=start_off(mark, rng))
-        errors += [] if found is None or found.flagged else [found.center_px - mark.place[:, 2]]
-    return f"{_rms(errors)} px, {count - len(errors)} not measured"
 
 
 def one_front(count: int) -> str:
@@ -110,10 +82,8 @@ def _lone(disks: Sequence[Any], _predicted: Sequence[Array]) -> list[Any]:
 
 Study = Callable[[int], str]
 SWITCHED: dict[str, tuple[Study, Any, str, Any]] = {
-    "borders of the ground": (borders, matching, "_with_border", lambda _given, _part, fit: fit),
     "faint marks": (faint, frame_measurement, "look_for_faint", lambda _sighter, _reach_px: None),
     "dusty disks": (dusty_disks, targets, "doubts", _lone),
-    "rounding": (rounding, PictureFit, "unround", lambda _self: None),
     "fronts": (one_front, fronts, "FRONT_COST", 1e30),
 }
 

@@ -26,12 +26,10 @@ from numpy.typing import NDArray
 from true_marks import (
     KIND,
     KINDS,
-    Border,
     Kind,
     TrueMark,
     grain_correlation,
     grainy,
-    over_border,
     some_mark,
     whitened_rms,
 )
@@ -41,7 +39,6 @@ from measure.scans.jpeg import rounding_step_dn
 Array = NDArray[np.float64]
 
 SNRS, BLURS_PX = (5.0, 10.0, 20.0, 50.0, 100.0), (0.6, 1.0, 1.6, 2.5)
-BORDER_SNR, BORDER_STEPS, BORDER_PX, MOST_BENT = 20.0, (0.5, 0.8), 12.0, 0.01
 SEED = 20
 POOL, FEW = 50, 3  # different marks in a cell; where the bound of each takes seconds
 GRAINS_PX, GRAIN_SNR = (0.7, 1.0, 1.5), 20.0
@@ -224,39 +221,6 @@ def compressed(grey: Array, quality: int, rng: np.random.Generator) -> tuple[Arr
     return whole[top : top + grey.shape[0], left : left + grey.shape[1]], rounding_step_dn(data.tobytes())
 
 
-def borders(kinds: Sequence[Kind], count: int) -> None:
-    """A border of the ground, within 12 px of the window's middle, under marks through which it shines or not."""
-    print(f"\na border of the ground at SNR {BORDER_SNR:g}, blur 1; its step in contrasts:")
-    print("rms in px, realised / claimed, the worst, each over its claim; -n: lost")
-    cells = [(opaque, step) for opaque in (False, True) for step in BORDER_STEPS]
-    names = [f"{'opaque' if opaque else 'seen through'} {step:g}" for opaque, step in cells]
-    print(f"{'':14}" + "".join(f"{name:>26}" for name in names))
-
-    def row(kind: Kind) -> str:
-        words = []
-        for opaque, step in cells:
-            rng = np.random.default_rng([SEED, KINDS.index(kind), int(10 * step), 12])
-            errors, covariances = [], []
-            for _ in range(count):
-                mark, sign = some_mark(kind, 1.0, rng), int(rng.choice((-1, 1)))
-                bend = rng.uniform(-MOST_BENT, MOST_BENT)
-                border = Border(rng.uniform(-BORDER_PX, BORDER_PX), rng.uniform(-np.pi, np.pi), bend)
-                light = over_border(mark, int(rng.choice((-1, 1))) * step, border, opaque, sign)
-                noise = rng.standard_normal(light.shape) / BORDER_SNR
-                found = measured(mark, GROUND + CONTRAST * (1 + light + noise), rng, off=start_off(mark, rng))
-                if found is not None and not found.flagged:
-                    errors.append(found.center_px - mark.place[:, 2])
-                    covariances.append(found.covariance_px2)
-            each = [whitened_rms([error], [covariance]) for error, covariance in zip(errors, covariances, strict=True)]
-            lost = f"-{count - len(errors)}" if len(errors) < count else ""
-            rms = np.sqrt(np.mean(np.square(errors)))
-            words.append(f"{rms:8.4f} {whitened_rms(errors, covariances):6.2f} {max(each):6.1f}{lost:<4}")
-        return f"{kind.name:14}" + "".join(f"{each:>26}" for each in words)
-
-    for kind in kinds:
-        ROWS.print(f"borders {count} {kind.name}", partial(row, kind))
-
-
 def unlike_drawing(kinds: Sequence[Kind], count: int) -> None:
     """By how much the cause `unlike drawing` makes claims larger under noise alone, where there is none."""
     print(
@@ -299,7 +263,6 @@ STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
     "grain": grain,
     "clipping": clipping,
     "jpeg": jpeg,
-    "borders": borders,
     "unlike": unlike_drawing,
 }
 

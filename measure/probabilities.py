@@ -75,9 +75,6 @@ FALSE_DOUBT = _limit(
 RIGHT_PITCH_REFUSED = _limit(0.01, "calling a right pitch wrong", "the frame has a problem")
 
 # What a fit believes of its window.
-BORDER_FEIGNED = _limit(  # the luckiest of some hundred borders, in one of many million marks
-    1e-12, "noise feigning a border of the ground", "the mark is fitted with a border"
-)
 NATURAL_END = _limit(  # there are many windows
     1e-6, "grey values heaping up so at an end by nature", "they count as clipped"
 )

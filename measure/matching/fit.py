@@ -9,13 +9,6 @@ from numpy.typing import NDArray
 from measure.marks.rendering import chip_mask, picture, true
 from measure.marks.shapes import MarkTemplate
 from measure.matching.models import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel
-from measure.matching.rounding import (
-    COARSEST_VARIANCE,
-    ROUNDING_VARIANCE,
-    likely_sigma,
-    unrounded,
-    unrounded_variance,
-)
 from measure.matching.saturation import noise_scale
 from measure.matching.window import Coding
 from measure.noise.damage import damage, damage_where_lossy, grown
@@ -34,7 +27,7 @@ _AREA_PX = 0.5  # of the margin: by so much an area may be another one
 _DAMAGE_SIGMAS = 3.2  # of smoothed residuals: one pixel in seven hundred of a window without damage goes beyond
 _PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
 _LEAST_VARIANCE_DN2 = 1e-12
-_UNROUNDED_PX, _MOST_UNROUNDED = 0.0001, 30  # a move by other grey values that needs no further ones; how often
+_ROUNDING_VARIANCE = 1 / 12  # of evenly spread light less the number it is rounded to, in steps
 _WEIGHTED_STEPS = 4  # by the grain's weights: the place is nearly right before
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # a last step that needs no further one; the longest that may be the last
 _UNSETTLED = Reason("the adjustment did not converge", Code.NO_FIT)
@@ -48,16 +41,15 @@ EDGE_BLURS = 3.0  # from the frame's border, in which a mark ends: a thousandth 
 
 class PictureFit:
     """The fit in progress. area: the pixels about the mark that are there; used: those of them that are undamaged;
-    least_variance_dn2: what a grey value's noise is at least, by its rounding; rounding_variance_dn2: what of it that
-    makes; reason: why it failed. is_lossy: whether
-    the picture was compressed with loss; coding: how its light was stored."""
+    reason: why it failed. is_lossy: whether the picture was compressed with loss; coding: how its light was
+    stored."""
 
     def __init__(self, model: PictureModel, usable: Mask, is_lossy: bool, coding: Coding) -> None:
         self.model, self.usable, self.is_lossy, self.coding = model, usable, is_lossy, coding
         self.options = model.options
         self.area = self.used = usable
         self.far = np.zeros_like(usable)
-        self.variance_dn2, self.least_variance_dn2, self.rounding_variance_dn2 = 1.0, 0.0, 0.0
+        self.variance_dn2 = 1.0
         self.reason = NO_REASON
 
     def approach(self) -> None:
@@ -76,14 +68,6 @@ class PictureFit:
         if not self.reason:
             self._steady()
             self._adjust(robust=True, tolerance_px=0.05)
-
-    def approach_from_near(self) -> None:
-        """Plain, from a state that is right but for what is new in the model."""
-        self.choose_area()
-        if not self.reason:
-            self._adjust(robust=False, tolerance_px=0.05)
-        if self.reason == _UNSETTLED:
-            self.reason = NO_REASON
 
     def refine(self) -> None:
         """Robust from there, then on what is undamaged."""
@@ -107,29 +91,6 @@ class PictureFit:
                 self.reason = Reason("the ground about the mark is not plain", Code.NO_FIT)
                 return
             self._adjust(robust=False, tolerance_px=0.002)
-
-    def unround(self) -> None:
-        """Where grey values were rounded more coarsely than they are noisy: adjust to what their intervals say."""
-        model, rounded = self.model, self.model.grey
-        ordinary = self.used & (model.clipped == 0)
-        is_whole = not self.is_lossy and model.background_px is None and not isinstance(model.mark, MarkTemplate)
-        steps = None if self.reason or not is_whole else self.coding.steps_dn(ordinary)
-        if steps is None:
-            return
-        step2 = float(np.mean((steps * model.steadiness)[ordinary] ** 2))
-        self.rounding_variance_dn2 = ROUNDING_VARIANCE * step2
-        if np.mean(model.residuals[ordinary] ** 2) > COARSEST_VARIANCE * step2:
-            return
-        for _ in range(_MOST_UNROUNDED):
-            drawn, before = model.drawn, model.state.pixel_from_mark[:, 2]
-            off = (rounded - drawn) / steps
-            sigma = likely_sigma(off[ordinary])
-            self.least_variance_dn2 = unrounded_variance(sigma) * step2
-            self.rounding_variance_dn2 = self.least_variance_dn2 - sigma**2 * step2
-            model.take_grey(np.where(ordinary, drawn + steps * unrounded(off, sigma), rounded))
-            self._adjust(robust=False, tolerance_px=_UNROUNDED_PX)
-            if self.reason or np.hypot(*(model.state.pixel_from_mark[:, 2] - before)) < _UNROUNDED_PX:
-                break
 
     def _steady(self) -> None:
         """Take into account by how much noise grows with light, as the residuals of the present state show it."""
@@ -216,6 +177,17 @@ class PictureFit:
         return _FLOOR * self.contrast_dn
 
     @property
+    def rounding_variance_dn2(self) -> float:
+        """What rounding to whole grey values adds to the noise; 0 where they were compressed or smoothed since."""
+        model = self.model
+        is_whole = not self.is_lossy and model.background_px is None and not isinstance(model.mark, MarkTemplate)
+        ordinary = self.used & (model.clipped == 0)
+        steps = self.coding.steps_dn(ordinary) if is_whole else None
+        if steps is None:
+            return 0.0
+        return _ROUNDING_VARIANCE * float(np.mean((steps * model.steadiness)[ordinary] ** 2))
+
+    @property
     def telling(self) -> Mask:
         """The pixels used whose residuals say how large the noise is."""
         return self.used & self.model.tells
@@ -275,7 +247,7 @@ class PictureFit:
         model.linearise(self.used)
         noise_dn = max(robust_scale(model.residuals[self.telling]), _DRAWN * self.contrast_dn, 1e-9)
         judged_dn = model.noise_dn if model.is_clipped else 0.0  # what clipped grey values were judged by
-        self.variance_dn2 = max(noise_dn**2, judged_dn**2, self.least_variance_dn2)
+        self.variance_dn2 = max(noise_dn**2, judged_dn**2)
         scale_dn = max(noise_dn, _SCALE_FLOOR * self.contrast_dn) if robust else np.inf
         cost = self._cost(scale_dn)
         for _ in range(_ITERATIONS):

@@ -3,7 +3,6 @@
 The model of a window is `gain * picture(mark) + offset + slopes`; unknown are the mark's place, if wished its rotation,
 scale and shear, the blur, and four grey-value parameters, all in one Gauss-Newton adjustment. Dust and scratches
 are first weighted down (Tukey's biweight), then cut out where smoothed residuals stand out; the rest decides.
-Where what is left shows a border of the ground, beyond doubt, this enters the model, and all is adjusted once more.
 Where grain correlates the noise, its autocovariance, from the residuals and from blank film beside the mark, weighs the
 last steps and gives the covariance (generalised least squares).
 """
@@ -16,11 +15,8 @@ from numpy.typing import NDArray
 
 from measure.covariance import Cause, Covariance
 from measure.marks.rendering import extent_px, frame_beside, known
-from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Polygon
+from measure.marks.shapes import Mark, MarkTemplate
 from measure.match_options import MatchOptions
-from measure.matching.alike_marks import taken_out_of
-from measure.matching.border_search import is_overwhelming, likely_border
-from measure.matching.bordered_model import BorderedModel
 from measure.matching.covariance import (
     Landscape,
     LinearFit,
@@ -37,8 +33,8 @@ from measure.matching.models import GREY, PictureModel, State, background_px, is
 from measure.matching.saturation import Sides, clear_of_ends
 from measure.matching.tone_information import told_tone, untold_tone
 from measure.matching.window import Coding, ScanWindow
-from measure.noise.grain import blank_patches, grain_model, is_coloured
-from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, noise_model, products
+from measure.noise.grain import blank_patches, grain_model, is_coloured, taken_out
+from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, products
 from measure.reason import Reason
 from measure.tone.estimate import MarkTone
 
@@ -124,7 +120,6 @@ def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: Match
         if not detail.reason:
             whole = _with_ground(given, detail_part, detail) if fit.reason else fit
             part, fit = detail_part, whole if _is_right(whole) else detail
-    fit = _with_border(given, part, fit)
     result = _result(fit, _surroundings(given, part, fit))
     moved = np.array(result.pixel_from_mark)
     moved[:, 2] += part.corner_px + window.origin_px
@@ -180,7 +175,6 @@ def _fitted(given: _Given, options: MatchOptions, coarse_px: float | None = None
         fit = _begun(given, part, wide, coarse_px, fit.model.state.moved(narrow.corner_px - part.corner_px))
         fit.choose_area()
     fit.refine()
-    fit.unround()
     return part, fit
 
 
@@ -199,50 +193,6 @@ def _with_ground(given: _Given, part: _Part, detail: PictureFit) -> PictureFit:
     return fit
 
 
-def _with_border(given: _Given, part: _Part, fit: PictureFit) -> PictureFit:
-    """The mark fitted on a ground with a border, where what the fit leaves shows one beyond doubt and the new fit is
-    right; else the fit as it is."""
-    if not _may_hide_border(given.mark, fit):
-        return fit
-    plain = fit if fit.model.background_px is None else _on_whole_ground(given, part, fit)
-    border = likely_border(plain.model, plain.area, fit.floor_dn)
-    if border is None:
-        return fit
-    bordered = _begun(given, part, fit.options, None, kind=BorderedModel)
-    assert isinstance(bordered.model, BorderedModel)
-    bordered.model.begin(plain.model, plain.area, *border)
-    bordered.approach_from_near()
-    bordered.refine()
-    bordered.unround()
-    return bordered if _is_right(bordered) and _has_step(bordered, bordered.model) else fit
-
-
-def _on_whole_ground(given: _Given, part: _Part, detail: PictureFit) -> PictureFit:
-    """Where the mark's detail alone was fitted: the same state, with the ground that goes best with it."""
-    whole = _begun(given, part, detail.options, None, detail.model.state.moved(np.zeros(2)))
-    whole.choose_area()
-    whole.model.linearise(whole.used)
-    return whole
-
-
-def _may_hide_border(mark: Mark, fit: PictureFit) -> bool:
-    """Whether a mark left what may be a border of its ground. What has straight edges only looks like one itself; of a
-    disk in perspective, a target, little ground is taken in."""
-    has_lines = isinstance(mark, MarkShape) and not all(isinstance(part, Polygon) for part in mark.parts)
-    if fit.reason or not has_lines or fit.options.freedom == "ellipse":
-        return False
-    noise, is_white = as_if_white(fit.model.residuals, fit.telling, len(fit.model.design))
-    is_noise = is_white or noise.variance_dn2 < fit.floor_dn**2
-    return not is_noise or fit.damaged_fraction > 0
-
-
-def _has_step(fit: PictureFit, model: BorderedModel) -> bool:
-    """Whether the ground has a step at the border: more than the noise that is left makes."""
-    noise = noise_model(model.residuals, fit.telling, len(model.design)).at_least(fit.floor_dn**2)
-    chi_square = model.step_chi_square(fit.covariance(noise))
-    return is_overwhelming(chi_square, 1, noise, int(fit.telling.sum()) - len(model.design))
-
-
 class _Surroundings(NamedTuple):
     """The whole window (height, width) about a mark: its grey values; free: what may be blank film as that under the
     mark; frame: where it shows the exposed frame that the mark is cut into."""
@@ -257,8 +207,6 @@ def _surroundings(given: _Given, part: _Part, fit: PictureFit) -> _Surroundings:
     where = given.mark, place, width, height, EDGE_BLURS * fit.model.seen_blur_px
     free = given.blank & known(*where)
     free[part.rows, part.cols] &= ~fit.area
-    if isinstance(fit.model, BorderedModel):
-        free &= ~fit.model.near_border(part.corner_px, free.shape)
     return _Surroundings(given.grey, free, given.usable & frame_beside(*where))
 
 
@@ -268,7 +216,6 @@ def _begun(
     options: MatchOptions,
     coarse_px: float | None,
     state: State | None = None,
-    kind: type[PictureModel] = PictureModel,
 ) -> PictureFit:
     rows, cols = part
     start, ends, usable = given.start.copy(), given.sides[rows, cols], given.usable[rows, cols]
@@ -276,7 +223,7 @@ def _begun(
     if coarse_px is not None:
         # What is left of a clipped grey value without its surroundings is no limit of anything.
         usable, ends = usable & (ends == 0), np.zeros_like(ends)
-    model = kind(given.grey[rows, cols], ends, given.mark, start, options, coarse_px)
+    model = PictureModel(given.grey[rows, cols], ends, given.mark, start, options, coarse_px)
     model.state = state or model.state
     return PictureFit(model, usable, given.is_lossy, given.coding.part(rows, cols))
 
@@ -304,15 +251,13 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
     model, used = fit.model, fit.telling
     told = float(model.information[fit.used].sum())
     noise, is_white = as_if_white(model.scores, fit.used, len(model.design), told)
-    if fit.least_variance_dn2:  # nor does blank film show more than its rounding
-        noise = noise.at_least(fit.least_variance_dn2)
-        about = about._replace(free=np.zeros_like(about.free))
+    noise = noise.at_least(fit.rounding_variance_dn2)
     unknown = np.full((len(model.design),) * 2, np.inf)
     precision = _Precision(Covariance.of_noise(unknown[:2, :2]), unknown, np.inf)
     if not fit.reason:
         patches = blank_patches(about.grey, about.free, noise.variance_dn2)
         if not is_white or is_coloured(patches):
-            taken = taken_out_of(fit, used)
+            taken = taken_out(used, model.design)
             noise = grain_model(model.residuals, used, taken, noise.neighbour_correlation, patches)
         precision = _weighed(fit, used, noise, about)
     state, covariance = model.state, precision.covariance
@@ -362,8 +307,7 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     model = fit.model
     covariance, by_grey = fit.weigh(noise)
     priors_dn2 = model.prior_weights() * noise.variance_dn2
-    own = model.apart_from_border
-    more = second_order(model.design[own], model.slopes, fit.used, covariance[np.ix_(own, own)], priors_dn2[own])
+    more = second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
     by_noise = covariance[:2, :2]
     rounded = fit.rounding_variance_dn2 * np.trace(products(by_grey[:2], by_grey[:2]))
     share = min(float(rounded / np.trace(by_noise)), 1.0)
@@ -381,7 +325,7 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     return _Precision(
         place,
         covariance,
-        contrast_sigma=float(np.sqrt(max(float(model.contrast_by @ covariance @ model.contrast_by), 1e-12))),
+        contrast_sigma=float(np.sqrt(max(float(covariance[-GREY, -GREY]), 1e-12))),
         edges=edge_place(linear, model.blur_px),
         sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
         own_shape=own_shape(linear, shape, strain, model.departures()) if tells_shape else None,

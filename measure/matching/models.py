@@ -1,6 +1,6 @@
 """The model of a window that shows a mark: `gain * picture(mark) + offset + slopes`, its state and its derivatives."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -61,31 +61,23 @@ def is_round(mark: Mark) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """pixel_from_mark (2, 3); variance_px2 of the blur; greys (4,): gain, offset, slopes, 0 until fitted; border (6,):
-    of the ground, as a `BorderedModel` has it, (0,) where there is none."""
+    """pixel_from_mark (2, 3); variance_px2 of the blur; greys (4,): gain, offset, slopes, 0 until fitted."""
 
     pixel_from_mark: Array
     variance_px2: float
     greys: Array
-    border: Array = field(default_factory=lambda: np.zeros(0))
 
     def moved(self, shift_px: Array) -> "State":
         """The same state where all places are (2,) px farther on; the greys are still to be fitted there."""
         place = self.pixel_from_mark.copy()
         place[:, 2] += shift_px
-        return State(place, self.variance_px2, np.zeros(GREY), self.border)
-
-    def with_border(self, border: Array, greys: Array) -> "State":
-        """The same on a ground with a border, of other greys (4,)."""
-        return State(self.pixel_from_mark, self.variance_px2, greys, border)
+        return State(place, self.variance_px2, np.zeros(GREY))
 
 
 class PictureModel:
     """The model at its present state: design (unknowns, height, width) and residuals (height, width). The unknowns are
-    column and row, the generators' parameters, the blur's variance if it is estimated, those of a border in the ground
-    if there is one, and the greys.
+    column and row, the generators' parameters, the blur's variance if it is estimated, and the greys.
 
-    border_unknowns: how many a border in the ground has; border: where they stand in the design.
     bent: how far, in units of the blur, a series may bend the drawing before it is drawn anew.
     start: where the mark is expected, where the state begins too.
     light (height, width): grey values with their surroundings, grey: what is fitted of them.
@@ -97,8 +89,6 @@ class PictureModel:
     steadiness (height, width): the noise of an ordinary pixel over that of each, a chip's as `chip_steadiness` gives
     it. Residuals and design are multiplied by it: so their noise is alike everywhere. half_tones (height, width): of a
     chip, as `covariance_of_changed_tone` needs it."""
-
-    border_unknowns = 0
 
     def __init__(
         self,
@@ -138,8 +128,7 @@ class PictureModel:
         self.steadiness, self.half_tones = np.ones(grey.shape), np.zeros(grey.shape)
         self.residuals = np.zeros_like(grey)
         moving = 2 + len(self.generators) + options.estimate_blur
-        self.border = slice(moving, moving + self.border_unknowns)
-        self.design = np.zeros((self.border.stop + GREY, *grey.shape))
+        self.design = np.zeros((moving + GREY, *grey.shape))
 
     def linearise(self, used: Mask) -> None:
         """Design and residuals of the present state; the greys from a linear fit to what is used, at first. Close to
@@ -156,7 +145,7 @@ class PictureModel:
         greys[0], greys[1:] = self.detail(shown.value), self.ground
         if not self.state.greys.any():
             self.state = State(place, self.state.variance_px2, factors(greys * used, self.grey))
-        columns = self.design[: self.border.start]
+        columns = self.design[:-GREY]
         columns[0], columns[1] = shown.by_col, shown.by_row
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
         moves = np.stack([slope * along for slope in columns[:2] for along in (col, row)])
@@ -167,9 +156,8 @@ class PictureModel:
             columns[self.blur] = -0.5 * shown.laplacian
         if self.background_px is not None:
             columns[:] = [self.detail(column) for column in columns]
-        contrast, beyond = self._by_border(shown)
-        columns *= -contrast
-        self.residuals = self.grey - combined(self.state.greys, greys) - beyond
+        columns *= -self.state.greys[0]
+        self.residuals = self.grey - combined(self.state.greys, greys)
         if isinstance(self.mark, MarkTemplate):
             self.steadiness = chip_steadiness(self.mark, place, width, height)
             self.half_tones = self.steadiness * self.state.greys[0] * self.detail(4 * shown.value * (1 - shown.value))
@@ -177,22 +165,6 @@ class PictureModel:
             each *= self.steadiness
         self._censor()
         self._linearised = self.state, self.residuals
-
-    def _by_border(self, shown: Rendering) -> tuple[Array | float, Array | float]:
-        """The mark's contrast, and what a border of the ground adds to the light: here there is none."""
-        return self.state.greys[0], 0.0
-
-    def _border_steps(self, step: Array) -> float:
-        """Of how many steps as long as its linearisation is good for a step of the border's unknowns is."""
-        return 0.0
-
-    def take_grey(self, grey: Array) -> None:
-        """Other grey values (height, width) for the same light."""
-        change, self.grey, self.light = (grey - self.grey) * self.steadiness, grey, grey
-        self.residuals = self.residuals + change
-        if self._linearised is not None:
-            at, residuals = self._linearised
-            self._linearised = at, residuals + change
 
     def take_noise(self, noise_dn: float) -> None:
         """Judge clipped grey values by noise of that standard deviation, unless it changes nothing of their part."""
@@ -211,7 +183,6 @@ class PictureModel:
         change[self.linear] = self._parameters(place[:, :2] @ np.linalg.inv(linear) - np.eye(2))
         if self.blur is not None:
             change[self.blur] = self.state.variance_px2 - before.variance_px2
-        change[self.border] = self.state.border - before.border
         change[-GREY:] = self.state.greys - before.greys
         return change
 
@@ -258,21 +229,9 @@ class PictureModel:
         return np.maximum(self.information / np.maximum(self.slopes**2, _LEAST), 1.0)
 
     @property
-    def apart_from_border(self) -> NDArray[np.int_]:
-        """(n,) which of the unknowns are not those of a border."""
-        return np.delete(np.arange(len(self.design)), self.border)
-
-    @property
     def tells_size(self) -> bool:
         """Whether the size is an unknown: then it is the first of the generators' parameters."""
         return len(self.generators) > 0
-
-    @property
-    def contrast_by(self) -> Array:
-        """(unknowns,) what each unknown counts in the mark's contrast, a sum of unknowns."""
-        by = np.zeros(len(self.design))
-        by[-GREY] = 1.0
-        return by
 
     @property
     def contrast_dn(self) -> float:
@@ -327,7 +286,6 @@ class PictureModel:
         """Take a step, shortened where it leaves the range of a linearisation; its length in px."""
         shift, linear = step[:2], step[self.linear]
         longest = max(np.hypot(*shift) / _LONGEST_SHIFT_PX, np.abs(linear).max(initial=0.0) / _LONGEST_CHANGE, 1.0)
-        longest = max(longest, self._border_steps(step[self.border]))
         place = self.state.pixel_from_mark.copy()
         place[:, 2] += shift / longest
         place[:, :2] += combined(linear / longest, self.generators) @ place[:, :2]
@@ -337,8 +295,7 @@ class PictureModel:
             seen = self.seen_blur_px
             ratio = np.clip(1 + step[self.blur] / longest / (2 * seen**2), 1 / _MOST_BLURRED, _MOST_BLURRED)
             variance = float(np.clip((seen * ratio) ** 2 - PIXEL_VARIANCE_PX2, *self._variance_range()))
-        border = self.state.border + step[self.border] / longest
-        self.state = State(place, variance, self.state.greys + step[-GREY:] / longest, border)
+        self.state = State(place, variance, self.state.greys + step[-GREY:] / longest)
         reach = max(self.grey.shape) / 4
         return float(np.hypot(*shift) + reach * _LONGEST_CHANGE * np.abs(linear).max(initial=0.0))
 

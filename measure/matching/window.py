@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
-from measure.matching.rounding import rounding_step
 from measure.matching.saturation import Sides, clipped_sides
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR, Tone
@@ -39,7 +38,7 @@ class Coding:
     def steps_dn(self, used: Mask) -> Array | None:
         """(height, width) the light between the limits from which each value was rounded; None where the values used
         are no multiples of one step, or not known."""
-        step = 0.0 if self.stored is None else rounding_step(np.asarray(self.stored[used], float))
+        step = 0.0 if self.stored is None else _common_step(np.asarray(self.stored[used], float))
         if self.stored is None or not step:
             return None
         if self.tone.is_identity:
@@ -134,3 +133,10 @@ def _between(grey: NDArray[np.floating]) -> float:
     low, high = float(grey.min()), float(grey.max())
     level = np.asarray((grey - low) / max(high - low, 1e-12) * (_LEVELS - 1), np.uint8)
     return low + (cv2.threshold(level, 0, 1, cv2.THRESH_BINARY | cv2.THRESH_OTSU)[0] + 1) / (_LEVELS - 1) * (high - low)
+
+
+def _common_step(grey: Array) -> float:
+    """The step that all grey values are multiples of, from one another; 0 where there is none."""
+    gaps = np.diff(np.unique(grey))
+    step = float(gaps.min(initial=np.inf))
+    return step if np.isfinite(step) and not np.any(gaps % step) else 0.0

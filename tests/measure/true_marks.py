@@ -4,7 +4,6 @@ places from differences of those pictures. Nothing of `measure` draws here."""
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring, cross, dot, polygon, ring_cross, ring_dot
 from synthetic_images import areas
-from synthetic_images.areas import coverage
 from synthetic_images.optics import reach_px, seen_coverage
 
 Array = NDArray[np.float64]
@@ -235,30 +233,6 @@ def grain_correlation(grain_px: float, reach: int = 9) -> Array:
     correlation = (1 - WHITE) * np.exp(-(index[:, None] ** 2 + index[None] ** 2) / (4 * grain_px**2))
     correlation[reach, reach] = 1.0
     return np.asarray(correlation)
-
-
-class Border(NamedTuple):
-    """How far a border passes from the middle of a window, px, the direction (rad) of its normal, and how much it
-    bends, 1/px."""
-
-    off_px: float
-    turn_rad: float
-    bend: float
-
-
-def over_border(mark: TrueMark, step: float, border: Border, opaque: bool, sign: int = 1) -> Array:
-    """(size, size) a mark of contrast 1, light or (sign -1) dark, on a ground that rises by a step beyond a border and
-    shines through unless the mark is opaque."""
-    pad = reach_px(mark.blur_px)
-    side = mark.size + 2 * pad
-    paint = coverage(areas_of(mark.kind.shape, mark.place), -pad, -pad, side, side, _FINE).astype(float)
-    col = (np.arange(side * _FINE) + 0.5) / _FINE - 0.5 - pad - (mark.size - 1) / 2
-    row, (c, s) = col[:, None], (np.cos(border.turn_rad), np.sin(border.turn_rad))
-    beyond_px = c * col + s * row - border.off_px - border.bend * (c * row - s * col) ** 2 / 2
-    ground = step * np.clip(beyond_px * _FINE + 0.5, 0, 1)
-    light = np.where(opaque, ground * (1 - paint), ground) + sign * paint
-    seen = gaussian_filter(light, mark.blur_px * _FINE, truncate=5.0).reshape(side, _FINE, side, _FINE)
-    return np.asarray(seen.mean(axis=(1, 3))[pad:-pad, pad:-pad])
 
 
 def whitened_rms(errors: Sequence[Array], covariances: Sequence[Array]) -> float:
