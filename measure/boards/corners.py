@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 from scipy.special import erf, ndtr, owens_t
 
 from measure.covariance import Covariance
+from measure.matching.gauss_newton import gauss_newton
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow
 from measure.noise.noise_model import correlated, noise_model, products
@@ -146,7 +147,7 @@ class _CornerFit:
         for stage, tolerance_px in enumerate(_STAGES_TOLERANCE_PX):
             if not self.reason:
                 self.scale_dn = self._residual_scale() if stage else np.inf
-                self._adjust(tolerance_px)
+                self.reason = gauss_newton(self, tolerance_px, _MAX_ITERATIONS).reason
 
     def result(self) -> Corner:
         """The corner in the scan, with the covariance that the residuals' own autocovariance gives."""
@@ -181,16 +182,6 @@ class _CornerFit:
         reach_px = float(self.reach.min())
         meeting = junction(self.grey - np.where(damaged, residuals, 0.0), self.center, reach_px)
         return meeting if np.hypot(*(meeting - self.center)) < reach_px / 2 else None
-
-    def _adjust(self, tolerance_px: float) -> None:
-        for _ in range(_MAX_ITERATIONS):
-            if self.reason:
-                return
-            design, residuals = self._linearised()
-            self.weights = self._area() * tukey_weights(residuals, self.scale_dn)
-            if self._step(design, residuals) < tolerance_px:
-                return
-        self.reason = self.reason or Reason("the fit does not settle", Code.NO_FIT)
 
     def _area(self) -> Array:
         """Weights 0 to 1 of a parallelogram about the corner; its border is smooth, and it moves with the corner: a
@@ -232,23 +223,31 @@ class _CornerFit:
         right = np.tensordot(grey * self.weights, self.grey, axes=2)
         return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0])
 
-    def _step(self, design: Array, residuals: Array) -> float:
-        """A Gauss-Newton step, shortened to what a linearisation can bear; its length in px."""
+    def solve(self) -> Array | None:
+        """A Gauss-Newton step, shortened to what a linearisation can bear; None where an unknown shows nowhere."""
+        design, residuals = self._linearised()
+        self.weights = self._area() * tukey_weights(residuals, self.scale_dn)
         used = self.weights > 0
         if not np.all((design[:, used] != 0).any(axis=1)):
-            self.reason = Reason("nothing here shows where the edges meet", Code.NO_FIT)
-            return 0.0
+            return None
         step = gauss_newton_step(design[:, used], residuals[used], self.weights[used], _DAMPING)
-        step /= max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / _LONGEST_TURN_RAD, 1.0)
+        return np.asarray(step / max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / _LONGEST_TURN_RAD, 1.0))
+
+    def step(self, step: Array) -> float:
+        """Take a step; its length in px."""
         self.center += step[:2]
         self.edges += step[2:4]
         variance = np.clip(self.variance + step[4], self.variance / 2, self.variance * 2)
         self.variance = float(np.clip(variance, _LEAST_BLUR_PX**2, self.max_variance))
-        if np.hypot(*(self.center - self.start)) > self.max_shift_px:
-            self.reason = Reason("the fit ran away to something else", Code.NO_FIT)
-        elif np.abs(self.edges - self.start_edges).max() > _MOST_TURN_RAD:
-            self.reason = Reason("the edges here run otherwise than they should", Code.SIZE)
         return float(np.hypot(*step[:2]))
+
+    def failure(self) -> Reason:
+        """Why the corner is none that was expected here, empty where it may be one."""
+        if np.hypot(*(self.center - self.start)) > self.max_shift_px:
+            return Reason("the fit ran away to something else", Code.NO_FIT)
+        if np.abs(self.edges - self.start_edges).max() > _MOST_TURN_RAD:
+            return Reason("the edges here run otherwise than they should", Code.SIZE)
+        return NO_REASON
 
 
 def junction(grey: Array, start_px: Array, reach_px: float) -> Array:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from measure.marks.rendering import chip_mask, picture, true
 from measure.marks.shapes import MarkTemplate
-from measure.matching.models import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel
+from measure.matching.gauss_newton import UNSETTLED, gauss_newton, gauss_newton_halving
+from measure.matching.models import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel, State
 from measure.matching.saturation import noise_scale
 from measure.matching.window import Coding
 from measure.noise.damage import damage, damage_where_lossy, grown
@@ -30,7 +31,6 @@ _LEAST_VARIANCE_DN2 = 1e-12
 _ROUNDING_VARIANCE = 1 / 12  # of evenly spread light less the number it is rounded to, in steps
 _WEIGHTED_STEPS = 4  # by the grain's weights: the place is nearly right before
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # a last step that needs no further one; the longest that may be the last
-_UNSETTLED = Reason("the adjustment did not converge", Code.NO_FIT)
 _HARDLY_SHOWN = Reason(
     "most of the mark lies outside of the scan, or beyond an edge far stronger than it", Code.OUTSIDE
 )
@@ -61,7 +61,7 @@ class PictureFit:
         if not self.reason:
             self.model.bent = ROUGHLY_BENT
             self._adjust(robust=False, tolerance_px=0.1)
-        if self.reason == _UNSETTLED:  # dust may keep squares from settling, and not what holds against it
+        if self.reason == UNSETTLED:  # dust may keep squares from settling, and not what holds against it
             self.reason = NO_REASON
         if not self.reason and self.model.has_moved(begun, _AREA_PX):
             self.choose_area()
@@ -156,15 +156,9 @@ class PictureFit:
     def _step_by(self, weights: Array) -> Array | None:
         """Gauss-Newton with weighted derivatives: how far the mark moved, (2,) px; None where it does not settle."""
         model, start = self.model, self.model.state.pixel_from_mark[:, 2]
-        for _ in range(_WEIGHTED_STEPS):
-            step = self._solve(weights, 1.0)
-            if step is None:
-                return None
-            moved = model.step(step)
-            model.linearise(self.used)
-            if moved < _CLOSE_PX:
-                break
-        settled = moved < _SETTLED_PX and not model.ran_away()
+        adjustment = _Adjustment(model, self.used, 1.0, weighted=weights)
+        moved_px = gauss_newton(adjustment, _CLOSE_PX, _WEIGHTED_STEPS).moved_px
+        settled = moved_px < _SETTLED_PX and not model.ran_away()
         return np.asarray(model.state.pixel_from_mark[:, 2] - start) if settled else None
 
     @property
@@ -236,7 +230,7 @@ class PictureFit:
             self.reason = self.reason or _HARDLY_SHOWN
 
     def _adjust(self, robust: bool, tolerance_px: float) -> None:
-        """Gauss-Newton until the mark moves less than tolerance_px; a step that does not improve the fit is halved."""
+        """Gauss-Newton until the mark moves less than tolerance_px."""
         model = self.model
         if model.is_clipped:
             noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
@@ -249,46 +243,40 @@ class PictureFit:
         judged_dn = model.noise_dn if model.is_clipped else 0.0  # what clipped grey values were judged by
         self.variance_dn2 = max(noise_dn**2, judged_dn**2)
         scale_dn = max(noise_dn, _SCALE_FLOOR * self.contrast_dn) if robust else np.inf
-        cost = self._cost(scale_dn)
-        for _ in range(_ITERATIONS):
-            weights = model.design * (self.used * tukey_weights(model.residuals, scale_dn))
-            step = self._solve(weights, self.variance_dn2)
-            if step is None:
-                self.reason = Reason("the picture does not determine the mark's place", Code.NO_FIT)
-                return
-            before, cost_before = model.state, cost
-            moved = model.step(step)
-            model.linearise(self.used)
-            if moved < tolerance_px:
-                return
-            cost = self._cost(scale_dn)
-            for _ in range(_HALVINGS):
-                if cost <= cost_before:
-                    break
-                step = step / 2
-                model.state = before
-                moved = model.step(step)
-                model.linearise(self.used)
-                cost = self._cost(scale_dn)
-            if cost > cost_before and float(np.hypot(*step[:2])) < tolerance_px:
-                # No part of the step improves the fit: where size, blur and contrast hang together it ends flat.
-                model.state, moved = before, 0.0
-                model.linearise(self.used)
-            self.reason = model.ran_away()
-            if self.reason or moved < tolerance_px:
-                return
-        self.reason = _UNSETTLED
+        adjustment = _Adjustment(model, self.used, self.variance_dn2, scale_dn)
+        self.reason = gauss_newton_halving(adjustment, tolerance_px, _ITERATIONS, _HALVINGS).reason
 
-    def _cost(self, scale_dn: float) -> float:
-        """What the adjustment makes small: Tukey's loss, squares where the scale is infinite, and the priors'."""
-        priors = np.sum(self.model.prior_weights() * self.model.departures() ** 2)
-        return float(tukey_loss(self.model.residuals * self.used, scale_dn) + self.variance_dn2 * priors)
 
-    def _solve(self, weights: Array, variance_dn2: float) -> Array | None:
-        """The step by weighted derivatives (unknowns, height, width), a pixel's weight being the share of this variance
-        in its own; None where it is not determined. A blur at its limit stays there instead of pulling the others."""
-        model = self.model
-        priors = model.prior_weights() * variance_dn2
+class _Adjustment:
+    """A picture's model as `gauss_newton` steps it. variance_dn2: a pixel's whose weight is 1; scale_dn: of Tukey's
+    weights, infinite for squares; weighted (unknowns, height, width): derivatives times other weights, if given."""
+
+    def __init__(
+        self,
+        model: PictureModel,
+        used: Mask,
+        variance_dn2: float,
+        scale_dn: float = np.inf,
+        weighted: Array | None = None,
+    ) -> None:
+        self.model, self.used = model, used
+        self.variance_dn2, self.scale_dn, self.weighted = variance_dn2, scale_dn, weighted
+        self.failure = model.ran_away
+
+    @property
+    def state(self) -> State:
+        return self.model.state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self.model.state = state
+
+    def solve(self) -> Array | None:
+        """A blur at its limit stays there instead of pulling the others."""
+        model, weights = self.model, self.weighted
+        if weights is None:
+            weights = model.design * (self.used * tukey_weights(model.residuals, self.scale_dn))
+        priors = model.prior_weights() * self.variance_dn2
         normal = products(weights, model.design) + np.diag(priors)
         right = products(weights, model.residuals[None])[:, 0] - priors * model.departures()
         free = np.ones(len(right), dtype=bool)
@@ -297,3 +285,13 @@ class PictureFit:
             free[model.blur] = False
             step = solution(normal, right, free)
         return step
+
+    def step(self, step: Array) -> float:
+        moved_px = self.model.step(step)
+        self.model.linearise(self.used)
+        return moved_px
+
+    def cost(self) -> float:
+        """Tukey's loss, and the priors'."""
+        priors = np.sum(self.model.prior_weights() * self.model.departures() ** 2)
+        return float(tukey_loss(self.model.residuals * self.used, self.scale_dn) + self.variance_dn2 * priors)
