@@ -27,15 +27,15 @@ Indices = NDArray[np.intp]
 UNCHECKED = 0.01  # redundancy of given values that place something alone, and contradict nothing
 LEAST_REDUNDANCY = 1.0  # of observations that are to tell sigma0
 TOO_GOOD = 1e-3  # probability of given values that agree so well with the others if their sigma were right
-NO_EVIDENCE = 0.01  # part that the other observations' errors have in residuals, below which they show nothing of them
+NO_EVIDENCE = 0.01  # part that the other observations' errors have in residuals, below which these show nothing of them
 ERROR_FREE = 1e-4  # v'Pv over redundancy of observations that were computed, not made
 APART = 3.0  # ratio of standard deviations of one camera's marks that belong to two sources
 
 
 @dataclass(frozen=True)
 class _Given:
-    """Values that a file gives of one owner: positions of the unknowns, v'Pv, redundancy, and the part that the other
-    observations' errors have in the residuals."""
+    """Values that a file gives of one owner: positions of the unknowns, v'Pv, redundancy, and the least part that the
+    other observations' errors have in any combination of the residuals."""
 
     group: GivenGroup
     positions: Indices
@@ -51,10 +51,10 @@ def variance_factor(
 
     The given values of fiducials (F5, F6), of interior orientations and distortion (F7 to F9), of scanners and of
     boards are left out where they agree with the other observations better than their standard deviations allow
-    (F-test, `TOO_GOOD`); those of fiducials also where a camera shows nothing but fiducials and their residuals hold
-    nothing of the measuring error (`NO_EVIDENCE`): nothing else would then tell how good they are. Where all that is
-    not given by these files has a redundancy below 1, sigma0 is not estimated but 1, and standard deviations are a
-    priori ones.
+    (F-test, `TOO_GOOD`); those of fiducials also where a camera shows nothing but fiducials and some combination of
+    their residuals holds nothing of the measuring error (`NO_EVIDENCE`): nothing else would then tell how good they
+    are. Where all that is not given by these files has a redundancy below 1, sigma0 is not estimated but 1, and
+    standard deviations are a priori ones.
 
     Parameters
     ----------
@@ -64,8 +64,9 @@ def variance_factor(
 
     Notes
     -----
-    With u = P^½ v of given values and Q their cofactor matrix, the redundancy of a group is the trace of
-    M = I - P^½ Q P^½, and the other observations' part in it is tr(M - M²) (Förstner 1979).
+    With P^½ v the residuals of given values in their standard deviations and Q their cofactor matrix, the redundancy of
+    a group is the trace of M = I - P^½ Q P^½. Along an eigenvector of M with the eigenvalue m the others' errors are
+    1 - m of the residual's variance; m is 0 along what the group alone determines.
     """
     problem = numbering.problem
     given = [each for each in _given_groups(numbering, state, factor, weighting) if each.redundancy > UNCHECKED]
@@ -99,7 +100,7 @@ def _given_groups(numbering: Numbering, state: State, factor: Factor, weighting:
         free = np.eye(len(positions)) - q / np.outer(sigma[positions], sigma[positions])
         vpv = float(((differences[positions] / sigma[positions]) ** 2).sum())
         redundancy = float(np.trace(free))
-        evidence = 1.0 - float((free**2).sum()) / redundancy if redundancy > 0.0 else 0.0
+        evidence = 1.0 - float(np.linalg.eigvalsh(free)[-1])
         yield _Given(group, positions, vpv, redundancy, evidence)
 
 
