@@ -1,4 +1,4 @@
-"""What a scan file is to those who read windows: a grid of segments, of which those decoded last are held."""
+"""The grid of segments (tiles, strips) of a picture, and a cache of those decoded last."""
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What a scan's file says of itself in its head, without any pixel of it."""
+"""The head of a scan file: format, size, pixel pitch and declared tone curve, without decoding a pixel."""
 
 import zlib
 from dataclasses import dataclass
@@ -33,10 +33,17 @@ class ScanHead:
 
 
 def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
-    """Some kilobytes are read of the largest file. max_pixels: as `open_scan` takes it.
+    """Reads the head of a scan file: some kilobytes, however large the file is.
 
-    Raises MeasurementError for a file that cannot be opened as a scan, as far as its head and its length tell: that a
-    JPEG or PNG picture is damaged shows only when it is decoded.
+    Parameters
+    ----------
+    max_pixels : as `open_scan` takes it.
+
+    Raises
+    ------
+    MeasurementError
+        For a file that cannot be opened as a scan, as far as its head and its length show. Damage of a JPEG or PNG
+        picture shows only when it is decoded.
     """
     start = first_bytes(path)
     if start[:4] in TIFF_STARTS:

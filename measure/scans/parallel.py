@@ -25,8 +25,8 @@ def map_or_replace(
     lost: Callable[[Item, str], Made],
     chunk: int = 1,
 ) -> Iterator[Made]:
-    """The same, but what a worker was ended over costs none of the others. lost: what is made of such an item, and of
-    why it is one."""
+    """Like `map_items`, but an item that ends its worker costs none of the others. lost: makes the result of such an
+    item, from it and the reason."""
     if workers is None:
         yield from map(function, items)
         return

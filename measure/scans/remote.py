@@ -8,7 +8,7 @@ import sys
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from io import BufferedIOBase
@@ -28,6 +28,7 @@ Extent = tuple[int, int]  # first byte, and the byte after the last
 _EXTRAS = {"s3": "s3", "http": "http", "https": "http"}  # of reseau, by the scheme of an address
 _BLOCK_BYTES = 1 << 16  # of heads, tags and tables, fetched at a time
 _MOST_BLOCKS = 256  # of an object, held
+_LARGE_READ_BYTES = 4 * _BLOCK_BYTES  # from here on by one request, and not held
 _KEPT_OBJECTS = 8  # whose blocks are held
 _WAITS_S = (0.1, 0.5, 2.0)  # before an address is asked again
 _TIMEOUT_S = 30.0  # without a byte
@@ -151,7 +152,7 @@ class Address(PosixPath):
 
 @dataclass
 class Traffic:
-    """What this process has asked stores and servers for: ranges, and their bytes."""
+    """Ranges and bytes that this process has requested from stores and servers."""
 
     ranges: int = 0
     bytes: int = 0
@@ -182,8 +183,17 @@ def is_address(text: str) -> bool:
 
 
 def find_addresses(pattern: str) -> list[Path]:
-    """The one address, or the objects that a pattern finds, `**` being any number of folders. Servers list no files:
-    each address on one is named. Raises as `Address` does."""
+    """Finds the objects of a pattern in a store.
+
+    Parameters
+    ----------
+    pattern : `**` stands for any number of folders. Servers list no files: an address on one is returned as it is.
+
+    Raises
+    ------
+    MissingError, UnreachableError, MeasurementError
+        As `Address` does.
+    """
     address = Address(pattern)
     system = _file_system(address)
     if _scheme(address) != "s3" or not any(sign in pattern for sign in "*?["):
@@ -193,8 +203,13 @@ def find_addresses(pattern: str) -> list[Path]:
 
 
 def list_addresses(address: Address) -> list[Path]:
-    """Every object of a store below an address, at any depth, or every file that the pages of a server list there.
-    Raises as `Address` does."""
+    """Lists every object of a store below an address, at any depth, or every file that a server's pages list there.
+
+    Raises
+    ------
+    MissingError, UnreachableError, MeasurementError
+        As `Address` does.
+    """
     system = _file_system(address)
     if _scheme(address) == "s3":
         names = _retry(address, lambda: list(system.find(address.location)))
@@ -219,11 +234,11 @@ def tiff_file(path: Path) -> "TiffFile":
 
 @dataclass
 class _RemoteObject:
-    """What is known of an object: its size, what the store calls its content, and blocks of it by their numbers."""
+    """An object in a store: its size, the checksum of its content, and fsspec's cache of its blocks."""
 
     size: int
     etag: str
-    blocks: dict[int, bytes] = field(default_factory=dict)
+    blocks: Any
 
 
 _objects: OrderedDict[str, _RemoteObject] = OrderedDict()
@@ -250,39 +265,24 @@ class _RemoteFile(BufferedIOBase):
         return self._place
 
     def read(self, size: int | None = -1) -> bytes:
-        end = self._object.size if size is None or size < 0 else min(self._place + size, self._object.size)
-        if end <= self._place:
-            return b""
-        numbers = range(self._place // _BLOCK_BYTES, (end - 1) // _BLOCK_BYTES + 1)
-        first = numbers[0] * _BLOCK_BYTES
-        data = b"".join(self._blocks(numbers))[self._place - first : end - first]
-        self._place = end
-        return data
-
-    def _blocks(self, numbers: range) -> list[bytes]:
-        held = self._object.blocks
-        blocks = {number: held.get(number) for number in numbers}
-        missing = [number for number, block in blocks.items() if block is None]
-        if missing:
-            first, after = missing[0] * _BLOCK_BYTES, min((missing[-1] + 1) * _BLOCK_BYTES, self._object.size)
-            (data,) = self._address.ranges([(first, after)])
-            for number in range(missing[0], missing[-1] + 1):
-                blocks[number] = data[number * _BLOCK_BYTES - first :][:_BLOCK_BYTES]
-            if len(held) + len(numbers) > _MOST_BLOCKS:  # as where a whole file is hashed
-                held.clear()
-            held.update((number, blocks[number] or b"") for number in numbers)
-        return [blocks[number] or b"" for number in numbers]
+        start, end = self._place, self._object.size
+        if size is not None and size >= 0:
+            end = min(start + size, end)
+        self._place = max(start, end)
+        if end - start < _LARGE_READ_BYTES:
+            return bytes(self._object.blocks._fetch(start, end))
+        return self._address.ranges([(start, end)])[0]
 
 
 def _remote_object(address: Address) -> _RemoteObject:
-    """As it was when its size was last asked for."""
+    """The object as it was when its size was last requested."""
     with _holding:
         known = _objects.get(str(address))
     return _query_object(address) if known is None else known
 
 
 def _query_object(address: Address) -> _RemoteObject:
-    """Asked for anew; blocks of the same content are kept."""
+    """Requests size and checksum anew; blocks of an unchanged content are kept."""
     system = _file_system(address)
     info = _retry(address, lambda: _info(system, address.location))
     size, etag = info.get("size"), next((str(info[key]) for key in _CHECKSUMS if info.get(key)), "")
@@ -291,11 +291,18 @@ def _query_object(address: Address) -> _RemoteObject:
     with _holding:
         known = _objects.get(str(address))
         if known is None or (known.size, known.etag) != (size, etag):
-            known = _objects[str(address)] = _RemoteObject(int(size), etag)
+            known = _objects[str(address)] = _RemoteObject(int(size), etag, _block_cache(address, int(size)))
         _objects.move_to_end(str(address))
         while len(_objects) > _KEPT_OBJECTS:
             _objects.popitem(last=False)
     return known
+
+
+def _block_cache(address: Address, size: int) -> Any:
+    def fetch(start: int, end: int) -> bytes:
+        return address.ranges([(start, min(end, size))])[0]
+
+    return import_module("fsspec.caching").BlockCache(_BLOCK_BYTES, fetch, size, _MOST_BLOCKS)
 
 
 def _info(system: Any, address: str) -> Mapping[str, Any]:
@@ -323,7 +330,7 @@ def _fetch_ranges(address: Address, cat_ranges: Any, starts: list[int], ends: li
 
 
 def _retry(address: Address, ask: Callable[[], Made]) -> Made:
-    """What is asked for, after some tries: also of what is forbidden, as a busy store says now and then."""
+    """Repeats a request that fails, also one that is forbidden: a busy store answers so now and then."""
     for wait_s in (*_WAITS_S, None):
         try:
             return ask()

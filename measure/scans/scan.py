@@ -46,7 +46,7 @@ class Scan:
     """An opened scan: its size, its pitch, and windows of grey values that grow with light on the scanner's sensor.
 
     width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows;
-    tone: what is believed of the curve between light and these grey values.
+    tone: the curve between light and these grey values, with its uncertainty.
     pitch_um: (x, y) from the file's resolution tags, None where it has none that can be believed, and then pitch_note
     says why. problems: what of the file needs a look, a sentence each; orientation: as `OpenedPicture` has it.
     The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
@@ -114,13 +114,13 @@ class Scan:
         return self._segments.segment_height_px, self._segments.segment_width_px
 
     def with_name(self, name: str) -> "Scan":
-        """The same under the name that a project has for it: files of several folders may be called alike."""
+        """The scan under the name that a project has for it: files of several folders may have one name."""
         scan = copy(self)
         scan.name = name
         return scan
 
     def with_tone(self, tone: Tone) -> "Scan":
-        """The same scan with another belief about its tone curve."""
+        """The scan with another tone curve."""
         scan = copy(self)
         scan.tone = tone
         return scan
@@ -221,7 +221,7 @@ class Scan:
 
     @property
     def last_reduction(self) -> tuple[int, Array] | None:
-        """The factor and the grey values of the whole scan as it was reduced last; None where nobody asked for it."""
+        """The factor and the grey values of the whole scan as it was reduced last; None before the first time."""
         return next(((f, weighted(grey, self._grey_weights)) for f, grey in self._reduced.items()), None)
 
     def reduced_window(
@@ -364,12 +364,24 @@ def _reduction_steps(factor: int) -> tuple[int, ...]:
 
 
 def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
-    """Open a TIFF, BigTIFF, JPEG or PNG file, told apart by its first bytes and not by its name; path: of a file, or
-    an address as `Address` has it.
+    """Opens a TIFF, BigTIFF, JPEG or PNG file. Its first bytes give the format, not its name.
 
-    max_pixels: how many a scan may have; None: as many as `check_size` says.
-    Raises MeasurementError, with what to do, for a file that is missing, empty, truncated or no such picture,
-    UnreachableError for an address that does not answer.
+    Parameters
+    ----------
+    path : of a file, or an address as `Address` has it.
+    max_pixels : how many a scan may have; None: the limits of `check_size`.
+
+    Raises
+    ------
+    MeasurementError
+        For a file that is missing, empty, truncated or no such picture; the message says what to do.
+    UnreachableError
+        For an address that does not answer.
+
+    Examples
+    --------
+    >>> with open_scan("scans/0001.tif") as scan:
+    ...     grey = scan.window(100, 200, 64, 64)
     """
     path = scan_path(path)
     start = first_bytes(path)

@@ -18,8 +18,17 @@ _GREY_BAND_PX = 1 << 20  # of the scan that is held in grey at a time, about
 
 
 def crop_scan(scan: Scan, window: Window) -> Scan:
-    """The window's pixels count from its own first one; the scan stays open as long as it is read. Raises ValueError
-    for a window that the scan does not have."""
+    """A window of a scan as a scan of its own, whose pixels count from the window's first one.
+
+    Parameters
+    ----------
+    scan : stays open as long as the window is read.
+
+    Raises
+    ------
+    ValueError
+        For a window that does not lie in the scan.
+    """
     col, row, width, height = window
     if min(width, height) < 1 or min(col, row) < 0 or col + width > scan.width_px or row + height > scan.height_px:
         raise ValueError(

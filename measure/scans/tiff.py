@@ -223,12 +223,19 @@ def _numbers(file: BinaryIO, layout: _Layout, entry: _Entry) -> tuple[int, ...]:
 
 
 def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
-    """The first full-resolution picture of a TIFF file, or that of the page that the path names; of an address its
-    overviews too: a file is read sooner than their makers' ways of averaging are known. max_pixels: as `check_size`
-    takes it.
+    """The first full-resolution picture of a TIFF file, or that of the page that the path names.
 
-    Raises MeasurementError for a truncated file, for pictures that are no grey, palette or colour scan of up to
-    16 bits a sample, and for those that claim more than such a file can hold.
+    Parameters
+    ----------
+    path : of an address the overviews are opened, too. Of a local file the picture itself is averaged, for how others
+        averaged is not known.
+    max_pixels : as `check_size` takes it.
+
+    Raises
+    ------
+    MeasurementError
+        For a truncated file, for pictures that are no grey, palette or colour scan of up to 16 bits a sample, and for
+        those that claim more than such a file can hold.
     """
     try:
         taken = check_directories(path)

@@ -70,6 +70,25 @@ def test_eight_windows_take_few_requests_and_bytes(tmp_path: Path, server: Range
     assert server.sent_bytes - head_bytes <= 8 * 4 * 1.01 * TILE_PX**2
 
 
+def test_bytes_are_fetched_by_blocks_and_once_and_large_reads_by_one_request(
+    tmp_path: Path, server: RangeServer
+) -> None:
+    data = np.random.default_rng(2).bytes(1_000_001)
+    (tmp_path / "a.bin").write_bytes(data)
+    block = 1 << 16
+    with scan_path(f"{server.url}/a.bin").open("rb") as file:
+        for place, size, gets in ((block - 10, 20, 2), (100, 50, 0), (2 * block - 10, 10, 0), (len(data) - 5, 9, 1)):
+            before = server.gets
+            file.seek(place)
+            assert file.read(size) == data[place : place + size]
+            assert server.gets - before == gets
+        before = server.gets
+        file.seek(7)
+        assert file.read() == data[7:]
+        assert server.gets - before == 1
+        assert file.read(3) == b""
+
+
 def spotted() -> Any:
     """Ground with a few round spots, and where their middles are."""
     rng = np.random.default_rng(3)
