@@ -41,7 +41,13 @@ from pipeline.report.page import write_frame_page, write_report
 from pipeline.report_data import adjusted, frame_data, measured, report_data
 from pipeline.results.adjustment_file import write_adjustment
 from pipeline.results.adjustment_reader import covariance_path, read_adjustment
-from pipeline.results.comparator_file import ComparatorPoint, measurement_of, read_comparator, write_comparator
+from pipeline.results.comparator_file import (
+    ComparatorPoint,
+    measurement_of,
+    pitches_of,
+    read_comparator,
+    write_comparator,
+)
 from pipeline.results.fingerprints import of_file
 from pipeline.results.frames_file import for_images, write_frames
 from pipeline.results.measured_record import record_of
@@ -50,6 +56,7 @@ from pipeline.summary import Summary, summarise
 from pipeline.text.atomic import write_atomically
 
 if TYPE_CHECKING:
+    from pipeline.opencv_check.opencv_corners import BoardPictures
     from pipeline.thumbnails import Thumbnails
 
 _ONE_BY_ONE = 2000  # scans: of more the summary tells totals and what needs a look, from the store
@@ -307,9 +314,23 @@ def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> 
     from pipeline.opencv_check.check import check_against_opencv
 
     made_from = {project.adjustment_path.name: of_file(new.at(project.adjustment_path))}
-    check = {"reseau": version("reseau"), "made_from": made_from, **check_against_opencv(adjustment).to_json()}
+    found = check_against_opencv(adjustment, _board_pictures(project, new))
+    check = {"reseau": version("reseau"), "made_from": made_from, **found.to_json()}
     text = json.dumps(check, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     write_atomically(new.place(project.check_path), text)
+
+
+def _board_pictures(project: Project, new: Unpublished) -> "BoardPictures | None":
+    """Those of the board; None where there is no scan of it, or OpenCV finds no such board."""
+    from pipeline.opencv_check.opencv_corners import BoardPictures, detector_name
+
+    board = project.targets.board if project.targets else None
+    if board is None or not project.scans or not detector_name(board):
+        return None
+    pitch_um = pitches_of(new.at(project.comparator))
+    if project.pitch_um:
+        pitch_um = dict.fromkeys(project.scans, project.pitch_um) | pitch_um
+    return BoardPictures(board, project.open_scan, pitch_um)
 
 
 def _reported(project: Project, new: Unpublished) -> Summary:

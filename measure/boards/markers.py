@@ -177,7 +177,7 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
         spec, read = better
     outlines = [outline[None].astype(np.float32) for outline in read.corners_px.values()]
     numbers_read = np.array(list(read.corners_px), np.int32)[:, None]
-    corners, numbers, _, _ = cv2.aruco.CharucoDetector(_charuco_board(spec)).detectBoard(
+    corners, numbers, _, _ = cv2.aruco.CharucoDetector(charuco_board(spec)).detectBoard(
         picture, markerCorners=outlines, markerIds=numbers_read
     )
     if corners is None or len(corners) < _FEWEST_CORNERS:
@@ -237,7 +237,7 @@ def _aruco_markers(spec: ArucoSpec) -> Markers:
     return {number: np.array([points[f"{number}.{index}"][:2] for index in range(4)]) for number in numbers}
 
 
-def _charuco_board(spec: CharucoSpec) -> cv2.aruco.CharucoBoard:
+def charuco_board(spec: CharucoSpec) -> cv2.aruco.CharucoBoard:
     numbers = np.arange(spec.first_id, spec.first_id + spec.columns * spec.rows // 2)
     size = (spec.columns, spec.rows)
     dictionary = aruco_dictionary(spec.dictionary)
@@ -248,7 +248,7 @@ def _charuco_board(spec: CharucoSpec) -> cv2.aruco.CharucoBoard:
 
 def _charuco_markers(spec: CharucoSpec) -> Markers:
     """OpenCV's board: y down, its origin at the upper left square's corner."""
-    board = _charuco_board(spec)
+    board = charuco_board(spec)
     return dict(zip(np.ravel(board.getIds()).tolist(), np.array(board.getObjPoints())[..., :2], strict=True))
 
 

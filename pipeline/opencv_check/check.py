@@ -8,6 +8,7 @@ changes is told too.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import cv2
@@ -21,6 +22,7 @@ from adjust.solution.adjustment import adjust
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate, calibrate_fisheye
 from pipeline.opencv_check.opencv_conversion import Converted, converted
+from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners
 from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, Freedom, model_names
 from pipeline.results.check_file import CameraCheck, Check, Row, Verdict
 
@@ -38,8 +40,10 @@ NOTABLE_SPREAD = 1.5
 NOTABLE_ROUNDING = 0.01  # of the standard deviation of an image coordinate
 
 
-def check_against_opencv(adjustment: Adjustment) -> Check:
+def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None = None) -> Check:
     """Compare every camera of an adjustment with OpenCV's calibration of the same observations.
+
+    pictures: of a board; in those of digital cameras OpenCV's own points are calibrated, too.
 
     "agrees": no parameter differs by more than one sigma, or a strong lens does not fit OpenCV's model well enough for
     that and the same observations agree once the adjustment is given OpenCV's model; "differs": one does, or priors and
@@ -47,10 +51,10 @@ def check_against_opencv(adjustment: Adjustment) -> Check:
     says which.
     """
     names = [camera.name for camera in adjustment.network.cameras]
-    return Check({name: _check_camera(adjustment, name) for name in names})
+    return Check({name: _check_camera(adjustment, name, pictures) for name in names})
 
 
-def _check_camera(adjustment: Adjustment, name: str) -> CameraCheck:
+def _check_camera(adjustment: Adjustment, name: str, pictures: BoardPictures | None) -> CameraCheck:
     if not adjustment.converged:
         return CameraCheck("not possible", f"The adjustment itself has no solution: {_without_stop(adjustment)}.")
     camera = adjustment.network.camera_by_name[name]
@@ -72,7 +76,7 @@ def _check_camera(adjustment: Adjustment, name: str) -> CameraCheck:
     undetermined = _undetermined(solved, name)
     if undetermined:
         return CameraCheck("not possible", undetermined, *counts)
-    return _compared(adjustment, problem, solved, counts)
+    return _compared(adjustment, problem, solved, counts, pictures)
 
 
 def _hindrance(camera: Camera) -> str:
@@ -112,7 +116,13 @@ def _without_stop(adjustment: Adjustment) -> str:
     return " ".join(causes).rstrip(".")
 
 
-def _compared(adjustment: Adjustment, problem: BareProblem, solved: Adjustment, counts: tuple[int, int]) -> CameraCheck:
+def _compared(
+    adjustment: Adjustment,
+    problem: BareProblem,
+    solved: Adjustment,
+    counts: tuple[int, int],
+    pictures: BoardPictures | None,
+) -> CameraCheck:
     rms_um, sigma_um = _rms_um(solved), 1e3 * problem.sigma_mm
     known: dict[str, Any] = {"images": counts[0], "points": counts[1], "rms_reseau_um": rms_um}
     try:
@@ -127,17 +137,20 @@ def _compared(adjustment: Adjustment, problem: BareProblem, solved: Adjustment, 
             f"where a coordinate's standard deviation is {sigma_um:.2f} um."
         )
         return CameraCheck("not possible", reason, **known)
+    is_fisheye = problem.network.cameras[0].distortion.family == FISHEYE
+    calibrated = partial(
+        calibrate_fisheye if is_fisheye else calibrate, freedom=problem.freedom, start=conversion.parameters
+    )
     try:
-        is_fisheye = problem.network.cameras[0].distortion.family == FISHEYE
-        opencv = (calibrate_fisheye if is_fisheye else calibrate)(
-            problem.images, problem.freedom, conversion.parameters
-        )
+        opencv = calibrated(problem.images)
     except cv2.error as error:
         return CameraCheck("not possible", f"OpenCV refuses these observations: {error.err}.", **known)
     sigmas_tell = rms_um > ROUNDINGS * opencv.rounding_um
     names = model_names(problem.network.cameras[0].distortion.family)
     rows = _rows(names, problem.freedom, conversion, solved.sigma0 if sigmas_tell else 1.0, opencv)
     known |= {"rms_opencv_um": opencv.rms_um, "rows": rows}
+    if pictures is not None and _is_digital(adjustment, problem):
+        known["corners_px"] = compare_corners(problem.images, pictures, calibrated)
     if opencv.rms_um > WORSE_RMS * rms_um + ROUNDINGS * opencv.rounding_um:
         reason = (
             f"OpenCV ends in a worse solution, {opencv.rms_um:.2f} um a point against {rms_um:.2f} um: it begins every "
@@ -157,6 +170,14 @@ def _compared(adjustment: Adjustment, problem: BareProblem, solved: Adjustment, 
         verdict, reason = _with_departure(reason, _departures(adjustment, solved, problem.network.cameras[0]))
     rms = f"The residuals are {opencv.rms_um:.2f} um rms a point in OpenCV, {rms_um:.2f} um here."
     return CameraCheck(verdict, f"{reason} {rms} {_notes(problem, opencv, sigmas_tell)}", **known)
+
+
+def _is_digital(adjustment: Adjustment, problem: BareProblem) -> bool:
+    """Whether the camera's frame is that of its pictures."""
+    network = adjustment.network
+    camera = network.camera_by_name[problem.network.cameras[0].name]
+    transformations = {network.image_by_name[image.image].transformation for image in problem.images}
+    return not camera.fiducials and transformations == {"none"}
 
 
 def _rms_um(solved: Adjustment) -> float:

@@ -266,6 +266,24 @@ def _check_problems(check: Json) -> Iterator[Problem]:
         )
 
 
+def _corners_notes(check: Json) -> Iterator[str]:
+    """What OpenCV's own points of a board give in the place of those that were measured here."""
+    for name, camera in check["cameras"].items():
+        corners = camera.get("corners_px")
+        if corners:
+            measured, own = (_pixel_figures(corners[each]) for each in ("reseau", "opencv"))
+            lost = f" OpenCV found no board in {listed(corners['not_found'])}." if corners["not_found"] else ""
+            yield (
+                f"OpenCV's calibration of {name} from {corners['points']} points of {corners['images']} pictures: with "
+                f"the points measured here {measured}; with OpenCV's own ({corners['detector']}) {own}.{lost}"
+            )
+
+
+def _pixel_figures(figures: Json) -> str:
+    named = ", ".join(f"{name} {figures[name]:.2f}" for name in ("fx", "fy", "cx", "cy"))
+    return f"{named} px, rms {figures['rms']:.3f} px a point"
+
+
 def _is_solved(data: ReportData) -> bool:
     return data.adjustment is not None and not any(_no_solution(data.adjustment))
 
@@ -324,6 +342,8 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield "There is no check against OpenCV yet: run `reseau check`."
     elif data.check["verdict"] == "not possible" and not is_film_alone(data):
         yield f"OpenCV cannot check this calibration. {data.check['reason']}"
+    if data.check:
+        yield from _corners_notes(data.check)
     if data.adjustment:
         yield from data.adjustment.get("notes", ())
         yield from _lens_notes(data.adjustment)

@@ -33,8 +33,33 @@ class Row:
 
 
 @dataclass(frozen=True)
+class PixelCalibration:
+    """Camera matrix and rms a point of OpenCV's calibration, in pixels from the centre of the first one, y down."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class CornersCheck:
+    """OpenCV's calibration of a board's points as measured here (reseau) and as OpenCV itself finds them (opencv), in
+    the images and points that both have; detector: OpenCV's functions; not_found: images where these find no board."""
+
+    detector: str
+    images: int
+    points: int
+    not_found: tuple[str, ...]
+    reseau: PixelCalibration
+    opencv: PixelCalibration
+
+
+@dataclass(frozen=True)
 class CameraCheck:
-    """The comparison of one camera. rms in um a point (not an axis); the refit's residual in um, rms over the image."""
+    """The comparison of one camera. rms in um a point (not an axis); the refit's residual in um, rms over the image;
+    corners_px: of a digital camera's board, where its pictures are at hand."""
 
     verdict: Verdict
     reason: str
@@ -44,6 +69,7 @@ class CameraCheck:
     rms_reseau_um: float | None = None
     refit_residual_um: float | None = None
     rows: tuple[Row, ...] = ()
+    corners_px: CornersCheck | None = None
 
     def to_json(self) -> dict[str, Any]:
         return {**asdict(self), "rows": [row.to_json() for row in self.rows]}

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from drawn_frames import layout_of
+from drawn_frames import PITCH_UM, layout_of
 from drawn_project import CAMERA, write_project
 
 from measure.marks.shapes import MarkShape, polygon
 from pipeline.archive.digests import add_digests
+from pipeline.archive.measurement import picture_sizes_mm
 from pipeline.archive.schema import opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
@@ -30,6 +31,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import read_project
 from pipeline.measuring.checked import CheckedScan, checked
 from pipeline.measuring.scan_task import Measure, ScanTask
+from pipeline.results.comparator_file import measurement_of
 from pipeline.results.measured_scan import MeasuredScan
 
 SAID = pytest.CaptureFixture[str]
@@ -72,6 +74,14 @@ def folder(done: Path, tmp_path: Path) -> Path:
 
 def measure(folder: Path, *options: str) -> int:
     return run(["measure", str(folder / "project.toml"), *options])
+
+
+def test_the_size_of_a_picture_is_that_of_its_scan(done: Path) -> None:
+    digest = measurement_of(done / "comparator.csv")
+    height, width = tifffile.imread(done / "a.tif").shape[:2]
+    size = pytest.approx((width * PITCH_UM / 1000.0, height * PITCH_UM / 1000.0))
+    assert picture_sizes_mm(done / "out" / "measurement.db", digest) == {"a": size, "b": size, "c": size}
+    assert picture_sizes_mm(done / "out" / "measurement.db", "") == {}
 
 
 def marks(folder: Path) -> bytes:

@@ -396,7 +396,8 @@ def test_json_has_the_documented_keys_and_no_nan() -> None:
     assert set(written) == {"verdict", "reason", "cameras"}
     camera = written["cameras"]["rc20"]
     assert set(camera) == {
-        "verdict", "reason", "images", "points", "rms_opencv_um", "rms_reseau_um", "refit_residual_um", "rows"
+        "verdict", "reason", "images", "points", "rms_opencv_um", "rms_reseau_um", "refit_residual_um", "rows",
+        "corners_px",
     }  # fmt: skip
     assert set(camera["rows"][0]) == {"name", "unit", "reseau", "opencv", "difference_sigmas"}
     assert set(camera["rows"][0]["reseau"]) == {"value", "sigma"}

@@ -1,0 +1,125 @@
+"""A board's points as OpenCV itself finds them in a digital picture, beside those that were measured here."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from measure.boards.markers import charuco_board
+from measure.boards.specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec, aruco_dictionary
+from measure.errors import MeasurementError
+from measure.scans.scan import Scan
+from pipeline.opencv_check.opencv_calibration import ImagePoints, OpenCvCalibration, can_begin
+from pipeline.results.check_file import CornersCheck, PixelCalibration
+from pipeline.results.comparator_file import comparator_from_pixel
+
+Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+Calibrate = Callable[[Sequence[ImagePoints]], OpenCvCalibration]
+
+HALF_WINDOW_PX = 11  # of cornerSubPix, as OpenCV's own sample of a calibration has it
+CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.0001)  # of the same sample
+FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_FAST_CHECK | cv2.CALIB_CB_NORMALIZE_IMAGE  # of the same sample
+NEAREST = 0.4  # of the distance to the next point, within which a point of OpenCV's is that of a name
+FEWEST_PICTURES = 3
+
+
+@dataclass(frozen=True)
+class BoardPictures:
+    """The pictures of a board. open_scan: of an image, raises MeasurementError or KeyError where its scan is not at
+    hand; pitch_um: across and down, by image."""
+
+    board: BoardSpec
+    open_scan: Callable[[str], Scan]
+    pitch_um: Mapping[str, tuple[float, float]]
+
+    def points_mm(self, image: str) -> Array:
+        """(n, 2) the points that OpenCV finds, in comparator coordinates; none where the scan is not at hand."""
+        try:
+            with self.open_scan(image) as scan:
+                grey = scan.window(0, 0, scan.width_px, scan.height_px) * (255.0 / scan.full_scale_dn)
+                pitch_um = self.pitch_um[image]
+        except (MeasurementError, KeyError):
+            return np.zeros((0, 2))
+        picture = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+        return comparator_from_pixel(find_points(picture, self.board), pitch_um)
+
+
+def detector_name(board: BoardSpec) -> str:
+    """OpenCV's functions that find such a board; empty where it has none that is customary."""
+    match board:
+        case ChessboardSpec():
+            return f"findChessboardCorners and cornerSubPix, half a window of {HALF_WINDOW_PX} px"
+        case CircleGridSpec(asymmetric=False):
+            return "findCirclesGrid"
+        case CharucoSpec():
+            return "CharucoDetector"
+        case ArucoSpec():
+            return "ArucoDetector"
+        case _:
+            return ""
+
+
+def find_points(picture: Bytes, board: BoardSpec) -> Array:
+    """(n, 2) column and row of a board's points by OpenCV's own functions with their customary settings."""
+    found: object = True
+    points = None
+    match board:
+        case ChessboardSpec():
+            found, points = cv2.findChessboardCorners(picture, (board.columns, board.rows), flags=FLAGS)
+            if found:
+                points = cv2.cornerSubPix(picture, points, (HALF_WINDOW_PX,) * 2, (-1, -1), CRITERIA)
+        case CircleGridSpec(asymmetric=False):
+            found, points = cv2.findCirclesGrid(picture, (board.columns, board.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
+        case CharucoSpec():
+            points = cv2.aruco.CharucoDetector(charuco_board(board)).detectBoard(picture)[0]
+        case ArucoSpec():
+            markers = cv2.aruco.ArucoDetector(aruco_dictionary(board.dictionary)).detectMarkers(picture)[0]
+            points = np.concatenate(markers) if len(markers) else None
+    return np.asarray(points, dtype=float).reshape(-1, 2) if found and points is not None else np.zeros((0, 2))
+
+
+def compare_corners(
+    images: Sequence[ImagePoints], pictures: BoardPictures, calibrate: Calibrate
+) -> CornersCheck | None:
+    """OpenCV's calibration of the points that were measured here, and of OpenCV's own in their place: of those that
+    both have. None where too few pictures are at hand, or OpenCV finds its board in too few."""
+    both = [pair for image in images if (pair := _paired(image, pictures)) is not None]
+    if len(both) < FEWEST_PICTURES:
+        return None
+    found = {image.image for image, _ in both}
+    try:
+        measured, own = (calibrate(each) for each in zip(*both, strict=True))
+    except cv2.error:
+        return None
+    pitch_mm = np.array(pictures.pitch_um[both[0][0].image]) / 1000.0
+    return CornersCheck(
+        detector_name(pictures.board),
+        len(both),
+        sum(len(image.xyz) for image, _ in both),
+        tuple(image.image for image in images if image.image not in found),
+        _in_pixels(measured, pitch_mm),
+        _in_pixels(own, pitch_mm),
+    )
+
+
+def _paired(image: ImagePoints, pictures: BoardPictures) -> tuple[ImagePoints, ImagePoints] | None:
+    """The points that both have, each named as the one measured here that is nearest; None where they are too few."""
+    own_mm = pictures.points_mm(image.image)
+    if len(own_mm) == 0 or len(image.xyz) < 2:
+        return None
+    apart_mm = KDTree(image.xy_mm).query(image.xy_mm, k=2)[0][:, 1]
+    distance_mm, nearest = KDTree(own_mm).query(image.xy_mm)
+    rows = np.flatnonzero(distance_mm < NEAREST * apart_mm)
+    if not can_begin(image.xyz[rows]):
+        return None
+    xyz = image.xyz[rows]
+    return ImagePoints(image.image, xyz, image.xy_mm[rows]), ImagePoints(image.image, xyz, own_mm[nearest[rows]])
+
+
+def _in_pixels(calibration: OpenCvCalibration, pitch_mm: Array) -> PixelCalibration:
+    fx, fy, cx, cy = (calibration.parameters[:4] / np.tile(pitch_mm, 2) * (1.0, 1.0, 1.0, -1.0)).tolist()
+    return PixelCalibration(fx, fy, cx, cy, calibration.rms_um / 1000.0 / float(np.sqrt(pitch_mm.prod())))
