@@ -111,8 +111,8 @@ def _paired(image: ImagePoints, pictures: BoardPictures) -> tuple[ImagePoints, I
     own_mm = pictures.points_mm(image.image)
     if len(own_mm) == 0 or len(image.xyz) < 2:
         return None
-    apart_mm = KDTree(image.xy_mm).query(image.xy_mm, k=2)[0][:, 1]
-    distance_mm, nearest = KDTree(own_mm).query(image.xy_mm)
+    apart_mm = np.asarray(KDTree(image.xy_mm).query(image.xy_mm, k=2)[0])[:, 1]
+    distance_mm, nearest = (np.asarray(each) for each in KDTree(own_mm).query(image.xy_mm))
     rows = np.flatnonzero(distance_mm < NEAREST * apart_mm)
     if not can_begin(image.xyz[rows]):
         return None

@@ -43,14 +43,15 @@ TURNS = [(0.5, 0.0, 0.1), (-0.5, 0.1, 0.0), (0.0, 0.55, -0.1), (0.1, -0.5, 0.2),
 
 def pose(number: int) -> tuple[Array, Array]:
     """Rotation (3, 3) from the board, whose y is up, to a camera whose y is down, and shift (3,)."""
-    rotation = cv2.Rodrigues(np.array(TURNS[number]))[0] @ np.diag([1.0, -1.0, -1.0])
+    rotation = np.asarray(cv2.Rodrigues(np.array(TURNS[number]))[0], float) @ np.diag([1.0, -1.0, -1.0])
     shift = np.array([4.0 * number - 8.0, 6.0 - 3.0 * number, 290.0 + 10.0 * number])
-    return rotation, shift - rotation @ POINTS.mean(axis=0)
+    return rotation, np.asarray(shift - rotation @ POINTS.mean(axis=0), float)
 
 
 def corners_px(number: int) -> Array:
     rotation, shift = pose(number)
-    return cv2.projectPoints(POINTS, cv2.Rodrigues(rotation)[0], shift, MATRIX, np.zeros(5))[0].reshape(-1, 2)
+    places = cv2.projectPoints(POINTS, cv2.Rodrigues(rotation)[0], shift, MATRIX, np.zeros(5))[0]
+    return np.asarray(places, float).reshape(-1, 2)
 
 
 def picture(number: int) -> NDArray[np.uint8]:
@@ -64,7 +65,7 @@ def picture(number: int) -> NDArray[np.uint8]:
     light = np.where(inside & ((column + line) % 2 == 0), 40.0, 210.0)
     pixels = light.reshape(SIZE_PX[1], FINENESS, SIZE_PX[0], FINENESS).mean(axis=(1, 3))
     noise = np.random.default_rng(number).normal(0.0, 2.0, pixels.shape)
-    return np.clip(np.rint(pixels + noise), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(pixels + noise), 0, 255), np.uint8)
 
 
 @pytest.fixture(scope="module")
