@@ -201,7 +201,7 @@ def find_squares(picture: Bytes, spec: SquareGridSpec) -> tuple[dict[str, Array]
             assignment = max(assignments, key=lambda found: upright(found, centers))
             notes = ("the grid looks the same when turned: it was taken as upright in the scan",)
             corners = {
-                spec.name_of(place): _ordered(quads[index], _steps(assignment, centers, place))
+                spec.square_name(place): _ordered(quads[index], _steps(assignment, centers, place))
                 for place, index in assignment.items()
             }
             return corners, notes[: len(assignments) - 1], other_grids(centers, appearances, assignment, spec.places())

@@ -150,14 +150,14 @@ class SquareGridSpec:
         return [(row, column) for row in range(self.rows) for column in range(self.columns)]
 
     @staticmethod
-    def name_of(place: tuple[int, int]) -> str:
+    def square_name(place: tuple[int, int]) -> str:
         """Of a square by its row and column."""
         return f"r{place[0]}c{place[1]}"
 
     def object_points(self) -> dict[str, Point3]:
         """Id to (X, Y, 0) in mm."""
         corners = _corners(self.columns, self.rows, self.square_mm, self.gap_mm)
-        return {f"{self.name_of((row, column))}.{corner}": at for (row, column, corner), at in corners.items()}
+        return {f"{self.square_name((row, column))}.{corner}": at for (row, column, corner), at in corners.items()}
 
 
 @dataclass(frozen=True)

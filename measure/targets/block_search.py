@@ -55,7 +55,7 @@ class Block:
         end = np.minimum(np.add(self.place_px, self.size_px), (self.scan.width_px, self.scan.height_px))
         return np.asarray((places >= first[:, None]) & (places < end[:, None]))
 
-    def grey_at(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> Image:
+    def grey_values(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> Image:
         """(n, count) grey values at columns and rows (n, count) from places corners (n, 2) of the scan on; beyond the
         block any of its values."""
         width, height = self.size_px
@@ -87,7 +87,7 @@ def _nearly_means(samples: Samples, factor: int) -> Samples | Image:
     return samples if factor == 1 else means(samples, factor)
 
 
-def joined(first: Record, *others: Record) -> Record:
+def concatenate(first: Record, *others: Record) -> Record:
     """One record of what several of a kind hold."""
     names = [field.name for field in fields(first)]
     return type(first)(*(np.concatenate([getattr(record, name) for record in (first, *others)]) for name in names))
@@ -117,7 +117,7 @@ class Patches:
     contrasts: Array
 
     @classmethod
-    def of(cls, candidates: Sequence[Candidate]) -> "Patches":
+    def collect(cls, candidates: Sequence[Candidate]) -> "Patches":
         return cls(
             np.array([each.center_px for each in candidates]).reshape(-1, 2),
             np.array([each.pixel_from_disk for each in candidates]).reshape(-1, 2, 2),
@@ -135,7 +135,7 @@ class Patches:
         """(n,) of the circles of the same area."""
         return np.asarray(np.sqrt(np.abs(np.linalg.det(self.shapes))))
 
-    def by_strength(self) -> "Patches":
+    def strongest_first(self) -> "Patches":
         """The strongest first, whatever the order in which they were found."""
         return self.part(np.lexsort((*self.centers.T[::-1], -np.abs(self.contrasts))))
 
@@ -169,17 +169,17 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | 
     rows, cols = height + 2 * margin, width + 2 * margin
     spare: list[Samples] = []  # new memory for every block would take longer than what is done in it
 
-    def in_block(corner: tuple[int, int]) -> Patches:
+    def block_patches(corner: tuple[int, int]) -> Patches:
         row0, col0 = (place - margin for place in corner)
         memory = spare.pop() if spare else np.empty((rows, cols, scan.channels), scan.samples_dtype)
         block = Block(scan, col0, row0, margin, scan.samples(col0, row0, cols, rows, memory))
-        found = _separate(joined(Patches.of(()), *_patches_in(block, octaves)))
+        found = _separate(concatenate(Patches.collect(()), *_octave_patches(block, octaves)))
         found = confirmed(block, found) if confirmed else found
         spare.append(memory)
         return found
 
     corners = product(range(0, scan.height_px, height), range(0, scan.width_px, width))
-    return _separate(joined(*map_in_threads(in_block, corners))).candidates()
+    return _separate(concatenate(*map_in_threads(block_patches, corners))).candidates()
 
 
 def _block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:
@@ -204,7 +204,7 @@ def _whole(size: int, unit: int) -> int:
     return -(-size // unit) * unit
 
 
-def _patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
+def _octave_patches(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
     """Those that lie in the block, in pixels of the scan."""
     reductions = block.reductions({octave.factor for octave in octaves})
     width, height = (size - 2 * block.margin_px for size in block.size_px)
@@ -224,7 +224,7 @@ def _patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
 
 def _separate(found: Patches) -> Patches:
     """The strongest of candidates that lie within one another, the strongest first."""
-    found = found.by_strength()
+    found = found.strongest_first()
     kept: set[int] = set()
     for index, near in enumerate(cKDTree(found.centers).query_ball_point(found.centers, 0.7 * found.radii)):
         if kept.isdisjoint(near):

@@ -66,9 +66,9 @@ class Comparison:
     covariance_px2: Array
 
 
-def compared(targets: TargetPlaces, seen_px: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Comparison:
+def compared(targets: TargetPlaces, observed_px: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Comparison:
     """Targets seen at (n, 2) px with covariances (n, 2, 2), in an image of this width and height."""
-    offsets = seen_px - targets.places_px
+    offsets = observed_px - targets.places_px
     fits = [_fitted(_design(targets, size_px, bending), offsets, targets, covariance_px2) for bending in _BENDING]
     best = min(fits, key=lambda fit: float(np.median(np.linalg.norm(fit.off_px, axis=1))))
     own = covariance_px2 + best.more_px2[:, None, None] * np.eye(2)
@@ -106,10 +106,10 @@ class _Fit:
     more_px2: Array
 
 
-def _fitted(design: Array, offsets: Array, targets: TargetPlaces, seen_px2: Array) -> _Fit:
+def _fitted(design: Array, offsets: Array, targets: TargetPlaces, observed_px2: Array) -> _Fit:
     """Student's t by expectation and maximisation, the scatter anew in each round."""
-    off, predicted, unknowns = offsets - np.median(offsets, axis=0), np.zeros_like(seen_px2), design.shape[2]
-    variances, more_px2 = _scatter(off, predicted, targets, seen_px2)
+    off, predicted, unknowns = offsets - np.median(offsets, axis=0), np.zeros_like(observed_px2), design.shape[2]
+    variances, more_px2 = _scatter(off, predicted, targets, observed_px2)
     weights = student_weights(_squares(off, variances), 2.0)
     fit = None
     for _ in range(_ROUNDS):
@@ -125,7 +125,7 @@ def _fitted(design: Array, offsets: Array, targets: TargetPlaces, seen_px2: Arra
         squares = _squares(off, variances + predicted)
         before, weights = weights, student_weights(squares, 2.0)
         fit = _Fit(off, squares, float(np.einsum("nij,nji->", hat, by_weight)), predicted, more_px2)
-        variances, more_px2 = _scatter(off, predicted, targets, seen_px2)
+        variances, more_px2 = _scatter(off, predicted, targets, observed_px2)
         if np.abs(weights - before).max() < _SETTLED:
             break
     assert fit is not None
@@ -137,25 +137,25 @@ def _squares(off: Array, covariances: Array) -> Array:
     return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariances), off))
 
 
-def _scatter(off: Array, predicted: Array, targets: TargetPlaces, seen_px2: Array) -> tuple[Array, Array]:
+def _scatter(off: Array, predicted: Array, targets: TargetPlaces, observed_px2: Array) -> tuple[Array, Array]:
     """Of the targets about their places: (n, 2, 2) px², and (n,) px² of it that all of them scatter more than is known.
 
     They may scatter less than is claimed of their coordinates, or even of where they were seen; then that counts less.
     Points whose coordinates are free have a scatter of their own.
     """
-    variances, more_px2 = seen_px2 + targets.covariance_px2, np.zeros(len(off))
+    variances, more_px2 = observed_px2 + targets.covariance_px2, np.zeros(len(off))
     for group in (targets.is_free, ~targets.is_free):
         if not group.any():
             continue
-        points, seen, open_px2 = (
+        points, observed, open_px2 = (
             float(np.median(np.einsum("nii->n", one[group]))) / 2.0
-            for one in (targets.covariance_px2, seen_px2, predicted)
+            for one in (targets.covariance_px2, observed_px2, predicted)
         )
         own = max(float(np.median((off[group] ** 2).sum(axis=1))) / _MEDIAN - open_px2, _LEAST_PX2)
-        of_seen = min(own / max(seen, _LEAST_PX2), 1.0)
-        of_points = min(max(own - seen, 0.0) / max(points, _LEAST_PX2), 1.0) if targets.is_claim else 1.0
-        known = of_seen * seen_px2[group] + of_points * targets.covariance_px2[group]
-        more_px2[group] = max(own - seen - points, _LEAST_PX2)
+        of_observed = min(own / max(observed, _LEAST_PX2), 1.0)
+        of_points = min(max(own - observed, 0.0) / max(points, _LEAST_PX2), 1.0) if targets.is_claim else 1.0
+        known = of_observed * observed_px2[group] + of_points * targets.covariance_px2[group]
+        more_px2[group] = max(own - observed - points, _LEAST_PX2)
         variances[group] = known + more_px2[group][:, None, None] * np.eye(2)
     return variances, more_px2
 
@@ -186,13 +186,13 @@ def _chances(fit: _Fit, targets: TargetPlaces) -> Array:
 @dataclass(frozen=True, eq=False)
 class ImagePoints:
     """What an image shows: index (n,), of the points; targets: where it should show them by their coordinates; by_point
-    (n, 2, 3): how far the unit of each coordinate moves them, px; seen_px (n, 2), covariance_px2 (n, 2, 2): where they
-    were seen; size_px of the image."""
+    (n, 2, 3): how far the unit of each coordinate moves them, px; observed_px (n, 2) and
+    covariance_px2 (n, 2, 2): where it does; size_px of the image."""
 
     index: NDArray[np.intp]
     targets: TargetPlaces
     by_point: Array
-    seen_px: Array
+    observed_px: Array
     covariance_px2: Array
     size_px: tuple[int, int]
 
@@ -202,15 +202,15 @@ class ImagePoints:
         known = self.by_point @ covariance @ self.by_point.swapaxes(1, 2)
         places = self.targets.places_px + moved
         targets = replace(self.targets, places_px=places, covariance_px2=known, is_claim=False)
-        return compared(targets, self.seen_px, self.covariance_px2, self.size_px)
+        return compared(targets, self.observed_px, self.covariance_px2, self.size_px)
 
 
 def compared_together(images: Sequence[ImagePoints], xyz: Array) -> list[Comparison]:
     """Each image's targets against its others and the other images; xyz (m, 3): the points, along a plane and above it
     if they lie on one: each coordinate has a spread of its own."""
-    known = _Known.at_first(len(images), xyz)
+    known = _Known.start(len(images), xyz)
     for _ in range(_POINT_ROUNDS - 1):
-        known = _gathered(_Readings.of(images, known), known)
+        known = _gathered(_Readings.read(images, known), known)
     return _comparisons(images, known)
 
 
@@ -225,7 +225,7 @@ class _Known:
     extent: float
 
     @classmethod
-    def at_first(cls, images: int, xyz: Array) -> "_Known":
+    def start(cls, images: int, xyz: Array) -> "_Known":
         extent = float(np.ptp(xyz, axis=0).max())
         none = np.zeros((images, *xyz.shape))
         return cls(none, np.zeros((*none.shape, 3)), np.full(3, _SPREAD * extent), extent)
@@ -250,7 +250,7 @@ def _gathered(readings: "_Readings", known: _Known) -> _Known:
         moments = of_prior[:, None] * (off**2 + np.einsum("nii->ni", covariance))
         spread = np.maximum(np.sqrt(moments[is_shared].mean(axis=0)), _LEAST * known.extent)
     others = [
-        readings.without(i).solved(np.delete(weights, i, axis=0), of_prior, spread) for i in range(len(weights))
+        readings.leave_out(i).solved(np.delete(weights, i, axis=0), of_prior, spread) for i in range(len(weights))
     ]  # fmt: skip
     offs, covariances = (np.stack(parts) for parts in zip(*others, strict=True))
     return replace(known, off=offs, covariance=covariances, spread=spread)
@@ -274,20 +274,20 @@ class _Readings:
     squares: Array
 
     @classmethod
-    def of(cls, images: Sequence[ImagePoints], known: _Known) -> "_Readings":
+    def read(cls, images: Sequence[ImagePoints], known: _Known) -> "_Readings":
         """What each image shows of the points, compared with what is known of them."""
         count = known.off.shape[:2]
         normal, right, squares = np.zeros((*count, 3, 3)), np.zeros((*count, 3)), np.zeros(count)
         comparisons = _comparisons(images, known)
         for i, (image, one, noise) in enumerate(zip(images, comparisons, _noises(comparisons), strict=True)):
-            seen = one.off_px + np.einsum("nij,nj->ni", image.by_point, known.off[i, image.index])
-            weighted = np.linalg.solve(noise, np.dstack([image.by_point, seen]))
+            offsets = one.off_px + np.einsum("nij,nj->ni", image.by_point, known.off[i, image.index])
+            weighted = np.linalg.solve(noise, np.dstack([image.by_point, offsets]))
             normal[i, image.index] = image.by_point.swapaxes(1, 2) @ weighted[..., :3]
             right[i, image.index] = np.einsum("nij,ni->nj", image.by_point, weighted[..., 3])
-            squares[i, image.index] = np.einsum("ni,ni->n", seen, weighted[..., 3])
+            squares[i, image.index] = np.einsum("ni,ni->n", offsets, weighted[..., 3])
         return cls(normal, right, squares)
 
-    def without(self, image: int) -> "_Readings":
+    def leave_out(self, image: int) -> "_Readings":
         return _Readings(*(np.delete(part, image, axis=0) for part in (self.normal, self.right, self.squares)))
 
     def solved(self, weights: Array, of_prior: Array, spread: Array) -> tuple[Array, Array]:
@@ -325,12 +325,12 @@ class _Readings:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenSheet:
-    """What a picture shows of a sheet: index (n,), of the points; seen_px (n, 2), covariance_px2 (n, 2, 2): where they
-    were seen; size_px of the picture."""
+class SheetImage:
+    """What a picture shows of a sheet: index (n,), of the points; observed_px (n, 2) and covariance_px2 (n, 2, 2):
+    where it does; size_px of the picture."""
 
     index: NDArray[np.intp]
-    seen_px: Array
+    observed_px: Array
     covariance_px2: Array
     size_px: tuple[int, int]
 
@@ -347,7 +347,7 @@ def is_flat(along: Array) -> bool:
     return bool(extent[2] <= FLAT * extent[0])
 
 
-def sheet_points(pictures: Sequence[SeenSheet], sheet: Array) -> list[ImagePoints | None]:
+def sheet_points(pictures: Sequence[SheetImage], sheet: Array) -> list[ImagePoints | None]:
     """Where one camera's pictures should show the points of a sheet, (m, 3) along its plane and above it; None for
     those that show too few, or that no camera sees so."""
     views = [_view(picture, sheet) for picture in pictures]
@@ -358,13 +358,13 @@ def sheet_points(pictures: Sequence[SeenSheet], sheet: Array) -> list[ImagePoint
     ]
 
 
-def _view(picture: SeenSheet, sheet: Array) -> SheetView | None:
+def _view(picture: SheetImage, sheet: Array) -> SheetView | None:
     if len(picture.index) < _LEAST_POINTS:
         return None
-    return robust_view(sheet[picture.index, :2], picture.seen_px, picture.size_px)
+    return robust_view(sheet[picture.index, :2], picture.observed_px, picture.size_px)
 
 
-def _image_points(picture: SeenSheet, view: SheetView, focal: float, sheet: Array) -> ImagePoints | None:
+def _image_points(picture: SheetImage, view: SheetView, focal: float, sheet: Array) -> ImagePoints | None:
     """Where the view folds or the sheet lies behind the camera, nothing is said of a point."""
     places = view.places_px(sheet[picture.index, :2])
     known = np.isfinite(places).all(axis=1)
@@ -374,14 +374,14 @@ def _image_points(picture: SeenSheet, view: SheetView, focal: float, sheet: Arra
     by_point = view.pixel_from_space(sheet[index, :2], focal, _STEP * float(np.ptp(sheet[:, :2])))
     places = places + by_point[..., 2] * sheet[index, 2:]
     targets = TargetPlaces(
-        places, _by_view(places, picture.size_px), np.zeros((len(index), 2, 2)), np.zeros(len(index), bool)
+        places, _view_derivatives(places, picture.size_px), np.zeros((len(index), 2, 2)), np.zeros(len(index), bool)
     )
     return ImagePoints(
-        index, targets, by_point, picture.seen_px[known], picture.covariance_px2[known], picture.size_px
+        index, targets, by_point, picture.observed_px[known], picture.covariance_px2[known], picture.size_px
     )  # fmt: skip
 
 
-def _by_view(places: Array, size_px: tuple[int, int]) -> Array:
+def _view_derivatives(places: Array, size_px: tuple[int, int]) -> Array:
     """(n, 2, 4) how far perspective and the lens's middle move places (n, 2), each by its standard deviation."""
     size = float(np.hypot(*size_px))
     about = (2.0 * places - (np.array(size_px) - 1.0)) / size

@@ -87,7 +87,7 @@ class CrossOctave:
         return int(np.ceil(2.0 * self.half[1] + 4))
 
     def patches(self, small: Image) -> Patches:
-        found = Patches.of(_patches(small, self.half, self.search, self.full_scale_dn))
+        found = Patches.collect(_patches(small, self.half, self.search, self.full_scale_dn))
         first = self._margin - 0.5
         last = np.array(small.shape[::-1]) - self._margin - 0.5
         return found.part(np.all((found.centers >= first) & (found.centers < last), axis=1))
@@ -119,7 +119,7 @@ def _crosses(thin: Image, level: float, half: tuple[float, float], search: Cross
         patch = np.where(labels[crop] == label, thin[crop], 0.0)
         # Half of what stands out: blur and noise make a patch at the lowest level wider than the cross.
         patch = np.where(patch > 0.5 * np.quantile(patch[patch > 0.0], 0.8), patch, 0.0)
-        cross = _cross_of(patch, search.line)
+        cross = _fit_cross(patch, search.line)
         if cross is None:
             continue
         center, bars = cross
@@ -130,7 +130,7 @@ def _crosses(thin: Image, level: float, half: tuple[float, float], search: Cross
     return found
 
 
-def _cross_of(patch: NDArray[np.floating], line: float) -> tuple[Array, Array] | None:
+def _fit_cross(patch: NDArray[np.floating], line: float) -> tuple[Array, Array] | None:
     """Centre (2,) and half bars (2, 2) in columns of a cross of which a patch (rows, columns) shows the brightness."""
     rows, cols = np.nonzero(patch)
     if len(rows) < 12:

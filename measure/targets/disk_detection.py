@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from measure.noise.robust_estimation import robust_scales
 from measure.scans.scan import Scan
-from measure.targets.block_search import Block, Candidate, Patches, joined, search_blocks
+from measure.targets.block_search import Block, Candidate, Patches, concatenate, search_blocks
 from measure.targets.disk_fit_batch import disks_among
 
 Array = NDArray[np.float64]
@@ -83,7 +83,7 @@ class Outlines:
 _NONE = Outlines(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0))
 
 
-def outlines_about(image: Image, blobs: Blobs) -> Outlines:
+def blob_outlines(image: Image, blobs: Blobs) -> Outlines:
     """Of those blobs, light ones, that end on every ray; most of what stands out of a landscape runs on along some."""
     near, between = partial(_nearest, image), partial(_interpolated, image)
     found = []
@@ -95,7 +95,7 @@ def outlines_about(image: Image, blobs: Blobs) -> Outlines:
         for some in _chunks(alike, _RAYS * REACH * radius / 0.5):
             profiles = _Profiles(between, some, radius, _RAYS, 0.5)
             found.append(_outlines(some.places[profiles.ends], profiles))
-    return joined(_NONE, *found)
+    return concatenate(_NONE, *found)
 
 
 def _chunks(blobs: Blobs, samples: float) -> Iterator[Blobs]:
@@ -198,14 +198,14 @@ def margin_px(radii: list[float]) -> int:
 def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int) -> Patches:
     """Patches of a disk's shape in a picture reduced by a factor that lie within its margin."""
     small, scan_px2 = np.ascontiguousarray(small), small.size * factor**2
-    cells = Cells.of(small.shape[1], round(scan_px2 / _CELL_PX**2))
+    cells = Cells.divide(small.shape[1], round(scan_px2 / _CELL_PX**2))
     is_textured = scan_px2 >= _TEXTURE_PX**2
     noise = cells.scales(_fine_structure(small)) if is_textured else np.zeros(len(cells.ends))
     found = []
     for sign, own in _blobs(small, radii, search, full_scale_dn, cells, is_textured):
-        outlines = outlines_about(small if sign > 0 else -small, own)
-        found.append(_round_ones(outlines, noise[cells.at(outlines.centers[:, 0])], factor, sign))
-    return joined(Patches.of(()), *found)
+        outlines = blob_outlines(small if sign > 0 else -small, own)
+        found.append(_round_ones(outlines, noise[cells.index(outlines.centers[:, 0])], factor, sign))
+    return concatenate(Patches.collect(()), *found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ class Cells:
     ends: NDArray[np.intp]
 
     @classmethod
-    def of(cls, width: int, count: int) -> "Cells":
+    def divide(cls, width: int, count: int) -> "Cells":
         """Some count of them, as far as they hold samples."""
         count = max(min(count, width // (2 * _EVERY)), 1)
         return cls(np.linspace(0, width, count + 1).astype(np.intp)[1:])
@@ -228,7 +228,7 @@ class Cells:
         own = samples[:, : count * wide].reshape(rows, count, wide).swapaxes(0, 1)
         return robust_scales(own.reshape(count, -1))
 
-    def at(self, columns: Array) -> NDArray[np.intp]:
+    def index(self, columns: Array) -> NDArray[np.intp]:
         """The cells in which columns lie."""
         return np.searchsorted(self.ends[:-1], columns, side="right")
 
@@ -302,12 +302,12 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
 
     def disks(block: Block, patches: Patches) -> Patches:
         found = disks_among(block, patches)
-        return found.part(_are_between(smallest, largest, found))
+        return found.part(_have_diameters(smallest, largest, found))
 
-    return search_blocks(scan, octaves_of(search, scan.full_scale_dn), disks)
+    return search_blocks(scan, disk_octaves(search, scan.full_scale_dn), disks)
 
 
-def _are_between(smallest_px: float, largest_px: float, disks: Patches) -> NDArray[np.bool_]:
+def _have_diameters(smallest_px: float, largest_px: float, disks: Patches) -> NDArray[np.bool_]:
     """(n,) whether the diameters of ellipses can be those of disks seen obliquely."""
     longer, shorter = 2 * np.linalg.svd(disks.shapes, compute_uv=False).T
     return np.asarray((longer >= smallest_px) & (shorter <= largest_px))
@@ -332,7 +332,7 @@ class DiskOctave:
         return patches(small, self.radii, self.search, self.full_scale_dn, self.factor)
 
 
-def octaves_of(search: DiskSearch, full_scale_dn: float) -> list[DiskOctave]:
+def disk_octaves(search: DiskSearch, full_scale_dn: float) -> list[DiskOctave]:
     """Radii from the smallest to the largest, each in the reduction that leaves it a few pixels."""
     smallest, largest = search.diameter_px[0] / 2, search.diameter_px[1] / 2
     count = int(np.ceil(np.log(largest / smallest) / np.log(_SCALE_STEP))) + 1

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION, gauss_newton_step, tukey_weights
-from measure.targets.block_search import Block, Patches, joined
+from measure.targets.block_search import Block, Patches, concatenate
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -63,7 +63,7 @@ class DiskPixels:
 
     def grey(self, block: Block) -> Image:
         """(n, pixels)"""
-        return block.grey_at(self.corners, *self.places)
+        return block.grey_values(self.corners, *self.places)
 
     def correlation(self, residuals: Image) -> Array:
         """(n,) of residuals (n, pixels) with those beside and below."""
@@ -72,8 +72,8 @@ class DiskPixels:
         at = self.numbers + cells * np.arange(len(left))[:, None]
         window = np.zeros(len(left) * cells, np.float32)
         window[at] = left
-        beside = window.take(at + 1, mode="clip") + window.take(at + self.side, mode="clip")
-        return np.asarray((left * beside).sum(axis=1) / np.maximum(2 * (left * left).sum(axis=1), 1e-6), float)
+        neighbours = window.take(at + 1, mode="clip") + window.take(at + self.side, mode="clip")
+        return np.asarray((left * neighbours).sum(axis=1) / np.maximum(2 * (left * left).sum(axis=1), 1e-6), float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class Areas:
     every: Indices
 
     @classmethod
-    def about(cls, places: Array, shapes: Array, margin_px: Array, every: Indices) -> "Areas":
+    def surround(cls, places: Array, shapes: Array, margin_px: Array, every: Indices) -> "Areas":
         """Of ellipses of shapes (n, 2, 2) and the ground beside them, margin_px (n,) wide."""
         squares, directions = np.linalg.eigh(shapes @ shapes.swapaxes(1, 2))
         return cls(places, np.sqrt(np.maximum(squares, 0.0)) + margin_px[:, None], directions, every)
@@ -155,7 +155,7 @@ class DiskStates:
     def radius(self) -> Array:
         return _radius_px(self.shapes)
 
-    def moved(self, by: NDArray[np.intp]) -> "DiskStates":
+    def shifted(self, by: NDArray[np.intp]) -> "DiskStates":
         """By (n, 2) columns and rows."""
         return replace(self, centers=self.centers + by)
 
@@ -203,10 +203,10 @@ class DiskModel:
         self.state = state
         self._col, self._row = col, row
 
-    def at(self, state: DiskStates) -> "DiskModel":
+    def relinearised(self, state: DiskStates) -> "DiskModel":
         return DiskModel(state, self._col, self._row)
 
-    def with_greys(self, greys: Array) -> "DiskModel":
+    def replace_greys(self, greys: Array) -> "DiskModel":
         model = copy(self)
         model.state = replace(self.state, greys=greys)
         return model
@@ -287,9 +287,9 @@ def disks_among(block: Block, patches: Patches) -> Patches:
     """Those patches that a disk explains, the strongest first, as fitted: a place within a tenth of a pixel or so."""
     starts = _states(patches)
     none = starts.part(np.zeros(0, np.intp))
-    promising = joined(none, *map(_promising, _groups(block, starts, _every(starts.radius))))
-    fitted = joined(none, *map(_fitted, _groups(block, promising, np.ones(len(promising.blur), np.intp))))
-    return Patches(fitted.centers, fitted.shapes, fitted.greys[:, 0]).by_strength()
+    promising = concatenate(none, *map(_promising, _groups(block, starts, _every(starts.radius))))
+    fitted = concatenate(none, *map(_final_fit, _groups(block, promising, np.ones(len(promising.blur), np.intp))))
+    return Patches(fitted.centers, fitted.shapes, fitted.greys[:, 0]).strongest_first()
 
 
 def _states(patches: Patches) -> DiskStates:
@@ -308,9 +308,9 @@ def _groups(block: Block, disks: DiskStates, every: NDArray[np.intp]) -> Iterato
     """The disks with every (n,) so many columns and rows: each is sampled by its own size, whatever it is together
     with."""
     margin = np.maximum(MARGIN * disks.radius, LEAST_MARGIN_PX)
-    areas = Areas.about(disks.centers, disks.shapes, margin, every)
+    areas = Areas.surround(disks.centers, disks.shapes, margin, every)
     for chosen in areas.alike():
-        yield _Group.of(block, disks.part(chosen), areas.part(chosen).pixels(block))
+        yield _Group.begin(block, disks.part(chosen), areas.part(chosen).pixels(block))
 
 
 def _promising(group: "_Group") -> DiskStates:
@@ -323,7 +323,7 @@ def _promising(group: "_Group") -> DiskStates:
     return group.part((group.misfit() < _HOPELESS) & group.is_sane()).disks_now()
 
 
-def _fitted(group: "_Group") -> DiskStates:
+def _final_fit(group: "_Group") -> DiskStates:
     """Those that are disks, after one step more."""
     group = group.stepped(is_robust=True)
     return group.part((group.misfit() < 1.0) & group.is_sane()).disks_now()
@@ -340,10 +340,10 @@ class _Group:
     model: DiskModel
 
     @classmethod
-    def of(cls, block: Block, disks: DiskStates, pixels: DiskPixels) -> "_Group":
-        grey, model = pixels.grey(block), DiskModel(disks.moved(-pixels.corners), *pixels.places)
+    def begin(cls, block: Block, disks: DiskStates, pixels: DiskPixels) -> "_Group":
+        grey, model = pixels.grey(block), DiskModel(disks.shifted(-pixels.corners), *pixels.places)
         greys = gauss_newton_step(model.grey_design(), grey, pixels.used.astype(np.float32), DAMPING)
-        return cls(disks, pixels, grey, model.with_greys(greys))
+        return cls(disks, pixels, grey, model.replace_greys(greys))
 
     @property
     def state(self) -> DiskStates:
@@ -375,7 +375,7 @@ class _Group:
             scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.state.greys[:, 0]) + 1e-6)
             weights *= tukey_weights(self.residuals / each(scale), 1.0)
         step = gauss_newton_step(self.model.design(), self.residuals, weights, DAMPING)
-        return replace(self, model=self.model.at(self.state.stepped(step)))
+        return replace(self, model=self.model.relinearised(self.state.stepped(step)))
 
     def misfit(self) -> Array:
         """(n,) what a disk leaves unexplained, over what is allowed; a picture of something else is alike in
@@ -394,4 +394,4 @@ class _Group:
 
     def disks_now(self) -> DiskStates:
         """As adjusted, in the scan."""
-        return self.state.moved(self.pixels.corners)
+        return self.state.shifted(self.pixels.corners)

@@ -113,12 +113,12 @@ class FittedDisk:
         """Why a disk that cannot be compared with others is doubtful: dust and spots look like it; empty otherwise."""
         shorter = self.half_axes_px[1]
         if shorter < _SMALL_RADIUS_PX:
-            told = f"small: half axis {shorter:.1f} px, dust of its size would look the same"
-            return Reason(told, Code.SMALL, Code.DUST)
+            message = f"small: half axis {shorter:.1f} px, dust of its size would look the same"
+            return Reason(message, Code.SMALL, Code.DUST)
         if not self.is_soft:
             return NO_REASON
-        told = f"its edge is as soft as a spot's: blur {self.blur_px:.1f} px, half axis {shorter:.1f} px"
-        return Reason(told, Code.BLUR, Code.DUST)
+        message = f"its edge is as soft as a spot's: blur {self.blur_px:.1f} px, half axis {shorter:.1f} px"
+        return Reason(message, Code.BLUR, Code.DUST)
 
     @property
     def quality(self) -> dict[str, float]:
@@ -153,12 +153,12 @@ def fit_disk(
     sure = max(MARGIN * radius, LEAST_MARGIN_PX, _LEAST_REACH_PX - radius)
     sure = max(min(sure, longest_margin_px, _LONGEST_MARGIN_PX), _NARROWEST_MARGIN_PX)
     wide = max(sure, min(PLAIN_MARGIN_PX, longest_margin_px))
-    fitted = _fit_by_margin(scan, start, shape, sure, wide)
-    disk = fitted(wide)
+    fit_with_ground = _fit_by_margin(scan, start, shape, sure, wide)
+    disk = fit_with_ground(wide)
     soft = min(_MARGIN_BLURS * disk.blur_px, longest_margin_px)
     # In less ground than its blur reaches, a disk's blur, size and contrast may run away together.
     if soft > wide and not (disk.reason and disk.is_fitted):
-        softer = fitted(soft)
+        softer = fit_with_ground(soft)
         disk = disk if softer.reason else softer
     if not disk.reason:
         return disk
@@ -166,7 +166,7 @@ def fit_disk(
     # it does how soft an edge is: what passes with less of it, at another place, may be the dust itself.
     if disk.is_soft or not sure < wide:
         return disk
-    narrow = fitted(sure)
+    narrow = fit_with_ground(sure)
     if narrow.reason or not disk.is_spoilt:
         return narrow
     agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
@@ -189,7 +189,7 @@ def _fit_by_margin(
     )
     window = read_window(scan, window_about(shape, start, wide_px + BESIDE_PX))
 
-    def fitted(margin_px: float) -> FittedDisk:
+    def fit_with_ground(margin_px: float) -> FittedDisk:
         fit = match(window, shape, start, replace(options, margin_px=margin_px))
         loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
         disk = FittedDisk(
@@ -204,9 +204,9 @@ def _fit_by_margin(
             sloping=fit.sloping,
             reason=NO_REASON if fit.converged else fit.reason,
         )
-        return _judged(disk, fit)
+        return _assess(disk, fit)
 
-    return fitted
+    return fit_with_ground
 
 
 def _mean_radius_px(pixel_from_disk: Array) -> float:
@@ -223,7 +223,7 @@ def _appearance_covariance(fit: Match) -> Array:
     return np.asarray(fit.covariance[np.ix_(figures, figures)] / np.outer(per, per))
 
 
-def _judged(disk: FittedDisk, fit: Match) -> FittedDisk:
+def _assess(disk: FittedDisk, fit: Match) -> FittedDisk:
     """The disk with its reason or weakness, where the fit's figures give one; residuals of a picture of something else
     are alike in neighbouring pixels."""
     if disk.reason:
@@ -234,19 +234,19 @@ def _judged(disk: FittedDisk, fit: Match) -> FittedDisk:
     most = contrast * (1 + min(_SURE * disk.contrast_sigma, _MOST_FAINTER)) if fit.covariance_is_white else contrast
     worst = WORST_SMOOTH_MISFIT if fit.neighbour_correlation > SMOOTH else WORST_MISFIT
     if not disk.is_fitted or most < LEAST_SNR * disk.noise_dn:
-        told = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
-        reason = Reason(told, Code.CONTRAST)
+        message = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
+        reason = Reason(message, Code.CONTRAST)
     elif disk.noise_dn > worst * contrast and not fit.covariance_is_white:
-        told = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
-        reason = Reason(told, Code.LIKENESS)
+        message = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
+        reason = Reason(message, Code.LIKENESS)
     elif disk.is_spoilt:
-        told = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
-        reason = Reason(told, Code.COVERED)
+        message = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
+        reason = Reason(message, Code.COVERED)
     elif shorter < SMALLEST_RADIUS_PX:
         reason = Reason(f"too small: half axis {shorter:.1f} px", Code.SMALL)
     elif disk.damaged_fraction > _WEAK_DAMAGE:
-        told = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it are damaged"
-        weakness = Reason(told, Code.COVERED)
+        message = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it are damaged"
+        weakness = Reason(message, Code.COVERED)
     return replace(disk, reason=reason, weakness=weakness)
 
 
@@ -326,7 +326,7 @@ def _common(appearances: Array, disks: Sequence[FittedDisk]) -> _Common:
     direction: stretch and shear spread alike. Damage that was seen makes more of it likely.
     """
     noise = np.array([disk.appearance_covariance for disk in disks])
-    dust, by_slope = _dust_variances(disks), _by_slope(disks)
+    dust, slope_logs = _dust_variances(disks), _slope_log_densities(disks)
     damaged = np.array([disk.damaged_fraction > 0 for disk in disks])
     before = np.array([_WHOLE, _DAMAGED])
     shares = before
@@ -336,11 +336,11 @@ def _common(appearances: Array, disks: Sequence[FittedDisk]) -> _Common:
     for _ in range(_ROUNDS):
         weights = np.linalg.inv(noise + np.diag(spread) + dust)
         last, off = kinds, appearances - appearance
-        logs = np.log(shares[damaged.astype(int)].T) + by_slope + _log_density(off, weights)
+        logs = np.log(shares[damaged.astype(int)].T) + slope_logs + _log_density(off, weights)
         kinds = np.exp(logs - logs.max(axis=0))
         kinds /= kinds.sum(axis=0)
-        seen = np.array([kinds[:, ~damaged].sum(axis=1), kinds[:, damaged].sum(axis=1)])
-        shares = (seen + _BEFORE * before) / (seen.sum(axis=1, keepdims=True) + _BEFORE)
+        counts = np.array([kinds[:, ~damaged].sum(axis=1), kinds[:, damaged].sum(axis=1)])
+        shares = (counts + _BEFORE * before) / (counts.sum(axis=1, keepdims=True) + _BEFORE)
         clean, weights = kinds[0], weights[0]
         weighed = clean[:, None, None] * weights
         appearance = np.linalg.solve(weighed.sum(axis=0), np.einsum("nij,nj->i", weighed, appearances))
@@ -363,7 +363,7 @@ def _dust_variances(disks: Sequence[FittedDisk]) -> Array:
     return np.asarray(np.multiply.outer(np.square(_DUST), appearance[..., None] ** 2 * np.eye(len(_DUST_APPEARANCE))))
 
 
-def _by_slope(disks: Sequence[FittedDisk]) -> Array:
+def _slope_log_densities(disks: Sequence[FittedDisk]) -> Array:
     """(kinds, n) the logarithms of the probability densities of the places with sloping paint: these are independent of
     the appearances, for they are told by residuals. 0 where a disk has none."""
     logs = np.zeros((len(_DUST), len(disks)))

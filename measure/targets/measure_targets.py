@@ -67,7 +67,7 @@ def search_targets(
     for prediction in predictions:
         near, why = [], NO_REASON
         for spot in _spots(scan, prediction, polarity, shape):
-            index, reason = _fitted_at(scan, spot, prediction, size_tolerance, shape, result)
+            index, reason = _fit_spot(scan, spot, prediction, size_tolerance, shape, result)
             if index is None:
                 why = why or reason
             elif index not in near:
@@ -126,7 +126,7 @@ def _compared_part(pixel_from_disk: Array, half: NDArray[np.intp], shape: MarkSh
     return np.asarray(np.linalg.norm(places @ np.linalg.inv(grown).T, axis=-1) <= 1, np.float32)
 
 
-def _fitted_at(
+def _fit_spot(
     scan: Scan, spot: Array, prediction: Prediction, size_tolerance: float, shape: MarkShape, result: SearchResult
 ) -> tuple[int | None, Reason]:
     """The index of the disk at a spot, fitted now or before; None, and why, if there is none of the right size."""
@@ -134,7 +134,7 @@ def _fitted_at(
     if index is not None:
         disk = result.disks[index]
     else:
-        disk = fit_disk(scan, spot, prediction.pixel_from_disk, shape=_in_perspective(shape, prediction))
+        disk = fit_disk(scan, spot, prediction.pixel_from_disk, shape=_perspective_shape(shape, prediction))
         if disk.reason:
             return None, disk.reason
         if np.hypot(*(disk.center_px - prediction.center_px)) > prediction.search_px + 1:
@@ -147,7 +147,7 @@ def _fitted_at(
     return index, NO_REASON
 
 
-def _in_perspective(shape: MarkShape, prediction: Prediction) -> MarkShape:
+def _perspective_shape(shape: MarkShape, prediction: Prediction) -> MarkShape:
     """The shape as it is seen but for an affinity. A disk is an ellipse all the same."""
     if shape is UNIT_DISK:
         return shape
@@ -171,8 +171,8 @@ def _keep_common_polarity(result: SearchResult) -> None:
     for number, near in enumerate(result.near):
         kept = [index for index in near if result.disks[index].contrast_dn * sign > 0]
         if near and not kept:
-            told = f"what was found there is not {name} as the other targets are"
-            result.why_none[number] = Reason(told, Code.POLARITY)
+            message = f"what was found there is not {name} as the other targets are"
+            result.why_none[number] = Reason(message, Code.POLARITY)
         result.near[number] = kept
 
 
@@ -354,17 +354,17 @@ def measure_disks(
     A disk is a prediction's target if it is the one disk of the right size near the place where the prediction and the
     shift that all targets share put it. Points are named once; ValueError otherwise.
     """
-    return _measured(scan, predictions, options or TargetOptions(), UNIT_DISK)
+    return _measure_predicted(scan, predictions, options or TargetOptions(), UNIT_DISK)
 
 
 def measure_crosses(
     scan: Scan, predictions: Sequence[TargetPrediction], line: float, options: TargetOptions | None = None
 ) -> tuple[MarkMeasurement, ...]:
     """The same for upright crosses: radius 1 is half an arm-to-arm length, line is the arms' width in that unit."""
-    return _measured(scan, predictions, options or TargetOptions(), MarkShape(cross(1.0, line)))
+    return _measure_predicted(scan, predictions, options or TargetOptions(), MarkShape(cross(1.0, line)))
 
 
-def _measured(
+def _measure_predicted(
     scan: Scan, predictions: Sequence[TargetPrediction], options: TargetOptions, shape: MarkShape
 ) -> tuple[MarkMeasurement, ...]:
     names = [prediction.point for prediction in predictions]
@@ -419,9 +419,9 @@ def _identified(
 
 def _compared(rows: list[_Row]) -> list[_Row]:
     """Those that are unlike the others of the frame are weak."""
-    seen = [(row, row.disk) for row in rows if row.disk is not None and row.status.is_observation]
-    reasons = doubts([disk for _, disk in seen], [row.prediction.pixel_from_disk for row, _ in seen])
-    doubt = {id(row): reason for (row, _), reason in zip(seen, reasons, strict=True) if reason}
+    observed = [(row, row.disk) for row in rows if row.disk is not None and row.status.is_observation]
+    reasons = doubts([disk for _, disk in observed], [row.prediction.pixel_from_disk for row, _ in observed])
+    doubt = {id(row): reason for (row, _), reason in zip(observed, reasons, strict=True) if reason}
     return [
         replace(row, status=Status.WEAK, reason=Reason.joined((row.reason, doubt[id(row)])))
         if id(row) in doubt

@@ -108,50 +108,50 @@ class SheetView:
         return float(np.hypot(*self.size_px)) / 2.0
 
 
-def fitted_view(view: SheetView, points: Array, seen: Array) -> SheetView | None:
-    """The view, near one given, that explains best where points of the sheet (n, 2) are seen (n, 2) px, single wrong
-    ones tolerated; None where no camera sees them so."""
-    homography = homography_through(points, view.undistorted(seen))
+def fitted_view(view: SheetView, points: Array, observed_px: Array) -> SheetView | None:
+    """The view, near one given, that explains best where points (n, 2) of the sheet are observed (n, 2), single
+    wrong ones tolerated; None where no camera sees them so."""
+    homography = homography_through(points, view.undistorted(observed_px))
     if homography is None:
         return None
     start = SheetView(homography, view.radial, view.size_px)
     terms = 0 if len(points) < _RADIAL_FROM else 1 if len(points) < _SECOND_RADIAL_FROM else 2
     scale = np.abs(homography).max(axis=0)
 
-    def with_parameters(values: Array) -> SheetView:
+    def view_from_parameters(values: Array) -> SheetView:
         matrix = np.append(values[:8], homography[2, 2] / scale[2]).reshape(3, 3) * scale
         return SheetView(matrix, np.append(values[8:], np.zeros(2 - terms)), view.size_px)
 
     def residuals(values: Array) -> Array:
-        candidate = with_parameters(values)
-        difference = candidate.undistorted(seen) - candidate.ideal(points)
+        candidate = view_from_parameters(values)
+        difference = candidate.undistorted(observed_px) - candidate.ideal(points)
         return np.nan_to_num(difference, nan=1.0).ravel()
 
     values = np.append((start.homography / scale).ravel()[:8], view.radial[:terms])
     width = max(robust_scale(residuals(values)), 1e-4)
     solution = least_squares(residuals, values, loss="soft_l1", f_scale=width, max_nfev=30)
-    found = with_parameters(solution.x)
+    found = view_from_parameters(solution.x)
     return found if np.abs(found.radial).max() < _LARGEST_RADIAL else start
 
 
-def robust_view(points: Array, seen: Array, size_px: tuple[int, int]) -> SheetView | None:
-    """The view that more than half of the points (n, 2), seen at (n, 2) px, agree with, wherever the others are; None
-    where no camera sees them so.
+def robust_view(points: Array, observed_px: Array, size_px: tuple[int, int]) -> SheetView | None:
+    """The view that more than half of the points (n, 2), observed at (n, 2) px, agree with, wherever the others are;
+    None where no camera sees them so.
 
     Least median of squares (Rousseeuw 1984) without a lens, then the lens as well, by those that do not lie far off.
     """
-    homography = cv2.findHomography(points, seen, cv2.LMEDS)[0]
+    homography = cv2.findHomography(points, observed_px, cv2.LMEDS)[0]
     if homography is None:
         return None
-    off = np.hypot(*(cv2.perspectiveTransform(points[:, None], homography)[:, 0] - seen).T)
+    off = np.hypot(*(cv2.perspectiveTransform(points[:, None], homography)[:, 0] - observed_px).T)
     view = SheetView(np.eye(3), np.zeros(2), size_px)
     for _ in range(_SETTLING):
         near = off <= max(_FAR * float(np.median(off)), _LEAST_FAR_PX)
-        fitted = fitted_view(view, points[near], seen[near])
+        fitted = fitted_view(view, points[near], observed_px[near])
         if fitted is None:
             return None
         view = fitted
-        off = np.nan_to_num(np.hypot(*(view.places_px(points) - seen).T), nan=np.inf)
+        off = np.nan_to_num(np.hypot(*(view.places_px(points) - observed_px).T), nan=np.inf)
     return view
 
 
@@ -233,33 +233,33 @@ def _suggestions(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> list[She
     tried = pairs[:: len(pairs) // _MOST_PAIRS + 1]
     views = []
     for hand, (first, second) in product((np.diag([1.0, -1.0]), np.eye(2)), tried):
-        points, seen = _by_two(sheet, dots, first, second, hand)
+        points, observed_px = _two_dot_points(sheet, dots, first, second, hand)
         empty = SheetView(np.eye(3), np.zeros(2), size_px)
-        homography = homography_through(points, empty.undistorted(seen))
+        homography = homography_through(points, empty.undistorted(observed_px))
         if homography is not None:
             views.append(replace(empty, homography=homography))
     return views
 
 
-def _by_two(sheet: Array, dots: Dots, first: int, second: int, hand: Array) -> tuple[Array, Array]:
+def _two_dot_points(sheet: Array, dots: Dots, first: int, second: int, hand: Array) -> tuple[Array, Array]:
     """Places on the sheet (10, 2) and in the picture (10, 2) that two dots give: centres and ends of radius vectors.
 
     Their ellipses are turned so that the line through both is that of the sheet. On this line, a projective map u(t)
     has u'(0) u'(T) = (u(T) / T)²: that gives the radius on the sheet.
     """
     steps = np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], np.float64)
-    along_px, seen = [], []
+    along_px, observed_px = [], []
     for own, other in ((first, second), (second, first)):
         axes = _right_handed(dots.pixel_from_disk[own])
         line_px = dots.centers_px[other] - dots.centers_px[own]
         on_disk = np.linalg.solve(axes, line_px)
         turned = axes @ _turn(hand @ (sheet[dots.coded[other]] - sheet[dots.coded[own]]), on_disk) @ hand
         along_px.append(np.hypot(*line_px) / np.hypot(*on_disk))
-        seen.append(dots.centers_px[own] + steps @ turned.T)
+        observed_px.append(dots.centers_px[own] + steps @ turned.T)
     apart = np.hypot(*(sheet[dots.coded[second]] - sheet[dots.coded[first]]))
     radius = apart * np.sqrt(along_px[0] * along_px[1]) / np.hypot(*line_px)
     points = [sheet[dots.coded[own]] + radius * steps for own in (first, second)]
-    return np.concatenate(points), np.concatenate(seen)
+    return np.concatenate(points), np.concatenate(observed_px)
 
 
 def _right_handed(axes: Array) -> Array:
@@ -282,15 +282,15 @@ def _neighbourhood(sheet: Array, points: list[int]) -> Indices:
 def _pairs(view: SheetView, sheet: Array, centers_px: Array, among: Indices) -> dict[int, int]:
     """The dot of each of the points `among`: nearest to one another and nearer than any other point's place."""
     places = view.places_px(sheet)
-    seen = among[np.isfinite(places[among]).all(axis=1)]
-    if len(seen) < 2 or not len(centers_px):
+    visible = among[np.isfinite(places[among]).all(axis=1)]
+    if len(visible) < 2 or not len(centers_px):
         return {}
     tree = cKDTree(places[np.isfinite(places).all(axis=1)])
-    spacing = np.asarray(tree.query(places[seen], k=[2])[0])[:, 0]
-    distance, dot = (np.asarray(found) for found in cKDTree(centers_px).query(places[seen]))
-    back = np.asarray(cKDTree(places[seen]).query(centers_px)[1])
-    mutual = (back[dot] == np.arange(len(seen))) & (distance < _NEAR * spacing)
-    return {int(point): int(one) for point, one in zip(seen[mutual], dot[mutual], strict=True)}
+    spacing = np.asarray(tree.query(places[visible], k=[2])[0])[:, 0]
+    distance, dot = (np.asarray(found) for found in cKDTree(centers_px).query(places[visible]))
+    back = np.asarray(cKDTree(places[visible]).query(centers_px)[1])
+    mutual = (back[dot] == np.arange(len(visible))) & (distance < _NEAR * spacing)
+    return {int(point): int(one) for point, one in zip(visible[mutual], dot[mutual], strict=True)}
 
 
 def _grown(view: SheetView, sheet: Array, dots: Dots) -> Naming | None:
@@ -317,10 +317,10 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     """The names that lie where the view and their neighbours put them, each dot alone at its place; None where they are
     too few."""
     points = np.array(list(pairs))
-    seen = dots.centers_px[list(pairs.values())]
+    observed_px = dots.centers_px[list(pairs.values())]
     places = view.places_px(sheet)
-    places += _unevenness(sheet, points, seen - places[points])
-    off = seen - places[points]
+    places += _unevenness(sheet, points, observed_px - places[points])
+    off = observed_px - places[points]
     gate_px = max(_GATE_SIGMAS * robust_scale(off.ravel()), _LEAST_GATE_PX)
     tree = cKDTree(dots.centers_px)
 
@@ -370,9 +370,9 @@ def _areas(shapes: Array) -> Array:
     return np.asarray(np.abs(shapes[:, 0, 0] * shapes[:, 1, 1] - shapes[:, 0, 1] * shapes[:, 1, 0]))
 
 
-def _alike(seen: Array, expected: Array) -> NDArray[np.bool_]:
+def _alike(shapes: Array, expected: Array) -> NDArray[np.bool_]:
     """(n,) whether ellipses (n, 2, 2) are of the size and the shape expected."""
     known = _areas(expected) > 0.0
-    radii = np.linalg.svd(np.linalg.solve(expected[known], seen[known]), compute_uv=False)
+    radii = np.linalg.svd(np.linalg.solve(expected[known], shapes[known]), compute_uv=False)
     known[known] = np.all((radii < _SHAPE) & (radii > 1.0 / _SHAPE), axis=1)
     return known

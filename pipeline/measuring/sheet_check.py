@@ -11,7 +11,7 @@ from measure.probabilities import SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.status import Status
-from measure.targets.consistency import FLAT, ImagePoints, SeenSheet, along_plane, compared_together, sheet_points
+from measure.targets.consistency import FLAT, ImagePoints, SheetImage, along_plane, compared_together, sheet_points
 from pipeline.files.project_file import Project
 from pipeline.measuring.coded_points import CodedPoints
 from pipeline.results.measured_scan import MeasuredScan
@@ -75,10 +75,10 @@ def _images(project: Project, scans: Sequence[MeasuredScan], sheet: _Sheet) -> d
     return images
 
 
-def _seen(scan: MeasuredScan, row: Mapping[str, int]) -> SeenSheet:
+def _seen(scan: MeasuredScan, row: Mapping[str, int]) -> SheetImage:
     targets = [mark for mark in scan.frame.marks if mark.kind == "target" and mark.point in row]
     marks = [mark for mark in targets if mark.status.is_observation]
-    return SeenSheet(
+    return SheetImage(
         np.array([row[mark.point] for mark in marks], dtype=np.intp),
         np.array([mark.center_px for mark in marks]).reshape(-1, 2),
         np.array([mark.covariance_px2 for mark in marks]).reshape(-1, 2, 2),

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from measure.scans.scan import Scan
 from measure.targets.block_search import search_blocks
-from measure.targets.disk_detection import DiskSearch, disk_candidates, octaves_of
+from measure.targets.disk_detection import DiskSearch, disk_candidates, disk_octaves
 from measure.targets.disks import FittedDisk, fit_disk
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ def test_texture_holds_hardly_any_disks() -> None:
     rng = np.random.default_rng(5)
     picture = GROUND + 30000 * gaussian_filter(rng.normal(size=(160, 180)), 2) + rng.normal(0, NOISE, (160, 180))
     scan, search = scan_of(picture), DiskSearch((6.0, 30.0))
-    patches = search_blocks(scan, octaves_of(search, scan.full_scale_dn))
+    patches = search_blocks(scan, disk_octaves(search, scan.full_scale_dn))
     disks = disk_candidates(scan, search)
     assert len(patches) > 20
     assert len(disks) <= len(patches) / 2

@@ -116,7 +116,7 @@ def test_a_block_is_a_part_of_the_scan_and_of_its_reductions(tmp_path: Path, cha
         block = Block(scan, 12, 0, 12, scan.samples(12, 0, 72, 60))
         rows, cols = np.indices((40, 40)).reshape(2, 1, -1)
         for col0, row0 in ((20, 3), (31, 4)):
-            grey = block.grey_at(np.array([[col0, row0]]), cols, rows)
+            grey = block.grey_values(np.array([[col0, row0]]), cols, rows)
             np.testing.assert_array_equal(grey.reshape(40, 40), scan.window(col0, row0, 40, 40))
         for factor, small in block.reductions({2, 3, 4}).items():
             row, col, height, width = 0, 12 // factor, 60 // factor, 72 // factor
@@ -131,7 +131,7 @@ class Watched:
     factor, margin_px, widest_px = 4, 8, 100
 
     def patches(self, small: NDArray[np.float32]) -> Patches:
-        return Patches.of(())
+        return Patches.collect(())
 
 
 @pytest.mark.parametrize("layout", [{"tile": (32, 48)}, {"rowsperstrip": 7}, {"rowsperstrip": HEIGHT}])
