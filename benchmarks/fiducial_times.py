@@ -55,7 +55,7 @@ STAGES: dict[str, list[tuple[Any, str]]] = {
     "search: correlations": [(FrameSearch, "_about_middle")],
     "search: constellation": [(FrameSearch, "_placements")],
     "first looks": [(measure.fiducials.mark_fit, "seen")],
-    "picture fits": [(measure.matching.match, "_fitted")],
+    "picture fits": [(measure.matching.match, "_fit_part")],
     "weights of grain": [(PictureFit, "weigh")],
     "other causes, second places, checks of a mark": [(measure.matching.match, "_result")],
     "pose": [(measure.fiducials.stages, "named"), (measure.fiducials.measurement, "named")],

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, MarkTemplate, ring_cross
-from measure.matching.match import Match, MatchOptions, match, window_about
+from measure.matching.match import Match, MatchOptions, mark_window, match
 from measure.matching.window import ScanWindow
 from measure.scans.scan import Scan, open_scan
 
@@ -136,7 +136,7 @@ def print_channels(path: Path) -> None:
 
 
 def in_channel(scan: Scan, start: Array, weights: tuple[float, ...]) -> Match:
-    col0, row0, width, height = window_about(WILD, start, 10.0)
+    col0, row0, width, height = mark_window(WILD, start, 10.0)
     grey = scan.window(col0, row0, width, height, weights)
     window = ScanWindow(grey, (col0, row0), is_lossy=scan.is_lossy)
     return match(window, WILD, start, MatchOptions(linear_sigma=0.05))

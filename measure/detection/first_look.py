@@ -13,7 +13,7 @@ from measure.detection.correlation import correlation, variation
 from measure.detection.prediction import MarkPrediction
 from measure.detection.response_layers import highest
 from measure.marks.rendering import extent_px, known_picture
-from measure.matching.match import window_about
+from measure.matching.match import mark_window
 from measure.probabilities import NOISE_LIKE_A_MARK
 from measure.scans.scan import Scan
 
@@ -52,7 +52,7 @@ class _Look:
         reduced = np.column_stack([expected.linear, expected.center_px - shift_px]) / reduction
         search_px, blur_px = expected.search_px / reduction, blur_px / reduction
         spare = int(np.ceil(2 * blur_px))
-        col0, row0, width, tall = window_about(mark, reduced, search_px + spare + 2)
+        col0, row0, width, tall = mark_window(mark, reduced, search_px + spare + 2)
         centred = np.column_stack([reduced[:, :2], np.zeros(2)])
         least, greatest = extent_px(mark, centred)
         low, high = np.floor(least).astype(int) - spare, np.ceil(greatest).astype(int) + spare

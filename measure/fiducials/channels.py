@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
-from measure.matching.match import window_about
+from measure.matching.match import mark_window
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ def best_weights(
         return None
     contrast, covariance = np.zeros(scan.channels), np.zeros((scan.channels, scan.channels))
     for mark, pixel_from_mark, sign in marks:
-        col0, row0, width, height = window_about(mark, pixel_from_mark, _MARGIN_PX)
+        col0, row0, width, height = mark_window(mark, pixel_from_mark, _MARGIN_PX)
         channels = np.stack(
             [scan.window(col0, row0, width, height, unit).ravel() for unit in np.eye(scan.channels).tolist()]
         )

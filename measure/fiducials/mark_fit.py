@@ -11,8 +11,8 @@ from measure.detection.first_look import seen
 from measure.detection.prediction import MarkPrediction
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
-from measure.matching.match import Match, MatchOptions, match, window_about
-from measure.matching.window import beyond_edge, read_window
+from measure.matching.match import Match, MatchOptions, mark_window, match
+from measure.matching.window import pixels_beyond_edge, read_window
 from measure.noise.grain import BESIDE_PX
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.compression import covariance_of_compression, tone_variance
@@ -83,7 +83,7 @@ def nothing_within(search_px: float) -> Reason:
 
 def _lost(scan: Scan, expected: MarkPrediction) -> Reason:
     """That the file does not give all pixels of the mark, where it is expected or was fitted; empty where it does."""
-    why = scan.loss_reason(*window_about(expected.mark, expected.pixel_from_mark, 0.0))
+    why = scan.loss_reason(*mark_window(expected.mark, expected.pixel_from_mark, 0.0))
     return Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE) if why else NO_REASON
 
 
@@ -140,10 +140,10 @@ def _matched(
     """The mark matched from a place."""
     mark, start = expected.mark, expected.moved(center_px).pixel_from_mark
     seen_in = scan.with_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # chips are cut as the file has them
-    window = read_window(seen_in, window_about(mark, start, options.margin_px + BESIDE_PX), expected.weights)
+    window = read_window(seen_in, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
     if expected.surroundings.robust and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
-        window = window.without(beyond_edge(window.grey, mark, inner))
+        window = window.exclude(pixels_beyond_edge(window.grey, mark, inner))
     return match(window, mark, start, options_for(mark, options, frame_sigma))
 
 

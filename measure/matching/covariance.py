@@ -73,11 +73,11 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
     being 1. The bends are compared pixel by pixel, with grain in the covariance only: its weights amplify them as no
     noise does."""
     moving = len(design) - GREY + 1  # all but the ground's
-    among, seen = covariance[:moving, :moving], design * used
+    among, used_design = covariance[:moving, :moving], design * used
     # All that moves with the mark changes by its slope, against the move.
     whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
     changes = np.concatenate(np.gradient(whole, axis=(2, 1))) * (-slopes * used)
-    normal, shared = products(seen, seen), products(seen, changes)
+    normal, shared = products(used_design, used_design), products(used_design, changes)
     inverse: Array = np.asarray(np.linalg.inv(normal + np.diag(priors_dn2)), float)
     taken_up = np.asarray(inverse @ shared, float)
     by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # of the variance's logarithm, negative
@@ -102,16 +102,16 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
 # leaves next to nothing else.
 
 
-def covariance_of_landscape(light: Array, beside: Mask, moved: Array) -> Array:
+def covariance_of_landscape(light: Array, frame_pixels: Mask, moved: Array) -> Array:
     """(n, n) of figures, column and row of a place for example, for a landscape in the mark that varies as beside it.
 
-    light (height, width): grey values, and beside, alike, which of them show the frame; moved (n, height, width) of the
-    mark's window: derivatives of the figures by the grey values, as much of them as its light has part in.
+    light (height, width): grey values, and frame_pixels, alike, which of them show the frame; moved (n, height, width)
+    of the mark's window: derivatives of the figures by the grey values, as much of them as its light has part in.
     """
-    if beside.sum() < _LEAST_PX:
+    if frame_pixels.sum() < _LEAST_PX:
         return np.zeros((len(moved),) * 2)
     reach = max(moved.shape[1:])
-    lags = autocovariance(np.where(beside, light - light[beside].mean(), 0.0), beside, reach)
+    lags = autocovariance(np.where(frame_pixels, light - light[frame_pixels].mean(), 0.0), frame_pixels, reach)
     # The noise of single pixels counts already; what neighbours have in common is the landscape.
     lags[reach, reach] = max(lags[reach, reach + 1], 0.0)
     landscape = NoiseModel(float(lags[reach, reach]), lags, 1.0)
@@ -122,16 +122,16 @@ def covariance_of_landscape(light: Array, beside: Mask, moved: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """Where a mark shows one. light, beside: as `covariance_of_landscape` takes them; share (height, width): of it in
-    the light of the mark's window."""
+    """Where a mark shows one. light, frame_pixels: as of `covariance_of_landscape`; share (height, width): of it
+    in the light of the mark's window."""
 
     light: Array
-    beside: Mask
+    frame_pixels: Mask
     share: Array
 
     def covariance(self, by_grey: Array) -> Array:
         """(n, n) of figures whose derivatives by the grey values are by_grey (n, height, width)."""
-        return covariance_of_landscape(self.light, self.beside, by_grey * self.share)
+        return covariance_of_landscape(self.light, self.frame_pixels, by_grey * self.share)
 
 
 def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_change: float) -> Array:
@@ -263,11 +263,11 @@ def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) ->
     shape: which unknowns of the fit these are; strain: those of stretch and shear, which stay held by the frame;
     departures (unknowns,): of the match from what the frame gave.
     """
-    told = products(fit.by_grey, fit.design)
-    if np.diag(told)[shape].min() > _OWN:
+    resolution = products(fit.by_grey, fit.design)
+    if np.diag(resolution)[shape].min() > _OWN:
         return None
-    let_go = told.copy()  # as if no other unknown were held: each column is how far that unknown itself decides
-    let_go[:, strain] = np.eye(len(told))[:, strain]
+    let_go = resolution.copy()  # as if no other unknown were held: each column is how far that unknown itself decides
+    let_go[:, strain] = np.eye(len(resolution))[:, strain]
     try:
         freed = np.asarray(np.linalg.inv(let_go), float)[shape]
     except np.linalg.LinAlgError:
@@ -277,4 +277,4 @@ def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) ->
     if not np.all(variance > 0):
         return None
     change = products(by_noise, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
-    return OwnShape(change + freed @ told @ departures, np.sqrt(variance), -told[:2, shape])
+    return OwnShape(change + freed @ resolution @ departures, np.sqrt(variance), -resolution[:2, shape])

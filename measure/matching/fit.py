@@ -97,7 +97,7 @@ class PictureFit:
         model, coding = self.model, self.coding
         if coding.tone.is_identity or isinstance(model.mark, MarkTemplate):
             return
-        drawn, shown = model.drawn, np.abs(model.design[-GREY] / model.steadiness)
+        drawn, shown = model.drawn_light, np.abs(model.design[-GREY] / model.steadiness)
         ground = shown < _GROUND * shown.max()
         model.take_steadiness(steadiness(model.light - drawn, drawn / coding.full_scale_dn, ground, self.telling))
 
@@ -117,7 +117,7 @@ class PictureFit:
             return self._plain_covariance(noise)
         model, before = self.model, self.model.state
         weights, smeared = weighted(model.design, self.used, noise, self.contrast_dn)
-        moved = self._step_by(weights)
+        moved = self._step_weighted(weights)
         if moved is not None:
             weighed = self._covariance(weights, smeared)
             # What has more weight now measures the same place, or the noise is not what it was taken for. The plain
@@ -153,7 +153,7 @@ class PictureFit:
             covariance = inverse  # lags that are noise themselves: as if it were white
         return np.asarray((covariance + covariance.T) / 2), combined(inverse, weights)
 
-    def _step_by(self, weights: Array) -> Array | None:
+    def _step_weighted(self, weights: Array) -> Array | None:
         """Gauss-Newton with weighted derivatives: how far the mark moved, (2,) px; None where it does not settle."""
         model, start = self.model, self.model.state.pixel_from_mark[:, 2]
         adjustment = _Adjustment(model, self.used, 1.0, weighted=weights)
@@ -224,7 +224,7 @@ class PictureFit:
             self.far = distance > self.options.plain_px
             if outside.all():
                 self.reason = Reason("the mark lies outside of its window", Code.NO_FIT)
-        near = near & true(mark, place, width, height, EDGE_BLURS * self.model.seen_blur_px)
+        near = near & true(mark, place, width, height, EDGE_BLURS * self.model.total_blur_px)
         self.area = self.used = self.usable & near
         if (self.area & own).sum() < 0.5 * (near & own).sum() or self.area.sum() < 40:
             self.reason = self.reason or _HARDLY_SHOWN
@@ -240,8 +240,8 @@ class PictureFit:
             model.take_noise(noise_dn)
         model.linearise(self.used)
         noise_dn = max(robust_scale(model.residuals[self.telling]), _DRAWN * self.contrast_dn, 1e-9)
-        judged_dn = model.noise_dn if model.is_clipped else 0.0  # what clipped grey values were judged by
-        self.variance_dn2 = max(noise_dn**2, judged_dn**2)
+        clipping_dn = model.noise_dn if model.is_clipped else 0.0  # what clipped grey values were judged by
+        self.variance_dn2 = max(noise_dn**2, clipping_dn**2)
         scale_dn = max(noise_dn, _SCALE_FLOOR * self.contrast_dn) if robust else np.inf
         adjustment = _Adjustment(model, self.used, self.variance_dn2, scale_dn)
         self.reason = gauss_newton_halving(adjustment, tolerance_px, _ITERATIONS, _HALVINGS).reason

@@ -31,14 +31,14 @@ from measure.matching.covariance import (
 from measure.matching.fit import EDGE_BLURS, PictureFit
 from measure.matching.models import GREY, PictureModel, State, background_px, is_round
 from measure.matching.saturation import Sides, clear_of_ends
-from measure.matching.tone_information import told_tone, untold_tone
+from measure.matching.tone_information import mark_tone_information, tone_without_information
 from measure.matching.window import Coding, ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured, taken_out
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, products
 from measure.reason import Reason
 from measure.tone.estimate import MarkTone
 
-__all__ = ["Match", "MatchOptions", "match", "window_about"]
+__all__ = ["Match", "MatchOptions", "mark_window", "match"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -113,12 +113,12 @@ def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: Match
     is seen otherwise. Never raises for what the picture holds.
     """
     options = options or MatchOptions()
-    given = _given(window, mark, pixel_from_mark)
-    part, fit = _fitted(given, options)
+    given = _match_input(window, mark, pixel_from_mark)
+    part, fit = _fit_part(given, options)
     if not _is_right(fit):
-        detail_part, detail = _fitted(given, options, background_px(mark, given.start))
+        detail_part, detail = _fit_part(given, options, background_px(mark, given.start))
         if not detail.reason:
-            whole = _with_ground(given, detail_part, detail) if fit.reason else fit
+            whole = _refit_whole_ground(given, detail_part, detail) if fit.reason else fit
             part, fit = detail_part, whole if _is_right(whole) else detail
     result = _result(fit, _surroundings(given, part, fit))
     moved = np.array(result.pixel_from_mark)
@@ -140,7 +140,7 @@ class _Given(NamedTuple):
     coding: Coding
 
 
-def _given(window: ScanWindow, mark: Mark, pixel_from_mark: Array) -> _Given:
+def _match_input(window: ScanWindow, mark: Mark, pixel_from_mark: Array) -> _Given:
     start = np.array(pixel_from_mark, dtype=float)
     start[:, 2] -= window.origin_px
     usable, sides = window.usable, window.sides
@@ -162,17 +162,17 @@ class _Part(NamedTuple):
         return np.array([self.cols.start, self.rows.start], dtype=float)
 
 
-def _fitted(given: _Given, options: MatchOptions, coarse_px: float | None = None) -> tuple[_Part, PictureFit]:
+def _fit_part(given: _Given, options: MatchOptions, coarse_px: float | None = None) -> tuple[_Part, PictureFit]:
     """The mark fitted, in the part of the window about it, in that part's pixels. coarse_px: of a background that does
     not count, if one does not."""
     part = _part(given, options)
-    fit = _begun(given, part, options, coarse_px)
+    fit = _start_fit(given, part, options, coarse_px)
     fit.approach()
     reach_px = options.margin_blurs * fit.model.blur_px
     if not fit.reason and reach_px > options.margin_px:  # the blur spreads the mark beyond its margin
         wide = replace(options, margin_px=reach_px)
         narrow, part = part, _part(given, wide)
-        fit = _begun(given, part, wide, coarse_px, fit.model.state.moved(narrow.corner_px - part.corner_px))
+        fit = _start_fit(given, part, wide, coarse_px, fit.model.state.shifted(narrow.corner_px - part.corner_px))
         fit.choose_area()
     fit.refine()
     return part, fit
@@ -183,11 +183,11 @@ def _is_right(fit: PictureFit) -> bool:
     return not fit.reason and not is_textured(fit.model.residuals, fit.telling, fit.floor_dn)
 
 
-def _with_ground(given: _Given, part: _Part, detail: PictureFit) -> PictureFit:
+def _refit_whole_ground(given: _Given, part: _Part, detail: PictureFit) -> PictureFit:
     """The mark fitted with its ground from where its detail alone was fitted: a large speck carries the first steps,
     which are plain least squares, away from a mark, and not those of its detail."""
-    state = detail.model.state.moved(np.zeros(2))
-    fit = _begun(given, part, detail.options, None, state)
+    state = detail.model.state.shifted(np.zeros(2))
+    fit = _start_fit(given, part, detail.options, None, state)
     fit.choose_area()
     fit.refine()
     return fit
@@ -203,14 +203,14 @@ class _Surroundings(NamedTuple):
 
 
 def _surroundings(given: _Given, part: _Part, fit: PictureFit) -> _Surroundings:
-    place, (height, width) = fit.model.state.moved(part.corner_px).pixel_from_mark, given.grey.shape
-    where = given.mark, place, width, height, EDGE_BLURS * fit.model.seen_blur_px
+    place, (height, width) = fit.model.state.shifted(part.corner_px).pixel_from_mark, given.grey.shape
+    where = given.mark, place, width, height, EDGE_BLURS * fit.model.total_blur_px
     free = given.blank & known(*where)
     free[part.rows, part.cols] &= ~fit.area
     return _Surroundings(given.grey, free, given.usable & frame_beside(*where))
 
 
-def _begun(
+def _start_fit(
     given: _Given,
     part: _Part,
     options: MatchOptions,
@@ -229,7 +229,7 @@ def _begun(
 
 
 def _part(given: _Given, options: MatchOptions) -> _Part:
-    col0, row0, width, height = window_about(given.mark, given.start, options.margin_px + _SPARE_PX)
+    col0, row0, width, height = mark_window(given.mark, given.start, options.margin_px + _SPARE_PX)
     return _Part(
         *(
             slice(min(max(first, 0), size - 1), max(first + count, 1))
@@ -238,7 +238,7 @@ def _part(given: _Given, options: MatchOptions) -> _Part:
     )
 
 
-def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
+def mark_window(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
     """col0, row0, width, height of the window that holds the mark and margin_px about it."""
     least, greatest = extent_px(mark, np.asarray(pixel_from_mark, dtype=float))
     col0, row0 = np.floor(least - margin_px).astype(int)
@@ -249,9 +249,9 @@ def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[
 def _result(fit: PictureFit, about: _Surroundings) -> Match:
     """The match in the pixels of the fit's own window."""
     model, used = fit.model, fit.telling
-    told = float(model.information[fit.used].sum())
-    noise, is_white = as_if_white(model.scores, fit.used, len(model.design), told)
-    noise = noise.at_least(fit.rounding_variance_dn2)
+    information = float(model.information[fit.used].sum())
+    noise, is_white = as_if_white(model.scores, fit.used, len(model.design), information)
+    noise = noise.floored(fit.rounding_variance_dn2)
     unknown = np.full((len(model.design),) * 2, np.inf)
     precision = _Precision(Covariance.of_noise(unknown[:2, :2]), unknown, np.inf)
     if not fit.reason:
@@ -259,7 +259,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
         if not is_white or is_coloured(patches):
             taken = taken_out(used, model.design)
             noise = grain_model(model.residuals, used, taken, noise.neighbour_correlation, patches)
-        precision = _weighed(fit, used, noise, about)
+        precision = _estimate_precision(fit, used, noise, about)
     state, covariance = model.state, precision.covariance
     return Match(
         converged=not fit.reason,
@@ -302,7 +302,7 @@ class _Precision(NamedTuple):
     tone: MarkTone | None = None
 
 
-def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surroundings) -> _Precision:
+def _estimate_precision(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surroundings) -> _Precision:
     """The fit ended with the weights of its noise. used: the pixels that said how large this is."""
     model = fit.model
     covariance, by_grey = fit.weigh(noise)
@@ -344,11 +344,11 @@ def _tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, about: _Surroun
     if coding.tone.is_known or isinstance(model.mark, MarkTemplate):
         return None
     if model.background_px is not None:
-        return untold_tone(linear, model.light, model.detail, coding.tone, coding.full_scale_dn)
-    drawn, linear = model.drawn, replace(linear, noise=linear.noise.at_least(fit.floor_dn**2))
+        return tone_without_information(linear, model.light, model.detail, coding.tone, coding.full_scale_dn)
+    drawn, linear = model.drawn_light, replace(linear, noise=linear.noise.floored(fit.floor_dn**2))
     clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
     landscape = _landscape(model, about)
-    return told_tone(
+    return mark_tone_information(
         linear, drawn, model.grey, clear, priors_dn2, model.departures(), coding.tone, coding.full_scale_dn, landscape
     )
 
@@ -356,7 +356,7 @@ def _tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, about: _Surroun
 def _blur_sigma(model: PictureModel, covariance: Array) -> float:
     if model.blur is None or model.blur_is_at_limit:
         return np.inf
-    return float(np.sqrt(covariance[model.blur, model.blur]) / (2 * model.seen_blur_px**2))
+    return float(np.sqrt(covariance[model.blur, model.blur]) / (2 * model.total_blur_px**2))
 
 
 def _likeness(fit: PictureFit) -> float:

@@ -67,7 +67,7 @@ class State:
     variance_px2: float
     greys: Array
 
-    def moved(self, shift_px: Array) -> "State":
+    def shifted(self, shift_px: Array) -> "State":
         """The same state where all places are (2,) px farther on; the greys are still to be fitted there."""
         place = self.pixel_from_mark.copy()
         place[:, 2] += shift_px
@@ -108,8 +108,8 @@ class PictureModel:
         self.uncensored = np.zeros(grey.shape)
         is_chip = isinstance(mark, MarkTemplate)
         self.smoothed_px2 = _CHIP_SMOOTHED_PX**2 if is_chip else 0.0
-        seen = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), dtype=float) if is_chip else grey
-        self.light, self.grey = seen, self.detail(seen)
+        smoothed = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), dtype=float) if is_chip else grey
+        self.light, self.grey = smoothed, self.detail(smoothed)
         self.generators = generators(options.freedom, mark)
         self.linear = slice(2, 2 + len(self.generators))
         strains = are_strains(self.generators)
@@ -135,12 +135,12 @@ class PictureModel:
         where the design was last computed it stays, and the residuals follow from it."""
         if self._linearised is not None:
             at, residuals = self._linearised
-            if not self.has_moved(at, _LINEAR * self.seen_blur_px) and not self._is_bent():
+            if not self.has_moved(at, _LINEAR * self.total_blur_px) and not self._is_bent():
                 self.residuals = residuals - combined(self._change(at), self.design)
                 return
         height, width = self.grey.shape
         place = self.state.pixel_from_mark
-        shown = self._shown(width, height)
+        shown = self._render_mark(width, height)
         greys = self.design[-GREY:]
         greys[0], greys[1:] = self.detail(shown.value), self.ground
         if not self.state.greys.any():
@@ -150,7 +150,7 @@ class PictureModel:
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
         moves = np.stack([slope * along for slope in columns[:2] for along in (col, row)])
         # The blur does not bend with the mark: else a soft disk's size, blur and contrast run away together.
-        moves += self.seen_blur_px**2 * np.stack([shown.by_col_col, *[shown.by_col_row] * 2, shown.by_row_row])
+        moves += self.total_blur_px**2 * np.stack([shown.by_col_col, *[shown.by_col_row] * 2, shown.by_row_row])
         columns[self.linear] = combined(self.generators.reshape(-1, 4), moves)
         if self.blur is not None:
             columns[self.blur] = -0.5 * shown.laplacian
@@ -207,13 +207,13 @@ class PictureModel:
         at = self.clipped != 0
         if at.any():
             self.uncensored = self.residuals.copy()
-            said = censored(self.residuals[at], self.clipped[at], self.noise_dn)
-            self.residuals[at], self.slopes[at], self.information[at] = said
-            self.design[:, at] *= said.slopes
-            self.tells[at] = tells(said.slopes)
+            censoring = censored(self.residuals[at], self.clipped[at], self.noise_dn)
+            self.residuals[at], self.slopes[at], self.information[at] = censoring
+            self.design[:, at] *= censoring.slopes
+            self.tells[at] = tells(censoring.slopes)
 
     @property
-    def drawn(self) -> Array:
+    def drawn_light(self) -> Array:
         """(height, width) the light that the present state draws, with the surroundings if these do not count."""
         return self.light - (self.uncensored if self.is_clipped else self.residuals) / self.steadiness
 
@@ -253,7 +253,7 @@ class PictureModel:
         return float(np.sqrt(max(self.state.variance_px2 - self.smoothed_px2, 0.0)))
 
     @property
-    def seen_blur_px(self) -> float:
+    def total_blur_px(self) -> float:
         """The standard deviation of blur and pixel."""
         return float(np.sqrt(self.state.variance_px2 + PIXEL_VARIANCE_PX2))
 
@@ -267,7 +267,7 @@ class PictureModel:
     def _is_bent(self) -> bool:
         """Whether the present mark is bent farther than a series reaches; column by column of the linear part."""
         most = float(np.hypot(*self._bent()).max()) * self.reach_px
-        return most > self.bent * self.seen_blur_px
+        return most > self.bent * self.total_blur_px
 
     def _draw(self, linear: Array) -> None:
         self._drawn, self._mark_from_drawn = linear.copy(), np.linalg.inv(linear)
@@ -276,7 +276,7 @@ class PictureModel:
         """(2, 2) how far the present mark is bent from the one drawn."""
         return np.asarray(self.state.pixel_from_mark[:, :2] @ self._mark_from_drawn - np.eye(2))
 
-    def _shown(self, width: int, height: int) -> Rendering:
+    def _render_mark(self, width: int, height: int) -> Rendering:
         place = self.place_drawn()
         shown = render(self.mark, place, width, height, self.blur_px)
         change = self._bent()
@@ -292,9 +292,9 @@ class PictureModel:
         variance = self.state.variance_px2
         if self.blur is not None:
             # As a change of the standard deviation, the pixel's share included: so a blur far off is near in a step.
-            seen = self.seen_blur_px
-            ratio = np.clip(1 + step[self.blur] / longest / (2 * seen**2), 1 / _MOST_BLURRED, _MOST_BLURRED)
-            variance = float(np.clip((seen * ratio) ** 2 - PIXEL_VARIANCE_PX2, *self._variance_range()))
+            total_px = self.total_blur_px
+            ratio = np.clip(1 + step[self.blur] / longest / (2 * total_px**2), 1 / _MOST_BLURRED, _MOST_BLURRED)
+            variance = float(np.clip((total_px * ratio) ** 2 - PIXEL_VARIANCE_PX2, *self._variance_range()))
         self.state = State(place, variance, self.state.greys + step[-GREY:] / longest)
         reach = max(self.grey.shape) / 4
         return float(np.hypot(*shift) + reach * _LONGEST_CHANGE * np.abs(linear).max(initial=0.0))
@@ -318,8 +318,8 @@ class PictureModel:
         weights = np.zeros(len(self.design))
         weights[self.linear] = self._linear_weights
         if self.blur is not None:
-            seen = self.options.blur_px**2 + PIXEL_VARIANCE_PX2
-            weights[self.blur] = 1 / (2 * seen * self.options.blur_sigma) ** 2
+            total_px2 = self.options.blur_px**2 + PIXEL_VARIANCE_PX2
+            weights[self.blur] = 1 / (2 * total_px2 * self.options.blur_sigma) ** 2
         return weights
 
     def departures(self) -> Array:

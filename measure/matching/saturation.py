@@ -112,10 +112,10 @@ def _is_cut(grey: NDArray[np.floating]) -> bool:
     pile = int((grey == greatest).sum())
     if pile < _FEWEST:
         return False
-    beside = (grey[:, 1:] < greatest) & (grey[:, :-1] < greatest)
-    sigma = robust_scale(np.diff(grey.astype(float), axis=1)[beside]) / np.sqrt(2)
+    both_below = (grey[:, 1:] < greatest) & (grey[:, :-1] < greatest)
+    sigma = robust_scale(np.diff(grey.astype(float), axis=1)[both_below]) / np.sqrt(2)
     step = float(np.diff(np.unique(grey)).min(initial=np.inf))
-    if beside.sum() < _FEWEST or not sigma > _LEAST_STEPS * step:
+    if both_below.sum() < _FEWEST or not sigma > _LEAST_STEPS * step:
         return False
     tail = int((grey >= greatest - _TAIL * sigma).sum())
     return bool(bdtrc(pile - 1, tail, step / (_TAIL * sigma)) < NATURAL_END)

@@ -24,7 +24,7 @@ _LEAST_CONTRAST = 1e-6  # of the light that is drawn: rounding is about that lar
 _LEAST_VARIANCE = 1e-9  # of what is left of departures, over that of the departures themselves
 
 
-def told_tone(
+def mark_tone_information(
     fit: LinearFit,
     drawn: Array,
     grey: Array,
@@ -50,9 +50,11 @@ def told_tone(
 
     What another curve moves the mark by follows from the observed light, with all that the drawing leaves unexplained.
     """
-    told = _told(fit, ToneInformation.empty(), tone.derivatives(grey, full_scale_dn), tone, drawn, full_scale_dn)
+    mark_tone = _mark_tone(
+        fit, ToneInformation.empty(), tone.derivatives(grey, full_scale_dn), tone, drawn, full_scale_dn
+    )
     if np.ptp(drawn) <= _LEAST_CONTRAST * np.abs(drawn).max():  # nothing is drawn: there are no edges
-        return told
+        return mark_tone
     counts = fit.used & clear
     changes = tone.derivatives(drawn, full_scale_dn) * counts * fit.steadiness
     uneven = _uneven(fit.design[-GREY], fit.steadiness)
@@ -69,10 +71,12 @@ def told_tone(
     covariance += _LEAST_VARIANCE * max(whole, 1e-30) * np.eye(len(covariance))
     weighted = np.linalg.solve(covariance, normal).T
     estimate: Array = np.asarray(np.linalg.inv(np.eye(len(normal)) + weighted @ normal) @ weighted, float)
-    by_piece = told.on_place @ estimate @ _by_piece(left * (residuals + combined(estimate @ score, left)))
-    by_noise = np.trace(told.on_place @ estimate @ covariance @ estimate.T @ told.on_place.T)
+    by_piece = mark_tone.on_place @ estimate @ _piece_sums(left * (residuals + combined(estimate @ score, left)))
+    by_noise = np.trace(mark_tone.on_place @ estimate @ covariance @ estimate.T @ mark_tone.on_place.T)
     worse = max(float(np.sum(by_piece**2) / max(by_noise, 1e-30)), 1.0)
-    return replace(told, information=ToneInformation.from_score(normal, score + normal @ tone.mean, worse * covariance))
+    return replace(
+        mark_tone, information=ToneInformation.from_score(normal, score + normal @ tone.mean, worse * covariance)
+    )
 
 
 def _inverse(normal: Array) -> Array:
@@ -82,7 +86,7 @@ def _inverse(normal: Array) -> Array:
     return np.asarray(np.linalg.pinv(normal / scale, hermitian=True) / scale, float)
 
 
-def _by_piece(images: Array) -> Array:
+def _piece_sums(images: Array) -> Array:
     """(k, pieces) sums of images (k, height, width) over squares."""
     count, height, width = images.shape
     whole = np.pad(images, ((0, 0), (0, -height % _PIECE_PX), (0, -width % _PIECE_PX)))
@@ -90,16 +94,16 @@ def _by_piece(images: Array) -> Array:
     return np.asarray(squares.sum(axis=(2, 4)).reshape(count, -1))
 
 
-def untold_tone(
+def tone_without_information(
     fit: LinearFit, light: Array, detail: Callable[[Array], Array], tone: Tone, full_scale_dn: float
 ) -> MarkTone:
     """Of a mark whose detail alone was fitted: the curve moves it all the same, but its picture says nothing of the
     curve, for its surroundings are not drawn. light (height, width): with these; detail: takes them away."""
     changes = np.stack([detail(each) for each in tone.derivatives(light, full_scale_dn)])
-    return _told(fit, ToneInformation.empty(), changes, tone, light, full_scale_dn)
+    return _mark_tone(fit, ToneInformation.empty(), changes, tone, light, full_scale_dn)
 
 
-def _told(
+def _mark_tone(
     fit: LinearFit, said: ToneInformation, changes: Array, tone: Tone, light: Array, full_scale_dn: float
 ) -> MarkTone:
     """changes (k, height, width): of what was fitted, by the departures; light (height, width): of the picture."""

@@ -92,7 +92,7 @@ class ScanWindow:
     def sides(self) -> Sides:
         return np.zeros(self.grey.shape, np.int8) if self.clipped is None else self.clipped
 
-    def without(self, lost: Mask) -> "ScanWindow":
+    def exclude(self, lost: Mask) -> "ScanWindow":
         """The same, some of its pixels (height, width) no longer being true ones."""
         return replace(self, valid=self.usable & ~lost)
 
@@ -113,14 +113,14 @@ def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequen
     )
 
 
-def beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array) -> Mask:
+def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array) -> Mask:
     """Which pixels of a window (height, width), in which the mark stands about as pixel_from_mark (2, 3) says, lie
     beyond an edge that is far stronger than the mark is, or in its blur: that of the frame, or of the pad on which the
     mark stands. None where there is no such edge, or the mark itself lies beyond it."""
     drawn = picture(mark, pixel_from_mark, window.shape[1], window.shape[0], 1.0)
     away_px = cv2.distanceTransform((drawn <= _DRAWN).astype(np.uint8), cv2.DIST_L2, 5)
     near, shown = away_px <= _BESIDE_PX, drawn > _SHOWN * drawn.max()
-    lighter = window > _between(window[near])
+    lighter = window > _otsu_level(window[near])
     here = lighter if lighter[near & (away_px > 0)].mean() > 0.5 else ~lighter
     own, beyond = window[near & here], window[near & ~here]
     if not len(beyond) or here[shown].mean() <= 0.5 or abs(own.mean() - beyond.mean()) < _FAR * own.std():
@@ -128,7 +128,7 @@ def beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array
     return np.asarray(cv2.distanceTransform(here.astype(np.uint8), cv2.DIST_L2, 5) <= _EDGE_PX)
 
 
-def _between(grey: NDArray[np.floating]) -> float:
+def _otsu_level(grey: NDArray[np.floating]) -> float:
     """The grey value that parts the pixels into two kinds most unlike one another (Otsu, 1979)."""
     low, high = float(grey.min()), float(grey.max())
     level = np.asarray((grey - low) / max(high - low, 1e-12) * (_LEVELS - 1), np.uint8)

@@ -119,19 +119,19 @@ def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> A
     is tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q): the last two are sums of products of Q's columns, lag by lag,
     times the autocorrelation at that lag, whatever it is.
     """
-    rings, border, seen = _rings(farthest_px), int(farthest_px), design[:, used]
+    rings, border, used_design = _rings(farthest_px), int(farthest_px), design[:, used]
     within = np.pad(used, border)
     base = np.zeros((len(design), *within.shape), np.float32)
-    orthonormal = to_orthonormal(seen @ seen.T)
-    base[: len(orthonormal), within] = orthonormal @ seen
+    orthonormal = to_orthonormal(used_design @ used_design.T)
+    base[: len(orthonormal), within] = orthonormal @ used_design
     shape, index = padded(within.shape, REACH_PX), np.arange(-REACH_PX, REACH_PX + 1)
     spectra = np.conj(fft.rfft2(base, s=shape))
     flat, counted = base.reshape(len(base), -1), within.ravel().astype(np.float32)
     taken = []
     for ring in rings:
-        beside = ring.sums(flat, within.shape[1]) * counted
-        beside = (flat @ beside.T) @ flat - 2 * beside
-        lags = fft.irfft2((spectra * fft.rfft2(beside.reshape(base.shape), s=shape)).sum(axis=0), s=shape)
+        sums = ring.sums(flat, within.shape[1]) * counted
+        sums = (flat @ sums.T) @ flat - 2 * sums
+        lags = fft.irfft2((spectra * fft.rfft2(sums.reshape(base.shape), s=shape)).sum(axis=0), s=shape)
         taken.append(_KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel())
     return np.stack(taken, axis=1)
 

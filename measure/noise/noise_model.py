@@ -50,8 +50,8 @@ def to_orthonormal(normal: Array) -> Array:
     (n, n): the sums of their products."""
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     values, vectors = np.linalg.eigh(normal / np.outer(size, size))
-    told = values > _ALIKE * values[-1]
-    return np.asarray((vectors[:, told] / np.sqrt(values[told])).T / size)
+    significant = values > _ALIKE * values[-1]
+    return np.asarray((vectors[:, significant] / np.sqrt(values[significant])).T / size)
 
 
 def factors(images: Array, image: Array) -> Array:
@@ -76,7 +76,7 @@ class NoiseModel:
     def is_white(self) -> bool:
         return self.autocovariance_dn2.size == 1
 
-    def at_least(self, variance_dn2: float) -> "NoiseModel":
+    def floored(self, variance_dn2: float) -> "NoiseModel":
         """The same, of a variance that is not smaller."""
         if not self.variance_dn2:  # a picture without any noise: there is nothing to enlarge
             return NoiseModel(variance_dn2, np.full((1, 1), variance_dn2), 0.0, self.is_grain)
@@ -86,25 +86,27 @@ class NoiseModel:
         )
 
 
-def noise_model(residuals: Array, used: Mask, unknowns: int, told: float | None = None) -> NoiseModel:
-    """The noise model of residuals (height, width), where used, after a fit of so many unknowns. told: of how many
-    ordinary pixels they have the information, where some are clipped and residuals are their scores.
+def noise_model(residuals: Array, used: Mask, unknowns: int, information: float | None = None) -> NoiseModel:
+    """The noise model of residuals (height, width), where used, after a fit of so many unknowns. information: of
+    how many ordinary pixels they have the information, where some are clipped and residuals are their scores.
 
     Noise counts as white where the correlation of neighbours is within three standard errors of nothing.
     """
-    noise, is_white = as_if_white(residuals, used, unknowns, told)
+    noise, is_white = as_if_white(residuals, used, unknowns, information)
     if is_white:
         return noise
     lags = autocovariance(np.where(used, residuals, 0.0), used, REACH_PX) * _taper(REACH_PX)
     return replace(noise, autocovariance_dn2=lags * (noise.variance_dn2 / lags[REACH_PX, REACH_PX]))
 
 
-def as_if_white(residuals: Array, used: Mask, unknowns: int, told: float | None = None) -> tuple[NoiseModel, bool]:
+def as_if_white(
+    residuals: Array, used: Mask, unknowns: int, information: float | None = None
+) -> tuple[NoiseModel, bool]:
     """The same without correlations, and whether it has none."""
     count = max(int(used.sum()), 1)
     kept = np.where(used, residuals, 0.0)
     squares = float((kept**2).sum())
-    variance = squares / max((count if told is None else told) - unknowns, 1)
+    variance = squares / max((count if information is None else information) - unknowns, 1)
     correlation = _covariance_along(kept, used, 1) / (squares / count) if squares else 0.0
     return NoiseModel(variance, np.array([[variance]]), correlation), abs(correlation) < 3 / np.sqrt(2 * count)
 
@@ -206,8 +208,8 @@ def steadiness(residuals: Array, light: Array, ground: Mask, used: Mask) -> Arra
     if same.sum() >= _FEWEST and other.sum() >= _FEWEST:
         scales = [max(robust_scale(residuals[group]), 1e-9) for group in (other, same)]
         apart = float(np.mean(change[other]) - np.mean(change[same]))
-        told = apart**2 / (_SCALE_VARIANCE * (1 / same.sum() + 1 / other.sum()))
-        power = (weight * power + told * float(np.log(scales[0] / scales[1])) / apart) / (weight + told)
+        precision = apart**2 / (_SCALE_VARIANCE * (1 / same.sum() + 1 / other.sum()))
+        power = (weight * power + precision * float(np.log(scales[0] / scales[1])) / apart) / (weight + precision)
     return np.asarray(np.exp(-np.clip(power, 0.0, _MOST) * change))
 
 
@@ -224,10 +226,10 @@ def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -
     direction = ahead = covariance.roughly_inverse(right)
     strength = _dots(right, ahead)
     for _ in range(_ROUNDS):
-        seen = covariance.times(direction)
-        length = strength / np.maximum(_dots(direction, seen), 1e-30)
+        image = covariance.times(direction)
+        length = strength / np.maximum(_dots(direction, image), 1e-30)
         solution[left] += length * direction
-        rests[left] -= np.multiply(length, seen, out=seen)
+        rests[left] -= np.multiply(length, image, out=image)
         rest = rests[left]
         far = _dots(rest, rest)[:, 0, 0] >= _CLOSE**2  # of columns of unit length
         if not far.any():

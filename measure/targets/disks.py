@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 from measure.covariance import Cause, Covariance
 from measure.marks.shapes import Disk, MarkShape
 from measure.matching.covariance import SecondPlace
-from measure.matching.match import Match, MatchOptions, match, window_about
+from measure.matching.match import Match, MatchOptions, mark_window, match
 from measure.matching.models import GREY
 from measure.matching.window import read_window
 from measure.noise.grain import BESIDE_PX
@@ -187,7 +187,7 @@ def _fit_by_margin(
         linear_sigma=_FORM_SIGMA,
         strain_sigma=_FORM_SIGMA,
     )
-    window = read_window(scan, window_about(shape, start, wide_px + BESIDE_PX))
+    window = read_window(scan, mark_window(shape, start, wide_px + BESIDE_PX))
 
     def fit_with_ground(margin_px: float) -> FittedDisk:
         fit = match(window, shape, start, replace(options, margin_px=margin_px))

@@ -13,7 +13,7 @@ from measure.fiducials.mark_fit import sight
 from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import MarkShape, cross, polygon
 from measure.match_options import MatchOptions
-from measure.matching.window import beyond_edge
+from measure.matching.window import pixels_beyond_edge
 
 PX_PER_MM = 30.0
 GROUND, EDGE, NOISE = 55000.0, 5000.0, 600.0
@@ -47,7 +47,7 @@ def test_the_marks_own_ground_is_never_beyond_an_edge() -> None:
     mark = brute_picture(WING, place, 121, 121, 1.0)
     for contrast in (30000.0, -30000.0):  # the mark itself is the strongest edge of its window
         grey = 30000.0 + contrast * mark + np.random.default_rng(2).normal(0.0, NOISE, mark.shape)
-        assert not beyond_edge(grey, WING, place).any()
+        assert not pixels_beyond_edge(grey, WING, place).any()
 
 
 def test_a_cross_that_dust_touches_is_seen_where_the_others_put_it() -> None:

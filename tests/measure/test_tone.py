@@ -13,7 +13,7 @@ from measure.marks.shapes import MarkShape, polygon
 from measure.match_options import MatchOptions
 from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.match import Match, match
-from measure.matching.tone_information import told_tone
+from measure.matching.tone_information import mark_tone_information
 from measure.matching.window import read_window
 from measure.noise.noise_model import NoiseModel
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
@@ -74,17 +74,19 @@ def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the
     clear[5, 6:9] = True
     used, landscape = np.ones(shape, bool), Landscape(drawn, np.zeros(shape, bool), design[3])
     fit = LinearFit(rng.normal(size=shape), used, design, design / 576.0, noise, np.ones(shape))
-    said = told_tone(fit, drawn, drawn, clear, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape).information
+    said = mark_tone_information(
+        fit, drawn, drawn, clear, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape
+    ).information
     assert np.abs(said.matrix).max() < 1e-3
     blank = replace(fit, residuals=np.zeros(shape), noise=NoiseModel(4e-35, np.full((1, 1), 4e-35), 0.0))
     even = np.full(shape, 87.8)
-    assert not told_tone(
+    assert not mark_tone_information(
         blank, even, even, used, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape
     ).information.matrix.any()
 
 
 def test_noise_that_is_none_is_raised_to_a_floor() -> None:
-    raised = NoiseModel(0.0, np.zeros((1, 1)), 0.0).at_least(4.0)
+    raised = NoiseModel(0.0, np.zeros((1, 1)), 0.0).floored(4.0)
     assert raised.variance_dn2 == raised.autocovariance_dn2[0, 0] == 4.0
 
 
@@ -317,6 +319,6 @@ def test_what_a_mark_says_of_the_curve_is_the_same_however_closely_the_fit_held_
     for change in (0.0, 0.003):
         fit = LinearFit(residuals - change * design[2], everywhere, design, by_grey, noise, np.ones(shape))
         priors, departures = np.array([0, 0, 50.0, 0, 0, 0, 0]), np.array([0, 0, 0.002 + change, 0, 0, 0, 0])
-        told = told_tone(fit, drawn, drawn, everywhere, priors, departures, Tone.unknown(), FULL, landscape)
+        told = mark_tone_information(fit, drawn, drawn, everywhere, priors, departures, Tone.unknown(), FULL, landscape)
         rights.append(told.information.right_side)
     np.testing.assert_allclose(rights[1], rights[0], rtol=1e-6)
