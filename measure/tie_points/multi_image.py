@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import chdtrc
 
+from measure.matching.gauss_newton import UNSETTLED, gauss_newton
 from measure.noise.noise_model import NoiseModel, correlated, noise_model
 from measure.reason import NO_REASON, Code, Reason
 
@@ -177,6 +178,7 @@ class _Fit:
         edge = np.arange(-radius_px - 1, radius_px + 2)
         self.grid = np.stack(np.meshgrid(edge, edge), axis=-1).astype(float)
         self.used: Mask = np.hypot(self.grid[..., 0], self.grid[..., 1]) <= radius_px
+        self.splines: list[Array] = []
         self.values = np.zeros((len(pieces), *self.used.shape))
         self.gains = np.ones(len(pieces))
         self.design = np.zeros((6, *self.used.shape))
@@ -184,21 +186,31 @@ class _Fit:
 
     def run(self, smoothing_px: float) -> None:
         """Gauss-Newton steps until no point moves any more."""
-        splines = [_spline(piece.grey, smoothing_px) for piece in self.pieces]
-        for _ in range(_ITERATIONS):
-            self._resample(splines)
-            if any(self.reasons) or not self._linearise():
-                return
-            steps = self._steps()
-            for index, step in enumerate(steps):
-                self._move(index, step)
-            if any(self.reasons) or np.abs(steps[:, :2]).max() < _STILL_PX:
-                return
-        self.reasons = [r or Reason("the matching does not come to rest", Code.NO_FIT) for r in self.reasons]
+        self.splines = [_spline(piece.grey, smoothing_px) for piece in self.pieces]
+        if gauss_newton(self, _STILL_PX, _ITERATIONS).reason == UNSETTLED:
+            self.reasons = [Reason("the matching does not come to rest", Code.NO_FIT)] * len(self.pieces)
 
-    def _resample(self, splines: Sequence[Array]) -> None:
+    def solve(self) -> Array | None:
+        """(frames, 6) how the grid is to be bent for each piece to lie on the reference's; None with reasons."""
+        self._resample()
+        if any(self.reasons) or not self._linearise():
+            return None
+        differences = (self.values - self.values[self.reference])[:, self.used]
+        return np.asarray(np.linalg.solve(self.normal, self.design[:, self.used] @ differences.T).T)
+
+    def step(self, step: Array) -> float:
+        """Bend the grid by (frames, 6); how far the farthest point moved, px."""
+        for index, of_piece in enumerate(step):
+            self._move(index, of_piece)
+        return float(np.abs(step[:, :2]).max())
+
+    def failure(self) -> Reason:
+        """The first piece's that failed, empty where none did."""
+        return next((reason for reason in self.reasons if reason), NO_REASON)
+
+    def _resample(self) -> None:
         """All pieces on the grid of the patch, less their means, in units of their own contrast."""
-        for index, (piece, spline) in enumerate(zip(self.pieces, splines, strict=True)):
+        for index, (piece, spline) in enumerate(zip(self.pieces, self.splines, strict=True)):
             places = self.grid @ self.maps[index][:, :2].T + self.maps[index][:, 2] - piece.origin_px
             if places.min() < 0.0 or (places.max(axis=(0, 1)) > np.array(spline.shape)[::-1] - 1).any():
                 self.reasons[index] = Reason("the matching leaves the window about the approximate place", Code.NO_FIT)
@@ -245,11 +257,6 @@ class _Fit:
         patch = patches.mean(axis=0)[self.used]
         grey = np.linalg.qr(np.stack([np.ones_like(patch), patch], axis=1))[0]
         return np.asarray(design - grey @ (grey.T @ design))
-
-    def _steps(self) -> Array:
-        """(frames, 6) how the grid is to be bent for each piece to lie on the reference's."""
-        differences = (self.values - self.values[self.reference])[:, self.used]
-        return np.asarray(np.linalg.solve(self.normal, self.design[:, self.used] @ differences.T).T)
 
     def _move(self, index: int, step: Array) -> None:
         """Where a piece looks as the patch does at u + d(u), the patch at u is found at u - d(u)."""
