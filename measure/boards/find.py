@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.boards.lattice import NoSquareGridError, find_squares
+from measure.boards.lattice import find_squares
 from measure.boards.markers import find_aruco, find_charuco
 from measure.boards.specs import (
     ArucoSpec,
@@ -16,7 +16,6 @@ from measure.boards.specs import (
     FoundBoard,
     FoundCorner,
     SquareGridSpec,
-    corners_of_square,
 )
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
@@ -228,7 +227,7 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | Squa
         elif isinstance(spec, CharucoSpec):
             found = find_charuco(picture, spec)
         elif isinstance(spec, SquareGridSpec):
-            found = _find_squares(picture, spec)
+            found = find_squares(picture, spec)
         else:
             found = find_aruco(picture, spec)
         if found.corners:
@@ -262,13 +261,3 @@ def _scan_corner(corner: FoundCorner, factor: int) -> FoundCorner:
 def _scan_px(place_px: Array, factor: int) -> Array:
     """Pixel (i, j) of a reduced picture has its centre at factor j + (factor - 1) / 2."""
     return place_px * factor + (factor - 1) / 2
-
-
-def _find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:
-    """The corners of separate squares; steps are the square's sides that leave the corner."""
-    try:
-        squares, notes, others = find_squares(picture, spec)
-    except NoSquareGridError as error:
-        return FoundBoard({}, Reason(str(error), Code.NO_BOARD))
-    corners = {id: corner for name, four in squares.items() for id, corner in corners_of_square(name, four).items()}
-    return FoundBoard(corners, others_px=others, notes=notes)

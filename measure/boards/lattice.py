@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from measure.boards.specs import SquareGridSpec
+from measure.boards.specs import FoundBoard, FoundCorner, SquareGridSpec, corners_of_square
+from measure.reason import Code, Reason
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -181,16 +182,9 @@ def _outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integer
     return [-least - np.array(spare) for spare in product(range(int(extra[0]) + 1), range(int(extra[1]) + 1))]
 
 
-class NoSquareGridError(Exception):
-    """A picture shows no grid, or more of one than is meant; the message says what it shows."""
-
-
-def find_squares(picture: Bytes, spec: SquareGridSpec) -> tuple[dict[str, Array], tuple[str, ...], tuple[Array, ...]]:
-    """The corners (4, 2) of the squares that are seen, by their names, clockwise from the upper left one; notes on how
-    the grid was taken; the middles of further grids that look the same. A pixel or so off.
-
-    Raises NoSquareGridError where not nearly all of a grid of this size is seen.
-    """
+def find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:
+    """Find the corners of a grid of separate dark squares in a picture, a pixel or so off; steps are the square's sides
+    that leave the corner. Nearly all squares must be seen."""
     message = ""
     for share in _BLOCKS:
         quads = list(_dark_quads(picture, share))
@@ -200,11 +194,9 @@ def find_squares(picture: Bytes, spec: SquareGridSpec) -> tuple[dict[str, Array]
         if is_whole(assignments):
             assignment = max(assignments, key=lambda found: upright(found, centers))
             notes = ("the grid looks the same when turned: it was taken as upright in the scan",)
-            corners = {
-                spec.square_name(place): _ordered(quads[index], _steps(assignment, centers, place))
-                for place, index in assignment.items()
-            }
-            return corners, notes[: len(assignments) - 1], other_grids(centers, appearances, assignment, spec.places())
+            others = other_grids(centers, appearances, assignment, spec.places())
+            corners = _square_corners(quads, centers, assignment, spec)
+            return FoundBoard(corners, others_px=others, notes=notes[: len(assignments) - 1])
         message = (
             f"no grid of {spec.columns} x {spec.rows} squares is wholly seen; {len(quads)} spots look like squares"
         )
@@ -212,7 +204,7 @@ def find_squares(picture: Bytes, spec: SquareGridSpec) -> tuple[dict[str, Array]
             message = (
                 f"a grid of more than {spec.columns} x {spec.rows} squares is seen, or one with a line of it hidden"
             )
-    raise NoSquareGridError(message)
+    return FoundBoard({}, Reason(message, Code.NO_BOARD))
 
 
 def _dark_quads(picture: Bytes, share: float) -> Iterator[Array]:
@@ -229,15 +221,21 @@ def _dark_quads(picture: Bytes, share: float) -> Iterator[Array]:
             yield np.asarray(quad, float).reshape(4, 2)
 
 
-def _steps(assignment: dict[Place, int], centers: Array, place: Place) -> Array:
-    """(2, 2) the steps to the next column and the next row at a place, by a homography of all squares."""
+def _square_corners(
+    quads: list[Array], centers: Array, assignment: dict[Place, int], spec: SquareGridSpec
+) -> dict[str, FoundCorner]:
+    """The corners of a grid's squares, clockwise from the upper left one of each as the grid is meant to be seen."""
     grid = np.array([(column, row) for row, column in assignment], float)
-    homography, _ = cv2.findHomography(grid, centers[list(assignment.values())])
-    x, y, w = np.asarray(homography, float) @ (place[1], place[0], 1.0)
-    return np.asarray((homography[:2, :2] - np.outer((x, y), homography[2, :2]) / w) / w, float)
+    homography = np.asarray(cv2.findHomography(grid, centers[list(assignment.values())])[0], float)
+    corners: dict[str, FoundCorner] = {}
+    for (row, column), index in assignment.items():
+        steps = homography_steps(homography, np.array([column, row], float))
+        right, down = np.linalg.solve(steps, (quads[index] - quads[index].mean(axis=0)).T)
+        corners |= corners_of_square(spec.square_name((row, column)), quads[index][np.argsort(np.arctan2(down, right))])
+    return corners
 
 
-def _ordered(quad: Array, steps: Array) -> Array:
-    """The corners from the upper left one on, clockwise as the grid is meant to be seen."""
-    right, down = np.linalg.solve(steps, (quad - quad.mean(axis=0)).T)
-    return np.asarray(quad[np.argsort(np.arctan2(down, right))])
+def homography_steps(homography: Array, place: Array) -> Array:
+    """(2, 2) derivatives of a homography at a place: its steps to the next column and the next row."""
+    x, y, w = homography @ (*place, 1.0)
+    return np.asarray((homography[:2, :2] - np.outer((x, y), homography[2, :2]) / w) / w)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.boards.lattice import homography_steps
 from measure.boards.specs import ArucoSpec, CharucoSpec, FoundBoard, FoundCorner, aruco_dictionary, corners_of_square
 from measure.reason import NO_REASON, Code, Reason
 from measure.targets.sheets import SheetView, robust_view
@@ -257,13 +258,7 @@ def _charuco_steps(ids: NDArray[np.int64], places: Array, spec: CharucoSpec) -> 
     across = spec.columns - 1
     board = np.stack([ids % across, ids // across], axis=-1).astype(float)
     homography, _ = cv2.findHomography(board, places)
-    return [_homography_steps(np.asarray(homography, float), place) for place in board]
-
-
-def _homography_steps(homography: Array, place: Array) -> Array:
-    """(2, 2) derivatives of a homography at a place."""
-    x, y, w = homography @ (*place, 1.0)
-    return np.asarray((homography[:2, :2] - np.outer((x, y), homography[2, :2]) / w) / w)
+    return [homography_steps(np.asarray(homography, float), place) for place in board]
 
 
 def off_corners(found: Mapping[str, FoundCorner], spec: CharucoSpec, read: ReadMarkers) -> dict[str, Reason]:
@@ -281,7 +276,7 @@ def off_corners(found: Mapping[str, FoundCorner], spec: CharucoSpec, read: ReadM
         image_px = np.concatenate([read.corners_px[number] for number in touching])
         homography = np.asarray(cv2.findHomography(squares, image_px)[0], float)
         x, y, w = homography @ (*place, 1.0)
-        squares_off = np.linalg.solve(_homography_steps(homography, place), corner.center_px - (x / w, y / w))
+        squares_off = np.linalg.solve(homography_steps(homography, place), corner.center_px - (x / w, y / w))
         if np.hypot(*squares_off) > _OFF_SQUARES:
             message = f"it lies {np.hypot(*squares_off):.1f} squares off where the markers beside it put it"
             off[name] = Reason(message, Code.OFF_PLACE)
