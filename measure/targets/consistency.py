@@ -69,7 +69,7 @@ class Comparison:
 def compared(targets: TargetPlaces, observed_px: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Comparison:
     """Targets seen at (n, 2) px with covariances (n, 2, 2), in an image of this width and height."""
     offsets = observed_px - targets.places_px
-    fits = [_fitted(_design(targets, size_px, bending), offsets, targets, covariance_px2) for bending in _BENDING]
+    fits = [_regression(_design(targets, size_px, bending), offsets, targets, covariance_px2) for bending in _BENDING]
     best = min(fits, key=lambda fit: float(np.median(np.linalg.norm(fit.off_px, axis=1))))
     own = covariance_px2 + best.more_px2[:, None, None] * np.eye(2)
     return Comparison(best.off_px, _chances(best, targets), own + best.predicted_px2)
@@ -106,7 +106,7 @@ class _Fit:
     more_px2: Array
 
 
-def _fitted(design: Array, offsets: Array, targets: TargetPlaces, observed_px2: Array) -> _Fit:
+def _regression(design: Array, offsets: Array, targets: TargetPlaces, observed_px2: Array) -> _Fit:
     """Student's t by expectation and maximisation, the scatter anew in each round."""
     off, predicted, unknowns = offsets - np.median(offsets, axis=0), np.zeros_like(observed_px2), design.shape[2]
     variances, more_px2 = _scatter(off, predicted, targets, observed_px2)
