@@ -107,7 +107,7 @@ def _spent_s(
 
 def _measured(path: Path, layout: FiducialLayout, pitch_um: float, pose: str, tone: Tone) -> None:
     with open_scan(path) as scan:
-        measure_fiducials(scan.with_tone(tone), layout, (pitch_um, pitch_um), FiducialOptions(pose=pose))
+        measure_fiducials(scan.replace_tone(tone), layout, (pitch_um, pitch_um), FiducialOptions(pose=pose))
 
 
 def _by_stage_s(rounds: int, path: Path, layout: FiducialLayout, pitch_um: float) -> dict[str, float]:

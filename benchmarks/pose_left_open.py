@@ -145,7 +145,7 @@ def measured(case: Case, pose: str) -> FrameMeasurement:
     pitch = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)
     marks = tuple(replace(mark, mark=replace(mark.mark, polarity="auto")) for mark in case.layout.marks)
     layout = replace(case.layout, marks=marks)
-    return measure_fiducials(case.scan.with_tone(Tone.unknown()), layout, pitch, FiducialOptions(pose=pose))
+    return measure_fiducials(case.scan.replace_tone(Tone.unknown()), layout, pitch, FiducialOptions(pose=pose))
 
 
 def sigmas_off(case: Case, frame: FrameMeasurement, status: str) -> list[float]:

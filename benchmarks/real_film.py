@@ -79,7 +79,7 @@ def measure_scan(task: Task, tone: Tone) -> dict[str, Any]:
     begun = time.process_time()
     with open_scan(task.scan) as scan:
         pitch_um = task.pitch_um or scan.pitch_um
-        frame = measure_fiducials(scan.with_tone(tone), task.layout, pitch_um, FiducialOptions())
+        frame = measure_fiducials(scan.replace_tone(tone), task.layout, pitch_um, FiducialOptions())
     frame = judged([frame], task.layout, [pitch_um or (1.0, 1.0)]).frames[0]
     marks = {
         mark.point: {

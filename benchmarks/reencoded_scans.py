@@ -68,7 +68,7 @@ def copies(scan: Scan) -> dict[str, Scan]:
 
 def measured(scan: Scan, camera: str, tone: Tone, pitch_um: tuple[float, float] | None) -> FrameMeasurement:
     layout = read_camera(camera_path(f"library:{camera}", Path())).layout()
-    frame = measure_fiducials(scan.with_tone(tone), layout, pitch_um, FiducialOptions(pose="0"))
+    frame = measure_fiducials(scan.replace_tone(tone), layout, pitch_um, FiducialOptions(pose="0"))
     return judged([frame], layout, [pitch_um or (1.0, 1.0)]).frames[0]
 
 

@@ -43,7 +43,7 @@ _NOISES = (8.0, 15.0, 30.0, 60.0, 101.0)
 def rows_of(case: Case, index: int, said: Sequence[ToneInformation] = ()) -> list[Row]:
     """One for each mark of a frame; said: by other scans of its scanner."""
     start = time.process_time()
-    frame = measured(case, Tone.unknown().with_information(said))
+    frame = measured(case, Tone.unknown().include_information(said))
     seconds = time.process_time() - start
     rows = []
     for mark in frame.marks:
@@ -70,7 +70,7 @@ def rows_of(case: Case, index: int, said: Sequence[ToneInformation] = ()) -> lis
 
 
 def measured(case: Case, tone: Tone) -> FrameMeasurement:
-    scan = case.scan.with_tone(tone)
+    scan = case.scan.replace_tone(tone)
     return measure_fiducials(scan, case.layout, (PITCH_UM, PITCH_UM), FiducialOptions(pose=case.pose))
 
 

@@ -42,7 +42,7 @@ def said_by_scan(case: Case) -> Said | None:
     codes = np.linspace(0.0, 1.0, len(Tone().base))
     curve = np.interp(codes, coded(light.astype(np.float32), case.curve), light)
     layout = at_border(case.layout)
-    scan = case.scan.with_tone(Tone(curve, covariance=1e-12 * np.eye(5)))
+    scan = case.scan.replace_tone(Tone(curve, covariance=1e-12 * np.eye(5)))
     places = np.array([case.centers_px[mark.id] for mark in layout.marks])
     design = np.array([[*mark.xy_mm, 1.0] for mark in layout.marks])
     frame = np.linalg.lstsq(design, places, rcond=None)[0].T
@@ -65,7 +65,7 @@ def said_by_scan(case: Case) -> Said | None:
 def departures(codes: Array, light: Array) -> Array:
     """(k,) of a curve, the least ones, from that of which nothing is said, by the logarithms of both slopes."""
     unknown = Tone.unknown()
-    slope = [np.log(np.gradient(unknown.with_departures(mean).light(codes, 1.0).astype(float), codes))
+    slope = [np.log(np.gradient(unknown.replace_departures(mean).light(codes, 1.0).astype(float), codes))
              for mean in (np.zeros(5), *np.eye(5))]  # fmt: skip
     design = np.column_stack([*(one - slope[0] for one in slope[1:]), np.ones(len(codes))])
     wanted = np.log(np.maximum(np.gradient(light, codes), 1e-9)) - slope[0]

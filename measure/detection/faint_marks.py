@@ -66,7 +66,7 @@ def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px:
     extreme_dn: the lightest or darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as
     light or as dark it does not show.
     """
-    seen = [_found(scan.with_tone(curve), expected, extreme_dn, blur_px) for curve in scan.tone.plausible_curves]
+    seen = [_found(scan.replace_tone(curve), expected, extreme_dn, blur_px) for curve in scan.tone.plausible_curves]
     both = [each for each in seen if each is not None]
     if len(both) < len(seen):
         return None

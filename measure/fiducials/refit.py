@@ -51,7 +51,7 @@ def settle(sighter: FrameSighter) -> None:
     _settle_from(sighter, sighter.scan.tone)
     for power in _OTHER_STARTS if sighter.tone.disagreement > _AGREED and _leans_on_tone(sighter) else ():
         before = sighter.tone, sighter.scan, list(sighter.sightings)
-        _settle_from(sighter, sighter.prior_tone.with_power(power))
+        _settle_from(sighter, sighter.prior_tone.shift_to_power(power))
         if sighter.tone.disagreement >= before[0].disagreement:
             sighter.tone, sighter.scan, sighter.sightings = before
             sighter.judge()
@@ -61,7 +61,7 @@ def _settle_from(sighter: FrameSighter, tone: Tone) -> None:
     """From where the marks were seen, beginning with a tone curve."""
     unsettled = {index for index, fit in _clear(sighter).items() if _leans_or_is_strained(sighter, index, fit)}
     if tone is not sighter.scan.tone:
-        sighter.scan, unsettled = sighter.scan.with_tone(tone), set(_told_of_tone(sighter))
+        sighter.scan, unsettled = sighter.scan.replace_tone(tone), set(_told_of_tone(sighter))
     edges = _told_by_edges(sighter)
     for _ in range(_TONE_ROUNDS):
         unsettled |= _moved_by_tone(sighter, _frame_tone(sighter, edges))
@@ -87,7 +87,7 @@ def _moved_by_tone(sighter: FrameSighter, found: FrameTone) -> set[int]:
     clear = _clear(sighter)
     if not any(found.shift_px(one, before) > _MOVED * clear[index].sigma_px for index, one in told.items()):
         return set()
-    sighter.scan = sighter.scan.with_tone(found.next_curve(before))
+    sighter.scan = sighter.scan.replace_tone(found.next_curve(before))
     return set(told)
 
 

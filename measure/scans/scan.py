@@ -113,13 +113,13 @@ class Scan:
         """Height and width of what the file has in one piece."""
         return self._segments.segment_height_px, self._segments.segment_width_px
 
-    def with_name(self, name: str) -> "Scan":
+    def replace_name(self, name: str) -> "Scan":
         """The scan under the name that a project has for it: files of several folders may have one name."""
         scan = copy(self)
         scan.name = name
         return scan
 
-    def with_tone(self, tone: Tone) -> "Scan":
+    def replace_tone(self, tone: Tone) -> "Scan":
         """The scan with another tone curve."""
         scan = copy(self)
         scan.tone = tone

@@ -36,8 +36,8 @@ def crop_scan(scan: Scan, window: Window) -> Scan:
         )
     pitch, segments = Pitch(scan.pitch_um, scan.pitch_note), WindowSegments(scan, window)
     opened = OpenedPicture(segments, pitch, scan.notes, scan.problems, orientation=scan.orientation)
-    view = Scan(scan.path, segments, pitch, opened).with_name(scan.name)
-    return view.with_tone(scan.tone)
+    view = Scan(scan.path, segments, pitch, opened).replace_name(scan.name)
+    return view.replace_tone(scan.tone)
 
 
 class WindowSegments:

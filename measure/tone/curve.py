@@ -2,8 +2,8 @@
 
 Film, lens and scanner blur light; only then is it coded. A fit in light needs the curve from code to light, and light
 may be anything that grows linearly with it: gain and offset are in every fit. So a curve is known by the logarithm of
-its slope, up to a constant. Its distribution has a base curve and normal departures from it: of
-the logarithm of the slope, a power's share and a few smooth waves over the range of codes.
+its slope, up to a constant. Its distribution has a base curve and normal departures from it: of the logarithm of the
+slope, a power's share and a few smooth waves over the range of codes.
 """
 
 from collections.abc import Sequence
@@ -150,19 +150,19 @@ class Tone:
     def is_known(self) -> bool:
         return not self.covariance.any()
 
-    def with_vague_prior(self) -> "Tone":
+    def vague_prior(self) -> "Tone":
         """The base with departures of which only the prior is known: the curve lies between linear and sRGB."""
         mean = np.zeros(_COUNT)
         mean[0] = (_POWER - self._base_power) / _POWER_SIGMA
         return replace(self, mean=mean, covariance=np.eye(_COUNT))
 
-    def with_power(self, value: float) -> "Tone":
+    def shift_to_power(self, value: float) -> "Tone":
         """The curve with the departure that makes it most like a power."""
         mean = self.mean.copy()
         mean[0] += (value - self.equivalent_power(0.1, 0.9)[0]) / _POWER_SIGMA
-        return self.with_departures(mean)
+        return self.replace_departures(mean)
 
-    def with_departures(self, mean: Array) -> "Tone":
+    def replace_departures(self, mean: Array) -> "Tone":
         return replace(self, mean=mean)
 
     @property
@@ -171,9 +171,9 @@ class Tone:
         if self.is_known:
             return (self,)
         sigma = np.sqrt(self.covariance[0, 0]) * np.eye(_COUNT)[0]
-        return self.with_departures(self.mean - sigma), self.with_departures(self.mean + sigma)
+        return self.replace_departures(self.mean - sigma), self.replace_departures(self.mean + sigma)
 
-    def with_information(self, others: Sequence[ToneInformation]) -> "Tone":
+    def include_information(self, others: Sequence[ToneInformation]) -> "Tone":
         """The curve after information from other scans of the scanner.
 
         It is kept, and pooled anew with that of the scan itself: what is wrong alike in all scans does not average.
@@ -195,7 +195,7 @@ class Tone:
         declared, log_likelihood = self._most_likely(each)
         if not self.is_declared:
             return declared
-        free, free_log_likelihood = self.with_vague_prior()._most_likely(each)
+        free, free_log_likelihood = self.vague_prior()._most_likely(each)
         if free_log_likelihood - log_likelihood < _CONTRADICTED:
             return declared
         source = f"{self.source}, but the pictures contradict it"
@@ -208,9 +208,9 @@ class Tone:
         sharpened pictures, of film developed unevenly. So each speaks of a curve of its own, and how far these scatter
         about the scanner's is estimated with it, as the most likely variance of random effects. Beforehand its root
         has a half-Cauchy distribution (Gelman, 2006, Prior distributions for variance parameters)."""
-        return max((self._with_scatter(each, scatter) for scatter in _SCATTERS), key=itemgetter(1))
+        return max((self._scatter_estimate(each, scatter) for scatter in _SCATTERS), key=itemgetter(1))
 
-    def _with_scatter(self, each: Sequence[ToneInformation], scatter: float) -> tuple[ToneEstimate, float]:
+    def _scatter_estimate(self, each: Sequence[ToneInformation], scatter: float) -> tuple[ToneEstimate, float]:
         pooled = ToneInformation.pooled(each, scatter)
         information, prior = pooled.scanner_information, np.linalg.inv(self.covariance)
         covariance = np.linalg.inv(prior + information.matrix)

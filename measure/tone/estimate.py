@@ -92,4 +92,4 @@ class FrameTone:
     def next_curve(self, before: Tone) -> Tone:
         """The curve to match with next: no farther from the one before than what was linearised there holds."""
         step = self.tone.mean - before.mean
-        return self.tone.with_departures(before.mean + step / max(float(np.abs(step).max()) / _LONGEST, 1.0))
+        return self.tone.replace_departures(before.mean + step / max(float(np.abs(step).max()) / _LONGEST, 1.0))

@@ -136,7 +136,7 @@ def _measured(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     """What a scan shows, whole or in a window."""
     # Fiducials are seen through the curve; targets have edges all round, and are measured as they are.
     tone = tone_before(options.tone, options.said, scan.path)
-    frame = replace(_fiducials(options, scan.with_tone(tone)), image=task.name)
+    frame = replace(_fiducials(options, scan.replace_tone(tone)), image=task.name)
     pitch, problems, notes = _pitch(options, scan, frame)
     of_file = (Reason(f"{told[0].upper()}{told[1:]}.", Code.SECOND_PICTURE) for told in scan.problems)
     frame = replace(frame, problems=(*of_file, *frame.problems, *problems))

@@ -85,7 +85,7 @@ class ScanTask:
             raise MissingError(_NO_SCAN)
         from measure.scans.scan import open_scan
 
-        return open_scan(scan_path(self.scan), self.max_pixels).with_name(self.name)
+        return open_scan(scan_path(self.scan), self.max_pixels).replace_name(self.name)
 
     def posed(self, pose: str) -> "ScanTask":
         """The same scan in a pose that is known, nothing read in it."""

@@ -27,7 +27,7 @@ _SET = "it is set in the project"
 def tone_before(setting: float | str, said: Sequence[ToneInformation], scan: Path) -> Tone:
     """What is believed of the curve of a scan before it is measured, as the project, the file and other scans say: what
     it says itself is not in it yet. setting: as the project has it; said: by the others."""
-    return _prior(setting, scan).with_information(said)
+    return _prior(setting, scan).include_information(said)
 
 
 def said_of_tones(

@@ -126,8 +126,8 @@ def test_what_the_tone_curve_moves_a_faint_mark_by_is_in_its_covariance(tmp_path
     expected = MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1)
     with written_scan(grey, tmp_path) as scan:
         prior = Tone.unknown()
-        seen = find_faint(scan.with_tone(prior), expected, 0.0, 0.7)
-        ends = [find_faint(scan.with_tone(Tone(power(value))), expected, 0.0, 0.7) for value in (1.0, 2.2)]
+        seen = find_faint(scan.replace_tone(prior), expected, 0.0, 0.7)
+        ends = [find_faint(scan.replace_tone(Tone(power(value))), expected, 0.0, 0.7) for value in (1.0, 2.2)]
     assert seen is not None
     assert ends[0] is not None
     assert ends[1] is not None

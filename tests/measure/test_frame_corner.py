@@ -98,14 +98,14 @@ def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> No
     tone = Tone(power(gamma), covariance=np.eye(5))
 
     def fitted(tone: Tone) -> Match:
-        fit = corner_of_edges(scan.with_tone(tone), corner, MarkPrediction(corner, start, 6.0, 1))
+        fit = corner_of_edges(scan.replace_tone(tone), corner, MarkPrediction(corner, start, 6.0, 1))
         assert fit.converged
         return fit
 
     told = fitted(tone).tone
     assert told is not None
     for k in range(2):
-        more, less = (fitted(tone.with_departures(way * 0.1 * np.eye(5)[k])).center_px for way in (1, -1))
+        more, less = (fitted(tone.replace_departures(way * 0.1 * np.eye(5)[k])).center_px for way in (1, -1))
         np.testing.assert_allclose((more - less) / 0.2, told.on_place[:, k], atol=0.1)
     assert np.hypot(*told.on_place[:, 0]) > 0.15
     assert told.information.sum_of_squares < 25  # of 5 figures, by the true curve
@@ -121,10 +121,10 @@ def test_the_frames_edges_beside_its_marks_tell_the_curve(gamma: float) -> None:
     )
     scan = scan_of(65535 * (picture(5) / 65535) ** (1 / gamma))
     by_truth = Tone(power(gamma), covariance=np.eye(5))
-    (said,) = told_by_edges(scan.with_tone(by_truth), marks, MATRIX, None)
+    (said,) = told_by_edges(scan.replace_tone(by_truth), marks, MATRIX, None)
     assert said.sum_of_squares < 25  # of 5 figures
-    other = by_truth.with_power(gamma + 0.5)
-    (said,) = told_by_edges(scan.with_tone(other), marks, MATRIX, None)
+    other = by_truth.shift_to_power(gamma + 0.5)
+    (said,) = told_by_edges(scan.replace_tone(other), marks, MATRIX, None)
     prior = Tone(power(gamma + 0.5), covariance=4 * np.eye(5))
     found = prior.estimate([said]).tone
     value, sigma = found.equivalent_power(0.2, 0.5)

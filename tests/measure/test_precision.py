@@ -163,7 +163,7 @@ def test_what_compression_makes_of_the_tone_curve_is_alike_in_all_marks() -> Non
     grey = GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 100)
     expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
     for step, alike in ((0.0, 0.0), (0.1, 0.35**2)):  # 3.5 times the step over the contrast
-        scan = scan_of(grey, rounding_step_dn=step * CONTRAST).with_tone(Tone.unknown())
+        scan = scan_of(grey, rounding_step_dn=step * CONTRAST).replace_tone(Tone.unknown())
         fit = sight(scan, expected, FiducialOptions().match, mark.kind.known).fit
         assert fit is not None
         assert fit.tone is not None

@@ -47,7 +47,7 @@ def test_a_light_mark_is_not_damaged_for_its_noise(alike_in: str) -> None:
             code = np.clip(light + 0.004 * noise, 0.0, 1.0) ** (1 / 2.2)
         else:
             code = light ** (1 / 2.2) + 0.02 * noise
-        scan = scan_of(FULL * code).with_tone(Tone(power(2.2)))
+        scan = scan_of(FULL * code).replace_tone(Tone(power(2.2)))
         window = read_window(scan, (0, 0, mark.size, mark.size))
         fit = match(window, mark.kind.shape, mark.place, MatchOptions(linear_sigma=0.05))
         assert fit.converged, fit.reason

@@ -36,7 +36,7 @@ def code_of(mark: TrueMark, curve: float | str, snr: float, rng: np.random.Gener
 
 
 def fitted(mark: TrueMark, code: np.ndarray, tone: Tone) -> Match:
-    scan = scan_of(code).with_tone(tone)
+    scan = scan_of(code).replace_tone(tone)
     options = options_for(mark.kind.shape, MatchOptions(linear_sigma=0.05), mark.kind.known)
     return match(read_window(scan, (0, 0, mark.size, mark.size)), mark.kind.shape, mark.place, options)
 
@@ -44,7 +44,7 @@ def fitted(mark: TrueMark, code: np.ndarray, tone: Tone) -> Match:
 def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tuple[list[Match], FrameTone]:
     """From the first start at which the marks agree on the curve that they were matched by, or the best."""
     tried = []
-    for start in (prior, prior.with_power(1.0), prior.with_power(2.2)):
+    for start in (prior, prior.shift_to_power(1.0), prior.shift_to_power(2.2)):
         tried.append(settled_from(start, marks, codes, prior))
         if tried[-1][1].disagreement < SETTLED:
             break
@@ -110,7 +110,7 @@ def test_departures_change_light_as_their_derivatives_say() -> None:
     tone, codes = Tone.unknown(), np.linspace(0.1, 0.9, 9) * FULL
     for k in range(5):
         step = np.eye(5)[k] * 1e-3
-        more, less = (tone.with_departures(way * step).light(codes, FULL).astype(float) for way in (1, -1))
+        more, less = (tone.replace_departures(way * step).light(codes, FULL).astype(float) for way in (1, -1))
         by_departure = (more - less) / 2e-3
         told = tone.derivatives(tone.light(codes, FULL), FULL)[k]
         gain = np.polyfit(tone.light(codes, FULL).astype(float), by_departure - told, 1)  # but for gain and offset
@@ -154,7 +154,7 @@ def test_a_mark_says_no_more_of_the_curve_where_its_frame_is_known_without_error
     mark = some_mark(TIP, 1.0, rng)
     code = code_of(mark, 2.2, 80.0, rng)
     alike = [replace(mark, kind=replace(TIP, known=known)) for known in (1e-4, 1e-6)]
-    told = [fitted(each, code, Tone.unknown().with_power(2.2)).tone for each in alike]
+    told = [fitted(each, code, Tone.unknown().shift_to_power(2.2)).tone for each in alike]
     information = [one.information.matrix for one in told if one is not None]
     np.testing.assert_allclose(information[1], information[0], rtol=0.1, atol=0.1)
 
@@ -167,7 +167,7 @@ def test_the_linearised_effect_of_a_curve_is_that_of_a_fit_at_another_one() -> N
     assert told is not None
     for k in range(3):
         step = 0.1 * np.eye(5)[k]
-        more, less = (fitted(mark, code, tone.with_departures(way * step)).center_px for way in (1, -1))
+        more, less = (fitted(mark, code, tone.replace_departures(way * step)).center_px for way in (1, -1))
         np.testing.assert_allclose((more - less) / 0.2, told.on_place[:, k], atol=0.03)
 
 
@@ -240,7 +240,7 @@ def test_what_is_wrong_alike_in_all_pictures_of_a_scanner_does_not_average() -> 
         ]
         at_once, in_turn = (
             Tone.unknown().estimate(each).tone,
-            Tone.unknown().with_information(each[5:]).estimate(each[:5]).tone,
+            Tone.unknown().include_information(each[5:]).estimate(each[:5]).tone,
         )
         np.testing.assert_allclose(in_turn.mean, at_once.mean, atol=1e-9)
         error = at_once.mean - truth
@@ -256,7 +256,7 @@ def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -
     code = code_of(mark, 2.2, 80.0, rng) / 257
     known = []
     for step_dn in (0.0, 12.0):
-        scan = scan_of(code, 255, step_dn).with_tone(Tone.unknown())
+        scan = scan_of(code, 255, step_dn).replace_tone(Tone.unknown())
         expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
         fit = sight(scan, expected, MatchOptions(linear_sigma=0.05), mark.kind.known).fit
         assert fit is not None
