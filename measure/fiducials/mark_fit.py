@@ -139,9 +139,7 @@ def _matched(
 ) -> Match:
     """The mark matched from a place."""
     mark, start = expected.mark, expected.moved(center_px).pixel_from_mark
-    seen_in = (
-        scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan
-    )  # chips are cut as the file has them
+    seen_in = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
     window = read_window(seen_in, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
     if expected.surroundings.robust and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
