@@ -59,7 +59,7 @@ def test_a_window_decodes_only_its_tiles_and_a_whole_pass_each_tile_once(tmp_pat
             sample_bytes, rounding_step_dn = segments.sample_bytes, segments.rounding_step_dn
             lost = segments.lost
 
-            def fetched(self, places: Any) -> Any:
+            def fetch(self, places: Any) -> Any:
                 return {}
 
             def read(self, row: int, column: int, stored: Any = ()) -> Any:
