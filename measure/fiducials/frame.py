@@ -1,5 +1,6 @@
 """One frame in one placement: its marks as they were seen, and those told apart that do not belong."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -138,14 +139,26 @@ class Frame:
         fractions = [fit.damaged_fraction for fit in self.fits if fit is not None]
         return float(np.median(fractions)) if len(fractions) >= _CHECKED else 0.0
 
-    def misfit(self) -> str:
-        """A sentence for a frame that is not accepted."""
+    def misfit(self, ids: Sequence[str]) -> str:
+        """A sentence for a frame that is not accepted. ids: of its marks, in the order of the sightings."""
         found = f"{int(self.belongs.sum())} of {len(self.sightings)} marks were found where the others put them"
         if not self.agrees:
-            return f"the constellation does not fit: only {found}"
+            return f"the constellation does not fit: only {found}{self._told_outside(ids)}"
         return (
             f"{found}, but only {self._clear} of them look plainly like their drawings, where {self._least} have to: "
             "compare the drawings with the scan, or say by which curve it stores light (tone)"
+        )
+
+    def _told_outside(self, ids: Sequence[str]) -> str:
+        """A part of a sentence on marks that the others put outside of the scan."""
+        outside = [
+            id for id, sighting in zip(ids, self.sightings, strict=True) if Code.OUTSIDE in sighting.reason.codes
+        ]
+        if not outside or self.belongs.sum() < 2:
+            return ""
+        return (
+            f", and these put {', '.join(outside)} outside of the scan: scan the whole frame, or say by part_of in "
+            "images.csv that this scan is a part of it"
         )
 
     def verdict(self, index: int) -> tuple[Status, Reason]:

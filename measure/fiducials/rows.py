@@ -96,7 +96,8 @@ def _problems(scan: Scan, frame: Frame, pitch_um: tuple[float, float] | None) ->
         problems.append(Reason(told, Code.PITCH))
     used = int(frame.belongs.sum())
     if used <= 3:
-        told = f"an affine transformation on {used} fiducials has no redundancy: no check."
+        kind = "an affine transformation" if used == 3 else "a similarity"
+        told = f"{kind} on {used} fiducials has no redundancy: no check."
         problems.append(Reason(told, Code.NO_CHECK))
     return problems
 

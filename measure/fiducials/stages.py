@@ -95,7 +95,7 @@ def find_frame(
         if expected <= FRAMES_BY_CHANCE:
             found = replace(found, search=attempt.search, placements=placements, frame=frame, is_taken=True)
         elif attempt.is_given:
-            misfit = frame.misfit() if frame else Found.misfit
+            misfit = frame.misfit([mark.id for mark in layout.marks]) if frame else Found.misfit
             found = replace(found, placements=placements, frame=frame, is_taken=False, misfit=misfit)
         else:
             likely = [each for each in frames if _is_taken_if_given(each, attempt, at_given / tried)]

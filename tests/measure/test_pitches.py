@@ -63,6 +63,23 @@ def test_wrong_resolution_tags_are_named_with_the_pitch_of_the_marks(tmp_path: P
         assert pitch_problem(result, ALIKE, pitch_um, "the scan's file") is None  # once is enough
 
 
+def test_marks_outside_of_the_scan_are_named_where_the_others_are_too_few(tmp_path: Path) -> None:
+    """Four side marks, of which the upper and the lower one are cut off."""
+    layout = layout_of(
+        [MarkShape(RING_CROSS)] * 4, ((-10.0, 0.0), (10.0, 0.3), (0.0, 10.0), (0.2, -10.0)), (22.0, 22.0)
+    )
+    matrix = np.column_stack([pixel_from_camera("0", 0.0)[:, :2], (260.0, 260.0)])
+    result = measured(frame_picture(layout, matrix, size=520)[100:420], layout, tmp_path)
+    (problem,) = result.problems
+    assert "only 2 of 4 marks were found where the others put them, and these put 3, 4 outside of the scan" in problem
+
+
+def test_two_marks_are_said_to_give_a_similarity(tmp_path: Path) -> None:
+    layout = layout_of([MarkShape(RING_CROSS)] * 2, ((-7.0, 0.0), (7.0, 0.2)))
+    result = measured(frame_picture(layout, pixel_from_camera("0")), layout, tmp_path)
+    assert any("a similarity on 2 fiducials has no redundancy" in problem for problem in result.problems)
+
+
 def test_pixels_given_as_longer_one_way_need_no_look(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0", turn_rad=0.0)
     matrix[:, :2] = np.diag([1.012, 0.988]) @ matrix[:, :2]

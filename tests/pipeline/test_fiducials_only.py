@@ -144,3 +144,16 @@ def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(
     design = np.column_stack([np.ones(5), comparator_mm(0)])
     sigma = np.sqrt(np.linalg.inv(design.T @ design)[0, 0] * (1.0 + SIGMA_MM**2))
     assert result["images"]["a"]["transformation"]["a1"]["sigma"] == pytest.approx(sigma, rel=1e-3)
+
+
+def test_one_frame_within_its_certificate_needs_no_look(tmp_path: Path) -> None:
+    """Four calibrated fiducials of one frame, given to 10 µm and measured to 4 µm: nothing speaks against any."""
+    project = write_project(tmp_path, {"a": 4})
+    camera = tmp_path / "camera.toml"
+    camera.write_text(camera.read_text(encoding="utf-8").replace("sigma_mm = 0", "sigma_mm = 0.01"), encoding="utf-8")
+    assert run(["run", str(project)]) == 0
+    rows = (tmp_path / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    name, id_, kind, x, *rest = rows[1].split(",")
+    wrong = ",".join((name, id_, kind, str(float(x) + 0.4), *rest))  # 0.2 mm and more at each mark of an affine fit
+    (tmp_path / "comparator.csv").write_text("\n".join([rows[0], wrong, *rows[2:]]) + "\n", encoding="utf-8")
+    assert run(["run", str(project)]) == 1
