@@ -20,7 +20,12 @@ class UnorientedError(AdjustmentError):
 
 
 class NoImageError(AdjustmentError):
-    """An adjustment that cannot start, for with the approximations some point has no image."""
+    """An adjustment that cannot start, for with the approximations some point has no image; reasons: a sentence on each
+    frame of such a point, by its name; none where it is the whole camera's fault."""
+
+    def __init__(self, message: str, reasons: Mapping[str, str]) -> None:
+        super().__init__(message)
+        self.reasons = dict(reasons)
 
 
 class DatumError(AdjustmentError):

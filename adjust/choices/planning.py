@@ -11,7 +11,7 @@ from adjust.errors import AdjustmentError
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
-from adjust.problem.functions import blind_mark, computed_observations
+from adjust.problem.functions import blind_marks, computed_observations
 from adjust.problem.further_observations import at_computed
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Parameter
@@ -126,7 +126,8 @@ def _factor(numbering: Numbering) -> Factor:
 
 
 def _blind(problem: Problem) -> str:
+    told, _ = next(iter(blind_marks(problem, problem.start()).values()))
     return (
-        f"The network cannot be planned: {blind_mark(problem, problem.start())[0]}. Turn the camera towards the field, "
-        f"or leave the point out of that image."
+        f"The network cannot be planned: {told}. Turn the camera towards the field, or leave the point out of that "
+        "image."
     )

@@ -315,11 +315,13 @@ class _Fields:
 
         Of least algebraic error under the norm 1, with image coordinates about their mean and of the size 1.
         """
-        weights, counts = self.weights[some], self.weights[some].sum(axis=1)
+        weights = self.weights[some]
+        counts = np.maximum(weights.sum(axis=1), 1.0)  # of none where no pose agrees with any point
         xy = self.xy_mm[some] * (weights[..., None] / self._unit_mm)
         middle = xy.sum(axis=1) / counts[:, None]
         about = xy - middle[:, None] * weights[..., None]
         size = np.sqrt((about**2).sum(axis=(1, 2)) / counts)
+        size[size == 0.0] = 1.0
         x, y = np.moveaxis(about / size[:, None, None], -1, 0)
         points = self._homogeneous(some, columns)
         products = (points[..., :, None] * points[..., None, :]).reshape(*weights.shape, columns**2)

@@ -259,32 +259,40 @@ def _in_order(rows: Indices) -> Rows:
     return slice(int(rows[0]), int(rows[-1]) + 1) if whole else rows
 
 
-def blind_mark(problem: Problem, state: State) -> tuple[str, str]:
-    """The first mark that has no image in a state and why, and what to check; empty where all have one."""
-    observations = problem.network.observations
+def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
+    """By image the first mark that has no image in a state and why, and what to check; empty where all have one. Under
+    no name what is wrong with a whole camera."""
+    observations, numbers = problem.network.observations, problem.image_numbers
+    blind: dict[int, tuple[str, str]] = {}
     for name, rows in problem.targets_by_camera.items():
         interior, parameters, distortion = _camera(problem, state, name)
         if interior[0] <= 0.0:
             told = f"the principal distance of camera {name} is {interior[0]:.6g} mm and must be positive"
-            return told, "Give a positive one."
+            return {"": (told, "Give a positive one.")}
         seen = _seen(problem, state, name, rows)
         behind = seen.in_camera[:, 2] >= 0.0
         _, found = camera_from_image(distortion, interior, parameters, seen.imaged)
-        if behind.any() or not found.all():
-            row = int(np.argmax(behind if behind.any() else ~found))
-            return _blind_target(problem, int(rows[row]), bool(behind.any()))
-    targets = [_seen(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
-    camera_xy = _computed_in_camera(problem, state, targets)
-    if camera_xy is None:
-        return "", ""
-    _, found = _computed_in_comparator(problem, state, camera_xy)
-    row = int(np.argmin(found))
-    image = problem.network.images[problem.image_numbers[row]]
-    told = (
-        f"{observations.kind[row]} {observations.point[row]} is where the {image.transformation} transformation of "
-        f"image {image.name} folds over"
-    )
-    return told, "Check its number and those of the fiducial marks, or choose a transformation of a lower order."
+        for which, is_behind in ((behind, True), (~found, False)):
+            for row in _first_of_images(rows[which], numbers):
+                blind.setdefault(numbers[row], _blind_target(problem, row, is_behind))
+    targets = [] if blind else [_seen(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
+    camera_xy = None if blind else _computed_in_camera(problem, state, targets)
+    if camera_xy is not None:
+        _, found = _computed_in_comparator(problem, state, camera_xy)
+        for row in _first_of_images(np.flatnonzero(~found), numbers):
+            image = problem.network.images[numbers[row]]
+            told = (
+                f"{observations.kind[row]} {observations.point[row]} is where the {image.transformation} "
+                f"transformation of image {image.name} folds over"
+            )
+            check = "Check its number and those of the fiducial marks, or choose a transformation of a lower order."
+            blind[numbers[row]] = told, check
+    return {problem.network.images[number].name: reason for number, reason in blind.items()}
+
+
+def _first_of_images(rows: Indices, image_numbers: Indices) -> list[int]:
+    """The first of some rows of each image that they are of."""
+    return [int(rows[at]) for at in sorted(np.unique(image_numbers[rows], return_index=True)[1])]
 
 
 def _blind_target(problem: Problem, row: int, is_behind: bool) -> tuple[str, str]:

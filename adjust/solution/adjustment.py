@@ -50,7 +50,7 @@ def adjust(
     Where no approximations are given, or the iteration does not come to rest from them, it begins with those found from
     the network itself. Given points that are far off are named where the observations do not agree for them; robust
     estimation and data snooping begin without them. Images for which no orientation is found are left out, and tried
-    again once the lens is known (`Adjustment.left_out`).
+    again once the lens is known (`Adjustment.left_out`); so are those in which some point has no image to begin with.
 
     Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
     has no image, where the chosen datum does not hold the object space, or where a slip that concerns the whole network
@@ -62,8 +62,7 @@ def adjust(
     tried, family = partial(_tried, options=options), options.probabilities.family
     if approximations is not None:
         return with_plausibility(_as_a_whole(network, approximations, None, options), tried, family)
-    part, start, left_out = _orientable(network, options)
-    result = _as_a_whole(part, None, start, options)
+    result, left_out = _without_blind_images(*_orientable(network, options), options)
     found = _tried_again(network, result, left_out, options) if left_out else result
     return with_plausibility(found, tried, family)
 
@@ -82,6 +81,22 @@ def _orientable(network: Network, options: Options) -> tuple[Network, Approximat
     return (network, None, {}) if part is None or start is None else (part, start, reasons)
 
 
+def _without_blind_images(
+    part: Network, start: Approximations | None, left_out: dict[str, str], options: Options
+) -> tuple[Adjustment, dict[str, str]]:
+    """The adjustment of a network without those images, too, in which some point has no image to begin with, and why
+    images are left out. Raises NoImageError where too little would be left."""
+    try:
+        return _as_a_whole(part, None, start, options), left_out
+    except NoImageError as error:
+        rest = without_images(part, error.reasons) if error.reasons else None
+        begun = None if rest is None else _own_start(rest, options)
+        if rest is None or begun is None:
+            raise
+        reasons = error.reasons
+    return _without_blind_images(rest, begun, left_out | reasons, options)
+
+
 def _tried_again(network: Network, rest: Adjustment, left_out: dict[str, str], options: Options) -> Adjustment:
     """The adjustment with those images that were left out and that fit once the lens is known."""
     found = rest
@@ -92,8 +107,11 @@ def _tried_again(network: Network, rest: Adjustment, left_out: dict[str, str], o
             part = without_images(network, left_out.keys() - came)
             if part is None:
                 break
-            tried = _adjusted(part, start, options)
-            fit = fitting(tried, came, rest.sigma0) if tried.converged else set()
+            try:
+                tried = _adjusted(part, start, options)
+                fit = fitting(tried, came, rest.sigma0) if tried.converged else set()
+            except NoImageError as error:
+                tried, fit = rest, came - error.reasons.keys()
             if fit == came:
                 found = tried
                 break

@@ -12,7 +12,7 @@ from adjust.functional_model.families import family
 from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
-from adjust.problem.functions import blind_mark
+from adjust.problem.functions import blind_marks
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import NullDirection, Termination
 from adjust.problem.tested import TestedUnits
@@ -266,8 +266,12 @@ def _adjusted(problem: Problem, weighting: Weighting, state: State, limit: int) 
     numbering = Numbering(weighted)
     start = linearise(numbering, covariance, state)
     if start is None:
-        told, check = blind_mark(problem, state)
-        raise NoImageError(f"The adjustment cannot start: with the approximations, {told}. {check}")
+        reasons = {name: f"{told}. {check}" for name, (told, check) in blind_marks(problem, state).items()}
+        of_name = problem.network.image_by_name
+        raise NoImageError(
+            f"The adjustment cannot start: with the approximations, {next(iter(reasons.values()), '')}",
+            {of_name[name].frame: reason for name, reason in reasons.items() if name},
+        )
     singular = singular_directions(weighted, state, numbering.free, start.factor)
     if singular:
         solution = Solution(start, None, "singular", ())

@@ -115,6 +115,24 @@ def test_where_half_of_the_images_fail_it_is_no_single_one() -> None:
         adjust(network)
 
 
+@pytest.mark.parametrize("robust", [False, True])
+def test_an_image_with_a_point_behind_its_camera_is_left_out(robust: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One number of 55 is wrong: its point, in sight of all others, lies behind that one camera."""
+    monkeypatch.setitem(globals(), "BOARD", np.vstack([BOARD, [10.0, 5.0, -170.0]]))
+    rng = np.random.default_rng(6)
+    images = good_images(8, rng)
+    near = seen(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 120.0]))
+    near[-1] = 0.5, 0.3
+    result = adjust(network_of({**images, "near": near}, rng), options=Options(robust=robust))
+    assert result.converged
+    assert result.left_out["near"].startswith("point c54 lies behind the camera in image near.")
+    assert list(result.left_out) == ["near"]
+    assert any(each.startswith("Left out of the adjustment: point c54 lies behind") for each in result.warnings)
+    assert {image.name for image in result.network.images} == set(images)
+    assert abs(result.value("IO.cam.c") - C) < 4.0 * result.sigma("IO.cam.c")
+    assert 0.9 < result.sigma0 < 1.1
+
+
 def test_points_that_only_a_left_out_image_shows_go_with_it() -> None:
     rng = np.random.default_rng(5)
     images = good_images(6, rng)
