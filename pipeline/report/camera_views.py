@@ -199,7 +199,11 @@ def _lens_map(
     if not parameter_names(camera["distortion"]["family"]) or not rows:
         return None
     corners_mm = camera.get("lens_known", {}).get("frame_mm")
-    on = vectors.plane_about(*np.array(corners_mm), PLOT_PX) if corners_mm else vectors.plane(rows, frame_mm, PLOT_PX)
+    if corners_mm:
+        low, high = np.array(corners_mm, float)
+        on = vectors.plane_about(low, high, PLOT_PX)
+    else:
+        on = vectors.plane(rows, frame_mm, PLOT_PX)
     return lens_map(lens.lens(name, camera), covariance, on, radius_mm)
 
 

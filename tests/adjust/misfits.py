@@ -14,7 +14,7 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.network import Exterior, Image, Network, ObjectPoint
-from adjust.problem.observations import Observations
+from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.probabilities import Probabilities
 from adjust.solution.adjustment import adjust
 
@@ -119,6 +119,7 @@ def network(made: Scene, effects: Effects, kind: Kind, rng: np.random.Generator 
     frame = (float(2.0 * HALF_MM[0]), float(2.0 * HALF_MM[1])) if kind.frame_given else (0.0, 0.0)
     camera = Camera("cam", c, None, None, Distortion("opencv", given), {}, (float(middle[0]), float(middle[1])), frame)
     exterior = _exteriors(made) if kind.stations_given else {}
+    kinds: tuple[ObservationKind, ...] = ("target",) * len(images)
     return Network(
         (camera,),
         tuple(Image(name, "cam", "none", exterior.get(name)) for name in dict.fromkeys(images)),
@@ -129,7 +130,7 @@ def network(made: Scene, effects: Effects, kind: Kind, rng: np.random.Generator 
         Observations(
             tuple(images),
             tuple(points),
-            ("target",) * len(images),
+            kinds,
             xy_mm,
             np.tile((effects.pitch * SIGMA_MM) ** 2 * np.eye(2), (len(images), 1, 1)),
         ),
@@ -219,10 +220,10 @@ def drawn(name: str, seed: int, many: float = MANY) -> Network:
 def _size(name: str, kind: Kind, made: Scene, many: float) -> float:
     if name == NOTHING or not kind.sized:
         return 1.0
-    wanted = (many * Probabilities().noncentrality(kind.size)) ** 2
+    wanted = float((many * Probabilities().noncentrality(kind.size)) ** 2)
     if name == NOISE:
         count = 2 * len(network(made, Effects(), kind, None).observations)
-        return 2.0 * (np.sqrt(1.0 + many * 4.13 * np.sqrt(2.0 / count)) - 1.0)  # of the test of v'Pv
+        return 2.0 * float(np.sqrt(1.0 + many * 4.13 * np.sqrt(2.0 / count)) - 1.0)  # of the test of v'Pv
     size = 1.0
     for _ in range(2):
         result = adjust(network(made, kind.effect(size), kind, None))

@@ -37,9 +37,9 @@ def roll(tmp_path_factory: pytest.TempPathFactory) -> Path:
     one, two = (tifffile.imread(folder / "scans" / f"f{k}.tif") for k in (1, 2))
     for file in (folder / "scans").iterdir():
         file.unlink()
-    with tifffile.TiffWriter(folder / "scans" / "roll.tif") as file:
-        file.write(np.hstack([one, two]), metadata=None)
-        file.write(two, metadata=None)
+    with tifffile.TiffWriter(folder / "scans" / "roll.tif") as writer:
+        writer.write(np.hstack([one, two]), metadata=None)
+        writer.write(two, metadata=None)
     given = "".join(f'[[fiducial]]\nid = "{id}"\nxy_mm = [{x}, {y}]\nmark = "m"\n' for id, (x, y) in CORNERS.items())
     (folder / "camera.toml").write_text(
         f'name = "small"\nframe_mm = [16.0, 16.0]\nprincipal_distance_mm = 30.0\n{given}'
