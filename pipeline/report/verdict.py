@@ -268,7 +268,7 @@ def _check_problems(check: Json) -> Iterator[Problem]:
 
 def _corners_notes(check: Json) -> Iterator[str]:
     """What OpenCV's own points of a board give in the place of those that were measured here."""
-    for name, camera in check["cameras"].items():
+    for name, camera in check.get("cameras", {}).items():
         corners = camera.get("corners_px")
         if corners:
             measured, own = (_pixel_figures(corners[each]) for each in ("reseau", "opencv"))
