@@ -26,6 +26,7 @@ from pipeline.publishing.made_from import (
 from pipeline.publishing.publishing import outside_note
 from pipeline.report.data import Problem, ReportData
 from pipeline.results.adjustment_reader import read_adjustment, read_covariance
+from pipeline.results.check_file import read_check
 from pipeline.results.comparator_file import (
     ComparatorPoint,
     decisions_of,
@@ -36,7 +37,6 @@ from pipeline.results.comparator_file import (
 from pipeline.results.fingerprints import of_file
 from pipeline.results.measured_scan import FailureCode, MeasuredScan
 from pipeline.text.spelling import did_you_mean
-from pipeline.text.text_file import read_json
 from pipeline.text.wording import listed
 
 Json = dict[str, Any]
@@ -156,8 +156,9 @@ def adjusted(project: Project, at: At, most_frames: int | None = None) -> Report
     made_from = {**data.made_from, path.name: fingerprint}
     data = replace(data, adjustment=adjustment, covariance=covariance, made_from=made_from)
     check_path = at(project.check_path)
-    check = _json(check_path)
-    if check is None:
+    try:
+        check = read_check(check_path)
+    except FileNotFoundError:
         return data
     if check.get("made_from") != {path.name: fingerprint}:
         return _with_problem(
@@ -194,13 +195,3 @@ def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem
 
 def _with_problem(data: ReportData, what: str, next_step: str) -> ReportData:
     return replace(data, problems=(*data.problems, Problem(what, next_step)))
-
-
-def _json(path: Path) -> Json | None:
-    try:
-        content = read_json(path)
-    except FileNotFoundError:
-        return None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: is a JSON file of another kind. Delete it and run the stage again.")
-    return content

@@ -24,7 +24,8 @@ from adjust.problem.parameter import (
 )
 from pipeline.errors import InputError
 from pipeline.results.fingerprints import of_file
-from pipeline.text.text_file import MOST_MB, read_bytes, read_json, shown
+from pipeline.results.json_form import NUMBER, Each, check_form
+from pipeline.text.text_file import MOST_MB, read_bytes, read_json
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -72,12 +73,12 @@ def read_adjustment(path: Path) -> Json:
         raise InputError(f"{path}: there is no such file. Run `reseau adjust` first.") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; an adjustment.json is needed here.") from None
-    _check(content, _ADJUSTMENT, path, "")
+    check_form(content, _ADJUSTMENT, path, _AGAIN)
     _check_names(content, path)
     redundancy = content["redundancy"]
     whole = {"redundancy": redundancy, "a_priori": redundancy <= 0, "left_out": []}  # of files of earlier versions
     content = {**content, "sigma0_from": content.get("sigma0_from", whole)}
-    _check(content["sigma0_from"], _SIGMA0_FROM, path, "sigma0_from")
+    check_form(content["sigma0_from"], _SIGMA0_FROM, path, _AGAIN, "sigma0_from")
     return content
 
 
@@ -175,26 +176,17 @@ def stored_films(content: Json, images: Iterable[str]) -> dict[str, Film]:
 _AGAIN = "Run `reseau adjust` again; it writes both files."
 
 
-@dataclass(frozen=True)
-class _Each:
-    """A table from names, or a list, whose every entry has the same form."""
-
-    container: type
-    form: object
-
-
-_NUMBER = (float, int, type(None))  # null: a number that has no meaning here
 _RESIDUAL_NUMBERS = (
     "vx_um", "vy_um", "redundancy_x", "redundancy_y", "w", "weight", "sx_um", "sy_um",
     "camera_x_mm", "camera_y_mm", "camera_vx_um", "camera_vy_um",
 )  # fmt: skip
 FURTHER_NUMBERS = ("sigma", "v", "redundancy", "w", "detectable")
-_NAMED = {"name": str, **dict.fromkeys(("value", *FURTHER_NUMBERS), _NUMBER)}
-_QUANTITY = {"value": _NUMBER, "sigma": _NUMBER}
+_NAMED = {"name": str, **dict.fromkeys(("value", *FURTHER_NUMBERS), NUMBER)}
+_QUANTITY = {"value": NUMBER, "sigma": NUMBER}
 _SIGMA0_FROM = {
     "redundancy": (float, int),
     "a_priori": bool,
-    "left_out": _Each(list, {"group": str, "owner": str}),
+    "left_out": Each(list, {"group": str, "owner": str}),
 }
 _ADJUSTMENT = {
     "reseau": str,
@@ -205,81 +197,41 @@ _ADJUSTMENT = {
     "conditions": int,
     "unknowns": int,
     "redundancy": int,
-    "sigma0": _NUMBER,
-    "singular": _Each(list, {"parameters": list, "cause": str, "remedy": str}),
-    "cameras": _Each(
+    "sigma0": NUMBER,
+    "singular": Each(list, {"parameters": list, "cause": str, "remedy": str}),
+    "cameras": Each(
         dict,
         {
             "principal_distance_mm": _QUANTITY,
             "principal_point_mm": {"x": _QUANTITY, "y": _QUANTITY},
             "distortion": {"family": str},
-            "fiducials": _Each(dict, {"x_mm": _QUANTITY, "y_mm": _QUANTITY, "rho": _NUMBER}),
+            "fiducials": Each(dict, {"x_mm": _QUANTITY, "y_mm": _QUANTITY, "rho": NUMBER}),
         },
     ),
-    "images": _Each(
+    "images": Each(
         dict,
         {
             "transformation": {"kind": str},
             "exterior": dict.fromkeys(("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg"), _QUANTITY),
         },
     ),
-    "points": _Each(dict, {"X": _QUANTITY, "Y": _QUANTITY, "Z": _QUANTITY}),
-    "residuals": _Each(
-        list, dict.fromkeys(("image", "point", "kind"), str) | dict.fromkeys(_RESIDUAL_NUMBERS, _NUMBER)
-    ),
-    "distances": _Each(
+    "points": Each(dict, {"X": _QUANTITY, "Y": _QUANTITY, "Z": _QUANTITY}),
+    "residuals": Each(list, dict.fromkeys(("image", "point", "kind"), str) | dict.fromkeys(_RESIDUAL_NUMBERS, NUMBER)),
+    "distances": Each(
         list,
-        dict.fromkeys(("from", "to"), str) | dict.fromkeys(("distance", *FURTHER_NUMBERS), _NUMBER),
+        dict.fromkeys(("from", "to"), str) | dict.fromkeys(("distance", *FURTHER_NUMBERS), NUMBER),
     ),
-    "correlations": _Each(list, {"parameters": list, "rho": _NUMBER, "cause": str, "remedy": str}),
-    "calibrations": _Each(list, _NAMED),
-    "antennas": _Each(list, _NAMED),
-    "warnings": _Each(list, str),
-    "variance_factors": _Each(dict, _NUMBER),
-    "variance_sigmas": _Each(dict, _NUMBER),
-    "suspects": _Each(
+    "correlations": Each(list, {"parameters": list, "rho": NUMBER, "cause": str, "remedy": str}),
+    "calibrations": Each(list, _NAMED),
+    "antennas": Each(list, _NAMED),
+    "warnings": Each(list, str),
+    "variance_factors": Each(dict, NUMBER),
+    "variance_sigmas": Each(dict, NUMBER),
+    "suspects": Each(
         list,
         {"name": str, "group": str, "owner": str, "point": str, "alike": list, "error": list, "removed": bool}
-        | dict.fromkeys(("statistic", "critical", "w", "tau", "critical_tau"), _NUMBER),
+        | dict.fromkeys(("statistic", "critical", "w", "tau", "critical_tau"), NUMBER),
     ),
     "reliability": (dict, type(None)),
-    "groups": _Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), _NUMBER)),
-}
-
-
-def _check(content: Any, form: Any, path: Path, place: str) -> None:
-    """Refuse content that has not the form; keys beyond it are welcome."""
-    if isinstance(form, _Each):
-        _check(content, form.container, path, place)
-        entries = content.items() if isinstance(content, dict) else enumerate(content)
-        for key, item in entries:
-            _check(item, form.form, path, f"{place}[{key!r}]")
-    elif isinstance(form, dict):
-        _check(content, dict, path, place)
-        for key, inner in form.items():
-            if key not in content:
-                raise InputError(f"{path}: {place or 'the file'} has no key {key!r}. {_AGAIN}")
-            _check(content[key], inner, path, f"{place}.{key}" if place else key)
-    elif not isinstance(content, form) or (isinstance(content, bool) and form is not bool):
-        expected = " or ".join(_JSON_NAMES[kind] for kind in (form if isinstance(form, tuple) else (form,)))
-        raise InputError(f"{path}: {place or 'the file'} is {shown(content)}; it should be {expected}. {_AGAIN}")
-    elif isinstance(content, int | float) and not _is_finite(content):
-        raise InputError(f"{path}: {place} is {shown(content)}; it should be a finite number. {_AGAIN}")
-
-
-def _is_finite(number: float) -> bool:
-    try:
-        return math.isfinite(number)
-    except OverflowError:  # a whole number of hundreds of digits
-        return False
-
-
-_JSON_NAMES = {
-    dict: "a table",
-    list: "a list",
-    str: "a text",
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    type(None): "null",
+    "groups": Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), NUMBER)),
 }

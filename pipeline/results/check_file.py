@@ -2,7 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Literal
+
+from pipeline.results.json_form import NUMBER, Each, check_form
+from pipeline.text.text_file import read_json
 
 Verdict = Literal["agrees", "differs", "not possible"]
 
@@ -101,3 +105,36 @@ class Check:
             "reason": self.reason,
             "cameras": {name: check.to_json() for name, check in self.cameras.items()},
         }
+
+
+def read_check(path: Path) -> dict[str, Any]:
+    """The contents of `check.json`. Raises FileNotFoundError, and InputError for what is no such file."""
+    content: dict[str, Any] = read_json(path)
+    check_form(content, _CHECK, path, _AGAIN)
+    absent = CameraCheck("not possible", "").to_json()  # in files of earlier versions
+    cameras = {name: absent | camera for name, camera in content["cameras"].items()}
+    for name, camera in cameras.items():
+        place = f"cameras[{name!r}]"
+        check_form(camera, _CAMERA, path, _AGAIN, place)
+        if camera["corners_px"] is not None:
+            check_form(camera["corners_px"], _CORNERS, path, _AGAIN, f"{place}.corners_px")
+    return {**content, "cameras": cameras}
+
+
+_AGAIN = "Run `reseau check` again; it writes this file."
+_ESTIMATE = {"value": NUMBER, "sigma": NUMBER}
+_ROW = {"name": str, "unit": str, "reseau": _ESTIMATE, "opencv": _ESTIMATE, "difference_sigmas": NUMBER}
+_CAMERA = {
+    **dict.fromkeys(("images", "points", "rms_opencv_um", "rms_reseau_um", "refit_residual_um"), NUMBER),
+    "rows": Each(list, _ROW),
+}
+_PIXELS = dict.fromkeys(("fx", "fy", "cx", "cy", "rms"), (float, int))
+_CORNERS = {
+    "detector": str,
+    "images": int,
+    "points": int,
+    "not_found": Each(list, str),
+    "reseau": _PIXELS,
+    "opencv": _PIXELS,
+}
+_CHECK = {"verdict": str, "reason": str, "cameras": Each(dict, {"verdict": str, "reason": str})}

@@ -1,7 +1,7 @@
 """adjustment.json and adjustment.npz: what is written is what was adjusted, and what is broken is said."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -22,6 +22,7 @@ from pipeline.errors import InputError
 from pipeline.results import covariance_arrays
 from pipeline.results.adjustment_file import write_adjustment
 from pipeline.results.adjustment_reader import covariance_path, read_adjustment, read_covariance
+from pipeline.results.check_file import CameraCheck, Check, CornersCheck, PixelCalibration, Row, read_check
 
 
 @pytest.fixture
@@ -234,3 +235,34 @@ def test_a_covariance_whose_names_say_nothing_is_refused(path: Path) -> None:
     np.savez_compressed(file, **content)
     with pytest.raises(InputError, match="'c' names no quantity of an adjustment"):
         read_covariance(path)
+
+
+def places_in(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Every place of a JSON value, of lists those of the first entry."""
+    yield place
+    inner = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    for key, each in inner:
+        yield from places_in(each, (*place, key))
+
+
+def test_a_check_with_a_value_of_a_wrong_type_is_refused_with_its_place(tmp_path: Path) -> None:
+    pixels = PixelCalibration(1.0, 2.0, 3.0, 4.0, 0.5)
+    corners = CornersCheck("findChessboardCorners", 3, 12, ("a",), pixels, pixels)
+    camera = CameraCheck("agrees", "All agree.", 3, 12, 1.0, 1.1, 0.1, (Row("k1", "", 1.0, 0.1, 1.0, 0.1),), corners)
+    content = json.loads(json.dumps(Check({"K": camera}).to_json()))
+    path = tmp_path / "check.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    assert read_check(path) == content
+    for place in places_in(content):
+        spoilt: dict[Any, Any] = {"file": json.loads(json.dumps(content))}
+        *way, last = ("file", *place)
+        holder = spoilt
+        for key in way:
+            holder = holder[key]
+        holder[last] = True  # in the place of a table, a list, a text or a number
+        path.write_text(json.dumps(spoilt["file"]), encoding="utf-8")
+        with pytest.raises(InputError, match=r"is True; it should be .* Run `reseau check` again"):
+            read_check(path)
+    del content["cameras"]["K"]["corners_px"]  # of an earlier version
+    path.write_text(json.dumps(content), encoding="utf-8")
+    assert read_check(path)["cameras"]["K"]["corners_px"] is None
