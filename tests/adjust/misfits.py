@@ -119,7 +119,7 @@ def network(made: Scene, effects: Effects, kind: Kind, rng: np.random.Generator 
     frame = (float(2.0 * HALF_MM[0]), float(2.0 * HALF_MM[1])) if kind.frame_given else (0.0, 0.0)
     camera = Camera("cam", c, None, None, Distortion("opencv", given), {}, (float(middle[0]), float(middle[1])), frame)
     exterior = _exteriors(made) if kind.stations_given else {}
-    kinds: tuple[ObservationKind, ...] = ("target",) * len(images)
+    target: ObservationKind = "target"
     return Network(
         (camera,),
         tuple(Image(name, "cam", "none", exterior.get(name)) for name in dict.fromkeys(images)),
@@ -130,7 +130,7 @@ def network(made: Scene, effects: Effects, kind: Kind, rng: np.random.Generator 
         Observations(
             tuple(images),
             tuple(points),
-            kinds,
+            (target,) * len(images),
             xy_mm,
             np.tile((effects.pitch * SIGMA_MM) ** 2 * np.eye(2), (len(images), 1, 1)),
         ),
