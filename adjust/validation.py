@@ -22,6 +22,12 @@ DEFINITE = 1e-13  # least eigenvalue of an earlier calibration's correlation mat
 
 def validate(network: Network) -> None:
     """Raise AdjustmentError where a network is empty, contradictory or lacks what an image needs."""
+    validate_plan(network)
+    _check_places(network)
+
+
+def validate_plan(network: Network) -> None:
+    """As `validate`, of a network that is only planned: nothing is measured in it yet, whatever the places say."""
     _check_not_empty(network)
     _check_unique("camera", (camera.name for camera in network.cameras))
     _check_unique("image", (image.name for image in network.images))
@@ -37,7 +43,6 @@ def validate(network: Network) -> None:
     _check_antennas(network)
     _check_duplicate_observations(network)
     _check_values(network.observations)
-    _check_places(network)
     _check_parts(network)
     frames = {image.frame: image for image in network.images}
     for (frame, image), shown in zip(frames.items(), _shown(network).tolist()[: len(frames)], strict=True):

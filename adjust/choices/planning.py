@@ -21,7 +21,7 @@ from adjust.problem.result import Adjustment, NullDirection
 from adjust.quality.cofactor import free_cofactor
 from adjust.solution.adjustment import Options, adjust_problem, with_datum
 from adjust.undetermined.null_space import null_vectors
-from adjust.validation import validate
+from adjust.validation import validate_plan
 
 Array = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     Raises AdjustmentError where the network is empty or contradictory, or where a point has no image.
     """
     options = options or Options()
-    validate(network)
+    validate_plan(network)
     reduction = Reduction.of(network)
     problem = _at_computed_observations(number(reduction.network(network), reduction.approximations(values)))
     result = adjust_problem(problem, options)

@@ -28,7 +28,7 @@ class Stand:
         self.name, self.is_complete, self.accepted, self.measured = name, False, False, 0
         self.belongs, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
 
-    def misfit(self) -> str:
+    def misfit(self, ids: Sequence[str]) -> str:
         return f"not {self.name}"
 
 

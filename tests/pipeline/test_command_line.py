@@ -210,7 +210,7 @@ def test_full_disk_gets_a_message_and_leaves_earlier_results(project: Path, caps
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, handler)
     assert code == 2
-    assert "cannot be written" in capsys.readouterr().err
+    assert "Make room there" in capsys.readouterr().err
     assert results(project) == before
 
 
@@ -253,9 +253,9 @@ def test_an_interrupt_does_not_wait_for_the_scans_in_hand() -> None:
 def test_point_that_nobody_measured_is_named(project: Path, capsys: SAID) -> None:
     with (project / "points.csv").open("a", encoding="utf-8") as file:
         file.write("999,1,2,3,0,0,0,0,0,1\n")
-    code, summary, _ = adjusted(project, capsys)
-    assert code == 1
-    assert any("999" in problem["what"] for problem in summary["problems"])
+    code, _, _ = adjusted(project, capsys)
+    assert code == 0  # of a large pattern a part is used
+    assert any("999" in note for note in json.loads((project / "out" / "adjustment.json").read_text())["notes"])
 
 
 def test_measured_point_that_nobody_gave_is_named_with_its_line(project: Path, capsys: SAID) -> None:
