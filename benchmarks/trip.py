@@ -20,7 +20,8 @@ import tifffile
 ROOT = Path(__file__).parents[1]
 sys.path += [str(ROOT / "tests" / "pipeline"), str(ROOT / "tests" / "measure")]
 PACKAGES = ("measure", "adjust", "pipeline")
-MAPS = "measure/scans/parallel.py"  # calls what it is given for each of many, as `map` does
+# What calls the functions that it is given: for each of many, as `map` does, and in each Gauss-Newton step.
+CALLERS = ("measure/scans/parallel.py", "measure/matching/gauss_newton.py")
 
 
 class Followed:
@@ -53,7 +54,7 @@ class Followed:
         if file not in self._names:
             path = Path(file)
             inside = path.relative_to(ROOT) if path.is_relative_to(ROOT) else Path("elsewhere")
-            known = inside.parts[0] in PACKAGES and inside.as_posix() != MAPS
+            known = inside.parts[0] in PACKAGES and inside.as_posix() not in CALLERS
             self._names[file] = ".".join(inside.with_suffix("").parts) if known else ""
         return self._names[file]
 

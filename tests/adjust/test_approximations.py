@@ -89,7 +89,9 @@ def test_unknown_principal_distance_from_twenty_boards() -> None:
 def test_a_principal_distance_that_nothing_shows_is_asked_for() -> None:
     station = [(0.0, 0.0, 1500.0, 0.0, 0.0, 0.3)]
     truth = simulated(field(0.0), station)
-    with pytest.raises(AdjustmentError, match=r"principal distance of camera rc20 cannot be found .* give principal_distance_mm"):
+    with pytest.raises(
+        AdjustmentError, match=r"principal distance of camera rc20 cannot be found .* give principal_distance_mm"
+    ):
         approximate(without_interior(truth.network))
 
 

@@ -10,7 +10,7 @@ from simulated import Truth, affine, camera_point, rotation, simulated, torlegar
 from simulated_project import write_project
 
 from adjust.problem.network import Network
-from pipeline.cli import DONE, run
+from pipeline.cli import DONE, LOOK, run
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ def project_of(network: Network, folder: Path, crs: str = "") -> Path:
     for i in IMAGES:
         empty = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
         tifffile.imwrite(folder / "scans" / f"f{i}.tif", empty, compression="deflate")
-    assert run(["adjust", str(path)]) == DONE
+    assert run(["adjust", str(path)]) in (DONE, LOOK)  # a network may show points beyond its frame
     return path
 
 

@@ -46,7 +46,7 @@ def test_a_prior_holds_the_bend(tmp_path: Path) -> None:
     assert run(["adjust", str(project_of(tmp_path, "0.001"))]) in (DONE, LOOK)
     result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
     assert abs(result["boards"]["board"]["bend_x"]["value"]) < 0.2
-    assert result["groups"]["board"]["sigma0"] > 3.0
+    assert result["boards"]["board"]["significance"][0]["p"] < 1e-6  # the prior is contradicted
 
 
 def test_points_that_are_no_board_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

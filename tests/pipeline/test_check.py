@@ -1,8 +1,9 @@
 """The check against OpenCV, on simulated networks whose observations come from cv2.projectPoints."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -283,8 +284,8 @@ def test_a_fisheye_agrees_with_opencvs_fisheye(skew: bool) -> None:
 
 @pytest.mark.parametrize("what", ["parameters", "sigmas"])
 def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
-    def shifted(*arguments: Any) -> OpenCvCalibration:
-        found = calibrate(*arguments)
+    def shifted(*arguments: Any, **options: Any) -> OpenCvCalibration:
+        found = calibrate(*arguments, **options)
         if what == "sigmas":
             return replace(found, sigmas=1.4 * found.sigmas)
         return replace(found, parameters=found.parameters + 1.5 * found.sigmas)
@@ -297,12 +298,12 @@ def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, wha
 
 def test_every_run_gets_the_same_digits_of_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenCV's threads add up the images in the order in which they end, and the last digits go by it."""
-    given, threads = [], []
+    given, threads = list[Callable[[], OpenCvCalibration]](), []
     plain = cv2.calibrateCameraExtended
 
-    def kept(*arguments: Any) -> OpenCvCalibration:
-        given.append(arguments)
-        return calibrate(*arguments)
+    def kept(*arguments: Any, **options: Any) -> OpenCvCalibration:
+        given.append(partial(calibrate, *arguments, **options))
+        return calibrate(*arguments, **options)
 
     def watched(*arguments: Any, **options: Any) -> Any:
         threads.append(cv2.getNumThreads())
@@ -314,7 +315,7 @@ def test_every_run_gets_the_same_digits_of_opencv(monkeypatch: pytest.MonkeyPatc
     cv2.setNumThreads(4)
     try:
         checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
-        found = [calibrate(*given[0]) for _ in range(40)]
+        found = [given[0]() for _ in range(40)]
         assert cv2.getNumThreads() == 4
     finally:
         cv2.setNumThreads(before)
