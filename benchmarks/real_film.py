@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from reencoded_scans import CAMERAS
 
 from measure.covariance import Covariance
 from measure.fiducial_options import FiducialOptions
@@ -28,15 +29,6 @@ from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path
 
-AERIAL = {
-    "0b4cb981": "zeiss-rmk-a-153",
-    "000b3b38": "wild-rc10-153",
-    "08320661": "wild-rc10-153",
-    "0b50b18e": "wild-rc10-153",
-    "0a9a8c55": "register-glass-262",
-    "0cec8b13": "wild-rc8-153",
-    "d2ee9cf2": "wild-rc8-153",
-}
 MOVED_PX = 0.005
 
 
@@ -51,7 +43,7 @@ class Task(NamedTuple):
 
 def tasks(data: Path) -> Iterator[Task]:
     film = data / "film_scans"
-    for name, camera in AERIAL.items():
+    for name, camera in CAMERAS.items():
         yield Task(name, film / "aerial" / f"{name}.jpeg", layout(f"library:{camera}", Path()), None)
     for number in (11, 14, 15, 16, 17):
         yield Task(f"apollo-{number}", film / "reseau" / f"apollo-{number}.jpg", reseau(), (27.4, 27.4))

@@ -74,6 +74,7 @@ def read_adjustment(path: Path) -> Json:
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; an adjustment.json is needed here.") from None
     check_form(content, _ADJUSTMENT, path, _AGAIN)
+    check_form(content.get("made_from", {}), Each(dict, str), path, _AGAIN, "made_from")
     _check_names(content, path)
     redundancy = content["redundancy"]
     whole = {"redundancy": redundancy, "a_priori": redundancy <= 0, "left_out": []}  # of files of earlier versions

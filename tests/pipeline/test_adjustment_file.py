@@ -156,6 +156,7 @@ def test_text_that_is_no_json_is_named_with_its_line(path: Path) -> None:
         (("sigma0",), "1.0", r"sigma0 is '1\.0'; it should be a number"),
         (("iterations",), True, r"iterations is True; it should be a whole number"),
         (("cameras", "RC 20", "principal_distance_mm"), {"value": 1.0}, r"\['RC 20'\]\.principal_distance_mm has no"),
+        (("made_from",), 5, r"made_from is 5; it should be a table"),
         (("residuals",), [{"image": "f1"}], r"residuals\[0\] has no key 'point'"),
     ],
 )  # fmt: skip
