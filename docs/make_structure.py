@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
-from adjust.problem.functions import compute, derivatives
+from adjust.problem.condition_equations import compute, derivatives
 from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.problem.problem import ABSENT, Problem, number

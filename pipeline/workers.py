@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 
-from adjust.least_squares.kept_memory import keep_freed_memory
+from adjust.least_squares.malloc_tuning import keep_freed_memory
 
 KILLS = 2  # of its process, after which a task is given up: once may be chance, or another program's doing
 STARTS = 5  # of processes that are killed before they stand, one after another: then none will

@@ -17,7 +17,7 @@ from adjust.problem.problem import number
 from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, with_datum
-from adjust.solution.runs import run
+from adjust.solution.reweighting import run
 from adjust.validation import validate
 
 Array = NDArray[np.float64]

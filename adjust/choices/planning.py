@@ -11,7 +11,7 @@ from adjust.errors import AdjustmentError
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
-from adjust.problem.functions import blind_marks, computed_observations
+from adjust.problem.condition_equations import blind_marks, computed_observations
 from adjust.problem.further_observations import at_computed
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Parameter

@@ -10,7 +10,7 @@ from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import WhitenedRows, of_cameras, prior_differences, prior_root_weights, whitened_rows
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Factor
-from adjust.problem.functions import compute, computed_observations, derivatives
+from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.further_observations import square_sum
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import Iteration, Termination

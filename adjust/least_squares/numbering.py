@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from adjust.linear_algebra.fronts import Fronts, band_order, fronts_of
-from adjust.linear_algebra.sparse_blocks import Pattern
+from adjust.linear_algebra.schur_complement import Pattern
 from adjust.problem.problem import ABSENT, Problem, side_by_side
 
 Indices = NDArray[np.intp]

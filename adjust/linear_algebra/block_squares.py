@@ -14,7 +14,7 @@ from scipy.linalg import solve_triangular
 
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor
 from adjust.linear_algebra.fronts import Fronts
-from adjust.linear_algebra.triangle import Triangle
+from adjust.linear_algebra.sparse_factor import Triangle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -19,8 +19,8 @@ from adjust.linear_algebra.block_squares import STEADY, Normal, by_squares, is_t
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, of_columns
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.multifrontal import of_normal_equations, reflected, reflections_cost, triangle_of
-from adjust.linear_algebra.sparse_blocks import SparseRows, eliminated
-from adjust.linear_algebra.triangle import TEN_DIGITS
+from adjust.linear_algebra.schur_complement import SparseRows, eliminated
+from adjust.linear_algebra.sparse_factor import TEN_DIGITS
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

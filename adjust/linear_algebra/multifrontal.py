@@ -12,7 +12,7 @@ from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
 
 from adjust.linear_algebra.fronts import Fronts
-from adjust.linear_algebra.triangle import Triangle
+from adjust.linear_algebra.sparse_factor import Triangle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from adjust.least_squares.iteration import Linearised
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
-from adjust.linear_algebra.sparse_blocks import spread_squares
+from adjust.linear_algebra.schur_complement import spread_squares
 from adjust.problem.tested import TestedUnits
 from adjust.quality.reliability import Misfits, unit_rows
 from adjust.quality.residuals import group_sums

@@ -10,9 +10,8 @@ from scipy.special import chdtrc
 
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.initial_values.approximations import initial_values
-from adjust.initial_values.far_points import far_points
 from adjust.least_squares.iteration import factorise
-from adjust.least_squares.kept_memory import keep_freed_memory
+from adjust.least_squares.malloc_tuning import keep_freed_memory
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.network import STRAIGHT, Approximations, Network
 from adjust.problem.problem import Problem, number
@@ -21,11 +20,11 @@ from adjust.problem.result import Adjustment, Cofactor, VarianceFactor
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.solution.assessment import RunAssessment, conditions_of, redundancy_of, variance_of
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
+from adjust.solution.coordinate_blunders import Slip, far_points, few_points, freed, slips
 from adjust.solution.left_out_images import fitting, with_lens, without_images
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import with_plausibility
-from adjust.solution.runs import Run, again, run
-from adjust.solution.slips import Slip, few_points, freed, slips
+from adjust.solution.reweighting import Run, again, run
 from adjust.undetermined.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.undetermined.datum_choice import chosen_coordinates, chosen_points, with_held
 from adjust.validation import validate

@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.functional_model.transformation import marks_needed
 from adjust.least_squares.iteration import factorise
-from adjust.problem.functions import computed_observations
+from adjust.problem.condition_equations import computed_observations
 from adjust.problem.parameter import description
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.problem import Problem
@@ -32,7 +32,7 @@ from adjust.quality.suspicions import is_gross, swapped_numbers, unchecked_orien
 from adjust.quality.variance_components import factor_sigmas
 from adjust.quality.variance_factor import variance_factor
 from adjust.solution.explanations import Explained, explain
-from adjust.solution.runs import ROUNDS, Run
+from adjust.solution.reweighting import ROUNDS, Run
 from adjust.undetermined.diagnosis import undetermined, weak_directions
 from adjust.undetermined.flat_valleys import held_directions, inseparable
 from adjust.undetermined.scanner_directions import hardly_told

@@ -11,7 +11,7 @@ from adjust.problem.camera import Camera
 from adjust.quality.cofactor import free_cofactor
 from adjust.solution.model_hypotheses import OTHERS, ModelHypothesis
 from adjust.solution.noise_hypothesis import AddedNoise
-from adjust.solution.runs import Run
+from adjust.solution.reweighting import Run
 
 Array = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from adjust.quality.snooping import Contradiction, Search, contradictions, rest_
 from adjust.solution.explanation_words import noise_words, sentence
 from adjust.solution.model_hypotheses import ModelHypothesis, apart, model_hypotheses
 from adjust.solution.noise_hypothesis import AddedNoise, added_noise
-from adjust.solution.runs import Run, again
+from adjust.solution.reweighting import Run, again
 from adjust.undetermined.diagnosis import singular_directions
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
-from adjust.solution.runs import Run
+from adjust.solution.reweighting import Run
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

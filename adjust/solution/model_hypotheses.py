@@ -17,7 +17,7 @@ from adjust.problem.camera import Camera, Prior
 from adjust.problem.network import Approximations, Board, Image, Network, Scanner
 from adjust.problem.problem import Problem, State, number
 from adjust.solution.image_groups import two_groups
-from adjust.solution.runs import Run
+from adjust.solution.reweighting import Run
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -15,7 +15,7 @@ from scipy.special import chdtr, chdtrc, ndtr
 
 from adjust.problem.tested import TestedUnits
 from adjust.quality.residuals import group_sums, residuals
-from adjust.solution.runs import Run, again
+from adjust.solution.reweighting import Run, again
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

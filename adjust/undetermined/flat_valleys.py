@@ -17,7 +17,7 @@ from scipy.special import chdtrc
 
 from adjust.functional_model.families import family
 from adjust.least_squares.iteration import Linearised
-from adjust.problem.functions import observed_in_camera
+from adjust.problem.condition_equations import observed_in_camera
 from adjust.problem.problem import Problem, State
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.linear_algebra.factor import Factor
 from adjust.linear_algebra.multifrontal import with_rows
-from adjust.linear_algebra.triangle import Triangle
+from adjust.linear_algebra.sparse_factor import Triangle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -13,7 +13,7 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.board import board_form
 from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Camera, Distortion, Prior
-from adjust.problem.functions import compute, computed_observations, derivatives
+from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.images import adjusted_places
 from adjust.problem.network import Board, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations

@@ -14,7 +14,7 @@ from simulated import Truth, simulated
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import WhitenedRows, prior_root_weights
-from adjust.linear_algebra import elimination, fronts, triangle
+from adjust.linear_algebra import elimination, fronts, sparse_factor
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.fronts import Fronts, fronts_of
@@ -170,10 +170,10 @@ def test_variances_along_a_line_are_those_of_its_differences(
     weight: float, wide: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However weak its datum, which makes the heights uncertain by a million, and not what is observed."""
-    monkeypatch.setattr(triangle, "WIDE", wide)
+    monkeypatch.setattr(sparse_factor, "WIDE", wide)
     count = 400
     factor, blocks = levelled(count, weight)
-    assert len(factor.triangle.fronts) == count - 1
+    assert len(factor.sparse_factor.fronts) == count - 1
     np.testing.assert_allclose(factor.variances(), weight**-2 + 0.5 * np.arange(count), rtol=1e-9)
     (roots,) = row_roots(factor, blocks)
     np.testing.assert_allclose(roots @ roots.swapaxes(1, 2), np.full((count - 1, 2, 2), 0.5), atol=1e-9)

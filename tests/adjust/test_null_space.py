@@ -8,7 +8,7 @@ from simulated import field_points
 
 from adjust.linear_algebra.factor import BlockFactors, DenseBlocks, Factor
 from adjust.linear_algebra.fronts import Fronts
-from adjust.linear_algebra.triangle import Triangle
+from adjust.linear_algebra.sparse_factor import Triangle
 from adjust.solution.adjustment import Options, adjust
 from adjust.undetermined import null_space
 

@@ -11,7 +11,7 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_root_weights
-from adjust.problem.functions import compute, derivatives
+from adjust.problem.condition_equations import compute, derivatives
 from adjust.problem.network import Approximations, Network
 from adjust.problem.problem import State, number
 from adjust.problem.result import Adjustment

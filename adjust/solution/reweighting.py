@@ -12,7 +12,7 @@ from adjust.functional_model.families import family
 from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
-from adjust.problem.functions import blind_marks
+from adjust.problem.condition_equations import blind_marks
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import NullDirection, Termination
 from adjust.problem.tested import TestedUnits

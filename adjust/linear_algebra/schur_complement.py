@@ -16,7 +16,7 @@ from scipy.sparse import bsr_array, coo_array, csr_array
 
 from adjust.linear_algebra.block_squares import TALL
 from adjust.linear_algebra.factor import BlockFactors, Blocks
-from adjust.linear_algebra.triangle import Triangle
+from adjust.linear_algebra.sparse_factor import Triangle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
