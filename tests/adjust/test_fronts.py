@@ -173,7 +173,7 @@ def test_variances_along_a_line_are_those_of_its_differences(
     monkeypatch.setattr(sparse_factor, "WIDE", wide)
     count = 400
     factor, blocks = levelled(count, weight)
-    assert len(factor.sparse_factor.fronts) == count - 1
+    assert len(factor.triangle.fronts) == count - 1
     np.testing.assert_allclose(factor.variances(), weight**-2 + 0.5 * np.arange(count), rtol=1e-9)
     (roots,) = row_roots(factor, blocks)
     np.testing.assert_allclose(roots @ roots.swapaxes(1, 2), np.full((count - 1, 2, 2), 0.5), atol=1e-9)
