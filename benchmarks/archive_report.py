@@ -16,9 +16,8 @@ from pathlib import Path
 from archive_scale import told_of
 from archive_stand_ins import stand_in, write_project
 
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason, Status
 from measure.results import MarkMeasurement
-from measure.status import Status
 from pipeline.archive.file_state import Identity, file_state
 from pipeline.archive.identity import parts_hash
 from pipeline.archive.judging import JudgedScan, judge, judged_marks, judging_of, tell_written

@@ -12,10 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from measure.covariance import Cause, Covariance
-from measure.reason import Code, Reason
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
-from measure.status import Status
+from measure.flags import Cause, Code, Reason, Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline.archive.witness import Witnessed
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan

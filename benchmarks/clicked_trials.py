@@ -18,7 +18,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from measure.marks.poses import pose_in_camera
+from measure.geometry import pose_in_camera
 from pipeline.files.project_file import read_project
 from pipeline.review.trial import measured_as_shown
 from synthetic_images import areas, scene

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from search import OUTCOMES, POSE_OUTCOMES, judged, lines, print_table
 from search_frames import Case
 
-from measure.marks.poses import POSES, up_from_camera
+from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.marks.templates import cut, template_of
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
-from measure.special_marks.learned import cut, template_of
 
 Array = NDArray[np.float64]
 Crops = dict[str, NDArray[np.uint8]]

@@ -21,18 +21,17 @@ from numpy.typing import NDArray
 from search import lines
 from true_marks import Kind, TrueMark
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.across_frames import judged
 from measure.fiducials.constellation import Placement
 from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.rows import present_frame
+from measure.flags import NO_REASON, Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, dot, polygon, ring_cross, ring_dot
-from measure.reason import NO_REASON
 from measure.results import FrameMeasurement, Pose
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
-from measure.status import Status
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

@@ -12,18 +12,18 @@ from measured_marks import CONTRAST, GROUND, Found, measured
 from numpy.typing import NDArray
 from true_marks import KIND, Kind, TrueMark, some_mark
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.constellation import Placement
 from measure.fiducials.mark_fit import options_for
 from measure.fiducials.measure_frame import measure_frame
-from measure.marks.poses import POSES
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Status
+from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.matching.match import match
 from measure.matching.window import ScanWindow
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
-from measure.status import Status
 from measure.targets.disks import PLAIN_MARGIN_PX
 from measure.targets.measure_targets import TargetPrediction, measure_disks
 from synthetic_images.optics import reach_px, seen_coverage

@@ -21,8 +21,8 @@ from measured_marks import CONTRAST, GROUND, Cell, Found, best_errors
 from numpy.typing import NDArray
 from true_marks import KINDS, Kind, TrueMark, some_mark
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS

@@ -17,10 +17,10 @@ import numpy as np
 from search_frames import PITCH_UM, Case, draw_case
 
 from measure.fiducials.measurement import measure_fiducials
+from measure.flags import Status
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
-from measure.status import Status
 
 
 @dataclass(frozen=True)

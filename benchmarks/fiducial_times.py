@@ -40,8 +40,8 @@ import measure.fiducials.mark_fit
 import measure.fiducials.measurement
 import measure.fiducials.stages
 import measure.matching.match
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch
 from measure.marks.shapes import FiducialLayout
 from measure.matching.fit import PictureFit

@@ -23,7 +23,7 @@ import measure.fiducials.measure_frame as frame_measurement
 import measure.targets.measure_targets as targets
 from adjust.linear_algebra import fronts
 from adjust.solution.adjustment import adjust
-from measure.reason import NO_REASON
+from measure.flags import NO_REASON
 
 Array = NDArray[np.float64]
 

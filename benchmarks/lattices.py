@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from true_marks import areas_of
 
 from measure.fiducials.measurement import measure_fiducials
+from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.scans.scan import Scan
-from measure.status import Status
 from synthetic_images import areas
 from synthetic_images.optics import reach_px, seen_coverage
 

@@ -7,11 +7,11 @@ from drawn import scan_of
 from numpy.typing import NDArray
 from true_marks import ALL_MOVES, TrueMark
 
-from measure.covariance import Cause
 from measure.detection.prediction import MarkPrediction
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.frame import CLEAR_DAMAGE
 from measure.fiducials.mark_fit import sight
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Cause
 from measure.targets.disks import fit_disk
 
 Array = NDArray[np.float64]

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.flags import Status
 from measure.results import MarkMeasurement
-from measure.status import Status
 from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, Ties, measure_ties
 from synthetic_images.film import FrameGeometry

@@ -20,8 +20,8 @@ import numpy as np
 from search import lines
 from search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, Case, case_of, draw_case
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polarity, polygon, turned
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.tone.curve import Tone

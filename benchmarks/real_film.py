@@ -19,11 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from reencoded_scans import CAMERAS
 
-from measure.covariance import Covariance
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.across_frames import judged
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
+from measure.results import Covariance
 from measure.scans.scan import open_scan
 from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, MarkTemplate, ring_cross
-from measure.matching.match import Match, MatchOptions, mark_window, match
+from measure.matching.match import MatchOptions, mark_window, match
 from measure.matching.window import ScanWindow
+from measure.results import MarkFit
 from measure.scans.scan import Scan, open_scan
 
 Array = NDArray[np.float64]
@@ -135,7 +136,7 @@ def print_channels(path: Path) -> None:
         print(f"{path.stem:12} {one + '-' + other:12} {shift:>18} {rms:12.4f} {claimed:11.4f} {ratio:6.2f}")
 
 
-def in_channel(scan: Scan, start: Array, weights: tuple[float, ...]) -> Match:
+def in_channel(scan: Scan, start: Array, weights: tuple[float, ...]) -> MarkFit:
     col0, row0, width, height = mark_window(WILD, start, 10.0)
     grey = scan.window(col0, row0, width, height, weights)
     window = ScanWindow(grey, (col0, row0), is_lossy=scan.is_lossy)

@@ -19,15 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Cause, Covariance
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.across_frames import judged
 from measure.fiducials.measurement import measure_fiducials
-from measure.results import FrameMeasurement, MarkMeasurement
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Cause, Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan, open_scan
-from measure.status import Status
 from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path

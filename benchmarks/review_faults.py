@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Page, sync_playwright
 from review_load import START
 
-from measure.marks.poses import POSES
+from measure.geometry import POSES
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene
 

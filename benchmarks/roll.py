@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from writing import AT_MM, FRAME_MM, PITCH_UM, line, scene, stored
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
-from measure.marks.poses import POSES
+from measure.fiducials.options import FiducialOptions
+from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, WrittenPlace, ring_cross
 from measure.results import FrameMeasurement
 from measure.scans.cache import WholePicture

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from search_frames import KINDS, SYMMETRIES, Case, draw_case
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Status
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
 
 Json = dict[str, Any]
 

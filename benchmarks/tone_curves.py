@@ -27,11 +27,10 @@ from typing import Any
 import numpy as np
 from tone_frames import KINDS, PITCH_UM, TIPS, Case, draw_case
 
-from measure.covariance import Cause
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Cause, Status
 from measure.results import FrameMeasurement
-from measure.status import Status
 from measure.tone.curve import Tone, ToneInformation
 
 Row = dict[str, Any]

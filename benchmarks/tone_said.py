@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tone_frames import PITCH_UM, STORED, TIPS, Case, draw_case
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame_edges import told_by_edges
 from measure.fiducials.frame_sighter import FrameSighter
 from measure.fiducials.mark_fit import sight
+from measure.fiducials.options import FiducialOptions
 from measure.marks.frame_border import at_border
 from measure.tone.curve import Tone, ToneInformation
 from synthetic_images.tone_curve import coded

@@ -24,9 +24,9 @@ from writing_lines import ALIKE, line_text
 
 from measure.annotations.fields import is_plate
 from measure.annotations.line import Line, Reading
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
-from measure.marks.poses import POSES
+from measure.fiducials.options import FiducialOptions
+from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Side, WrittenPlace, ring_cross
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS

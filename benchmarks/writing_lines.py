@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from measure.annotations.detect_text import MISSING, networks
 from measure.annotations.read import read_writing
-from measure.marks.poses import POSES, pose_in_camera
+from measure.geometry import POSES, pose_in_camera
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan

@@ -1,23 +1,68 @@
-"""What a measurement hands on: marks with covariance, status and reason, and the frame they were found in."""
+"""What measuring hands on: marks with covariance, status and reason, and the frame they were found in."""
 
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from html import escape
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from measure.annotations.line import Line
-from measure.covariance import Covariance
-from measure.reason import NO_REASON, Code, Reason
-from measure.status import Status
-from measure.tone.estimate import FrameTone
+from measure.flags import NO_REASON, Cause, Code, Reason, Status
+from measure.tone.estimate import FrameTone, MarkTone
 
+Mask = NDArray[np.bool_]
+
+Array = NDArray[np.float64]
 Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # what is a place of the film, and no point of the object
-Array = NDArray[np.float64]
+# Stored results are used again only where this is the same. Raise it whenever scans would be measured otherwise:
+# tests/measure/test_revision.py fails where that was forgotten.
+MEASURE_REVISION = 13
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Covariance:
+    """The covariance of a place, (column, row): parts (2, 2) px2 by their causes, independent of one another.
+
+    What is common to several marks of a frame, as `tone` is, is in each of them by its own part.
+    """
+
+    parts: Mapping[Cause, Array]
+
+    @classmethod
+    def of_noise(cls, px2: Array) -> "Covariance":
+        """Of a place of which the noise (2, 2) is all that is known."""
+        return cls({Cause.NOISE: np.asarray(px2, float)})
+
+    @cached_property
+    def px2(self) -> Array:
+        """(2, 2): the sum."""
+        return np.asarray(sum(self.parts.values(), np.zeros((2, 2))))
+
+    @property
+    def sigmas_px(self) -> dict[Cause, float]:
+        """Of each cause the standard deviation of a coordinate, the mean of both; causes that add nothing are left
+        out."""
+        sigmas = {cause: float(np.sqrt(np.trace(self.parts[cause]) / 2)) for cause in Cause if cause in self.parts}
+        return {cause: sigma for cause, sigma in sigmas.items() if sigma > 0}
+
+    def plus(self, cause: Cause, px2: Array) -> "Covariance":
+        """With what a cause adds (2, 2); the same where that is nothing."""
+        if not np.any(px2):
+            return self
+        return Covariance({**self.parts, cause: self.parts.get(cause, np.zeros((2, 2))) + px2})
+
+    def through(self, matrix: Array) -> "Covariance":
+        """Of a place whose errors are these times a matrix (2, 2)."""
+        return Covariance({cause: matrix @ part @ matrix.T for cause, part in self.parts.items()})
+
+    def __repr__(self) -> str:
+        return "Covariance(" + ", ".join(f"{cause} {sigma:.3g} px" for cause, sigma in self.sigmas_px.items()) + ")"
 
 
 @dataclass(frozen=True, repr=False)
@@ -27,7 +72,7 @@ class MarkMeasurement:
     center_px: (2,) column and row, the centre of the top-left pixel being (0, 0). With status `predicted` it is the
     predicted place, with `absent` it may be None: there is nothing to say.
     covariance: of the centre, by its causes; None where nothing was fitted.
-    reason: one sentence, with its codes (`measure.reason`); empty only when the status is `measured`.
+    reason: one sentence, with its codes (`measure.flags`); empty only when the status is `measured`.
     quality: named figures of the fit: snr, contrast_dn, blur_px, noise_dn, damaged_fraction, second_method_sigmas, ...
     """
 
@@ -155,3 +200,96 @@ def _moved_mark(mark: MarkMeasurement, shift_px: Array) -> MarkMeasurement:
 def _moved_line(line: Line, shift_px: Array) -> Line:
     outline = tuple((col + float(shift_px[0]), row + float(shift_px[1])) for col, row in line.outline_px)
     return replace(line, outline_px=outline)
+
+
+# The revision of how scans are measured.
+#
+# Results that were kept are used again only where it is the same: it is raised whenever a scan would be measured
+# otherwise. tests/measure/test_revision.py fails where that was forgotten.
+
+
+@dataclass(frozen=True, eq=False)
+class SecondPlace:
+    """offset_px (2,): the second place less the matched one; covariance_px2 (2, 2): of that difference."""
+
+    offset_px: Array
+    covariance_px2: Array
+
+    @property
+    def sigmas(self) -> float:
+        """The length of the difference in its own standard deviations."""
+        return float(np.sqrt(self.offset_px @ np.linalg.solve(self.covariance_px2, self.offset_px)))
+
+    @property
+    def chance(self) -> float:
+        """The probability that noise alone makes the difference as long."""
+        return float(chdtrc(2, self.sigmas**2))
+
+
+@dataclass(frozen=True, eq=False)
+class OwnShape:
+    """change (2,): scale and rotation (rad) by the picture alone, less those of the frame, and sigma (2,), their
+    standard deviations; on_place (2, 2): px by which the place would follow, did the match not keep to the frame's."""
+
+    change: Array
+    sigma: Array
+    on_place: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MarkFit:
+    """A mark as fitted. Where converged is false, reason says why and the numbers are the last approximations.
+
+    center_px (2,) with its place_covariance, pixel_from_mark (2, 3): of the scan, not of the window. covariance: of all
+    unknowns of the `PictureModel` by the noise, None where another model was fitted.
+    contrast_dn: the mark's light less the background's, negative for a dark mark; stored_contrast_dn: the same of the
+    grey values that the file has. noise_dn: standard deviation of
+    one pixel, of a chip's picture after smoothing. damaged_fraction: share of the pixels about the mark, within
+    plain_px of it, that were cut out; lost_fraction: of what tells its place in the direction in which least of that is
+    left, what was. redundancy: pixels used less unknowns. neighbour_correlation: of the residuals;
+    they were taken as white where covariance_is_white. likeness: correlation of the fitted picture with the window,
+    less its plane background: 1 for a perfect mark, 0 for none.
+    significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
+    share included, and size_sigma of the mark's size; infinite where they were not estimated, or the blur is at an end
+    of its range. edges: the mark's place by another method, to compare;
+    sloping: an ellipse's, if its paint may grow lighter or darker from side to side. own_shape: what the picture says
+    of rotation and scale, where the frame gave them; tone: and of a tone curve that is not known.
+    """
+
+    converged: bool
+    reason: Reason
+    center_px: Array
+    place_covariance: Covariance
+    pixel_from_mark: Array
+    contrast_dn: float
+    stored_contrast_dn: float
+    noise_dn: float
+    blur_px: float
+    damaged_fraction: float
+    lost_fraction: float
+    redundancy: int
+    neighbour_correlation: float
+    covariance_is_white: bool
+    likeness: float
+    significance: float
+    blur_sigma: float = np.inf
+    size_sigma: float = np.inf
+    edges: SecondPlace | None = None
+    sloping: SecondPlace | None = None
+    own_shape: OwnShape | None = None
+    tone: MarkTone | None = None
+    covariance: Array | None = None
+
+    @property
+    def covariance_px2(self) -> Array:
+        """(2, 2) of the centre, all causes together."""
+        return self.place_covariance.px2
+
+    @property
+    def sigma_px(self) -> float:
+        """Standard deviation of a coordinate."""
+        return float(np.sqrt(np.trace(self.covariance_px2) / 2))
+
+    @property
+    def snr(self) -> float:
+        return abs(self.contrast_dn) / max(self.noise_dn, 1e-12)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from measure.status import Status
+from measure.flags import Status
 from pipeline.report.camera_views import fiducial_form
 from pipeline.report.data import ReportData
 from pipeline.report.fiducials import Figure

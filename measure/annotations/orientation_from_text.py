@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from measure.annotations.fields import is_of_film, is_plate, signs
 from measure.annotations.line import Line
-from measure.marks.poses import pose_in_camera, up_from_camera
+from measure.geometry import pose_in_camera, up_from_camera
 from measure.marks.shapes import Side, WrittenPlace
 
 Array = NDArray[np.float64]

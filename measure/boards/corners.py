@@ -23,14 +23,13 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.special import erf, ndtr, owens_t
 
-from measure.covariance import Covariance
+from measure.flags import NO_REASON, Code, Reason
 from measure.matching.gauss_newton import gauss_newton
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow
 from measure.noise.noise_model import correlated, noise_model, products
 from measure.noise.robust_estimation import gauss_newton_step, robust_scale, tukey_weights
-from measure.reason import NO_REASON, Code, Reason
-from measure.results import MarkMeasurement
+from measure.results import Covariance, MarkMeasurement
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

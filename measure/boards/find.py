@@ -17,7 +17,7 @@ from measure.boards.specs import (
     FoundCorner,
     SquareGridSpec,
 )
-from measure.reason import NO_REASON, Code, Reason
+from measure.flags import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.targets.sheets import robust_view
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.boards.specs import FoundBoard, FoundCorner, SquareGridSpec, corners_of_square
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from measure.boards.lattice import homography_steps
 from measure.boards.specs import ArucoSpec, CharucoSpec, FoundBoard, FoundCorner, aruco_dictionary, corners_of_square
-from measure.reason import NO_REASON, Code, Reason
+from measure.flags import NO_REASON, Code, Reason
 from measure.targets.sheets import SheetView, robust_view
 
 Array = NDArray[np.float64]

@@ -21,12 +21,10 @@ from measure.boards.specs import (
     SquareGridSpec,
     aruco_dictionary,
 )
-from measure.covariance import Covariance
+from measure.flags import NO_REASON, Code, Reason, Status
 from measure.matching.window import ScanWindow
-from measure.reason import NO_REASON, Code, Reason
-from measure.results import MarkMeasurement
+from measure.results import Covariance, MarkMeasurement
 from measure.scans.scan import Scan
-from measure.status import Status
 from measure.targets.block_search import Candidate
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.disks import FittedDisk, fit_disk

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.reason import NO_REASON, Reason
+from measure.flags import NO_REASON, Reason
 
 Point3 = tuple[float, float, float]
 Array = NDArray[np.float64]

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from measure.detection.correlation import WIDE, Map, Surroundings
 from measure.detection.scan_maps import Held, ScanMaps, Sought
+from measure.geometry import quarter_turned
 from measure.marks.rendering import extent_px, known_picture
 from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
+from measure.matching.window import FAINT
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import SINGLE_CHANNELS, Scan
 
@@ -28,7 +30,6 @@ _LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
 _SHARED_PX = 16  # of the reduced scan: places so near to one another share a window
 _ALIKE = 0.8  # correlation above which two pictures of marks share one response
 _LEARNED = 2.0  # times its finest detail: a notch or block is wider, and would be most of what ground is the median of
-FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,14 +180,6 @@ def _templates(looks: Sequence[Look], reduction: int, most_px: int = FULL.half_p
         turn = look.linear @ np.linalg.inv(linear)
         shown[key] = quarter_turned(template, turn) if _is_quarter(turn) else _template(look, reduction, most_px)
     return [shown[look.mark, look.linear.tobytes()] for look in looks]
-
-
-def quarter_turned(image: Grid, turn: Array) -> Grid:
-    """The image under a turn (2, 2) of its columns and rows by whole quarters, after a mirror if there is one."""
-    whole = np.rint(turn)
-    turned = image if whole[0, 0] else image.T
-    across, down = whole.sum(axis=1)
-    return np.ascontiguousarray(turned[:: int(down), :: int(across)])
 
 
 def _is_quarter(turn: Array) -> bool:

@@ -14,13 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Cause, Covariance
-from measure.detection.candidates import FAINT, detail_px
+from measure.detection.candidates import detail_px
 from measure.detection.prediction import MarkPrediction
+from measure.flags import NO_REASON, Cause
 from measure.marks.rendering import extent_px, picture
-from measure.matching.match import Match
-from measure.matching.window import Coding
-from measure.reason import NO_REASON
+from measure.matching.window import FAINT, Coding
+from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan, means
 
 Array = NDArray[np.float64]
@@ -48,7 +47,7 @@ class FaintMark:
     """fit: the mark; its significance is in standard deviations of what the texture about it answers, and its
     covariance comes from that texture. chance: how many answers as strong and as near the texture alone would give."""
 
-    fit: Match
+    fit: MarkFit
     chance: float
 
     @property
@@ -231,7 +230,7 @@ class _Field:
         lines = np.abs(response.template)
         lit = lines * self.room[patch]
         contrast_dn = self.polarity * amplitude * float(np.average(self.room_dn[patch], weights=lit))
-        fit = Match(
+        fit = MarkFit(
             converged=True,
             reason=NO_REASON,
             center_px=place,

@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import ndtr
 
-from measure.detection.candidates import FAINT, detail_px
+from measure.detection.candidates import detail_px
 from measure.detection.correlation import correlation, variation
 from measure.detection.prediction import MarkPrediction
 from measure.detection.response_layers import highest
+from measure.flags import NOISE_LIKE_A_MARK
 from measure.marks.rendering import extent_px, known_picture
 from measure.matching.match import mark_window
-from measure.probabilities import NOISE_LIKE_A_MARK
+from measure.matching.window import FAINT
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

@@ -7,16 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, fdtrc
 
-from measure.covariance import Cause
 from measure.fiducials.consistency import Explanation, Misfit, explained, scan_sites
 from measure.fiducials.doubts import TOLD, Doubt, doubted, observed
 from measure.fiducials.frame import may_be_wrong
+from measure.fiducials.options import ANY_FILM, BelievedFilm
 from measure.fiducials.triangles import by_triangles
-from measure.film import ANY_FILM, BelievedFilm
+from measure.flags import FALSE_DOUBT, NO_REASON, Cause, Code, Reason
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
-from measure.probabilities import FALSE_DOUBT
-from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 
 Array = NDArray[np.float64]

@@ -9,17 +9,17 @@ from scipy.special import comb
 
 from measure.detection.candidates import Effort
 from measure.detection.first_look import seen as sight_of_mark
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.frame_sighter import FrameSighter
 from measure.fiducials.hypotheses import PitchHypothesis
 from measure.fiducials.measure_frame import look_at_frame
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch
+from measure.flags import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
 from measure.marks.shapes import FiducialLayout
-from measure.match_options import MatchOptions
-from measure.matching.match import Match
-from measure.probabilities import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
+from measure.matching.options import MatchOptions
+from measure.results import MarkFit
 from measure.scans.scan import Scan
 
 _COMPARED = 3  # best placements: the one that chance makes least is among them
@@ -95,5 +95,5 @@ def likeness(frame: Frame) -> float:
     return float(np.mean([0.0 if fit is None else _undamaged(fit) for fit in frame.fits]))
 
 
-def _undamaged(fit: Match) -> float:
+def _undamaged(fit: MarkFit) -> float:
     return fit.likeness * (1.0 - fit.damaged_fraction)

@@ -6,17 +6,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Cause, Covariance
-from measure.fiducial_options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.measure_frame import measure_frame
-from measure.marks.poses import POSES, up_from_camera
+from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
+from measure.flags import NO_REASON, Cause, Code, Reason, Status
+from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
-from measure.reason import NO_REASON, Code, Reason
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
-from measure.status import Status
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from scipy.spatial.distance import pdist
 from scipy.special import chdtrc, chdtri, fdtrc, logsumexp
 
 from measure.fiducials.doubts import TOLD, observed
-from measure.film import MOST_BENT_MM, SCATTER_DEGREES
-from measure.marks.poses import up_from_camera
+from measure.fiducials.options import MOST_BENT_MM, SCATTER_DEGREES
+from measure.flags import FALSE_DOUBT
+from measure.geometry import up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
-from measure.probabilities import FALSE_DOUBT
 from measure.results import FrameMeasurement
 
 Array = NDArray[np.float64]

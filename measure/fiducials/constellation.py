@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from measure.detection.candidates import Responses
 from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.response_layers import LEAST_TOLERANCE_PX, Layer, narrowed
-from measure.marks.poses import up_from_camera
+from measure.geometry import up_from_camera
 from measure.marks.shapes import LayoutMark, Mark
 
 Array = NDArray[np.float64]

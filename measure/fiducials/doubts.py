@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Cause
-from measure.reason import NO_REASON, Reason
+from measure.flags import NO_REASON, Cause, Reason, Status
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
 
 Array = NDArray[np.float64]
 TOLD = np.log(100.0)  # log-odds at which one cause rather than another is taken for what is off

@@ -10,11 +10,10 @@ from measure.detection.faint_marks import FaintMark, find_faint
 from measure.detection.prediction import MarkPrediction
 from measure.fiducials.frame_sighter import FrameSighter
 from measure.fiducials.mark_fit import Sighting
+from measure.flags import NO_REASON, TEXTURE_LIKE_A_FAINT_MARK, Code, Reason
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FrameCorner, Mark
-from measure.matching.match import Match
-from measure.probabilities import TEXTURE_LIKE_A_FAINT_MARK
-from measure.reason import NO_REASON, Code, Reason
+from measure.results import MarkFit
 
 Array = NDArray[np.float64]
 
@@ -91,7 +90,7 @@ def _extremes_dn(sighter: FrameSighter) -> Array:
     return np.asarray(np.percentile(np.concatenate(grey), _EXTREMES))
 
 
-def _reached_dn(sighter: FrameSighter, agreeing: Mapping[int, Match]) -> dict[int, float]:
+def _reached_dn(sighter: FrameSighter, agreeing: Mapping[int, MarkFit]) -> dict[int, float]:
     """How light, or dark, the marks that agree are: in a scan without lights they pass its extreme."""
     reached: dict[int, list[float]] = {}
     for index, fit in list(agreeing.items())[:_LOOKED_AT]:

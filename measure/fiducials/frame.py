@@ -9,11 +9,9 @@ from scipy.special import chdtrc
 
 from measure.fiducials.constellation import Placement
 from measure.fiducials.mark_fit import Sighting
-from measure.film import SCATTER_MM
-from measure.matching.match import Match
-from measure.probabilities import LARGE_ERROR
-from measure.reason import NO_REASON, Code, Reason
-from measure.status import Status
+from measure.fiducials.options import SCATTER_MM
+from measure.flags import LARGE_ERROR, NO_REASON, Code, Reason, Status
+from measure.results import MarkFit
 from measure.tone.curve import LINEAR
 from measure.tone.estimate import FrameTone
 
@@ -52,7 +50,7 @@ class Frame:
     part: bool = False
 
     @property
-    def fits(self) -> list[Match | None]:
+    def fits(self) -> list[MarkFit | None]:
         """The fits of the marks that belong."""
         return [s.fit if ok else None for s, ok in zip(self.sightings, self.belongs, strict=True)]
 

@@ -7,13 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from measure.film import AFFINITY_SIGMA
+from measure.fiducials.options import AFFINITY_SIGMA
+from measure.flags import RIGHT_PITCH_REFUSED, Code, Reason, Status
 from measure.marks.shapes import FiducialLayout
-from measure.probabilities import RIGHT_PITCH_REFUSED
-from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.scan import Scan
-from measure.status import Status
 
 Array = NDArray[np.float64]
 

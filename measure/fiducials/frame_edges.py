@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout, FrameCorner, LayoutMark
+from measure.matching.frame_edge import Course, edge_along, said_by_edges
 from measure.scans.scan import Scan
-from measure.special_marks.frame_edge import Course, edge_along, said_by_edges
 from measure.tone.curve import ToneInformation
 
 Array = NDArray[np.float64]

@@ -6,21 +6,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Cause
 from measure.detection.correlation import CLOSE
 from measure.detection.first_look import strongest
 from measure.detection.prediction import MarkPrediction
-from measure.fiducial_options import CLICK_SIGMA_PX, FiducialOptions
 from measure.fiducials.channels import best_weights
 from measure.fiducials.constellation import NARROW, Placement, sign_of
 from measure.fiducials.frame import CLEAR_LIKENESS, Frame
 from measure.fiducials.interior_orientation import fit_frame, outliers
 from measure.fiducials.mark_fit import Sighting, nothing_within, sight
-from measure.marks.poses import up_from_camera
+from measure.fiducials.options import CLICK_SIGMA_PX, FiducialOptions
+from measure.flags import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK, Cause, Reason
+from measure.geometry import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
-from measure.matching.match import Match
-from measure.probabilities import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
-from measure.reason import Reason
+from measure.results import MarkFit
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 from measure.tone.estimate import FrameTone
@@ -252,7 +250,7 @@ class FrameSighter:
     def _predicted_px(self) -> Array:
         return self.camera @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2]
 
-    def _fits(self, index: NDArray[np.intp]) -> list[Match]:
+    def _fits(self, index: NDArray[np.intp]) -> list[MarkFit]:
         """Of marks that were seen."""
         return [s.fit for s in (self.sightings[i] for i in index) if s is not None and s.fit is not None]
 
@@ -267,5 +265,5 @@ class FrameSighter:
         return np.asarray(np.sqrt(measured**2 + given**2 + self.options.film_sigma_mm**2))
 
 
-def _is_plain(fit: Match) -> bool:
+def _is_plain(fit: MarkFit) -> bool:
     return fit.likeness >= CLEAR_LIKENESS and fit.significance >= _LEAST_SIGNIFICANCE

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from measure.fiducial_options import FiducialOptions
+from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.scans.scan import Scan
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.film import AFFINITY_SIGMA
-from measure.probabilities import TRUE_MARK_AN_OUTLIER
+from measure.fiducials.options import AFFINITY_SIGMA
+from measure.flags import TRUE_MARK_AN_OUTLIER
 
 Array = NDArray[np.float64]
 

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from measure.matching.covariance import OwnShape
-from measure.matching.match import Match
+from measure.flags import MARK_UNLIKE_THE_OTHERS
 from measure.matching.models import PIXEL_VARIANCE_PX2
-from measure.probabilities import MARK_UNLIKE_THE_OTHERS
+from measure.results import MarkFit, OwnShape
 
 Array = NDArray[np.float64]
 # The standard deviation of a figure from mark to mark, by the variance that so many marks show beyond their own.
@@ -51,7 +50,7 @@ class SharedBlur:
     sigma: float
     differs: bool
 
-    def is_borne_out_by(self, fit: Match) -> bool:
+    def is_borne_out_by(self, fit: MarkFit) -> bool:
         """Whether a match that took it as an observation comes out with such a blur: noise moves the estimate from an
         observation by the root of what it takes from its variance."""
         moved = _log_seen_px(fit.blur_px) - _log_seen_px(self.blur_px)
@@ -59,7 +58,7 @@ class SharedBlur:
         return bool(fit.blur_sigma < self.sigma and 2 * ndtr(-off) >= MARK_UNLIKE_THE_OTHERS)
 
 
-def shared_blurs(fits: Sequence[Match]) -> list[SharedBlur | None]:
+def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
     """For each mark what the others tell of its blur, None where they need not, for its own picture tells it well and
     it is as theirs, or where they are too few."""
     own = np.array([_log_seen_px(fit.blur_px) for fit in fits])
@@ -137,7 +136,7 @@ def touch_of_edges(shape: SharedShape, on_place: Array, middle_px: float, is_dam
     return Touch(shape.touched(_TOUCHED_PX / middle_px, is_damaged), float(np.hypot(*(on_place @ shape.off))), 0.0)
 
 
-def shared_sizes(fits: Sequence[Match], linear: Array) -> list[SharedShape | None]:
+def shared_sizes(fits: Sequence[MarkFit], linear: Array) -> list[SharedShape | None]:
     """The size of each mark beside the others', of marks that are drawn alike and tell their own; None where they are
     too few. linear: (2, 2) px per mm, of the frame."""
     own = np.array([np.log(np.linalg.det(fit.pixel_from_mark[:, :2]) / np.linalg.det(linear)) / 2 for fit in fits])

@@ -5,19 +5,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Cause
-from measure.detection.candidates import FAINT
 from measure.detection.first_look import seen
 from measure.detection.prediction import MarkPrediction
+from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
-from measure.matching.match import Match, MatchOptions, mark_window, match
-from measure.matching.window import pixels_beyond_edge, read_window
+from measure.matching.frame_edge import fit_frame_corner
+from measure.matching.match import MatchOptions, mark_window, match
+from measure.matching.window import FAINT, pixels_beyond_edge, read_window
 from measure.noise.grain import BESIDE_PX
-from measure.reason import NO_REASON, Code, Reason
+from measure.results import MarkFit
 from measure.scans.compression import covariance_of_compression, tone_variance
 from measure.scans.scan import Scan
-from measure.special_marks.frame_corner import corner_of_edges
 from measure.tone.curve import LINEAR
 
 Array = NDArray[np.float64]
@@ -41,7 +40,7 @@ class Sighting:
 
     predicted_px: Array
     inside: bool
-    fit: Match | None
+    fit: MarkFit | None
     reason: Reason = NO_REASON
     chance: float = 1.0
     closer: bool = False
@@ -87,7 +86,7 @@ def _lost(scan: Scan, expected: MarkPrediction) -> Reason:
     return Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE) if why else NO_REASON
 
 
-def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> Reason:
+def _unlike(fit: MarkFit, expected: MarkPrediction, full_scale_dn: float) -> Reason:
     """Why what was fitted is no such mark; empty where it may be."""
     off_px = float(np.hypot(*(fit.center_px - expected.center_px)))
     if off_px > expected.search_px + _DRIFT_PX:
@@ -108,12 +107,14 @@ def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> Reaso
 
 def _fitted(
     scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None
-) -> tuple[Match | None, float]:
+) -> tuple[MarkFit | None, float]:
     """The mark matched where it looks most like itself, and the expected number of places that noise makes look so;
     None where nothing looks like it."""
     mark = expected.mark
     if isinstance(mark, FrameCorner):
-        return corner_of_edges(scan, mark, expected), 1.0
+        return fit_frame_corner(
+            scan, mark, expected.pixel_from_mark, expected.search_px, expected.polarity, expected.weights
+        ), 1.0
     look = seen(scan, expected) if expected.search_px > 0 else (expected.center_px, 0.0)
     if look is None:
         return None, 1.0
@@ -125,18 +126,18 @@ def _fitted(
     return fit, chance
 
 
-def _ran_away(fit: Match, start_px: Array, options: MatchOptions) -> bool:
+def _ran_away(fit: MarkFit, start_px: Array, options: MatchOptions) -> bool:
     return not fit.converged and bool(np.hypot(*(fit.center_px - start_px)) > options.max_shift_px)
 
 
-def _is_near(fit: Match, expected: MarkPrediction) -> bool:
+def _is_near(fit: MarkFit, expected: MarkPrediction) -> bool:
     """Whether it is still where the mark may be."""
     return bool(np.hypot(*(fit.center_px - expected.center_px)) <= expected.search_px)
 
 
 def _matched(
     scan: Scan, expected: MarkPrediction, center_px: Array, options: MatchOptions, frame_sigma: float | None
-) -> Match:
+) -> MarkFit:
     """The mark matched from a place."""
     mark, start = expected.mark, expected.moved(center_px).pixel_from_mark
     seen_in = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values

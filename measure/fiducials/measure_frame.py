@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.constellation import Placement
 from measure.fiducials.faint_marks import faint_reach_px, look_for_faint
 from measure.fiducials.frame import Frame
 from measure.fiducials.frame_sighter import MANY, FrameSighter
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.refit import compare_shapes, compare_sizes, count_tone, settle, share_blur
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan

@@ -9,25 +9,23 @@ from numpy.typing import NDArray
 from measure.annotations.detect_text import networks
 from measure.annotations.line import KnownLine, Line
 from measure.annotations.read import read_writing
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.clicked_frame import clicked_frame, contradicted_pose, is_shown, with_clicks
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import pitch_hypotheses
 from measure.fiducials.measure_frame import measure_frame, rename_frame
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.rows import absent_frame, lost_frame, present_frame
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch
 from measure.fiducials.significance import doubt
 from measure.fiducials.stages import find_frame, likeliest_pose
+from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason, Status
+from measure.geometry import up_from_camera
 from measure.marks.frame_border import at_border
-from measure.marks.poses import up_from_camera
 from measure.marks.shapes import FiducialLayout
-from measure.probabilities import FRAMES_BY_CHANCE
-from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, Pose
 from measure.scans.scan import Scan
-from measure.status import Status
 
 Array = NDArray[np.float64]
 

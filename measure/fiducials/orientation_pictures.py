@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.detection.candidates import detail_px, quarter_turned
+from measure.detection.candidates import detail_px
+from measure.geometry import quarter_turned
 from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
 from measure.marks.shapes import Mark, MarkTemplate
-from measure.matching.match import Match
 from measure.noise.robust_estimation import TukeyFit, robust_scale, tukey_fit
+from measure.results import MarkFit
 from measure.scans.scan import Scan, means
 
 Array = NDArray[np.float64]
@@ -151,7 +152,7 @@ class Site:
     def __init__(
         self,
         scan: Scan,
-        like: Match,
+        like: MarkFit,
         center_px: Array,
         weights: Sequence[float] | None,
         drawings: Drawings,

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Cause
 from measure.fiducials.frame import CLEAR_LIKENESS, WRONG_PX
 from measure.fiducials.frame_edges import told_by_edges
 from measure.fiducials.frame_sighter import FrameSighter
@@ -21,14 +20,13 @@ from measure.fiducials.mark_comparison import (
     touch_of_round,
 )
 from measure.fiducials.mark_fit import leans_on_frame, sight, strained_px
+from measure.flags import LARGE_ERROR, Cause, Code, Reason
 from measure.marks.rendering import reach_px
 from measure.marks.shapes import Disk, Mark, MarkShape, Ring
-from measure.match_options import MatchOptions
-from measure.matching.match import Match
 from measure.matching.models import is_round
+from measure.matching.options import MatchOptions
 from measure.noise.noise_model import may_be_noise
-from measure.probabilities import LARGE_ERROR
-from measure.reason import Code, Reason
+from measure.results import MarkFit
 from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import FrameTone, MarkTone
 
@@ -75,7 +73,7 @@ def _settle_from(sighter: FrameSighter, tone: Tone) -> None:
     sighter.tone = _frame_tone(sighter, edges)
 
 
-def _leans_or_is_strained(sighter: FrameSighter, index: int, fit: Match) -> bool:
+def _leans_or_is_strained(sighter: FrameSighter, index: int, fit: MarkFit) -> bool:
     mark, linear = sighter.layout.marks[index].mark, sighter.pixel_from_camera[:, :2]
     off_px = strained_px(mark, fit.pixel_from_mark[:, :2], linear, _frame_sigma(sighter))
     return leans_on_frame(mark) or off_px > _STRAINED * fit.sigma_px
@@ -203,7 +201,7 @@ def _radius_mm(mark: Mark) -> float:
     return max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
 
 
-def _clear(sighter: FrameSighter) -> dict[int, Match]:
+def _clear(sighter: FrameSighter) -> dict[int, MarkFit]:
     """The fits of marks that belong and are plainly there."""
     return {
         index: sighting.fit
@@ -212,7 +210,7 @@ def _clear(sighter: FrameSighter) -> dict[int, Match]:
     }
 
 
-def _adjusted(sighter: FrameSighter) -> dict[int, Match]:
+def _adjusted(sighter: FrameSighter) -> dict[int, MarkFit]:
     """Those of them that were matched, not only seen as faint marks, and are drawn: a chip has a blur of its own."""
     return {
         index: fit
@@ -221,7 +219,7 @@ def _adjusted(sighter: FrameSighter) -> dict[int, Match]:
     }
 
 
-def _only_seen(sighter: FrameSighter) -> dict[int, Match]:
+def _only_seen(sighter: FrameSighter) -> dict[int, MarkFit]:
     """The fits of marks that belong and are drawn, but were only seen as faint marks, with no blur of their own."""
     return {
         index: sighting.fit
@@ -264,7 +262,7 @@ def _match_faint(sighter: FrameSighter, index: int, frame_sigma: float, blur: Sh
         _take(sighter, index, fit)
 
 
-def _matched(sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float) -> Match | None:
+def _matched(sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float) -> MarkFit | None:
     """A mark where it was seen, matched with the frame's rotation and scale where it leans on them."""
     before = sighter.sightings[index]
     if before is None or before.fit is None:
@@ -273,7 +271,7 @@ def _matched(sighter: FrameSighter, index: int, options: MatchOptions, frame_sig
     return sight(sighter.scan, expected, options, frame_sigma).fit
 
 
-def _take(sighter: FrameSighter, index: int, fit: Match) -> None:
+def _take(sighter: FrameSighter, index: int, fit: MarkFit) -> None:
     """Another fit of a mark that was seen; what was said of it holds."""
     sighting = sighter.sightings[index]
     if sighting is not None:

@@ -7,14 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from measure.fiducials.frame import Frame
-from measure.film import AFFINITY_SIGMA
+from measure.fiducials.options import AFFINITY_SIGMA
+from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate
-from measure.matching.covariance import SecondPlace
-from measure.reason import NO_REASON, Code, Reason
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.matching.covariance import honest_covariance
+from measure.results import FrameMeasurement, MarkMeasurement, Pose, SecondPlace
 from measure.scans.scan import Scan
-from measure.special_marks.learned import honest_covariance
-from measure.status import Status
 
 _FAINT = Reason(
     "the frame was found at a closer look only, its marks being faint beside what surrounds them", Code.FAINT_FRAME

@@ -14,17 +14,15 @@ from numpy.typing import NDArray
 
 from measure.annotations.line import Line
 from measure.annotations.orientation_from_text import line_score, main_pose, writing_likelihoods
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.frame_sighter import first_search_px
 from measure.fiducials.interior_orientation import FrameFit, fit_frame
+from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions
 from measure.fiducials.orientation_pictures import Drawings, Shown, Site
-from measure.film import SCATTER_DEGREES
-from measure.marks.poses import pose_in_camera, up_from_camera
+from measure.geometry import pose_in_camera, up_from_camera
 from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
-from measure.matching.match import Match
-from measure.results import Pose
+from measure.results import MarkFit, Pose
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan
 
@@ -134,7 +132,7 @@ class _Named:
         cls,
         placement: Placement,
         layout: FiducialLayout,
-        seen: Sequence[Match],
+        seen: Sequence[MarkFit],
         missed: Sequence[Array],
         options: FiducialOptions,
     ) -> "_Named | None":

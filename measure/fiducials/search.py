@@ -12,10 +12,10 @@ from measure.detection.candidates import FULL, Effort, Look, Responses, respond,
 from measure.detection.correlation import WIDE, Map, Surroundings
 from measure.detection.response_layers import Layer, Reach, layers_of
 from measure.detection.scan_maps import Held
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
 from measure.fiducials.hypotheses import PitchHypothesis, beside_mm, centred_places_px, reach_mm, room_mm, turned_mm
-from measure.marks.poses import POSES, up_from_camera
+from measure.fiducials.options import FiducialOptions
+from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 

@@ -17,8 +17,7 @@ from measure.fiducials.constellation import sign_of
 from measure.fiducials.frame import CLEAR_LIKENESS, Frame
 from measure.fiducials.frame_sighter import first_search_px
 from measure.fiducials.search import FrameSearch
-from measure.probabilities import FRAME_BY_CHANCE, NO_FRAME
-from measure.reason import NO_REASON, Code, Reason
+from measure.flags import FRAME_BY_CHANCE, NO_FRAME, NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

@@ -13,18 +13,17 @@ from numpy.typing import NDArray
 
 from measure.annotations.line import Line
 from measure.detection.correlation import CLOSE, GRAINY
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import Hypotheses, is_worth_a_look, outermost, slightly_longer
 from measure.fiducials.measure_frame import measure_frame, rename_frame
+from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch
 from measure.fiducials.significance import doubt, expected_as_good, expected_where_seen
-from measure.film import AFFINITY_SIGMA
-from measure.marks.poses import POSES
+from measure.flags import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE
+from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
-from measure.probabilities import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE
 from measure.results import Pose
 from measure.scans.remote import Address
 from measure.scans.scan import Scan

@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import chdtrc, chdtri, fdtrc, logsumexp
 
-from measure.covariance import Cause
 from measure.fiducials.doubts import TOLD, Doubt, observed
-from measure.film import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_MM
+from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_MM
+from measure.flags import FALSE_DOUBT, NO_REASON, Cause, Code, Reason
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
-from measure.probabilities import FALSE_DOUBT
-from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 
 Array = NDArray[np.float64]

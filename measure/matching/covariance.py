@@ -7,10 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
-from scipy.special import chdtrc
 
+from measure.marks.rendering import render
+from measure.marks.shapes import MarkTemplate
+from measure.marks.shared_picture import SMOOTHED_PX2
+from measure.marks.templates import GRAIN_PX
 from measure.matching.models import GREY
 from measure.noise.noise_model import NoiseModel, autocovariance, coloured, combined, correlated, products
+from measure.results import Covariance, MarkFit, OwnShape, SecondPlace
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -26,6 +30,9 @@ _SMOOTHING = 1.5  # times the scan's blur: noise of about 1.3 times the match's,
 _LEAST_SMOOTHING_PX = 1.0  # below it pixels sample the derivative too coarsely
 _WORST_CONDITION = 1e6  # of a normal matrix: beyond it double precision leaves no figure of a place in small windows
 _OWN = 0.9  # of what is known of rotation and scale: where the picture gives so much, little is the frame's
+
+
+_LEAST_TOLD = 0.1  # of the slopes' squares: less would tell nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,24 +159,6 @@ def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_chang
 # known: noise moves both places, in part together. What it cannot explain is damage or a mark unlike its drawing.
 
 
-@dataclass(frozen=True, eq=False)
-class SecondPlace:
-    """offset_px (2,): the second place less the matched one; covariance_px2 (2, 2): of that difference."""
-
-    offset_px: Array
-    covariance_px2: Array
-
-    @property
-    def sigmas(self) -> float:
-        """The length of the difference in its own standard deviations."""
-        return float(np.sqrt(self.offset_px @ np.linalg.solve(self.covariance_px2, self.offset_px)))
-
-    @property
-    def chance(self) -> float:
-        """The probability that noise alone makes the difference as long."""
-        return float(chdtrc(2, self.sigmas**2))
-
-
 def edge_place(fit: LinearFit, blur_px: float) -> SecondPlace | None:
     """The place by the mark's edges, None where they do not give one.
 
@@ -247,16 +236,6 @@ def _kernels(sigma_px: float) -> tuple[Array, Array, Array]:
 # moves the place as it changes that scale, and leaves no other trace: both are in the picture, and may be compared.
 
 
-@dataclass(frozen=True, eq=False)
-class OwnShape:
-    """change (2,): scale and rotation (rad) by the picture alone, less those of the frame, and sigma (2,), their
-    standard deviations; on_place (2, 2): px by which the place would follow, did the match not keep to the frame's."""
-
-    change: Array
-    sigma: Array
-    on_place: Array
-
-
 def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) -> OwnShape | None:
     """What the picture says of the two unknowns of a shape, None where they were its own anyway, or it says nothing.
 
@@ -278,3 +257,46 @@ def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) ->
         return None
     change = products(by_noise, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
     return OwnShape(change + freed @ resolution @ departures, np.sqrt(variance), -resolution[:2, shape])
+
+
+def honest_covariance(template: MarkTemplate, scan: str, fit: MarkFit) -> Covariance:
+    """Of a mark measured in a scan that has a share in its template.
+
+    The scan's noise is in the template too and so is missing from the residuals, in which only the rest, one less its
+    share, is left. Where the template is that scan's picture alone nothing is left: then noise from the picture itself.
+    Slopes of the template that are noise tell nothing of the place, but the fit took them for slopes of the mark.
+    """
+    share = template.shares.get(scan, 0.0)
+    if share == 1.0:
+        return Covariance.of_noise(_covariance_of_noise(template, fit))
+    widened = _without_slope_noise(template, fit)
+    return fit.place_covariance.through(widened / np.sqrt(1.0 - share))
+
+
+def _without_slope_noise(template: MarkTemplate, fit: MarkFit) -> Array:
+    """(2, 2) what an error of the place is to be multiplied by: the squares of all slopes that the fit saw over those
+    of the mark's."""
+    linear, blur_px2 = fit.pixel_from_mark[:, :2], SMOOTHED_PX2 + fit.blur_px**2
+    px_per_sample = float(np.sqrt(abs(np.linalg.det(linear)))) * template.pitch_um / 1000
+    side = int(np.ceil(len(template.image) * px_per_sample))
+    place = np.column_stack([linear, np.full(2, (side - 1) / 2)])
+    shown = render(template, place, side, side, float(np.sqrt(blur_px2)))
+    slopes = np.stack([shown.by_col.ravel(), shown.by_row.ravel()]).astype(float)
+    noise = template.slope_noise_dn / max(float(np.ptp(template.image)), 1e-9) / px_per_sample
+    noise *= SMOOTHED_PX2 / blur_px2  # more blur takes as much of the slopes of white noise
+    told, axes = np.linalg.eigh(slopes @ slopes.T)
+    marks = np.maximum(told - noise**2 * side**2, _LEAST_TOLD * told)
+    return np.asarray(axes * (told / marks) @ axes.T)
+
+
+def _covariance_of_noise(template: MarkTemplate, fit: MarkFit) -> Array:
+    """Of a shift, gain and offset, from the picture's slopes and its noise, as grain of GRAIN_PX correlates it."""
+    side = template.image.shape[0]
+    linear = fit.pixel_from_mark[:, :2]
+    shown = render(template, np.column_stack([linear, np.full(2, side / 2)]), side, side, 0.0)
+    columns = [fit.contrast_dn * shown.by_col, fit.contrast_dn * shown.by_row, shown.value, np.ones_like(shown.value)]
+    design = np.stack([column.ravel() for column in columns], axis=1)
+    size = np.linalg.norm(design, axis=0)
+    inverse = np.linalg.pinv((design / size).T @ (design / size)) / np.outer(size, size)
+    # As many pixels as such grain is wide are one observation: the sum of its correlations.
+    return np.asarray(4 * np.pi * GRAIN_PX**2 * max(template.noise_dn, 1e-3) ** 2 * inverse[:2, :2])

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.flags import NO_REASON, Code, Reason
 from measure.marks.rendering import chip_mask, picture, true
 from measure.marks.shapes import MarkTemplate
 from measure.matching.gauss_newton import UNSETTLED, gauss_newton, gauss_newton_halving
@@ -15,7 +16,6 @@ from measure.matching.window import Coding
 from measure.noise.damage import damage, damage_where_lossy, grown
 from measure.noise.noise_model import NoiseModel, combined, correlated, may_be_noise, products, steadiness, weighted
 from measure.noise.robust_estimation import robust_scale, solution, tukey_loss, tukey_weights
-from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason
 
 Array = NDArray[np.float64]
 

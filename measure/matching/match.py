@@ -7,21 +7,18 @@ Where grain correlates the noise, its autocovariance, from the residuals and fro
 last steps and gives the covariance (generalised least squares).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Cause, Covariance
+from measure.flags import Cause
 from measure.marks.rendering import extent_px, frame_beside, known
 from measure.marks.shapes import Mark, MarkTemplate
-from measure.match_options import MatchOptions
 from measure.matching.covariance import (
     Landscape,
     LinearFit,
-    OwnShape,
-    SecondPlace,
     covariance_of_changed_tone,
     edge_place,
     own_shape,
@@ -30,15 +27,16 @@ from measure.matching.covariance import (
 )
 from measure.matching.fit import EDGE_BLURS, PictureFit
 from measure.matching.models import GREY, PictureModel, State, background_px, is_round
+from measure.matching.options import MatchOptions
 from measure.matching.saturation import Sides, clear_of_ends
 from measure.matching.tone_information import mark_tone_information, tone_without_information
 from measure.matching.window import Coding, ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured, taken_out
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, products
-from measure.reason import Reason
+from measure.results import Covariance, MarkFit, OwnShape, SecondPlace
 from measure.tone.estimate import MarkTone
 
-__all__ = ["Match", "MatchOptions", "mark_window", "match"]
+__all__ = ["MarkFit", "MatchOptions", "mark_window", "match"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -46,66 +44,7 @@ Mask = NDArray[np.bool_]
 _SPARE_PX = 2.0  # beyond the margin: room for the mark to move
 
 
-@dataclass(frozen=True, eq=False)
-class Match:
-    """A mark as fitted. Where converged is false, reason says why and the numbers are the last approximations.
-
-    center_px (2,) with its place_covariance, pixel_from_mark (2, 3): of the scan, not of the window. covariance: of all
-    unknowns of the `PictureModel` by the noise, None where another model was fitted.
-    contrast_dn: the mark's light less the background's, negative for a dark mark; stored_contrast_dn: the same of the
-    grey values that the file has. noise_dn: standard deviation of
-    one pixel, of a chip's picture after smoothing. damaged_fraction: share of the pixels about the mark, within
-    plain_px of it, that were cut out; lost_fraction: of what tells its place in the direction in which least of that is
-    left, what was. redundancy: pixels used less unknowns. neighbour_correlation: of the residuals;
-    they were taken as white where covariance_is_white. likeness: correlation of the fitted picture with the window,
-    less its plane background: 1 for a perfect mark, 0 for none.
-    significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
-    share included, and size_sigma of the mark's size; infinite where they were not estimated, or the blur is at an end
-    of its range. edges: the mark's place by another method, to compare;
-    sloping: an ellipse's, if its paint may grow lighter or darker from side to side. own_shape: what the picture says
-    of rotation and scale, where the frame gave them; tone: and of a tone curve that is not known.
-    """
-
-    converged: bool
-    reason: Reason
-    center_px: Array
-    place_covariance: Covariance
-    pixel_from_mark: Array
-    contrast_dn: float
-    stored_contrast_dn: float
-    noise_dn: float
-    blur_px: float
-    damaged_fraction: float
-    lost_fraction: float
-    redundancy: int
-    neighbour_correlation: float
-    covariance_is_white: bool
-    likeness: float
-    significance: float
-    blur_sigma: float = np.inf
-    size_sigma: float = np.inf
-    edges: SecondPlace | None = None
-    sloping: SecondPlace | None = None
-    own_shape: OwnShape | None = None
-    tone: MarkTone | None = None
-    covariance: Array | None = None
-
-    @property
-    def covariance_px2(self) -> Array:
-        """(2, 2) of the centre, all causes together."""
-        return self.place_covariance.px2
-
-    @property
-    def sigma_px(self) -> float:
-        """Standard deviation of a coordinate."""
-        return float(np.sqrt(np.trace(self.covariance_px2) / 2))
-
-    @property
-    def snr(self) -> float:
-        return abs(self.contrast_dn) / max(self.noise_dn, 1e-12)
-
-
-def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: MatchOptions | None = None) -> Match:
+def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: MatchOptions | None = None) -> MarkFit:
     """Fit the mark to a window of the scan.
 
     pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col, row): its last column is the
@@ -246,7 +185,7 @@ def mark_window(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[i
     return int(col0), int(row0), int(col1 - col0 + 1), int(row1 - row0 + 1)
 
 
-def _result(fit: PictureFit, about: _Surroundings) -> Match:
+def _result(fit: PictureFit, about: _Surroundings) -> MarkFit:
     """The match in the pixels of the fit's own window."""
     model, used = fit.model, fit.telling
     information = float(model.information[fit.used].sum())
@@ -261,7 +200,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
             noise = grain_model(model.residuals, used, taken, noise.neighbour_correlation, patches)
         precision = _estimate_precision(fit, used, noise, about)
     state, covariance = model.state, precision.covariance
-    return Match(
+    return MarkFit(
         converged=not fit.reason,
         reason=fit.reason,
         center_px=state.pixel_from_mark[:, 2],
@@ -291,7 +230,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
 class _Precision(NamedTuple):
     """How well a fit is known: its place by all causes, the covariance of its unknowns (unknowns, unknowns) and the
     standard deviation of the contrast by the noise, and what the linearised fit says beside the unknowns, as in
-    `Match`."""
+    `MarkFit`."""
 
     place: Covariance
     covariance: Array

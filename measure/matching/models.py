@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.flags import NO_REASON, Code, Reason
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
 from measure.marks.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
-from measure.match_options import Freedom, MatchOptions
+from measure.matching.options import Freedom, MatchOptions
 from measure.matching.saturation import Sides, censored, tells
 from measure.noise.noise_model import combined, factors
-from measure.reason import NO_REASON, Code, Reason
 
 # Changes of the mark's linear part: (I + e G) times it, G a generator.
 _TURN, _SCALE = ((0.0, -1.0), (1.0, 0.0)), ((1.0, 0.0), (0.0, 1.0))

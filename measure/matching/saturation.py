@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, log_ndtr
 
+from measure.flags import NATURAL_END
 from measure.noise.robust_estimation import robust_scale
-from measure.probabilities import NATURAL_END
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

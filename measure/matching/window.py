@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -13,6 +14,8 @@ from measure.matching.saturation import Sides, clipped_sides
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR, Tone
 
+Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -21,6 +24,9 @@ _BESIDE_PX = 6.0  # about the drawing: the mark's own ground
 _FAR = 5.0  # standard deviations of the mark's side, the mark being part of it: so far off is no ground of this mark
 _EDGE_PX = 4.0  # an edge's blur: of 1.4 px it leaves a five hundredth of the edge so far off
 _DRAWN, _SHOWN = 0.05, 0.5  # of the mark's contrast: all of it, and what is plainly its own
+
+
+FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.fft import dct
 from scipy.special import ndtri, stdtrit
 
-from measure.probabilities import JPEG_GRID, JPEG_STEP
+from measure.flags import JPEG_GRID, JPEG_STEP
 
 Array = NDArray[np.float64]
 

@@ -8,17 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from measure.covariance import Cause, Covariance
+from measure.flags import LARGE_ERROR, MUCH_DUST, NO_REASON, Cause, Code, Reason
 from measure.marks.shapes import Disk, MarkShape
-from measure.matching.covariance import SecondPlace
-from measure.matching.match import Match, MatchOptions, mark_window, match
+from measure.matching.match import MatchOptions, mark_window, match
 from measure.matching.models import GREY
 from measure.matching.window import read_window
 from measure.noise.grain import BESIDE_PX
 from measure.noise.noise_model import may_be_noise
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
-from measure.probabilities import LARGE_ERROR, MUCH_DUST
-from measure.reason import NO_REASON, Code, Reason
+from measure.results import Covariance, MarkFit, SecondPlace
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
 from measure.targets.disk_detection import LEAST_SNR
@@ -214,7 +212,7 @@ def _mean_radius_px(pixel_from_disk: Array) -> float:
     return float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
 
 
-def _appearance_covariance(fit: Match) -> Array:
+def _appearance_covariance(fit: MarkFit) -> Array:
     """(5, 5) as a fitted disk has it."""
     assert fit.covariance is not None
     gain = len(fit.covariance) - GREY
@@ -223,7 +221,7 @@ def _appearance_covariance(fit: Match) -> Array:
     return np.asarray(fit.covariance[np.ix_(figures, figures)] / np.outer(per, per))
 
 
-def _assess(disk: FittedDisk, fit: Match) -> FittedDisk:
+def _assess(disk: FittedDisk, fit: MarkFit) -> FittedDisk:
     """The disk with its reason or weakness, where the fit's figures give one; residuals of a picture of something else
     are alike in neighbouring pixels."""
     if disk.reason:

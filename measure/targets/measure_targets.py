@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.rendering import extent_px, picture
 from measure.marks.shapes import MarkShape, cross, thinnest_mm
 from measure.noise.robust_estimation import robust_scale
-from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.status import Status
 from measure.targets.disks import SMALLEST_RADIUS_PX, UNIT_DISK, FittedDisk, doubts, fit_disk
 
 Array = NDArray[np.float64]

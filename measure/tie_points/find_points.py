@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from measure.covariance import Covariance
-from measure.reason import NO_REASON, Code, Reason
-from measure.results import MarkMeasurement
-from measure.status import Status
+from measure.flags import NO_REASON, Code, Reason, Status
+from measure.results import Covariance, MarkMeasurement
 from measure.tie_points.features import Features, TieFrame
 from measure.tie_points.measurement import TiePoint, measure_points
 from measure.tie_points.tracks import Shared, find_all_features, find_candidates, verify_pairs

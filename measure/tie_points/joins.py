@@ -15,13 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Cause, Covariance
 from measure.errors import MeasurementError
-from measure.probabilities import POINT_REFUSED
-from measure.reason import NO_REASON, Code, Reason
-from measure.results import MarkMeasurement
+from measure.flags import NO_REASON, POINT_REFUSED, Cause, Code, Reason, Status
+from measure.results import Covariance, MarkMeasurement
 from measure.scans.parallel import map_or_replace
-from measure.status import Status
 from measure.tie_points.features import Features, TieFrame, find_features, in_turn, shared_features
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
 from measure.tie_points.verification import neighbour_outliers

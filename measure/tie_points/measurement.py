@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from measure.errors import MeasurementError
+from measure.flags import POINT_REFUSED, Code, Reason
 from measure.noise.robust_estimation import robust_scale
-from measure.probabilities import POINT_REFUSED
-from measure.reason import Code, Reason
 from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import TieFrame
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Bending, Matched, Piece, bending_variance, match_pieces

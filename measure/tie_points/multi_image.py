@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import chdtrc
 
+from measure.flags import NO_REASON, Code, Reason
 from measure.matching.gauss_newton import UNSETTLED, gauss_newton
 from measure.noise.noise_model import NoiseModel, correlated, noise_model
-from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.errors import MeasurementError
+from measure.flags import Code, Reason
 from measure.noise.robust_estimation import least_distances
-from measure.reason import Code, Reason
 from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import Features, TieFrame, find_features, in_turn, shared_features
 from measure.tie_points.multi_image import RADIUS_PX

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
+from measure.flags import POINT_OFF_ITS_NEIGHBOURS, POINT_OFF_ITS_RAY
 from measure.noise.robust_estimation import least_distances, robust_scale
-from measure.probabilities import POINT_OFF_ITS_NEIGHBOURS, POINT_OFF_ITS_RAY
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -10,11 +10,10 @@ import numpy as np
 from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.result import Adjustment
 from measure.fiducials.frame_checks import without_lost
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason, Status
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.remote import fetch_location, scan_path
 from measure.scans.scan import open_scan
-from measure.status import Status
 from measure.targets.measure_targets import TargetPrediction
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings

@@ -3,7 +3,7 @@ which results are of other options."""
 
 from collections.abc import Callable
 
-from measure.revision import MEASURE_REVISION
+from measure.results import MEASURE_REVISION
 from pipeline.archive.decided import by_image
 from pipeline.archive.key import options_hash
 from pipeline.files.decisions_file import Choice

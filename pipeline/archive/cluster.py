@@ -10,7 +10,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from measure.errors import MeasurementError
-from measure.revision import MEASURE_REVISION
+from measure.results import MEASURE_REVISION
 from measure.scans.remote import is_address, scan_path
 from pipeline.errors import InputError, missing_extra
 from pipeline.workers import KILLS, WorkerKilled, processes, work_alone

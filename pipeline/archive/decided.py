@@ -11,11 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from measure.covariance import Cause, Covariance
-from measure.fiducial_options import CLICK_SIGMA_PX, Click
-from measure.reason import Code, Reason
-from measure.results import MarkMeasurement
-from measure.status import Status
+from measure.fiducials.options import CLICK_SIGMA_PX, Click
+from measure.flags import Cause, Code, Reason, Status
+from measure.results import Covariance, MarkMeasurement
 from pipeline.archive.digests import row_digest
 from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, standing
 from pipeline.measuring.scan_task import ScanTask

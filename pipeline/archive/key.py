@@ -3,7 +3,7 @@
 import hashlib
 import json
 
-from measure.revision import MEASURE_REVISION
+from measure.results import MEASURE_REVISION
 from pipeline.archive.file_state import Identity
 
 

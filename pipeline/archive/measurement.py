@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason
 from measure.results import FrameMeasurement
 from pipeline.archive.digests import DamagedError
 from pipeline.archive.judging import judged_records, judging_of, latest

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
 
-from measure.revision import MEASURE_REVISION
+from measure.results import MEASURE_REVISION
 from pipeline.archive.digests import IS_JUDGING_SOUND, DamagedError, damaged_results, is_sound, marks_digest, seal
 from pipeline.archive.file_state import FileState, Identity
 from pipeline.archive.key import fingerprint, options_hash

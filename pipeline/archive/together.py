@@ -8,10 +8,9 @@ from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 
-from measure.reason import Code, Reason
-from measure.revision import MEASURE_REVISION
+from measure.flags import Code, Reason, Status
+from measure.results import MEASURE_REVISION
 from measure.scans.remote import scan_path
-from measure.status import Status
 from pipeline.archive.identity import content_hash
 from pipeline.archive.judging import JudgedScan, Lot
 from pipeline.archive.key import shard_of

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any
 
-from measure.reason import Code
-from measure.status import Status
+from measure.flags import Code, Status
 
 
 class Verdict(StrEnum):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from adjust.problem.network import ObjectPoint
-from measure.status import Status
+from measure.flags import Status
 from pipeline.blocks.mapping import Mapped, Sight
 from pipeline.blocks.pictures import BlockPicture, BlockScan
 from pipeline.errors import InputError

@@ -16,7 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from measure.marks.poses import POSES
+from measure.geometry import POSES
 from pipeline.errors import InputError
 from pipeline.results.fingerprints import NO_FINGERPRINT
 from pipeline.text.atomic import write_atomically, writing

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from measure.marks.poses import POSES
+from measure.geometry import POSES
 from measure.marks.shapes import Point
 from pipeline.text.image_names import image_name
 from pipeline.text.tables import Table

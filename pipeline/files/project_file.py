@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, cast, get_args
 
 from adjust.problem.camera import Prior
 from adjust.problem.network import ObjectPoint
-from measure.fiducial_options import Reads
-from measure.film import ANY_FILM, BelievedFilm
-from measure.marks.poses import POSES
+from measure.fiducials.options import ANY_FILM, BelievedFilm, Reads
+from measure.geometry import POSES
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
 from pipeline.files.camera_file import CameraFile, read_camera

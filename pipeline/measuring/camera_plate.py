@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from measure.annotations.fields import CAMERA, fields_of
 from measure.annotations.line import Line
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason
 from pipeline.files.camera_file import CameraFile
 from pipeline.results.measured_scan import MeasuredScan
 

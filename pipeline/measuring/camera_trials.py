@@ -13,12 +13,12 @@ from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from measure.annotations.detect_text import networks
 from measure.annotations.read import read_writing
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.camera_recognition import likeness
 from measure.fiducials.frame import Frame
+from measure.fiducials.options import FiducialOptions
+from measure.flags import CAMERA_BY_CHANCE
 from measure.marks.frame_border import at_border
 from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.probabilities import CAMERA_BY_CHANCE
 from measure.scans.scan import Scan, open_scan
 from measure.scans.scan_views import thumbnail
 from pipeline.files.camera_file import CameraFile

@@ -7,7 +7,7 @@ from typing import NewType
 
 from measure.boards.corners import one_definition
 from measure.fiducials.across_frames import judged
-from measure.film import BelievedFilm
+from measure.fiducials.options import BelievedFilm
 from measure.results import FrameMeasurement
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.roll import Roll

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from measure.reason import NO_REASON, Code, Reason
+from measure.flags import NO_REASON, Code, Reason, Status
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.status import Status
 from measure.targets.block_search import Candidate
 from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_disks
 from pipeline.files.camera_file import CameraFile

@@ -4,10 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason, Status
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.status import Status
 from measure.targets.block_search import Candidate
 from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_disks
 from measure.targets.sheets import Dots, Naming, name_dots

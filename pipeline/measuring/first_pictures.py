@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.detection.recurrence import Recurrence, Window, about, recurrence
 from measure.errors import MeasurementError
 from measure.fiducials.clicked_frame import LEAST_CLICKS, on_a_line
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.measurement import measure_fiducials
+from measure.geometry import POSES, up_from_camera
 from measure.marks import shapes
-from measure.marks.poses import POSES, up_from_camera
+from measure.marks.templates import cut, template_of
 from measure.scans.parallel import map_items
 from measure.scans.scan import Scan
-from measure.special_marks.learned import cut, template_of
-from measure.special_marks.recurring import Recurrence, Window, about, recurrence
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.learned_table import Clicks, LearnedFrom

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason, Status
 from measure.results import MarkMeasurement
 from measure.scans.remote import scan_path
-from measure.status import Status
 from measure.tie_points.features import TieFrame
 from measure.tie_points.joins import measure_joins
 from pipeline.files.project_file import Project

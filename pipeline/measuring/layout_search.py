@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.camera_recognition import Answer, answer, seen
 from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
+from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon, thinnest_mm
 from measure.scans.scan import Scan
 from measure.scans.scan_views import thumbnail

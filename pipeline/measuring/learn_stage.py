@@ -14,11 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from measure.marks.shapes import LearnedMark, Mark, MarkTemplate
-from measure.results import FrameMeasurement
-from measure.revision import MEASURE_REVISION
+from measure.marks.templates import Chip, cut, template_of, with_common_origins
+from measure.results import MEASURE_REVISION, FrameMeasurement
 from measure.scans.parallel import map_items
-from measure.special_marks.learned import Chip, cut, template_of
-from measure.special_marks.symmetry import with_common_origins
 from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.project_file import Project

@@ -13,16 +13,15 @@ from measure.annotations.detect_text import MISSING, networks
 from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
 from measure.fiducials.frame_checks import pitch_problem, with_damage
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.second_frame import second_frame
+from measure.flags import Code, Reason, Status
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
-from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, moved_frame
 from measure.scans.remote import public_text
 from measure.scans.scan import Scan
 from measure.scans.scan_part import ScanPart, Window
 from measure.scans.scan_views import crop_scan
-from measure.second_frame import second_frame
-from measure.status import Status
 from pipeline.errors import InputError, what_to_do
 from pipeline.measuring.camera_model import misplaced_principal_point
 from pipeline.measuring.handed_out import Submits, results_of

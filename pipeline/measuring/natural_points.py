@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason
 from measure.scans.remote import scan_path
 from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import measure_ties

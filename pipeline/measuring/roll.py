@@ -14,10 +14,10 @@ import numpy as np
 from measure.annotations.line import KnownLine, Line, without_numbers
 from measure.annotations.orientation_from_text import bounded, line_score
 from measure.fiducials.scan_orientation import DECIDED, TOLD
-from measure.marks.poses import POSES, pose_in_camera, up_from_camera
+from measure.flags import Status
+from measure.geometry import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import WrittenPlace
 from measure.results import FrameMeasurement, Pose
-from measure.status import Status
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, few_of
 from pipeline.progress import Reporter
 from pipeline.results.measured_scan import MeasuredScan

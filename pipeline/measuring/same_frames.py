@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason
 from measure.results import FrameMeasurement
 from pipeline.results.frames_file import said
 from pipeline.results.measured_scan import MeasuredScan

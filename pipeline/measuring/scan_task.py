@@ -11,7 +11,7 @@ from adjust.problem.camera import Distortion, Prior
 from adjust.problem.network import Exterior
 from measure.annotations.line import KnownLine
 from measure.errors import MissingError
-from measure.fiducial_options import FiducialOptions
+from measure.fiducials.options import FiducialOptions
 from measure.results import Pose
 from measure.scans.remote import fetch_location, public_address, scan_path
 from measure.tone.curve import ToneInformation

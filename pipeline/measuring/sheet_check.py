@@ -7,10 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.probabilities import SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE
-from measure.reason import Code, Reason
+from measure.flags import SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE, Code, Reason, Status
 from measure.results import MarkMeasurement
-from measure.status import Status
 from measure.targets.consistency import FLAT, ImagePoints, SheetImage, along_plane, compared_together, sheet_points
 from pipeline.files.project_file import Project
 from pipeline.measuring.coded_points import CodedPoints

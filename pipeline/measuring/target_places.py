@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_vector
-from measure.probabilities import TARGET_ELSEWHERE, TARGET_OFF_PLACE
-from measure.reason import Code, Reason
+from measure.flags import TARGET_ELSEWHERE, TARGET_OFF_PLACE, Code, Reason, Status
 from measure.results import MarkMeasurement
-from measure.status import Status
 from measure.targets.consistency import TargetPlaces, compared
 from pipeline.measuring.target_field import Field
 from pipeline.results.comparator_file import pixel_from_comparator

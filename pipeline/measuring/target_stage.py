@@ -10,10 +10,9 @@ from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.initial_values.resection import resect
 from measure.boards.measure import measure_board
-from measure.reason import Code, Reason
+from measure.flags import Code, Reason, Status
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan
-from measure.status import Status
 from measure.targets.measure_targets import TargetPrediction
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.camera_model import camera_model

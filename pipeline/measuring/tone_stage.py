@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, Polygon
-from measure.revision import MEASURE_REVISION
+from measure.results import MEASURE_REVISION
 from measure.scans.head import declared_tone
 from measure.tone.curve import Tone, ToneInformation, power, srgb
 from pipeline.files.camera_file import CameraFile

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial.legendre import legval2d, legvander2d
 from numpy.typing import NDArray
 
-from measure.status import Status
+from measure.flags import Status
 from pipeline.archive.measurement import read_measurement
 from pipeline.results.measured_scan import MeasuredScan
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from measure.covariance import MEANING, Covariance
-from measure.status import Status
+from measure.flags import CAUSE_MEANING, Status
+from measure.results import Covariance
 from pipeline.report import thumbnails, vectors
 from pipeline.report.data import Json, ReportData
 from pipeline.report.marks import Frame, Mark
@@ -167,7 +167,9 @@ def _causes(covariance: Covariance | None) -> tuple[tuple[str, str, str], ...]:
     sigmas = {} if covariance is None else covariance.sigmas_px
     told = {cause: sigma for cause, sigma in sigmas.items() if sigma >= _LEAST_TOLD_PX}
     return (
-        tuple((str(cause), fixed(sigma, 3), MEANING[cause]) for cause, sigma in told.items()) if len(told) > 1 else ()
+        tuple((str(cause), fixed(sigma, 3), CAUSE_MEANING[cause]) for cause, sigma in told.items())
+        if len(told) > 1
+        else ()
     )
 
 

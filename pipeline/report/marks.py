@@ -8,10 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Covariance
-from measure.reason import Code, Reason
-from measure.results import MarkMeasurement
-from measure.status import Status
+from measure.flags import Code, Reason, Status
+from measure.results import Covariance, MarkMeasurement
 from pipeline.report.data import Json, ReportData
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_scan import MeasuredScan

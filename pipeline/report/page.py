@@ -10,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from measure import reason, status
+from measure import flags
 from pipeline.drawing import svg
 from pipeline.report.camera_views import camera_views
 from pipeline.report.charts import fraction_plot
@@ -108,8 +108,8 @@ def _common(data: ReportData) -> dict[str, Any]:
         "adjustment": data.adjustment,
         "critical_w": critical_w(2 * len(data.adjustment["residuals"])) if data.adjustment else 0.0,
         "has_pictures": data.thumbnail is not None,
-        "meaning": status.MEANING,
-        "codes": reason.MEANING,
+        "meaning": flags.STATUS_MEANING,
+        "codes": flags.CODE_MEANING,
     }
 
 

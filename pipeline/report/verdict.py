@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from adjust.problem.parameter import description, parameter_from_text
-from measure.status import Status
+from measure.flags import Status
 from pipeline.report.data import Json, Problem, ReportData
 from pipeline.report.fractions import places_px
 from pipeline.report.frame_problems import assumed_poses, frame_problems, pixel_locking, said_by

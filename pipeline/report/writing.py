@@ -3,7 +3,7 @@
 from markupsafe import Markup
 
 from measure.annotations.line import Line
-from measure.marks.poses import up_from_camera
+from measure.geometry import up_from_camera
 from pipeline.drawing import svg
 from pipeline.results.measured_scan import MeasuredScan
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem.observations import ObservationKind
+from measure.flags import Status
 from measure.results import FrameMeasurement
-from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.text.atomic import atomic_path
 from pipeline.text.csv_table import Row, csv_line, csv_rows

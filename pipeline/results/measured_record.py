@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.annotations.line import Line, Reading
-from measure.covariance import Cause, Covariance
-from measure.reason import Reason
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
-from measure.status import Status
+from measure.flags import Cause, Reason, Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, srgb
 from measure.tone.estimate import FrameTone
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import MEANING
+from measure.flags import CAUSE_MEANING
 from measure.marks.shapes import FrameCorner, LayoutMark
 from measure.results import MarkMeasurement
 from pipeline.archive.digests import DamagedError
@@ -203,5 +203,5 @@ def _second(mark: MarkMeasurement) -> list[float] | None:
 def _causes(mark: MarkMeasurement) -> list[Json]:
     """What its sigma consists of, the largest part first."""
     parts = mark.covariance.parts.items() if mark.covariance else ()
-    told = [(str(c), MEANING[c], float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
+    told = [(str(c), CAUSE_MEANING[c], float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
     return [{"cause": c, "meaning": m, "sigma_px": s} for c, m, s in sorted(told, key=lambda one: -one[2])]

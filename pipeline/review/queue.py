@@ -13,8 +13,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from measure.reason import Code
-from measure.status import Status
+from measure.flags import Code, Status
 from pipeline.archive.digests import check_judging, damaged_frames, damaged_sentence
 from pipeline.archive.verdicts import Verdict
 from pipeline.files.project_file import Project

@@ -19,8 +19,8 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from measure.errors import MeasurementError
-from measure.fiducial_options import Click
-from measure.marks.poses import POSES
+from measure.fiducials.options import Click
+from measure.geometry import POSES
 from pipeline.errors import InputError
 from pipeline.files.decisions_file import KINDS, LEARNED, MEANING, OF_SCANS, Choice, Decision
 from pipeline.files.project_file import Project

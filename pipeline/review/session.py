@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from itertools import chain
 from typing import Any
 
-from measure.marks.poses import POSES
+from measure.geometry import POSES
 from measure.scans.remote import fetch_location
 from pipeline.archive.store import Store
 from pipeline.errors import InputError

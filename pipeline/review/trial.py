@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from measure.fiducial_options import Click
+from measure.fiducials.options import Click
 from pipeline.errors import InputError
 from pipeline.files.learned_table import Clicks
 from pipeline.files.project_file import Project

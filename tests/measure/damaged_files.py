@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
 from measure.fiducials.measurement import measure_fiducials
+from measure.flags import Status
 from measure.results import FrameMeasurement
 from measure.scans.scan import open_scan
-from measure.status import Status
 
 Damage = Callable[[bytearray, np.random.Generator], None]
 

@@ -7,11 +7,11 @@ import numpy as np
 from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Status
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, Mark, MarkShape, Part, ring_cross
 from measure.results import FrameMeasurement
-from measure.status import Status
 
 PITCH_UM, PX_PER_MM = 50.0, 20.0
 FRAME_PX = 400

@@ -9,13 +9,13 @@ from drawn import scan_of
 from drawn_frames import ALIKE
 
 from measure.detection.correlation import CLOSE, GRAINY
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials import stages
 from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import PitchHypothesis, pitch_hypotheses
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch
 from measure.fiducials.stages import Attempt, Found, find_frame
-from measure.probabilities import FRAMES_BY_CHANCE
+from measure.flags import FRAMES_BY_CHANCE
 
 GIVEN = PitchHypothesis((0.05, 0.05), 0.04, (0.05, 0.05))
 SCAN = scan_of(np.zeros((400, 400)))

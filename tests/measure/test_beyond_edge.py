@@ -8,11 +8,11 @@ from scipy.ndimage import gaussian_filter
 
 from measure.detection.correlation import CLOSE
 from measure.detection.prediction import MarkPrediction
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.mark_fit import sight
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import MarkShape, cross, polygon
-from measure.match_options import MatchOptions
+from measure.matching.options import MatchOptions
 from measure.matching.window import pixels_beyond_edge
 
 PX_PER_MM = 30.0

@@ -28,10 +28,9 @@ from measure.boards.specs import (
     SquareGridSpec,
     aruco_dictionary,
 )
-from measure.covariance import Covariance
-from measure.results import MarkMeasurement
+from measure.flags import Status
+from measure.results import Covariance, MarkMeasurement
 from measure.scans.scan import open_scan
-from measure.status import Status
 
 Array = NDArray[np.float64]
 WIDTH, HEIGHT = 320, 260

@@ -11,16 +11,16 @@ from brute_marks import Array, written_scan
 from drawn_frames import CORNERS, NUMBERED, RING_CROSS, assert_right, frame_picture, layout_of, pixel_from_camera
 from range_server import range_server
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.hypotheses import PitchHypothesis, is_lattice, room_mm
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch
+from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
 from measure.results import FrameMeasurement
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan, open_scan
-from measure.status import Status
 
 PITCH_UM = (50.0, 50.0)
 

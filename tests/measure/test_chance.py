@@ -10,23 +10,23 @@ from drawn import scan_of
 from drawn_frames import layout_of, paint
 from numpy.typing import NDArray
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measurement
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import PitchHypothesis, pitch_hypotheses
 from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.orientation_pictures import SPOILT, Shown, Site
 from measure.fiducials.rows import present_frame
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch
 from measure.fiducials.significance import doubt
-from measure.marks.poses import POSES, up_from_camera
+from measure.flags import Status
+from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, MarkShape, dot
+from measure.marks.templates import cut, template_of
 from measure.results import Pose
 from measure.scans.scan import Scan
-from measure.special_marks.learned import cut, template_of
-from measure.status import Status
 
 PX_PER_MM = 20.0
 CONTRAST_DN = 8000.0

@@ -7,7 +7,7 @@ from brute_marks import Array, written_scan
 from drawn_frames import FRAME_PX, NUMBERED, assert_right, measured, paint, pixel_from_camera
 
 from measure.fiducials.channels import best_weights
-from measure.special_marks.learned import cut
+from measure.marks.templates import cut
 
 RED, GREEN, BLUE = np.eye(3)
 AS_LIGHT = 0.299 / 0.587  # of green that is lost for a mark of more red to be as light as its ground

@@ -17,12 +17,11 @@ from drawn_frames import (
     pixel_from_camera,
 )
 
-from measure.covariance import Cause
-from measure.fiducial_options import CLICK_SIGMA_PX, Click, FiducialOptions
-from measure.marks.poses import POSES
+from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
+from measure.flags import Cause, Status
+from measure.geometry import POSES
 from measure.marks.shapes import MarkShape
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
 
 FAR_TURN_RAD = 0.35  # twenty degrees: no search looks for a frame that is laid so
 

@@ -6,10 +6,10 @@ from drawn import scan_of
 from true_marks import KIND, TrueMark, some_mark, whitened_rms
 
 from measure.detection.prediction import MarkPrediction
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.mark_fit import sight
-from measure.matching.match import Match
+from measure.fiducials.options import FiducialOptions
 from measure.matching.saturation import censored, clipped_sides, noise_scale
+from measure.results import MarkFit
 
 FULL, CONTRAST = 65535.0, 20000.0
 
@@ -21,7 +21,7 @@ def dark_mark(name: str, beyond: float, snr: float, rng: np.random.Generator) ->
     return mark, FULL + CONTRAST * (beyond - mark.picture + noise)
 
 
-def sighted(mark: TrueMark, grey: np.ndarray, polarity: int = -1) -> Match:
+def sighted(mark: TrueMark, grey: np.ndarray, polarity: int = -1) -> MarkFit:
     start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
     fit = sight(

@@ -10,15 +10,15 @@ from drawn import scan_of
 from drawn_frames import layout_of, paint
 
 from measure.detection.correlation import CLOSE, WIDE, Surroundings
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials import frame_sighter
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame_sighter import FrameSighter
 from measure.fiducials.mark_fit import Sighting
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Status
 from measure.marks.shapes import MarkShape, polygon, turned_part
-from measure.matching.match import Match
-from measure.status import Status
+from measure.results import MarkFit
 
 PX_PER_MM = 20.0
 HALF_MM = 5.5
@@ -62,7 +62,7 @@ def test_wings_are_found_beside_an_edge_that_is_nine_times_as_strong(contrast: f
 def test_at_a_closer_look_marks_are_taken_that_noise_seldom_makes_for_all_together_decide(
     surroundings: Surroundings, chance: float, is_taken: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    faint = cast(Match, SimpleNamespace(likeness=0.1, significance=3.0))
+    faint = cast(MarkFit, SimpleNamespace(likeness=0.1, significance=3.0))
     monkeypatch.setattr(
         frame_sighter, "sight", lambda _, expected, __: Sighting(expected.center_px, True, faint, chance=chance)
     )

@@ -7,7 +7,7 @@ from measure.detection.candidates import Responses
 from measure.detection.response_layers import layers_of, peaks
 from measure.detection.scan_maps import Held
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
-from measure.marks.poses import POSES, up_from_camera
+from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import LayoutMark, MarkShape, dot
 
 DOT = MarkShape(dot(0.3), "light")

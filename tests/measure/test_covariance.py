@@ -3,9 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from measure.covariance import MEANING, Cause, Covariance
-from measure.results import MarkMeasurement
-from measure.status import Status
+from measure.flags import CAUSE_MEANING, Cause, Status
+from measure.results import Covariance, MarkMeasurement
 
 
 def test_the_covariance_of_a_mark_is_the_sum_of_its_causes() -> None:
@@ -35,4 +34,4 @@ def test_a_stretched_place_stretches_every_cause() -> None:
 
 
 def test_every_cause_is_explained() -> None:
-    assert set(MEANING) == set(Cause)
+    assert set(CAUSE_MEANING) == set(Cause)

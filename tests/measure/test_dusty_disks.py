@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from drawn import drawn, ellipse, scan_of, whitened
 
-from measure.covariance import Covariance
-from measure.matching.covariance import SecondPlace
-from measure.status import Status
+from measure.flags import Status
+from measure.results import Covariance, SecondPlace
 from measure.targets.disks import FittedDisk, doubts
 from measure.targets.measure_targets import TargetPrediction, measure_disks
 

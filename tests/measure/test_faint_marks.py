@@ -6,9 +6,9 @@ import numpy as np
 from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
-from measure.covariance import Cause
 from measure.detection.faint_marks import FaintMark, find_faint
 from measure.detection.prediction import MarkPrediction
+from measure.flags import Cause
 from measure.marks.shapes import Bar, MarkShape, cross, dot
 from measure.tone.curve import Tone, power
 

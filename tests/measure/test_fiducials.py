@@ -23,11 +23,11 @@ from drawn_frames import (
 )
 from scipy.ndimage import gaussian_filter
 
-from measure.fiducial_options import FiducialOptions
-from measure.marks.poses import POSES
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Status
+from measure.geometry import POSES
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross
-from measure.special_marks.learned import cut, template_of
-from measure.status import Status
+from measure.marks.templates import cut, template_of
 
 
 @pytest.mark.parametrize("pose", POSES)

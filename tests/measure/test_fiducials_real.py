@@ -7,14 +7,14 @@ import pytest
 from numpy.typing import NDArray
 from real_data import DATA, needs
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
 from measure.results import FrameMeasurement
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan, open_scan
-from measure.status import Status
 
 SCANS = DATA / "film_scans"
 pytestmark = needs("film_scans")

@@ -8,8 +8,8 @@ from true_marks import KIND, some_mark
 
 from measure.detection.first_look import seen
 from measure.detection.prediction import MarkPrediction
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.mark_fit import sight
+from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import MarkShape, cross, polygon
 
 GROUND, CONTRAST = 25000.0, 15000.0

@@ -9,11 +9,11 @@ from drawn import Array, drawn, scan_of, transformed
 from drawn_frames import layout_of, pixel_from_camera
 from scipy.ndimage import gaussian_filter
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Status
 from measure.marks.frame_border import at_border, known_outline_mm
 from measure.marks.shapes import FiducialLayout, MarkShape, Point, Polygon, turned_part
-from measure.status import Status
 
 HALF_MM, WEDGE_MM, SIDES = 8.0, 7.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 PIXEL_FROM_CAMERA = pixel_from_camera("90", turn_rad=0.03)

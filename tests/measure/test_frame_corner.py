@@ -9,14 +9,13 @@ from drawn import drawn, scan_of, transformed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from measure.detection.prediction import MarkPrediction
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.frame_edges import told_by_edges
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, frame_corner, polygon
-from measure.matching.match import Match
-from measure.special_marks.frame_corner import corner_of_edges
-from measure.status import Status
+from measure.matching.frame_edge import fit_frame_corner
+from measure.results import MarkFit
 from measure.tone.curve import Tone, power
 
 Array = NDArray[np.float64]
@@ -85,7 +84,7 @@ def test_no_corner_is_seen_in_a_landscape(tmp_path: Path) -> None:
     start = np.column_stack([MATRIX[:, :2], (200.0, 200.0)])
     with written_scan(np.asarray(land), tmp_path) as scan:
         corner = frame_corner((-10.0, 10.0), 5.0)
-        fit = corner_of_edges(scan, corner, MarkPrediction(corner, start, 10.0, 1))
+        fit = fit_frame_corner(scan, corner, start, 10.0, 1)
     assert not fit.converged
     assert "edge of the frame" in fit.reason
 
@@ -97,8 +96,8 @@ def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> No
     scan = scan_of(65535 * (picture(4) / 65535) ** (1 / gamma))
     tone = Tone(power(gamma), covariance=np.eye(5))
 
-    def fitted(tone: Tone) -> Match:
-        fit = corner_of_edges(scan.replace_tone(tone), corner, MarkPrediction(corner, start, 6.0, 1))
+    def fitted(tone: Tone) -> MarkFit:
+        fit = fit_frame_corner(scan.replace_tone(tone), corner, start, 6.0, 1)
         assert fit.converged
         return fit
 

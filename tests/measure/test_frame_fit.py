@@ -5,8 +5,8 @@ import pytest
 from brute_marks import Array
 
 from measure.fiducials.interior_orientation import fit_frame, outliers
-from measure.film import AFFINITY_SIGMA
-from measure.marks.poses import POSES, up_from_camera
+from measure.fiducials.options import AFFINITY_SIGMA
+from measure.geometry import POSES, up_from_camera
 
 SQUARE = np.array([(100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0)])
 EIGHT = np.array([*SQUARE, (100.0, 0.0), (-100.0, 0.0), (0.0, 100.0), (0.0, -100.0)])

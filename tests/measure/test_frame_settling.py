@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 from true_marks import KIND, TrueMark, some_mark
 
-from measure.covariance import Cause, Covariance
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.frame_sighter import FrameSighter
 from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Cause, Status
 from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.results import Covariance
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
-from measure.status import Status
 
 PX_PER_MM, SIDE_PX, AT_MM = 10.0, 600, 20.0
 PLACES = [(x, y) for y in (-AT_MM, 0.0, AT_MM) for x in (-AT_MM, 0.0, AT_MM) if x or y]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from measure.flags import NO_REASON, Code, Reason
 from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED, gauss_newton, gauss_newton_halving
-from measure.reason import NO_REASON, Code, Reason
 
 FAR = Reason("too far", Code.NO_FIT)
 

@@ -7,8 +7,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from measure.covariance import Cause
-from measure.status import Status
+from measure.flags import Cause, Status
 from measure.tie_points.features import TieFrame
 from measure.tie_points.joins import Joins, measure_joins
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.covariance import Cause, Covariance
 from measure.fiducials.across_frames import judged
-from measure.film import BelievedFilm
-from measure.marks.poses import up_from_camera
+from measure.fiducials.options import BelievedFilm
+from measure.flags import Cause, Status
+from measure.geometry import up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
-from measure.status import Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 
 Array = NDArray[np.float64]
 PX_PER_MM, SIGMA_PX, FILM_MM = 50.0, 0.02, 0.003

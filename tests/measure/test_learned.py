@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
+from measure.detection.recurrence import recurrence
 from measure.marks.shapes import MarkShape, polygon
+from measure.marks.templates import Chip, template_of
+from measure.matching.covariance import honest_covariance
 from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
-from measure.special_marks.learned import Chip, honest_covariance, template_of
-from measure.special_marks.recurring import recurrence
 
 Array = NDArray[np.float64]
 

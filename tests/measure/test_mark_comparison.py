@@ -15,7 +15,7 @@ from measure.fiducials.mark_comparison import (
     shared_sizes,
     touch_of_round,
 )
-from measure.matching.covariance import OwnShape
+from measure.results import OwnShape
 
 PIXEL = 1 / 12
 

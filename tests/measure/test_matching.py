@@ -9,8 +9,9 @@ from brute_marks import Array, brute_picture, placed
 from scipy.ndimage import gaussian_filter
 
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
-from measure.matching.match import Match, MatchOptions, match
+from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
+from measure.results import MarkFit
 
 SIZE, SCALE, CONTRAST, GROUND = 41, 10.0, 500.0, 1000.0
 MARKS = {
@@ -40,7 +41,7 @@ def drawn(name: str, blur_px: float) -> tuple[tuple[Array, Array], ...]:
 
 def measured(
     grey: Array, mark: Mark, place: Array, rng: np.random.Generator, options: MatchOptions | None = None
-) -> Match:
+) -> MarkFit:
     """The match from a start that is off by up to 0.7 px, with the drawn size and no turn."""
     start = placed(SCALE, tuple(place[:, 2] + rng.uniform(-0.7, 0.7, 2)))
     return match(ScanWindow(grey), mark, start, options)

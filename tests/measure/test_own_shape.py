@@ -5,9 +5,10 @@ import numpy as np
 from drawn import Array, drawn, transformed
 
 from measure.marks.shapes import MarkShape, Polygon
-from measure.match_options import MatchOptions
-from measure.matching.match import Match, match
+from measure.matching.match import match
+from measure.matching.options import MatchOptions
 from measure.matching.window import ScanWindow
+from measure.results import MarkFit
 
 SIZE, CONTRAST = 41, 500.0
 PLACE = np.array([6.3, 20.2])
@@ -16,7 +17,7 @@ START = np.column_stack([np.diag([30.0, -30.0]), PLACE])
 FRAME = MatchOptions(linear_sigma=4e-4, margin_px=7.0)
 
 
-def fits(scale: float, turn: float, sigma: float, count: int) -> list[Match]:
+def fits(scale: float, turn: float, sigma: float, count: int) -> list[MarkFit]:
     """Wedges so much larger and turned against START, by half planes."""
     change = np.array([[1 + scale, -turn], [turn, 1 + scale]])
     mark_from_pixel = np.linalg.inv(change @ START[:, :2])

@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from measure.covariance import Covariance
 from measure.fiducials.frame_checks import pitch_problem
+from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
-from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 
 
 def layout(sigma_mm: float) -> FiducialLayout:

@@ -12,15 +12,15 @@ from drawn_frames import CORNERS, PITCH_UM, frame_picture, layout_of, measured, 
 from scipy.ndimage import gaussian_filter
 
 from measure.detection.first_look import seen
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials import mark_fit
 from measure.fiducials.constellation import Placement
 from measure.fiducials.hypotheses import pitch_hypotheses
 from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch
+from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, polygon, turned_part
-from measure.status import Status
 
 HALF_WEDGE = MarkShape(polygon(((0.0, 0.0), (1.4, 0.0), (1.4, 0.8))))
 ANGLES = [float(np.degrees(np.arctan2(y, x))) for x, y in CORNERS]

@@ -17,20 +17,20 @@ from true_marks import (
     whitened_rms,
 )
 
-from measure.covariance import Cause
 from measure.detection.prediction import MarkPrediction
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.mark_fit import sight
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.flags import Cause
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
-from measure.matching.match import Match
+from measure.results import MarkFit
 from measure.targets.disks import fit_disk
 from measure.tone.curve import Tone
 
 GROUND, CONTRAST, SNR = 25000.0, 15000.0, 20.0
 
 
-def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, rounding_step_dn: float = 0.0) -> Match:
+def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, rounding_step_dn: float = 0.0) -> MarkFit:
     start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
     scan, options = scan_of(grey, rounding_step_dn=rounding_step_dn), FiducialOptions().match

@@ -9,23 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from measure.reason import MEANING, NO_REASON, Code, Reason
+from measure.flags import CODE_MEANING, NO_REASON, Code, Reason, Status
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_every_code_has_a_meaning_and_is_short() -> None:
-    assert set(MEANING) == set(Code)
+    assert set(CODE_MEANING) == set(Code)
     assert all(re.fullmatch(r"[a-z]+(-[a-z]+)?", code) for code in Code)
-    assert all(meaning.endswith(".") for meaning in MEANING.values())
+    assert all(meaning.endswith(".") for meaning in CODE_MEANING.values())
 
 
 def test_the_page_has_the_table() -> None:
     page = (ROOT / "docs" / "reading-the-report.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `([a-z-]+)` \| (.+) \|$", page, flags=re.MULTILINE))
-    assert rows == {str(code): meaning for code, meaning in MEANING.items()}
+    assert rows == {str(code): meaning for code, meaning in CODE_MEANING.items()}
 
 
 def test_every_reason_of_the_code_has_a_code() -> None:
@@ -43,7 +42,7 @@ def test_every_code_is_used() -> None:
     used = {
         node.attr
         for file, node in nodes_of_files_with("Code.")
-        if file.name != "reason.py"
+        if file.name != "flags.py"
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "Code"
     }
     assert used == set(Code.__members__)

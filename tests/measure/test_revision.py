@@ -15,10 +15,9 @@ from scipy.ndimage import gaussian_filter
 
 from measure.boards.measure import measure_board
 from measure.boards.specs import ChessboardSpec
-from measure.fiducial_options import FiducialOptions
+from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import MarkShape, polygon, turned_part
-from measure.results import MarkMeasurement
-from measure.revision import MEASURE_REVISION
+from measure.results import MEASURE_REVISION, MarkMeasurement
 from measure.targets.measure_targets import TargetPrediction, measure_disks
 
 TABLE = Path(__file__).with_name("revision.json")

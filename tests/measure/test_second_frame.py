@@ -8,11 +8,11 @@ import pytest
 from brute_marks import written_scan
 from drawn_frames import ALIKE, FRAME_PX, PITCH_UM, frame_picture, pixel_from_camera
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.fiducials.second_frame import second_frame
 from measure.results import moved_frame
 from measure.scans.scan_views import crop_scan
-from measure.second_frame import second_frame
 
 
 @pytest.mark.parametrize(("second", "is_named"), [("0", True), ("90", True), (None, False)])

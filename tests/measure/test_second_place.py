@@ -9,10 +9,11 @@ from brute_marks import Array, brute_picture, placed
 from drawn import drawn, ellipse
 
 from measure.marks.shapes import Mark, MarkShape, polygon, ring_cross
-from measure.match_options import MatchOptions
-from measure.matching.covariance import SecondPlace, across_edges
-from measure.matching.match import Match, match
+from measure.matching.covariance import across_edges
+from measure.matching.match import match
+from measure.matching.options import MatchOptions
 from measure.matching.window import ScanWindow
+from measure.results import MarkFit, SecondPlace
 from measure.targets.disks import UNIT_DISK
 
 SIZE, CONTRAST = 41, 500.0
@@ -30,7 +31,7 @@ def edge_chances(mark: Mark, grey: Array, place: Array, options: MatchOptions, c
     return chances([match(ScanWindow(each), mark, place, options).edges for each in noisy])
 
 
-def disks(slope: float, sigma: float, count: int) -> list[Match]:
+def disks(slope: float, sigma: float, count: int) -> list[MarkFit]:
     """Disks whose paint is darker by slope times the contrast a radius to the right."""
     start = np.column_stack([RADIUS * np.eye(2), DISK_PLACE])
     inside = ellipse(DISK_PLACE, RADIUS * np.eye(2))

@@ -5,8 +5,8 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, some_mark, whitened_rms
 
-from measure.match_options import MatchOptions
 from measure.matching.match import match
+from measure.matching.options import MatchOptions
 from measure.matching.window import read_window
 from measure.noise.noise_model import steadiness
 from measure.tone.curve import Tone, power

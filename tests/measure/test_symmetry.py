@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from brute_marks import brute_picture
 
-from measure.marks.poses import POSES, up_from_camera
+from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import MarkShape, MarkTemplate, cross, polygon
-from measure.special_marks.symmetry import with_common_origins
+from measure.marks.templates import with_common_origins
 
 PLACES = np.array([(6.0, -6.0), (-6.0, -6.0), (-6.0, 6.0), (6.0, 6.0)])
 SIDE, PX_PER_MM = 61, 20.0

@@ -6,9 +6,9 @@ import pytest
 from drawn import drawn, ellipse, scan_of, transformed, whitened
 from numpy.typing import NDArray
 
+from measure.flags import Status
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.status import Status
 from measure.targets.crosses import CrossSearch, cross_candidates
 from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 

@@ -10,12 +10,13 @@ from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 from measure.detection.prediction import MarkPrediction
 from measure.fiducials.mark_fit import options_for, sight
 from measure.marks.shapes import MarkShape, polygon
-from measure.match_options import MatchOptions
 from measure.matching.covariance import Landscape, LinearFit
-from measure.matching.match import Match, match
+from measure.matching.match import match
+from measure.matching.options import MatchOptions
 from measure.matching.tone_information import mark_tone_information
 from measure.matching.window import read_window
 from measure.noise.noise_model import NoiseModel
+from measure.results import MarkFit
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone, MarkTone
 from synthetic_images.tone_curve import coded
@@ -35,13 +36,13 @@ def code_of(mark: TrueMark, curve: float | str, snr: float, rng: np.random.Gener
     return FULL * coded(np.clip(light, 0.0, 1.0).astype(np.float32), curve)
 
 
-def fitted(mark: TrueMark, code: np.ndarray, tone: Tone) -> Match:
+def fitted(mark: TrueMark, code: np.ndarray, tone: Tone) -> MarkFit:
     scan = scan_of(code).replace_tone(tone)
     options = options_for(mark.kind.shape, MatchOptions(linear_sigma=0.05), mark.kind.known)
     return match(read_window(scan, (0, 0, mark.size, mark.size)), mark.kind.shape, mark.place, options)
 
 
-def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tuple[list[Match], FrameTone]:
+def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tuple[list[MarkFit], FrameTone]:
     """From the first start at which the marks agree on the curve that they were matched by, or the best."""
     tried = []
     for start in (prior, prior.shift_to_power(1.0), prior.shift_to_power(2.2)):
@@ -53,7 +54,7 @@ def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tupl
 
 def settled_from(
     tone: Tone, marks: list[TrueMark], codes: list[np.ndarray], prior: Tone
-) -> tuple[list[Match], FrameTone]:
+) -> tuple[list[MarkFit], FrameTone]:
     for _ in range(5):
         fits = [fitted(mark, code, tone) for mark, code in zip(marks, codes, strict=True)]
         told = {n: fit.tone for n, fit in enumerate(fits) if fit.tone is not None}

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.covariance import Covariance
 from measure.fiducials.across_frames import judged
+from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
-from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 
 Array = NDArray[np.float64]
 THREE = {"1": (26.0, -26.0), "2": (-26.0, -25.0), "3": (-25.5, 26.0)}

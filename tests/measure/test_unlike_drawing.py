@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from true_marks import KIND, Kind, some_mark, whitened_rms
 
-from measure.covariance import Cause
+from measure.flags import Cause
 from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross
 from measure.matching.covariance import LinearFit
 from measure.matching.match import MatchOptions, match

@@ -12,9 +12,9 @@ from drawn_frames import PITCH_UM, RING_CROSS, frame_picture, layout_of, pixel_f
 
 from measure.annotations.line import KnownLine, Line, Reading, of_one_face
 from measure.annotations.orientation_from_text import main_pose, side_in_camera, writing_likelihoods
-from measure.fiducial_options import FiducialOptions, Reads
 from measure.fiducials.measurement import measure_fiducials
-from measure.marks.poses import POSES, pose_in_camera, up_from_camera
+from measure.fiducials.options import FiducialOptions, Reads
+from measure.geometry import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import MarkShape, Side, WrittenPlace
 from measure.results import FrameMeasurement
 

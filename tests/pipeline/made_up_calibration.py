@@ -28,9 +28,8 @@ from adjust.problem.result import (
     Suspect,
     VarianceFactor,
 )
-from measure.covariance import Cause, Covariance
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
-from measure.status import Status
+from measure.flags import Cause, Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline.report import ReportData, Thumbnail
 from pipeline.results.adjustment_file import write_adjustment
 from pipeline.results.adjustment_reader import read_adjustment, read_covariance

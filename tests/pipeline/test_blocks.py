@@ -14,7 +14,7 @@ from simulated import FIDUCIALS, affine, rotation
 from adjust.functional_model.transformation import Film
 from adjust.problem.camera import Distortion, Prior
 from adjust.problem.network import ObjectPoint
-from measure.status import Status
+from measure.flags import Status
 from pipeline.blocks.block_stage import written_block
 from pipeline.blocks.mapping import Mapped, Sight, camera_params
 from pipeline.blocks.pictures import BlockPicture, BlockScan, lattice_of, write_pictures

@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 from drawn_project import write_project
 
-from measure.covariance import Cause, Covariance
-from measure.fiducial_options import Click, FiducialOptions
-from measure.reason import Code, Reason
-from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
+from measure.fiducials.options import Click, FiducialOptions
+from measure.flags import Cause, Code, Reason, Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.archive.decided import after_checks, before_checks, decided
 from pipeline.cli import run
 from pipeline.errors import InputError, WriteError

@@ -11,12 +11,10 @@ import pytest
 import tifffile
 from kept_scans import keep_scans
 
-from measure.covariance import Cause, Covariance
-from measure.film import SCATTER_MM, BelievedFilm
+from measure.fiducials.options import SCATTER_MM, BelievedFilm
+from measure.flags import Cause, Code, Reason, Status
 from measure.marks.shapes import MarkShape, MarkTemplate, Polygon, turned
-from measure.reason import Code, Reason
-from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera

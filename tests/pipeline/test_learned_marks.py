@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from single_scans import measure_scan
 
+from measure.flags import Status
 from measure.marks.shapes import MarkTemplate
 from measure.results import FrameMeasurement
-from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import Project, read_project

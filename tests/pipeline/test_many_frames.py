@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 from kept_scans import keep_scans
 
-from measure.covariance import Cause, Covariance
-from measure.reason import Code, Reason
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
-from measure.status import Status
+from measure.flags import Cause, Code, Reason, Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline.archive.judging import tell_written
 from pipeline.archive.store import Store
 from pipeline.cli import run

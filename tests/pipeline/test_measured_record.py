@@ -12,10 +12,8 @@ from drawn_project import PROJECT, write_project
 from single_scans import measure_scan
 
 from measure.annotations.line import Line, Reading
-from measure.covariance import Cause, Covariance
-from measure.reason import Code, Reason
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
-from measure.status import Status
+from measure.flags import Cause, Code, Reason, Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone
 from pipeline.files.project_file import read_project

@@ -10,8 +10,7 @@ from in_process import Loses
 from scipy.spatial.distance import pdist
 
 from adjust.problem.camera import Prior
-from measure.reason import Code
-from measure.status import Status
+from measure.flags import Code, Status
 from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, measure_ties
 from measure.tie_points.tracks import TieCandidate

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.reason import NO_REASON
-from measure.status import Status
+from measure.flags import NO_REASON, Status
 from pipeline.drawing.svg import Axes, round_step, ticks
 from pipeline.report import Thumbnail
 from pipeline.report.data import Json

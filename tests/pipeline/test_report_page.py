@@ -9,10 +9,8 @@ from pathlib import Path
 import made_up_calibration
 import pytest
 
-from measure.reason import MEANING as REASONS
-from measure.reason import Code, Reason
+from measure.flags import CODE_MEANING, STATUS_MEANING, Code, Reason, Status
 from measure.results import FrameMeasurement
-from measure.status import MEANING, Status
 from pipeline.report import Problem, ReportData, render_report, write_report
 from pipeline.results.comparator_file import ComparatorPoint
 
@@ -119,7 +117,7 @@ def test_every_mark_has_its_picture() -> None:
 
 def test_the_statuses_are_those_of_the_table() -> None:
     text = Document(good_page()).text
-    for status, meaning in MEANING.items():
+    for status, meaning in STATUS_MEANING.items():
         assert status in text
         assert meaning in text
 
@@ -328,5 +326,5 @@ def test_marks_can_be_chosen_by_the_code_of_their_reason(measured: ReportData) -
     assert '<option value="covered">covered (1)</option>' in html
     text = Document(html).text
     assert "half of it is gone covered size" in text
-    assert REASONS[Code.COVERED] in text
+    assert CODE_MEANING[Code.COVERED] in text
     assert "<select" not in good_page()

@@ -8,8 +8,8 @@ import made_up_calibration
 import numpy as np
 import pytest
 
+from measure.flags import Status
 from measure.results import MarkMeasurement, Pose
-from measure.status import Status
 from pipeline.report import Problem, ReportData, judge
 from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import frames

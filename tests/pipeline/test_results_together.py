@@ -19,7 +19,7 @@ from test_command_line import replaced, results, rewritten_scans
 from adjust.errors import AdjustmentError
 from adjust.problem.camera import Prior
 from measure.errors import MeasurementError
-from measure.status import Status
+from measure.flags import Status
 from pipeline import stages
 from pipeline.adjusting import second_visit
 from pipeline.archive.measurement import read_measurement

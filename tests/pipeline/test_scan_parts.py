@@ -8,7 +8,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from measure.status import Status
+from measure.flags import Status
 from pipeline.cli import LOOK, WRONG_INPUT, run
 from pipeline.files.project_file import read_project
 from pipeline.measuring.measured import measured_scan

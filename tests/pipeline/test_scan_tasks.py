@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from drawn_project import CAMERA, PROJECT, write_project
 
-from measure.status import Status
+from measure.flags import Status
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project

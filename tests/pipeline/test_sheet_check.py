@@ -9,9 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from single_scans import measure_scan
 
-from measure.covariance import Covariance
-from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
+from measure.flags import Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.sheet_check import with_checked_sheet
 from pipeline.results.measured_scan import MeasuredScan

@@ -10,8 +10,8 @@ import tifffile
 from numpy.typing import NDArray
 from single_scans import measure_scan
 
+from measure.flags import Status
 from measure.results import MarkMeasurement
-from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
 from pipeline.files.target_table import read_targets

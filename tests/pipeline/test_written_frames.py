@@ -12,13 +12,11 @@ from rich.console import Console
 from measure.annotations import detect_text as networks_module
 from measure.annotations.line import Line, Reading
 from measure.annotations.orientation_from_text import side_in_camera, writing_likelihoods
-from measure.covariance import Cause, Covariance
-from measure.fiducial_options import FiducialOptions, Reads
-from measure.marks.poses import POSES, pose_in_camera
+from measure.fiducials.options import FiducialOptions, Reads
+from measure.flags import Cause, Code, Reason, Status
+from measure.geometry import POSES, pose_in_camera
 from measure.marks.shapes import Side, WrittenPlace
-from measure.reason import Code, Reason
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
-from measure.status import Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.errors import InputError

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.detection.candidates import FAINT
 from measure.detection.correlation import WIDE
+from measure.matching.window import FAINT
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

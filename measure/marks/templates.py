@@ -6,21 +6,19 @@ square root of their number. Where its origin lies on the mark is a convention, 
 the fiducial's coordinates.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.covariance import Covariance
-from measure.marks.rendering import render
+from measure.geometry import POSES, quarter_turned, up_from_camera
 from measure.marks.shapes import MarkTemplate
-from measure.matching.match import Match
+from measure.marks.shared_picture import NOISE_FLOOR, SharedPicture, adjusted, first_picture
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
-from measure.special_marks.shared_picture import NOISE_FLOOR, SMOOTHED_PX2, SharedPicture, adjusted, first_picture
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -30,8 +28,12 @@ _ROUNDS = 12  # of adjusting; five are enough where pictures are about as sharp 
 _SETTLED_PX, _SETTLED_PX2 = 0.005, 0.02  # no picture moves or is blurred further
 _ROOM_PX = 10  # about the chip, to move in
 _SPREAD_PX = 1.0  # over which it is averaged, for a few pictures alone hardly tell it, yet it changes at the edges
-_LEAST_TOLD = 0.1  # of the slopes' squares: less would tell nothing
-_GRAIN_PX = 1.0  # taken where one picture cannot tell how far its grain reaches
+GRAIN_PX = 1.0  # taken where one picture cannot tell how far its grain reaches
+_ALIKE = 0.8  # correlation of two pictures of one mark, with the landscape beside it
+_CORE = 0.15  # of the picture's side: by so much two origins may lie apart in each coordinate
+_SMOOTH_PX = 5  # of the pictures that are aligned: their noise
+_STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-5)
+_FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,36 +104,6 @@ def _aligned(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[SharedP
     return shared, steady
 
 
-def honest_covariance(template: MarkTemplate, scan: str, fit: Match) -> Covariance:
-    """Of a mark measured in a scan that has a share in its template.
-
-    The scan's noise is in the template too and so is missing from the residuals, in which only the rest, one less its
-    share, is left. Where the template is that scan's picture alone nothing is left: then noise from the picture itself.
-    Slopes of the template that are noise tell nothing of the place, but the fit took them for slopes of the mark.
-    """
-    share = template.shares.get(scan, 0.0)
-    if share == 1.0:
-        return Covariance.of_noise(_covariance_of_noise(template, fit))
-    widened = _without_slope_noise(template, fit)
-    return fit.place_covariance.through(widened / np.sqrt(1.0 - share))
-
-
-def _without_slope_noise(template: MarkTemplate, fit: Match) -> Array:
-    """(2, 2) what an error of the place is to be multiplied by: the squares of all slopes that the fit saw over those
-    of the mark's."""
-    linear, blur_px2 = fit.pixel_from_mark[:, :2], SMOOTHED_PX2 + fit.blur_px**2
-    px_per_sample = float(np.sqrt(abs(np.linalg.det(linear)))) * template.pitch_um / 1000
-    side = int(np.ceil(len(template.image) * px_per_sample))
-    place = np.column_stack([linear, np.full(2, (side - 1) / 2)])
-    shown = render(template, place, side, side, float(np.sqrt(blur_px2)))
-    slopes = np.stack([shown.by_col.ravel(), shown.by_row.ravel()]).astype(float)
-    noise = template.slope_noise_dn / max(float(np.ptp(template.image)), 1e-9) / px_per_sample
-    noise *= SMOOTHED_PX2 / blur_px2  # more blur takes as much of the slopes of white noise
-    told, axes = np.linalg.eigh(slopes @ slopes.T)
-    marks = np.maximum(told - noise**2 * side**2, _LEAST_TOLD * told)
-    return np.asarray(axes * (told / marks) @ axes.T)
-
-
 def _resampled(chip: Chip, pixel_from_mark: Array, side: int, pitch_um: float) -> Array:
     """The chip in the mark's own axes, x right and y up, its origin in the middle pixel."""
     step = (np.arange(side) - side // 2) * (pitch_um / 1000)
@@ -153,7 +125,7 @@ def _steadiness(residuals: Array, image: Array, steady: Mask) -> Array:
 
 def _noise_dn(grey: Array) -> float:
     """Of one pixel: what is finer than grain gets; lines are finer too, but few."""
-    return robust_scale(grey - cv2.GaussianBlur(grey, (0, 0), 2 * _GRAIN_PX))
+    return robust_scale(grey - cv2.GaussianBlur(grey, (0, 0), 2 * GRAIN_PX))
 
 
 def _detail_px(image: Array) -> float:
@@ -163,14 +135,84 @@ def _detail_px(image: Array) -> float:
     return 2 * float(np.interp(-0.5, -np.array(left), blurs))
 
 
-def _covariance_of_noise(template: MarkTemplate, fit: Match) -> Array:
-    """Of a shift, gain and offset, from the picture's slopes and its noise, as grain of _GRAIN_PX correlates it."""
-    side = template.image.shape[0]
-    linear = fit.pixel_from_mark[:, :2]
-    shown = render(template, np.column_stack([linear, np.full(2, side / 2)]), side, side, 0.0)
-    columns = [fit.contrast_dn * shown.by_col, fit.contrast_dn * shown.by_row, shown.value, np.ones_like(shown.value)]
-    design = np.stack([column.ravel() for column in columns], axis=1)
-    size = np.linalg.norm(design, axis=0)
-    inverse = np.linalg.pinv((design / size).T @ (design / size)) / np.outer(size, size)
-    # As many pixels as such grain is wide are one observation: the sum of its correlations.
-    return np.asarray(4 * np.pi * _GRAIN_PX**2 * max(template.noise_dn, 1e-3) ** 2 * inverse[:2, :2])
+# Learned marks that look like one another however their frame lies: then their origins are made one place of each.
+#
+# Where a learned mark's origin lies on it is a convention. In a frame that lies another way a mark may be taken for
+# another that looks like it there, and then the origin would lie elsewhere: unless every such pose takes the origins to
+# one another, as it takes the middles of crosses.
+
+
+def with_common_origins(
+    templates: Sequence[MarkTemplate], places_mm: Array, poses: Collection[str]
+) -> tuple[list[MarkTemplate], Array]:
+    """The templates of a camera's learned marks at places_mm (n, 2), each with those of the poses, which frames do not
+    tell apart, under which all of them look alike, and their origins such that these poses take them to one another;
+    and by how much these moved, mm (n, 2), in the camera's axes."""
+    count, rows, shifts, alike = len(templates), list[Array](), list[Array](), list[str]()
+    for pose in (pose for pose in POSES[1:] if pose in poses):
+        turn = up_from_camera(pose)
+        to = _partners(places_mm, turn, max(template.learned_mm for template in templates))
+        pairs = [] if to is None else [_aligned_origin(templates[k], templates[to[k]], turn) for k in range(count)]
+        found = [pair for pair in pairs if pair is not None]
+        if to is None or len(found) < count:
+            continue
+        alike.append(pose)
+        for k, shift in enumerate(found):
+            row = np.zeros((2, count, 2))
+            row[:, to[k]] += np.eye(2)
+            row[:, k] -= turn
+            rows.append(row.reshape(2, -1))
+            shifts.append(shift)
+    if not alike:
+        return list(templates), np.zeros((count, 2))
+    moves = np.linalg.lstsq(np.concatenate(rows), np.concatenate(shifts), rcond=None)[0].reshape(count, 2)
+    moved = [_with_origin(template, move, tuple(alike)) for template, move in zip(templates, moves, strict=True)]
+    return moved, moves
+
+
+def _partners(places_mm: Array, turn: Array, near_mm: float) -> list[int] | None:
+    """Which mark lies where a turn takes each; None where one has no such partner."""
+    apart = np.hypot(*np.moveaxis((places_mm @ turn.T)[:, None] - places_mm[None], -1, 0))
+    to = apart.argmin(axis=1)
+    return to.tolist() if apart.min(axis=1).max() < near_mm and len(set(to.tolist())) == len(to) else None
+
+
+def _aligned_origin(one: MarkTemplate, other: MarkTemplate, turn: Array) -> Array | None:
+    """Where a mark's origin lies beside another's, mm (2,), once it is turned and laid where it is most like that; None
+    where it is not like it."""
+    seen, shown = _about_origin(other), quarter_turned(_about_origin(one), _FLIP @ turn @ _FLIP)
+    side = min(len(seen), len(shown))
+    margin = int(np.ceil(_CORE * side))
+    within, core = _middle(seen, side), _middle(shown, side - 2 * margin)
+    answers = cv2.matchTemplate(within, core, cv2.TM_CCOEFF_NORMED)
+    row, col = np.unravel_index(int(answers.argmax()), answers.shape)
+    warp = np.array([[1, 0, col], [0, 1, row]], np.float32)
+    try:
+        everywhere = np.ones_like(within, np.uint8)
+        likeness, moved = cv2.findTransformECC(
+            core, within, warp, cv2.MOTION_TRANSLATION, _STEPS, everywhere, _SMOOTH_PX
+        )
+    except cv2.error:  # it comes to no end: the two are not alike
+        return None
+    shift_px = np.asarray(moved, float)[:, 2] - margin
+    return np.asarray(_FLIP @ shift_px * other.pitch_um / 1000) if likeness >= _ALIKE else None
+
+
+def _about_origin(template: MarkTemplate) -> Array:
+    """The largest square picture with the origin in its middle, to a part of a pixel."""
+    size = np.array(template.image.shape[::-1])
+    origin = np.array(template.origin_px)
+    half = int(np.floor(min(np.min(origin), np.min(size - 1 - origin))))
+    place = np.array([[1, 0, origin[0] - half], [0, 1, origin[1] - half]], np.float32)
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(template.image, place, (2 * half + 1,) * 2, flags=flags), np.float64)
+
+
+def _middle(picture: Array, side: int) -> NDArray[np.float32]:
+    spare = (len(picture) - side) // 2
+    return np.ascontiguousarray(picture[spare : spare + side, spare : spare + side], np.float32)
+
+
+def _with_origin(template: MarkTemplate, move_mm: Array, alike: tuple[str, ...]) -> MarkTemplate:
+    col, row = np.array(template.origin_px) + _FLIP @ move_mm * 1000 / template.pitch_um
+    return replace(template, origin_px=(float(col), float(row)), alike=alike)

@@ -1,9 +1,12 @@
-"""The eight ways a frame can lie in its scan: four quarter turns, with and without mirror."""
+"""Geometry of a scan: the eight scan orientations, four quarter turns with and without mirror."""
 
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
 
 Array = NDArray[np.float64]
 
@@ -26,3 +29,11 @@ def pose_in_camera(seen: str, frame: str) -> str:
     """How something lies in the camera's frame that is seen in the scan in one pose, the frame being in another."""
     own = up_from_camera(frame).T @ up_from_camera(seen)
     return next(pose for pose in POSES if np.array_equal(up_from_camera(pose), np.rint(own)))
+
+
+def quarter_turned(image: Grid, turn: Array) -> Grid:
+    """The image under a turn (2, 2) of its columns and rows by whole quarters, after a mirror if there is one."""
+    whole = np.rint(turn)
+    turned = image if whole[0, 0] else image.T
+    across, down = whole.sum(axis=1)
+    return np.ascontiguousarray(turned[:: int(down), :: int(across)])

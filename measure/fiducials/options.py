@@ -1,4 +1,4 @@
-"""What a user may set about the measurement of fiducial marks."""
+"""What a user may set about the measurement of fiducial marks, and prior knowledge of film and scanner."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -6,15 +6,32 @@ from typing import Literal
 import numpy as np
 
 from measure.annotations.line import KnownLine
-from measure.film import SCATTER_MM
-from measure.marks.poses import POSES
+from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
-from measure.match_options import MatchOptions
+from measure.matching.options import MatchOptions
 
+SCATTER_MM = 0.005  # of a mark, along an axis: a project's film_sigma_um says it better
+AFFINITY_SIGMA = 5e-3  # film stretches by a few parts in ten thousand, an office scanner by several thousandths
+SCATTER_DEGREES = 4.0  # of freedom that it is known with: to a third
+MOST_BENT_MM = 0.3  # beside an affine transformation
 Reads = Literal["none", "pose", "all"]
-
-
 CLICK_SIGMA_PX = 0.5  # of a place at which a person points, in a picture that is enlarged for it
+
+
+@dataclass(frozen=True)
+class BelievedFilm:
+    """The scatter of marks by film and scanner, along an axis. is_stated: somebody says so, and adds it to every mark
+    where it is adjusted; else a frame that scatters more has to bring all of its scatter along."""
+
+    sigma_mm: float = SCATTER_MM
+    is_stated: bool = False
+
+    @property
+    def added_later_mm(self) -> float:
+        return self.sigma_mm if self.is_stated else 0.0
+
+
+ANY_FILM = BelievedFilm()
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
-from measure.detection.candidates import FAINT
+from measure.flags import NO_REASON, Code, Reason
+from measure.marks.shapes import FrameCorner
+from measure.matching.window import FAINT
 from measure.noise.robust_estimation import gauss_newton_step, tukey_fit
+from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone, ToneInformation
+from measure.tone.estimate import MarkTone
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,6 +44,8 @@ _BLUR_RANGE_PX = (0.3, 4.0)
 _SCATTER_FLOOR_PX = 0.01  # under the scatter about a line: clean pictures have none
 _LEAST = 1e-6  # of the variance of all that edges show: what they hardly show
 _DRAWN = 0.005  # of a step: what is left of it below that may be the drawing's own
+_UNSEEN = Reason("an edge of the frame is not to be seen there as one line", Code.NOT_FOUND)
+_ROUNDED = 0.1  # of the reach: left out at every corner, for few are sharp
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +241,7 @@ def _line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask, as
         float(np.median(steps.blur[kept])),
         float(np.median(steps.likeness[kept])),
         int(on.sum()),
-        None if scan.tone.is_known else _told(scan, steps, kept, np.asarray(inverse @ weighted)[:, on]),
+        None if scan.tone.is_known else _edge_tone(scan, steps, kept, np.asarray(inverse @ weighted)[:, on]),
     )
 
 
@@ -249,7 +255,7 @@ def _alike(residuals: Array, on: Mask) -> float:
     return (1 + alike) / (1 - alike)
 
 
-def _told(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) -> EdgeTone:
+def _edge_tone(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) -> EdgeTone:
     """By the profiles kept, (n,) of all; by_place (2, n): derivatives of the line's offset and slope by their places.
 
     As `fitting.tone_estimate` has it for marks. Light that is uneven on either side says nothing of the curve, nor does
@@ -272,4 +278,101 @@ def _told(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) ->
         on_line=by_place @ (np.linalg.pinv(design) @ changes)[:, 0],
         least=float(codes[0]),
         greatest=float(codes[1]),
+    )
+
+
+# Corners of the exposed frame: the edge of the frame along both sides, each a straight line, and where they meet.
+#
+# What is rounded at the corner is left out.
+
+
+def fit_frame_corner(
+    scan: Scan,
+    mark: FrameCorner,
+    pixel_from_mark: Array,
+    search_px: float,
+    polarity: int,
+    weights: Sequence[float] | None = None,
+) -> MarkFit:
+    """The mark, within the search radius of its predicted place, its frame being lighter than its border or darker as
+    the polarity says. Not converged, with a reason, where either edge is not to be seen."""
+    inward = pixel_from_mark[:, :2] * np.array(mark.toward)  # columns: along x', y' into the frame, px per mm
+    per_mm = np.hypot(*inward)
+    unit = inward / per_mm
+    edges = []
+    for side in (0, 1):
+        along, across = unit[:, side], unit[:, 1 - side]
+        reach = mark.reach_mm * per_mm[side]
+        first = max(mark.radius_mm * per_mm[side], _ROUNDED * reach)
+        course = Course(scan, pixel_from_mark[:, 2], along, across, weights)
+        edge = edge_along(course, (first, reach), search_px, polarity)
+        if edge is None:
+            return _missed(pixel_from_mark, _UNSEEN)
+        edges.append(edge)
+    return _met(edges, unit, pixel_from_mark, scan.tone)
+
+
+def _met(edges: Sequence[Edge], unit: Array, pixel_from_mark: Array, tone: Tone) -> MarkFit:
+    """The corner: along the first edge x, y = a + b x, and along the second x = c + d y."""
+    first, second = edges
+    a, b, c, d = first.offset, first.slope, second.offset, second.slope
+    x, y = (c + d * a) / (1 - b * d), (a + b * c) / (1 - b * d)
+    scale = 1 / (1 - b * d)
+    by_first = scale * np.array([[d, d * x], [1.0, x]])  # of (x, y) by a, b
+    by_second = scale * np.array([[1.0, y], [b, b * y]])
+    covariance = by_first @ first.covariance @ by_first.T + by_second @ second.covariance @ by_second.T
+    center = pixel_from_mark[:, 2] + unit @ (x, y)
+    noise = max(edge.noise_dn for edge in edges)
+    contrast = min((edge.contrast_dn for edge in edges), key=abs)
+    return MarkFit(
+        converged=True,
+        reason=NO_REASON,
+        center_px=center,
+        place_covariance=Covariance.of_noise(unit @ covariance @ unit.T),
+        pixel_from_mark=np.column_stack([pixel_from_mark[:, :2], center]),
+        contrast_dn=contrast,
+        stored_contrast_dn=contrast,
+        noise_dn=noise,
+        blur_px=max(edge.blur_px for edge in edges),
+        damaged_fraction=1.0 - min(edge.share for edge in edges),
+        lost_fraction=0.0,
+        redundancy=sum(edge.count for edge in edges) - 4,
+        neighbour_correlation=0.0,
+        covariance_is_white=False,
+        likeness=min(edge.likeness for edge in edges),
+        significance=abs(contrast) / max(noise, 1e-12) * float(np.sqrt(min(edge.count for edge in edges))),
+        tone=_corner_tone(first, second, unit @ by_first, unit @ by_second, tone),
+    )
+
+
+def _corner_tone(first: Edge, second: Edge, by_first: Array, by_second: Array, tone: Tone) -> MarkTone | None:
+    """by_first, by_second (2, 2): derivatives of the corner's column and row by an edge's offset and slope."""
+    if first.tone is None or second.tone is None:
+        return None
+    return MarkTone(
+        said_by_edges([first.tone, second.tone], tone),
+        by_first @ first.tone.on_line + by_second @ second.tone.on_line,
+        min(first.tone.least, second.tone.least),
+        max(first.tone.greatest, second.tone.greatest),
+    )
+
+
+def _missed(pixel_from_mark: Array, reason: Reason) -> MarkFit:
+    return MarkFit(
+        converged=False,
+        reason=reason,
+        center_px=pixel_from_mark[:, 2],
+        place_covariance=Covariance.of_noise(np.full((2, 2), np.inf)),
+        pixel_from_mark=pixel_from_mark,
+        contrast_dn=0.0,
+        stored_contrast_dn=0.0,
+        noise_dn=0.0,
+        blur_px=0.0,
+        damaged_fraction=1.0,
+        lost_fraction=1.0,
+        redundancy=0,
+        neighbour_correlation=0.0,
+        covariance_is_white=True,
+        likeness=0.0,
+        significance=0.0,
     )

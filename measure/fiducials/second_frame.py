@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import FiducialOptions
+from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.shapes import FiducialLayout
-from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement
 from measure.scans.scan import Scan
 from measure.scans.scan_part import Window
 from measure.scans.scan_views import crop_scan
-from measure.status import Status
 
 Array = NDArray[np.float64]
 
