@@ -13,7 +13,7 @@ from simulated import Truth, field_points, simulated
 from adjust.least_squares.iteration import Linearised, factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_root_weights
-from adjust.linear_algebra import elimination, multifrontal, triangle
+from adjust.linear_algebra import elimination, multifrontal, sparse_factor
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.problem.network import Approximations, Network
@@ -224,7 +224,7 @@ def test_roots_of_cofactors_are_local_where_many_unknowns_are_shared(monkeypatch
     numbering, at = linearised(18)
     factor = factorise(numbering, at)
     wide, variances = list(row_roots(factor, at.rows)), factor.variances()
-    monkeypatch.setattr(triangle, "WIDE", 0)
+    monkeypatch.setattr(sparse_factor, "WIDE", 0)
     np.testing.assert_allclose(factor.variances(), variances, rtol=1e-9)
     for here, there in zip(row_roots(factor, at.rows), wide, strict=True):
         np.testing.assert_allclose(here @ here.swapaxes(1, 2), there @ there.swapaxes(1, 2), atol=1e-9)
@@ -245,7 +245,7 @@ def test_large_networks_are_adjusted_alike_whatever_the_order(monkeypatch: pytes
     """By normal equations: the same bits again, and the same to rounding from observations in another order."""
     monkeypatch.setattr(elimination, "REFLECTED", 0.0)
     monkeypatch.setattr(elimination, "CHEAP", 0.0)
-    monkeypatch.setattr(triangle, "WIDE", 0)
+    monkeypatch.setattr(sparse_factor, "WIDE", 0)
     rng = np.random.default_rng(12)
     network, start = simulated(rng, points=field_points(rng, 18), point_sigma=0.05, free={"k3": np.inf})
     first, again = adjust(network, start), adjust(network, start)
