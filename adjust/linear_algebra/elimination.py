@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
-from adjust.linear_algebra.block_squares import STEADY, Normal, by_squares, is_tall, normal_of
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, of_columns
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.multifrontal import of_normal_equations, reflected, reflections_cost, triangle_of
@@ -28,6 +27,7 @@ Indices = NDArray[np.intp]
 CHEAP = 1e7  # rows times columns squared in the shared unknowns up to which these rows are always reflected
 REFLECTED = 1e9  # the same, up to which they are wherever their normal equations would cost digits
 SAFE = 1e-6  # reciprocal condition of the shared triangle down to which normal equations will do beyond that
+STEADY = 1e3  # norm of the inverse of triangles up to which no singular value of the rows can be near 0
 
 
 def eliminate(
@@ -45,51 +45,36 @@ def eliminate(
     The prior's row (count,) is prior_root_weight times unknown = prior_right. The shared unknowns are those that no
     block owns, and stand first. A damping holds every scaled unknown where it is (Levenberg and Marquardt).
 
-    Blocks of many more rows than columns are squared, which is quickest, where all triangles turn out so well
-    conditioned (STEADY) that it does not matter. Otherwise, where the same rows are told as `sparse` ones, their own
-    unknowns are eliminated by orthonormal columns, and of what is left in the shared unknowns the normal equations are
-    factorised (Cholesky). That squares the condition: of variances the relative error is at most some 1e-16 times the
-    squared condition, 1e-10 where the condition is 1e3. Where it is worse, all rows are reflected, but for so many that
-    it would take too long: there 1e6 will do. Not sharp: singular values below 1e-6 need not be told from that.
+    Where the same rows are given as `sparse` ones and reflections would take long, their own unknowns are eliminated by
+    orthonormal columns, and of what is left in the shared unknowns the normal equations are factorised (Cholesky). That
+    squares the condition: of variances the relative error is at most some 1e-16 times the squared condition, 1e-10
+    where the condition is 1e3. Where it is worse, all rows are reflected, but for so many that it would take too long:
+    there 1e6 will do. Not sharp: singular values below 1e-6 need not be told from that.
 
     fronts: of the shared unknowns, which stand in their order; a single one if they are not told.
     """
-    if sparse is None or sparse.pattern.is_tall:
-        squares, normals = _of_dense(blocks, count)
-    else:
-        squares, normals = sparse.column_squares(count), []
+    cost = reflections_cost(fronts, *sparse.pattern.left_over) if sparse is not None and fronts is not None else 0.0
+    is_large = sparse is not None and cost > (CHEAP if sharp else REFLECTED)
+    blocks = blocks if is_large else list(blocks)  # laid out once
+    squares = sparse.column_squares(count) if sparse is not None and is_large else _column_squares(blocks, count)
     squares += prior_root_weight**2
     scale = np.where(squares > 0.0, np.sqrt(squares), 1.0)
     priors = _prior_rows(prior_root_weight / scale, prior_right, damping)
-    if normals and (fronts is None or len(fronts) == 1):
-        factor = by_squares(normals, scale, priors)
-        if factor is not None:
+    if sparse is not None and fronts is not None and is_large:
+        factor = _by_normal_equations(sparse, scale, priors, fronts, 0.0 if sharp else SAFE)
+        least = SAFE if cost > REFLECTED else TEN_DIGITS
+        if factor is not None and (not sharp or factor.triangle.reciprocal_condition > least):
             return factor
-    if sparse is not None and fronts is not None:
-        cost = reflections_cost(fronts, *sparse.pattern.left_over)
-        if cost > (CHEAP if sharp else REFLECTED):
-            factor = _by_normal_equations(sparse, scale, priors, fronts, 0.0 if sharp else SAFE)
-            if factor is not None and (
-                not sharp or factor.triangle.reciprocal_condition > (SAFE if cost > REFLECTED else TEN_DIGITS)
-            ):
-                return factor
     return _by_reflections(blocks, scale, priors, fronts)
 
 
-def _of_dense(blocks: Iterable[Blocks], count: int) -> tuple[Array, list[Normal]]:
-    """The sums (n,) of the squares in every column, and the blocks' normal equations; none where they are not tall."""
+def _column_squares(blocks: Iterable[Blocks], count: int) -> Array:
+    """The sums (n,) of the squares in every column."""
     squares = np.zeros(count)
-    normals: list[Normal] | None = []
     for block in blocks:
-        normals = None if normals is None or not is_tall(block) else [*normals, normal_of(block)]
-        of_block = normals[-1].squares if normals else _column_squares(block)
+        of_block = np.einsum("bmk,bmk->bk", block.matrix, block.matrix)
         squares += np.bincount(of_columns(np.arange(count), block).ravel(), of_block.ravel(), count)
-    return squares, normals or []
-
-
-def _column_squares(blocks: Blocks) -> Array:
-    """The sums (b, o + s) of the squares in every column."""
-    return np.asarray(np.einsum("bmk,bmk->bk", blocks.matrix, blocks.matrix))
+    return squares
 
 
 def _prior_rows(root_weight: Array, right: Array, damping: float) -> tuple[Array, Array]:

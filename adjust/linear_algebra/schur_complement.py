@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, coo_array, csr_array
 
-from adjust.linear_algebra.block_squares import TALL
 from adjust.linear_algebra.factor import BlockFactors, Blocks
 from adjust.linear_algebra.sparse_factor import Triangle
 
@@ -81,14 +80,6 @@ class Pattern:
         place[self.singles] = np.arange(len(self.singles))
         rows = self.of * self.own.shape[1] + np.arange(self.own.shape[1])[:, None]
         return np.asarray(rows[:, None] * (len(self.singles) + 1) + place[self.single[self.order]].T)
-
-    @property
-    def is_tall(self) -> bool:
-        """Whether all blocks have so many more rows than columns that it is quicker to square them as dense ones."""
-        rows = np.bincount(self.block, minlength=len(self.own))
-        grouped = np.bincount(self.block[self.group < len(self.members) - 1], minlength=len(self.own))
-        widths = self.own.shape[1] + self.members.shape[1] * grouped + len(self.singles)
-        return bool((2 * rows >= TALL * widths)[:-1].all())
 
     @cached_property
     def left_over(self) -> tuple[Indices, Indices]:

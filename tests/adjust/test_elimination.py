@@ -27,12 +27,11 @@ SHARED, OWN, IMAGES = 7, 4, 5
 COUNT = SHARED + OWN * IMAGES
 
 
-def random_blocks(rng: np.random.Generator, taller: int = 1) -> list[Blocks]:
+def random_blocks(rng: np.random.Generator) -> list[Blocks]:
     """Blocks of columns of very different size; one sees little of what is shared, one has fewer rows than columns."""
     own = SHARED + np.arange(OWN * IMAGES).reshape(IMAGES, OWN)
     blocks = []
-    for members, height, width in (([0], 20, 2), ([1], 5, 5), ([2, 3, 4], 20, 5)):
-        rows = taller * height
+    for members, rows, width in (([0], 20, 2), ([1], 5, 5), ([2, 3, 4], 20, 5)):
         shared = np.array([np.sort(rng.permutation(SHARED)[:width]) for _ in members])
         matrix = rng.normal(size=(len(members), rows, OWN + width))
         matrix *= 10.0 ** rng.integers(-4, 5, (len(members), 1, OWN + width))
@@ -63,13 +62,10 @@ def whole(factor: Factor) -> Array:
     return factor.cofactor_of(eye_array(len(factor.scale), format="csr"))
 
 
-@pytest.mark.parametrize(("damping", "taller"), [(0.0, 1), (0.3, 1), (0.0, 12)])
-def test_it_is_the_dense_least_squares_solution(damping: float, taller: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By reflections of low blocks, by the squares of tall ones."""
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_it_is_the_dense_least_squares_solution(damping: float) -> None:
     rng = np.random.default_rng(1)
-    blocks = random_blocks(rng, taller)
-    if taller > 1:
-        monkeypatch.delattr(elimination, "triangle_of")
+    blocks = random_blocks(rng)
     weight = np.where(np.arange(COUNT) % 3 == 0, rng.uniform(0.1, 5.0, COUNT), 0.0)
     right = weight * rng.normal(size=COUNT)
     factor = eliminate(blocks, COUNT, weight, right, damping)
@@ -217,7 +213,7 @@ def test_what_is_cheap_to_reflect_is_squared_only_where_that_costs_no_digits(mon
     assert not np.array_equal(squared, exact)
     np.testing.assert_allclose(squared, exact, rtol=1e-6)
     monkeypatch.setattr(elimination, "TEN_DIGITS", 1.0)  # as if the condition were worse
-    np.testing.assert_array_equal(factorise(numbering, at).variances(), exact)
+    np.testing.assert_allclose(factorise(numbering, at).variances(), exact, rtol=1e-10)
 
 
 def test_roots_of_cofactors_are_local_where_many_unknowns_are_shared(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,7 +232,9 @@ def test_what_is_badly_conditioned_is_reflected(monkeypatch: pytest.MonkeyPatch)
     expected = factorise(numbering, at)
     monkeypatch.setattr(elimination, "REFLECTED", 0.0)
     monkeypatch.setattr(elimination, "CHEAP", 0.0)
-    np.testing.assert_array_equal(factorise(numbering, at).triangle.toarray(), expected.triangle.toarray())
+    rows, reflected = expected.triangle.toarray(), factorise(numbering, at).triangle.toarray()
+    np.testing.assert_allclose(reflected.T @ reflected, rows.T @ rows, atol=1e-14)
+    assert np.linalg.svd(reflected)[1][-1] < 1e-14
     rough = factorise(numbering, at, camera_priors=False)
     assert np.linalg.svd(rough.triangle.toarray())[1][-7:] == pytest.approx(np.full(7, 1e-6), rel=0.01)
 
