@@ -42,7 +42,6 @@ COMMANDS: dict[str, Callable[..., int]] = {
 
 app = typer.Typer(
     help="From scanned film photographs to comparator coordinates and a calibrated camera.",
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
