@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/ready
 TESTED := $(VENV)/ready-to-test
 
-.PHONY: demo test lint types suite clean
+.PHONY: demo test test-all lint types suite clean
 
 demo: $(READY)
 	$(BIN)/reseau demo demo
@@ -15,12 +15,16 @@ demo: $(READY)
 test: lint
 	$(MAKE) --no-print-directory --jobs=2 types suite
 
+# With the studies, fuzz and kills that are marked as slow: many minutes.
+test-all: lint
+	$(MAKE) --no-print-directory --jobs=2 types suite MARKED="slow or not slow"
+
 # One BLAS thread a worker: two on two cores make the small factorisations ten times slower. And byte code is kept, also
 # where the environment forbids it: every process that a test starts would compile the program anew.
 suite: export OPENBLAS_NUM_THREADS = 1
 suite: export PYTHONDONTWRITEBYTECODE =
 suite: $(TESTED) $(PLAIN)/ready
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2 --dist loadgroup $(if $(MARKED),-m "$(MARKED)")
 
 lint: $(TESTED)
 	$(BIN)/ruff check .
