@@ -44,8 +44,8 @@ from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch
 from measure.marks.shapes import FiducialLayout
-from measure.matching.fit import PictureFit
-from measure.scans.scan import open_scan
+from measure.matching.gauss_newton import PictureFit
+from measure.scans.opening import open_scan
 from measure.scans.tiff_segments import TiffSegments
 from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout
+from measure.scans.opening import open_scan
 from measure.scans.parallel import map_in_threads
-from measure.scans.scan import open_scan
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.disks import fit_disk
 from pipeline.files.project_file import read_project

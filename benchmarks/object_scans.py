@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 from range_server import range_server
 
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 
 _MARKS = 8
 _MARGIN = 0.06  # of the side, from the picture's edge to a mark

@@ -24,7 +24,7 @@ from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import Covariance
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path

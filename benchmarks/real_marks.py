@@ -24,7 +24,8 @@ from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, MarkTemp
 from measure.matching.match import MatchOptions, mark_window, match
 from measure.matching.window import ScanWindow
 from measure.results import MarkFit
-from measure.scans.scan import Scan, open_scan
+from measure.scans.opening import open_scan
+from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
 

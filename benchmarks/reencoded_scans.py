@@ -26,7 +26,8 @@ from measure.flags import Cause, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
-from measure.scans.scan import Scan, open_scan
+from measure.scans.opening import open_scan
+from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path

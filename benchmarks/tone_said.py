@@ -24,7 +24,7 @@ from measure.fiducials.frame_edges import told_by_edges
 from measure.fiducials.frame_sighter import FrameSighter
 from measure.fiducials.mark_fit import sight
 from measure.fiducials.options import FiducialOptions
-from measure.marks.frame_border import at_border
+from measure.marks.frame_border import limit_to_frame
 from measure.tone.curve import Tone, ToneInformation
 from synthetic_images.tone_curve import coded
 
@@ -41,7 +41,7 @@ def said_by_scan(case: Case) -> Said | None:
     light = np.linspace(0.0, 1.0, 200001)
     codes = np.linspace(0.0, 1.0, len(Tone().base))
     curve = np.interp(codes, coded(light.astype(np.float32), case.curve), light)
-    layout = at_border(case.layout)
+    layout = limit_to_frame(case.layout)
     scan = case.scan.replace_tone(Tone(curve, covariance=1e-12 * np.eye(5)))
     places = np.array([case.centers_px[mark.id] for mark in layout.marks])
     design = np.array([[*mark.xy_mm, 1.0] for mark in layout.marks])

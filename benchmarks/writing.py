@@ -22,8 +22,7 @@ from lone_frames import fiducials_of, image_of, lone_frame, painted
 from search_frames import SIDES
 from writing_lines import ALIKE, line_text
 
-from measure.annotations.fields import is_plate
-from measure.annotations.line import Line, Reading
+from measure.annotations.fields import Line, Reading, is_plate
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.geometry import POSES

@@ -21,7 +21,7 @@ from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust
 from measure.boards.measure import measure_board
 from measure.boards.specs import SquareGridSpec
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from .results import FrameMeasurement as FrameMeasurement
 from .results import MarkFit as MarkFit
 from .results import MarkMeasurement as MarkMeasurement
 from .results import Pose as Pose
+from .scans.opening import open_scan as open_scan
 from .scans.scan import Scan as Scan
-from .scans.scan import open_scan as open_scan
 from .targets.measure_targets import TargetOptions as TargetOptions
 from .targets.measure_targets import TargetPrediction as TargetPrediction
 from .targets.measure_targets import measure_crosses as measure_crosses

@@ -137,17 +137,17 @@ class Reason(str):
         return type(self), (str(self), *self.codes)
 
     @classmethod
-    def joined(cls, reasons: Iterable["Reason"]) -> Self:
+    def combine(cls, reasons: Iterable["Reason"]) -> Self:
         """All that are not empty, with the codes of all."""
-        told = [reason for reason in reasons if reason]
-        return cls("; ".join(told), *(code for reason in told for code in reason.codes))
+        present = [reason for reason in reasons if reason]
+        return cls("; ".join(present), *(code for reason in present for code in reason.codes))
 
     @classmethod
     def read(cls, sentence: str, code: str) -> Self:
         """As it was written. Raises ValueError for a code that is not in the table."""
         return cls(sentence, *(Code(each) for each in code.split()))
 
-    def told(self, sentence: str) -> Self:
+    def reword(self, sentence: str) -> Self:
         """The same reason in another sentence."""
         return type(self)(sentence, *self.codes)
 

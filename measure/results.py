@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from measure.annotations.line import Line
+from measure.annotations.fields import Line
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
 from measure.tone.estimate import FrameTone, MarkTone
 
@@ -35,7 +35,7 @@ class Covariance:
     parts: Mapping[Cause, Array]
 
     @classmethod
-    def of_noise(cls, px2: Array) -> "Covariance":
+    def from_noise(cls, px2: Array) -> "Covariance":
         """Of a place of which the noise (2, 2) is all that is known."""
         return cls({Cause.NOISE: np.asarray(px2, float)})
 
@@ -102,8 +102,8 @@ class MarkMeasurement:
         """Name, status, place, standard deviations and reason in words; blank where there is none."""
         place = "" if self.center_px is None else f"({self.center_px[0]:.3f}, {self.center_px[1]:.3f})"
         sigmas = None if self.covariance_px2 is None else np.sqrt(np.diag(self.covariance_px2))
-        told = "" if sigmas is None else f"+- ({sigmas[0]:.3f}, {sigmas[1]:.3f})"
-        return self.point, str(self.status), place, told, str(self.reason)
+        sigmas_text = "" if sigmas is None else f"+- ({sigmas[0]:.3f}, {sigmas[1]:.3f})"
+        return self.point, str(self.status), place, sigmas_text, str(self.reason)
 
 
 @dataclass(frozen=True)
@@ -166,9 +166,9 @@ class FrameMeasurement:
 
     def __repr__(self) -> str:
         counts = Counter(str(mark.status) for mark in self.marks)
-        told = ", ".join(f"{count} {status}" for status, count in counts.items())
+        counts_text = ", ".join(f"{count} {status}" for status, count in counts.items())
         pose = "" if self.pose is None else f", pose {self.pose.name}{'' if self.pose.decided else ' (assumed)'}"
-        return f"FrameMeasurement({self.image!r}: {told or 'no marks'}{pose})"
+        return f"FrameMeasurement({self.image!r}: {counts_text or 'no marks'}{pose})"
 
     def _repr_html_(self) -> str:
         """Its marks, as a notebook shows them."""

@@ -12,7 +12,7 @@ from pipeline.archive.stored_marks import MarkColumns, StoredFrame, StoredMarks
 from pipeline.archive.verdicts import Verdict, verdict_of
 from pipeline.report.data import FrameTotals, Problem, ReportData
 from pipeline.report.fractions import centers_px, places_apart
-from pipeline.report.frame_problems import problems_of, without_numbers
+from pipeline.report.frame_problems import masked_text, problems_of
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.marks import Frame, frames
 from pipeline.report.verdict import is_film_alone, suspect_rows
@@ -42,7 +42,7 @@ class _Totals:
         self.marks[frame.image] = Counter(str(mark.status) for mark in frame.marks)
         self.of_targets.update((mark.kind, mark.status) for mark in frame.marks if not mark.is_fiducial)
         for problem in problems:
-            alike = without_numbers(problem.what), problem.next_step
+            alike = masked_text(problem.what), problem.next_step
             self.said.setdefault(alike, (problem, []))[1].append(frame.image)
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
@@ -189,4 +189,4 @@ def _listed(said: dict[tuple[str, str], tuple[Problem, list[str]]]) -> Iterator[
 
 
 def _has_numbers(problem: Problem) -> bool:
-    return without_numbers(problem.what) != problem.what
+    return masked_text(problem.what) != problem.what

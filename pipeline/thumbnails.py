@@ -9,8 +9,9 @@ import numpy as np
 
 from measure.errors import MeasurementError
 from measure.results import MarkMeasurement
+from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
-from measure.scans.scan import Scan, open_scan
+from measure.scans.scan import Scan
 from pipeline.archive.thumbnails import ThumbnailStore, thumbnails_path
 from pipeline.errors import InputError
 from pipeline.results.measured_scan import MeasuredScan

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.annotations.line import Reading
+from measure.annotations.fields import Reading
 
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -159,14 +159,14 @@ def _place(contour: NDArray[np.int32], probability: NDArray[np.float32]) -> Plac
     if length < height:
         length, height, angle = height, length, angle + 90.0
     tilt = (angle + 90.0) % 180.0 - 90.0
-    if height < _LEAST_PX or abs(tilt) > _TILT_DEG or _mean_within(contour, probability) < _SURE:
+    if height < _LEAST_PX or abs(tilt) > _TILT_DEG or _mean_probability(contour, probability) < _SURE:
         return None
     grown = _UNSHRUNK * length * height / (length + height)
     place = Place((float(center[0]), float(center[1])), length + grown, height + grown, tilt)
     return place if place.length_px >= _LONG * place.height_px else None
 
 
-def _mean_within(contour: NDArray[np.int32], probability: NDArray[np.float32]) -> float:
+def _mean_probability(contour: NDArray[np.int32], probability: NDArray[np.float32]) -> float:
     col, row, width, height = cv2.boundingRect(contour)
     inside = np.zeros((height, width), np.uint8)
     cv2.drawContours(inside, [contour], -1, 1, -1, offset=(-col, -row))

@@ -1,15 +1,17 @@
-"""What single lines of writing say: camera, run, frame, date, height, scale, where their form is known.
+"""Lines of writing in a scan, and what they say: camera, run, frame, date, height, scale, where their form is known.
 
 One table of patterns. What is ambiguous has a text and no value: a date whose day may be its month, a number that is
-perhaps another one's.
-"""
+perhaps another one's."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from difflib import SequenceMatcher
 
-from measure.annotations.line import Line
+from measure.marks.shapes import Side
 
+_ALIKE = 0.75  # of the characters of a line that is read twice
+_PLAINLY = 5.0  # characters by which one way reads better than any other: a thousand to one
 CAMERA = ("camera_type", "camera_number", "principal_distance_mm")  # what a camera's own plate says
 STRIP = ("run", "frames", "date", "time", "height", "scale")  # what a title says that was made for the flight
 _MONTHS = ("JAN", "FEB", "MAR", "APR", "MAY", "JUN", "JUL", "AUG", "SEP", "OCT", "NOV", "DEC")
@@ -26,6 +28,98 @@ _TYPES = (
 )
 _MAKERS = {"ILD": "Wild", "UAG": "Wild", "RMK": "Zeiss", "ZEISS": "Zeiss", "LMK": "Jena", "FAIRCHILD": "Fairchild"}
 _FILM = re.compile(r"KODAK|SAFETY|\bFILM\b|ESTAR|AGFA|GEVAERT|AVIPHOT|ILFORD|FERRANIA|AEROGRAPHIC|PLUS.?X|DOUBLE.?X")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a line says if it lies in one way. confidence: the mean of its characters', 0 to 1; legible: how many of
+    them can be read."""
+
+    text: str
+    confidence: float
+    legible: float
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of writing.
+
+    ways: what is read of it by the pose in which it may lie (that of a writing which lies upright in its own frame);
+    only the four along its own direction: a quarter turn is no question. pose: the way that is taken for the right one.
+    outline_px: the corners (column, row) of the rectangle about it, clockwise in the scan. side: of the scan, at which
+    it stands.
+    """
+
+    ways: Mapping[str, Reading]
+    pose: str
+    outline_px: tuple[tuple[float, float], ...]
+    side: Side
+
+    @property
+    def text(self) -> str:
+        return self.ways[self.pose].text
+
+    @property
+    def confidence(self) -> float:
+        return self.ways[self.pose].confidence
+
+    @property
+    def legible(self) -> float:
+        """How many of its characters can be read."""
+        return self.ways[self.pose].legible
+
+    @property
+    def lead(self) -> float:
+        """By how many characters its way reads better than any other."""
+        return self.legible - max((way.legible for pose, way in self.ways.items() if pose != self.pose), default=0.0)
+
+    @property
+    def center_px(self) -> tuple[float, float]:
+        col, row = (sum(values) / len(self.outline_px) for values in zip(*self.outline_px, strict=True))
+        return col, row
+
+
+@dataclass(frozen=True)
+class KnownLine:
+    """A line that stands at one place on frames that lie alike in their scans.
+
+    pose: the way in which it lies in the scan. outline_mm: its corners from the middle of the exposed frame, as the
+    scan shows them, to the right and up.
+    """
+
+    text: str
+    pose: str
+    side: Side
+    outline_mm: tuple[tuple[float, float], ...]
+
+    def matches(self, line: Line) -> bool:
+        """Whether it is plainly that line, which may say another number."""
+        own, other = masked_text(self.text), masked_text(line.text)
+        same = SequenceMatcher(None, own, other).ratio() >= _ALIKE
+        return same and line.pose == self.pose and line.lead >= _PLAINLY
+
+
+def masked_text(text: str) -> str:
+    """A text of which frames of a roll have the same: every digit is a 0, and only letters count beside them."""
+    return re.sub(r"\d", "0", re.sub(r"[\W_]", "", text.upper()))
+
+
+def read_from_one_face(lines: Sequence[Line]) -> tuple[Line, ...]:
+    """The lines as they read from the side of the film from which most can be read, those first that say most."""
+    faces = [[_best(line, mirrored) for line in lines] for mirrored in (False, True)]
+    face = max(faces, key=lambda face: sum(line.legible for line in face))
+    return tuple(sorted(face, key=lambda line: (-line.legible, line.center_px)))
+
+
+def _best(line: Line, mirrored: bool) -> Line:
+    poses = [pose for pose in line.ways if pose.endswith("m") == mirrored]
+    return replace(line, pose=max(poses, key=lambda pose: line.ways[pose].legible))
+
+
+# What single lines of writing say: camera, run, frame, date, height, scale, where their form is known.
+#
+# One table of patterns. What is ambiguous has a text and no value: a date whose day may be its month, a number that is
+# perhaps another one's.
 
 
 @dataclass(frozen=True)
@@ -103,7 +197,7 @@ _PATTERNS: tuple[tuple[str, str, Reader], ...] = (
 )
 
 
-def fields_of(lines: Sequence[Line]) -> tuple[Field, ...]:
+def find_fields(lines: Sequence[Line]) -> tuple[Field, ...]:
     """All fields of the lines, in their order; then the frame's own number, where one of the numbers lies among those
     of the run's frames."""
     found = [field for line in lines for field in _fields_of_line(line)]
@@ -145,10 +239,10 @@ def _frame_number(lines: Sequence[Line], found: Sequence[Field]) -> list[Field]:
     if len(ranges) != 1:
         return []
     ((first, last),) = ranges.values()
-    told = [field.line for field in found if field.name in (*CAMERA, *STRIP)]
+    plates_and_titles = [field.line for field in found if field.name in (*CAMERA, *STRIP)]
     numbers: dict[str, Line] = {}
     for line in lines:
-        if line in told:
+        if line in plates_and_titles:
             continue
         for digits in re.findall(r"\d+", line.text):
             if len(first) <= len(digits) <= len(last) and int(first) <= int(digits) <= int(last):

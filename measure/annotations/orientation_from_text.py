@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.annotations.fields import is_of_film, is_plate, signs
-from measure.annotations.line import Line
+from measure.annotations.fields import Line, is_of_film, is_plate, signs
 from measure.geometry import pose_in_camera, up_from_camera
 from measure.marks.shapes import Side, WrittenPlace
 

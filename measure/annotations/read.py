@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.annotations.detect_text import HEIGHT_PX, WAYS, Networks, Picture, Place, find_writing, read_ways
-from measure.annotations.line import Line, of_one_face
+from measure.annotations.fields import Line, read_from_one_face
 from measure.marks.shapes import Side
 from measure.scans.scan import Scan
 
@@ -51,9 +51,9 @@ def read_writing(
     for side, outline_px in places:
         strip = _strip(scan, side, frame_px, outline_px)
         lines += [] if strip is None else strip.lines(networks)
-        if enough(of_one_face(lines)):
+        if enough(read_from_one_face(lines)):
             break
-    return of_one_face(lines)
+    return read_from_one_face(lines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class _Strip:
 
 def _strip(scan: Scan, side: Side, frame_px: Array | None, outline_px: Array | None) -> _Strip | None:
     """What the scan shows at a side of the frame, or about a line there; None where that is nothing."""
-    low, high, longer_px = _beside(scan, side, frame_px)
+    low, high, longer_px = _side_range(scan, side, frame_px)
     if outline_px is not None:
         low = np.maximum(low, outline_px.min(axis=0) - _ABOUT * longer_px)
         high = np.minimum(high, outline_px.max(axis=0) + _ABOUT * longer_px)
@@ -117,7 +117,7 @@ def _strip(scan: Scan, side: Side, frame_px: Array | None, outline_px: Array | N
     width, height = (last - first).tolist()
     if min(width, height) < _LEAST_PX:
         return None
-    grey = _in_8_bits(scan.reduced_window(factor, int(first[0]), int(first[1]), width, height))
+    grey = _to_8_bits(scan.reduced_window(factor, int(first[0]), int(first[1]), width, height))
     turn = side in ("left", "right")  # a quarter clockwise, so that its columns run up in the scan
     linear = factor * (np.array([[0.0, 1.0], [-1.0, 0.0]]) if turn else np.eye(2))
     start = factor * (first + ((0, height - 1) if turn else (0, 0))) + (factor - 1) / 2
@@ -130,7 +130,7 @@ def _strip(scan: Scan, side: Side, frame_px: Array | None, outline_px: Array | N
     )
 
 
-def _beside(scan: Scan, side: Side, frame_px: Array | None) -> tuple[Array, Array, float]:
+def _side_range(scan: Scan, side: Side, frame_px: Array | None) -> tuple[Array, Array, float]:
     """The first place and the end of what is read at a side, in px (column, row), and the frame's longer side."""
     low, high = np.zeros(2), np.array([scan.width_px, scan.height_px], dtype=float)
     longer_px = float(high.max())
@@ -150,6 +150,6 @@ def _beside(scan: Scan, side: Side, frame_px: Array | None) -> tuple[Array, Arra
     return low, high, longer_px
 
 
-def _in_8_bits(grey: NDArray[np.float32]) -> Picture:
+def _to_8_bits(grey: NDArray[np.float32]) -> Picture:
     black, white = np.percentile(grey[::2, ::2], (_BLACK, _WHITE))
     return np.ascontiguousarray((255 * (grey - black) / max(white - black, 1e-9)).clip(0, 255), np.uint8)

@@ -329,4 +329,4 @@ def _junction_px(mark: MarkMeasurement) -> Array:
 def _moved_to_junction(mark: MarkMeasurement, variance_px2: float) -> MarkMeasurement:
     if not _has_junction(mark):
         return mark
-    return replace(mark, center_px=_junction_px(mark), covariance=Covariance.of_noise(variance_px2 * np.eye(2)))
+    return replace(mark, center_px=_junction_px(mark), covariance=Covariance.from_noise(variance_px2 * np.eye(2)))

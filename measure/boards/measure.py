@@ -113,7 +113,7 @@ def _dot_mark(name: str, disk: FittedDisk, is_detected: bool) -> MarkMeasurement
     """The row of a dot."""
     if disk.reason:
         status = Status.REJECTED if is_detected else Status.PREDICTED
-        reason = disk.reason.told(f"not fitted: {disk.reason}")
+        reason = disk.reason.reword(f"not fitted: {disk.reason}")
         return MarkMeasurement(name, "target", disk.center_px, None, status, reason)
     weakness = disk.weakness or disk.lone_doubt
     status = Status.WEAK if weakness else Status.MEASURED
@@ -276,7 +276,7 @@ def _corner_mark(name: str, fitted: FittedCorner | None, missing: Reason) -> Mar
         return MarkMeasurement(name, "target", None, None, Status.ABSENT, missing)
     corner = fitted.corner
     if corner.reason:
-        reason = corner.reason.told(f"not fitted: {corner.reason}")
+        reason = corner.reason.reword(f"not fitted: {corner.reason}")
         return MarkMeasurement(name, "target", corner.center_px, None, Status.PREDICTED, reason)
     quality = {
         "snr": abs(corner.contrast_dn) / max(corner.noise_dn, 1e-9),
@@ -293,5 +293,5 @@ def _corner_mark(name: str, fitted: FittedCorner | None, missing: Reason) -> Mar
     reason = Reason(message, Code.COVERED) if weak else NO_REASON
     status = Status.WEAK if weak else Status.MEASURED
     return MarkMeasurement(
-        name, "target", corner.center_px, Covariance.of_noise(corner.covariance_px2), status, reason, quality
+        name, "target", corner.center_px, Covariance.from_noise(corner.covariance_px2), status, reason, quality
     )

@@ -225,7 +225,7 @@ class _Field:
         slopes = np.asarray(np.cov(response.slopes()[:, texture]), dtype=float)
         scatter = float(np.sqrt(np.mean(response.value[texture] ** 2)))
         inverse, place = np.linalg.inv(bend) * self.step, center * self.step + self.origin
-        covariance = Covariance.of_noise(inverse @ slopes @ inverse)
+        covariance = Covariance.from_noise(inverse @ slopes @ inverse)
         distance_px = float(np.hypot(*(center - self.predicted)))
         lines = np.abs(response.template)
         lit = lines * self.room[patch]

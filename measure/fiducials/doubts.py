@@ -50,4 +50,4 @@ def _doubted(mark: MarkMeasurement, doubt: Doubt) -> MarkMeasurement:
     known = replace(mark, covariance=mark.covariance.plus(doubt.cause, doubt.px2))
     if not doubt.reason:
         return known
-    return replace(known, status=Status.WEAK, reason=Reason.joined((mark.reason, doubt.reason)))
+    return replace(known, status=Status.WEAK, reason=Reason.combine((mark.reason, doubt.reason)))

@@ -179,7 +179,7 @@ class Frame:
         is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX
         if may_be_wrong(fit.covariance_px2) and not is_plain:
             reasons.append(Reason(f"its standard deviation is {sigma_px:.2f} px", Code.IMPRECISE))
-        reason = Reason.joined(reasons)
+        reason = Reason.combine(reasons)
         return (Status.WEAK, reason) if reason else (Status.MEASURED, NO_REASON)
 
 

@@ -172,7 +172,7 @@ class FrameSighter:
         """Say of a mark that was seen why it may be wrong."""
         sighting = self.sightings[index]
         if sighting is not None:
-            self.sightings[index] = replace(sighting, reason=Reason.joined((sighting.reason, reason)))
+            self.sightings[index] = replace(sighting, reason=Reason.combine((sighting.reason, reason)))
 
     def widen(self, index: int, cause: Cause, px2: Array) -> None:
         """Count a covariance (2, 2) to a cause for the place of a mark that was seen."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.annotations.detect_text import networks
-from measure.annotations.line import KnownLine, Line
+from measure.annotations.fields import KnownLine, Line
 from measure.annotations.read import read_writing
 from measure.fiducials.clicked_frame import clicked_frame, contradicted_pose, is_shown, with_clicks
 from measure.fiducials.constellation import Placement
@@ -22,7 +22,7 @@ from measure.fiducials.significance import doubt
 from measure.fiducials.stages import find_frame, likeliest_pose
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason, Status
 from measure.geometry import up_from_camera
-from measure.marks.frame_border import at_border
+from measure.marks.frame_border import limit_to_frame
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement, Pose
 from measure.scans.scan import Scan
@@ -48,7 +48,7 @@ def measure_fiducials(
     picture shows: statuses, reasons and problems say it.
     """
     options = options or FiducialOptions()
-    layout = at_border(layout)
+    layout = limit_to_frame(layout)
     if scan.is_lost:
         return lost_frame(scan, layout)
     if is_shown(layout, options):
@@ -68,7 +68,7 @@ def _refused(frame: FrameMeasurement, why: Reason) -> FrameMeasurement:
         replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
         for mark in frame.marks
     )
-    return replace(frame, marks=tuple(marks), problems=(why.told(f"{why}."), *frame.problems))
+    return replace(frame, marks=tuple(marks), problems=(why.reword(f"{why}."), *frame.problems))
 
 
 def _searched(
@@ -93,7 +93,7 @@ def _searched(
     else:
         against = _against_the_set_pose(search, frame, lines or ())
     chance = doubt(search, frame)
-    problems = [each.told(f"{each}.") for each in (*_rivals(search, found, frame), chance, against) if each]
+    problems = [each.reword(f"{each}.") for each in (*_rivals(search, found, frame), chance, against) if each]
     doubts = problems if frame.measured else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
@@ -130,7 +130,7 @@ def _read(
     for known in known_lines:
         outline_px = np.array(known.outline_mm) @ pixel_from_up.T + matrix[:, 2]
         lines = read_writing(scan, nets, frame_px, (known.side, outline_px))
-        if any(known.is_seen_in(line) for line in lines):
+        if any(known.matches(line) for line in lines):
             return lines
     return read_writing(scan, nets, frame_px)
 

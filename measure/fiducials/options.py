@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from measure.annotations.line import KnownLine
+from measure.annotations.fields import KnownLine
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.matching.options import MatchOptions

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.annotations.line import Line
+from measure.annotations.fields import Line
 from measure.annotations.orientation_from_text import line_score, main_pose, writing_likelihoods
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame

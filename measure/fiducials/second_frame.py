@@ -10,9 +10,9 @@ from measure.fiducials.options import FiducialOptions
 from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement
+from measure.scans.opening import crop_scan
+from measure.scans.remote import Window
 from measure.scans.scan import Scan
-from measure.scans.scan_part import Window
-from measure.scans.scan_views import crop_scan
 
 Array = NDArray[np.float64]
 

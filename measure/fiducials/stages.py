@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.annotations.line import Line
+from measure.annotations.fields import Line
 from measure.detection.correlation import CLOSE, GRAINY
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame

@@ -37,7 +37,7 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
     cell_from_mark[:, 2] += 0.5
     cell_from_mark *= cells  # corners of cells are whole numbers
     covered = np.zeros((height * cells, width * cells), np.float32)
-    for pieces in _pieces_of(shape, cell_from_mark):
+    for pieces in _outline_pieces(shape, cell_from_mark):
         _add(covered, pieces)
     return covered
 
@@ -75,7 +75,7 @@ class _Pieces:
     middle: Array
 
 
-def _pieces_of(shape: MarkShape, cell_from_mark: Array) -> Iterator[_Pieces]:
+def _outline_pieces(shape: MarkShape, cell_from_mark: Array) -> Iterator[_Pieces]:
     """The outlines of all parts are cut at once."""
     parts = shape.parts
     outlines = [_outlines(part, cell_from_mark) for part in parts]
@@ -84,7 +84,10 @@ def _pieces_of(shape: MarkShape, cell_from_mark: Array) -> Iterator[_Pieces]:
     part_of = np.repeat(np.arange(len(parts)), [sum(map(len, own)) for own in outlines])
     linear, shift = cell_from_mark[:, :2].T, cell_from_mark[:, 2]
     start, end, part_of = _split(
-        shape.drawn_at(corners) @ linear + shift, shape.drawn_at(ends) @ linear + shift, part_of, axis=1
+        shape.perspective_places(corners) @ linear + shift,
+        shape.perspective_places(ends) @ linear + shift,
+        part_of,
+        axis=1,
     )
     start, end, part_of = _split(start, end, part_of, axis=0)
     tall, middle = end[:, 1] - start[:, 1], (start + end) / 2
@@ -142,11 +145,11 @@ def _add(covered: Single, pieces: _Pieces) -> None:
     """Add a part to what is covered already. Each piece of its outline adds its height to all cells right of it, and to
     its own what lies right of it there. Only the cells about the part are looked at."""
     height, width = covered.shape
-    seen = (pieces.row >= 0) & (pieces.row < height) & (pieces.col < width)
-    if not seen.any():
+    inside = (pieces.row >= 0) & (pieces.row < height) & (pieces.col < width)
+    if not inside.any():
         return
-    row, col, tall = pieces.row[seen], np.maximum(pieces.col[seen], 0), pieces.tall[seen]
-    own = tall * np.where(pieces.col[seen] < 0, 1.0, col + 1 - pieces.middle[seen])
+    row, col, tall = pieces.row[inside], np.maximum(pieces.col[inside], 0), pieces.tall[inside]
+    own = tall * np.where(pieces.col[inside] < 0, 1.0, col + 1 - pieces.middle[inside])
     row0, col0, col1 = row.min(), col.min(), min(pieces.col.max() + 1, width)
     tall_cells, wide_cells = row.max() - row0 + 1, col1 - col0 + 1
     cell = (row - row0) * wide_cells + col - col0

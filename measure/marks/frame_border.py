@@ -19,14 +19,14 @@ Array = NDArray[np.float64]
 _EDGE_MM = 0.1  # so near to the frame's edge a drawing ends on it
 
 
-def at_border(layout: FiducialLayout) -> FiducialLayout:
+def limit_to_frame(layout: FiducialLayout) -> FiducialLayout:
     """The layout with the drawings of solid marks known where they are true: of those whose points lie in the frame,
     and that reach its edge, within the frame; of those with a point on its edge or beyond, beyond the edge, unless they
     are dark."""
-    return replace(layout, marks=tuple(_at_border(mark, np.array(layout.frame_mm) / 2) for mark in layout.marks))
+    return replace(layout, marks=tuple(_limit_mark(mark, np.array(layout.frame_mm) / 2) for mark in layout.marks))
 
 
-def _at_border(mark: LayoutMark, half_mm: Array) -> LayoutMark:
+def _limit_mark(mark: LayoutMark, half_mm: Array) -> LayoutMark:
     shape, at = mark.mark, np.array(mark.xy_mm)
     if not _is_of_polygons(shape):
         return mark
@@ -56,7 +56,7 @@ def _is_of_polygons(mark: Mark) -> TypeGuard[MarkShape]:
 
 def drawn_outline_mm(mark: MarkShape) -> Array:
     """(n, 2) corners of a region that holds all that is drawn."""
-    return mark.drawn_at(np.concatenate([outline_mm(part) for part in mark.parts]))
+    return mark.perspective_places(np.concatenate([outline_mm(part) for part in mark.parts]))
 
 
 def known_outline_mm(mark: MarkShape) -> Array:
@@ -65,7 +65,7 @@ def known_outline_mm(mark: MarkShape) -> Array:
     if mark.known_mm is None:
         return drawn
     least, greatest = np.add(mark.known_mm, [[_EDGE_MM], [-_EDGE_MM]])
-    parts = [mark.drawn_at(outline_mm(part)) for part in mark.parts]
+    parts = [mark.perspective_places(outline_mm(part)) for part in mark.parts]
     for axis in (0, 1):
         parts = [_below(_below(part, axis, 1.0, greatest[axis]), axis, -1.0, -least[axis]) for part in parts]
     known = np.concatenate(parts)

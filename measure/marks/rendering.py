@@ -62,7 +62,7 @@ def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
     A drawn mark is 1 inside and 0 outside; a chip, to whose blur this one is added, spans 0 to 1.
     pixel_from_mark: (2, 3), from (x_mm, y_mm, 1) to (col, row) of the window.
     """
-    value, by_col, by_row, by_col_col, by_col_row, by_row_row = _seen(
+    value, by_col, by_row, by_col_col, by_col_row, by_row_row = _blurred_derivatives(
         mark, pixel_from_mark, (width, height), blur_px, ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     )
     return Rendering(value, by_col, by_row, by_col_col, by_col_row, by_row_row)
@@ -70,13 +70,13 @@ def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
 
 def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float, cells: int = CELLS) -> Array:
     """(height, width): the mark as `render` makes it, without derivatives; cells: of its drawing along a pixel."""
-    return _seen(mark, pixel_from_mark, (width, height), blur_px, ((0, 0),), cells)[0].astype(float)
+    return _blurred_derivatives(mark, pixel_from_mark, (width, height), blur_px, ((0, 0),), cells)[0].astype(float)
 
 
 def known_picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
     """(height, width): a rough picture of the mark, nan where its drawing is not known to be true."""
     drawn = picture(mark, pixel_from_mark, width, height, blur_px, ROUGH_CELLS)
-    return np.where(known(mark, pixel_from_mark, width, height, _BLURRED * blur_px), drawn, np.nan)
+    return np.where(known_mask(mark, pixel_from_mark, width, height, _BLURRED * blur_px), drawn, np.nan)
 
 
 def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
@@ -105,22 +105,22 @@ def _outline_mm(mark: Mark) -> Array:
     return known_outline_mm(mark)
 
 
-def true(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
+def true_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
     """(height, width): in which pixels the mark's drawing is true, and in all within margin_px of them."""
-    shown = known(mark, pixel_from_mark, width, height, margin_px)
+    shown = known_mask(mark, pixel_from_mark, width, height, margin_px)
     if isinstance(mark, MarkTemplate) or mark.true_mm is None:
         return shown
-    return shown & _within(mark.true_mm, pixel_from_mark, width, height, margin_px)
+    return shown & _rectangle_mask(mark.true_mm, pixel_from_mark, width, height, margin_px)
 
 
-def known(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
+def known_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
     """(height, width): in which pixels anything is known of the mark, and in all within margin_px of them."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None:
         return np.ones((height, width), dtype=bool)
-    return _within(mark.known_mm, pixel_from_mark, width, height, margin_px)
+    return _rectangle_mask(mark.known_mm, pixel_from_mark, width, height, margin_px)
 
 
-def _within(
+def _rectangle_mask(
     rectangle_mm: tuple[Point, Point], pixel_from_mark: Array, width: int, height: int, margin_px: float
 ) -> NDArray[np.bool_]:
     """(height, width): which pixels lie in a rectangle of the mark's plane, margin_px from its sides."""
@@ -129,7 +129,9 @@ def _within(
     return np.asarray(np.all((places >= least) & (places <= greatest), axis=-1))
 
 
-def frame_beside(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
+def frame_pixels_about(
+    mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float
+) -> NDArray[np.bool_]:
     """(height, width): which pixels show the exposed frame beside a mark that is cut into its border, farther than
     margin_px from the frame's edge; none beside other marks."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None or np.isfinite(mark.known_mm).all():
@@ -182,7 +184,7 @@ class _Drawing:
     shift_px: Array
 
 
-def _seen(
+def _blurred_derivatives(
     mark: Mark,
     pixel_from_mark: Array,
     size: tuple[int, int],
@@ -206,8 +208,8 @@ def _seen(
     if np.any(high <= low):
         return images
     (col0, row0), (cols, rows) = low - drawing.first, high - low
-    by_row = along[1].of(drawing.sharp, int(row0), int(rows))
-    by_both = along[0].of(
+    by_row = along[1].apply(drawing.sharp, int(row0), int(rows))
+    by_both = along[0].apply(
         np.ascontiguousarray(by_row.transpose(2, 0, 1)).reshape(len(by_row[0, 0]), -1), int(col0), int(cols)
     )
     by_both = by_both.reshape(len(by_both), int(cols), len(by_row), int(rows))
@@ -221,13 +223,13 @@ def _drawing(mark: MarkShape, pixel_from_mark: Array, blur_px: float, cells: int
     whole = np.floor(pixel_from_mark[:, 2])
     rest = pixel_from_mark[:, 2] - whole
     # Sharp cells cannot be moved by a part of their own size.
-    drawn_at = np.zeros(2) if blur_px * cells >= 1.0 else rest
-    sharp, origin = _drawn(mark, pixel_from_mark[:, :2].tobytes(), tuple(drawn_at.tolist()), cells)
-    return _Drawing(sharp, cells, whole.astype(int) - origin, rest - drawn_at)
+    drawing_origin = np.zeros(2) if blur_px * cells >= 1.0 else rest
+    sharp, origin = _sharp_cells(mark, pixel_from_mark[:, :2].tobytes(), tuple(drawing_origin.tolist()), cells)
+    return _Drawing(sharp, cells, whole.astype(int) - origin, rest - drawing_origin)
 
 
 @lru_cache(maxsize=_DRAWINGS)
-def _drawn(mark: MarkShape, linear: bytes, origin_px: tuple[float, float], cells: int) -> tuple[Single, Integers]:
+def _sharp_cells(mark: MarkShape, linear: bytes, origin_px: tuple[float, float], cells: int) -> tuple[Single, Integers]:
     """The mark's cells, its origin so far right and down of a pixel's centre; and which pixel (col, row) that is. Marks
     of a camera that are drawn alike share them."""
     place = np.column_stack([np.frombuffer(linear).reshape(2, 2), origin_px])
@@ -263,7 +265,7 @@ class _Average:
         self.reach = reach + abs(whole)
         self.first = -reach - whole
 
-    def of(self, sharp: Single, first: int, count: int) -> Single:
+    def apply(self, sharp: Single, first: int, count: int) -> Single:
         """(orders, count, columns) of the pixels from the first one on, of cells (rows, columns).
 
         Pixels are taken in blocks: a matrix for all of them would be nearly empty.

@@ -76,7 +76,7 @@ class MarkShape:
         if not self.parts:
             raise ValueError("a mark needs at least one part")
 
-    def drawn_at(self, places_mm: Array) -> Array:
+    def perspective_places(self, places_mm: Array) -> Array:
         """Where points (n, 2) of the parts are drawn."""
         return np.asarray(places_mm / (1.0 + places_mm @ self.perspective)[:, None])
 

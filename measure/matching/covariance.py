@@ -268,7 +268,7 @@ def honest_covariance(template: MarkTemplate, scan: str, fit: MarkFit) -> Covari
     """
     share = template.shares.get(scan, 0.0)
     if share == 1.0:
-        return Covariance.of_noise(_covariance_of_noise(template, fit))
+        return Covariance.from_noise(_covariance_of_noise(template, fit))
     widened = _without_slope_noise(template, fit)
     return fit.place_covariance.through(widened / np.sqrt(1.0 - share))
 

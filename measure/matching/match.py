@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.flags import Cause
-from measure.marks.rendering import extent_px, frame_beside, known
+from measure.marks.rendering import extent_px, frame_pixels_about, known_mask
 from measure.marks.shapes import Mark, MarkTemplate
 from measure.matching.covariance import (
     Landscape,
@@ -25,7 +25,7 @@ from measure.matching.covariance import (
     second_order,
     sloping_place,
 )
-from measure.matching.fit import EDGE_BLURS, PictureFit
+from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
 from measure.matching.models import GREY, PictureModel, State, background_px, is_round
 from measure.matching.options import MatchOptions
 from measure.matching.saturation import Sides, clear_of_ends
@@ -144,9 +144,9 @@ class _Surroundings(NamedTuple):
 def _surroundings(given: _Given, part: _Part, fit: PictureFit) -> _Surroundings:
     place, (height, width) = fit.model.state.shifted(part.corner_px).pixel_from_mark, given.grey.shape
     where = given.mark, place, width, height, EDGE_BLURS * fit.model.total_blur_px
-    free = given.blank & known(*where)
+    free = given.blank & known_mask(*where)
     free[part.rows, part.cols] &= ~fit.area
-    return _Surroundings(given.grey, free, given.usable & frame_beside(*where))
+    return _Surroundings(given.grey, free, given.usable & frame_pixels_about(*where))
 
 
 def _start_fit(
@@ -192,7 +192,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> MarkFit:
     noise, is_white = as_if_white(model.scores, fit.used, len(model.design), information)
     noise = noise.floored(fit.rounding_variance_dn2)
     unknown = np.full((len(model.design),) * 2, np.inf)
-    precision = _Precision(Covariance.of_noise(unknown[:2, :2]), unknown, np.inf)
+    precision = _Precision(Covariance.from_noise(unknown[:2, :2]), unknown, np.inf)
     if not fit.reason:
         patches = blank_patches(about.grey, about.free, noise.variance_dn2)
         if not is_white or is_coloured(patches):
@@ -250,7 +250,7 @@ def _estimate_precision(fit: PictureFit, used: Mask, noise: NoiseModel, about: _
     by_noise = covariance[:2, :2]
     rounded = fit.rounding_variance_dn2 * np.trace(products(by_grey[:2], by_grey[:2]))
     share = min(float(rounded / np.trace(by_noise)), 1.0)
-    place = Covariance.of_noise((1 - share) * by_noise).plus(Cause.ROUNDING, share * by_noise)
+    place = Covariance.from_noise((1 - share) * by_noise).plus(Cause.ROUNDING, share * by_noise)
     place = place.plus(Cause.SECOND_ORDER, more * by_noise)
     if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
         change = fit.contrast_dn / float(np.ptp(model.mark.image))

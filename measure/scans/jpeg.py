@@ -26,13 +26,15 @@ from numpy.typing import NDArray
 from tifffile import TiffFile
 
 from measure.scans.cache import OpenedPicture, WholePicture
-from measure.scans.file_checks import DECODING_ERRORS, check_size, damage_error
 from measure.scans.metadata import (
+    DECODING_ERRORS,
     JFIF_UNIT,
     MOST_CHANNELS,
     NO_TAGS,
     Pitch,
     Samples,
+    check_size,
+    damage_error,
     exif_tags,
     grey_or_colour,
     orientation_notes,

@@ -9,13 +9,15 @@ import imagecodecs
 
 from measure.errors import MeasurementError
 from measure.scans.cache import OpenedPicture, WholePicture
-from measure.scans.file_checks import DECODING_ERRORS, check_size, damage_error
 from measure.scans.metadata import (
+    DECODING_ERRORS,
     MOST_CHANNELS,
     NO_TAGS,
     PNG_UNIT,
     Pitch,
     Samples,
+    check_size,
+    damage_error,
     grey_or_colour,
     pitch_from_density,
 )

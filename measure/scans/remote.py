@@ -1,4 +1,4 @@
-"""Scans that are no local files, but objects in a store or files of a server, read by ranges of their bytes."""
+"""Paths of scans that are no whole local files: parts of a file, objects in a store, files of a server."""
 
 import hashlib
 import os
@@ -17,8 +17,10 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
-from measure.scans.scan_part import ScanPart, is_scan_part
 
+Window = tuple[int, int, int, int]  # first column and row, width and height, px
+
+_PART = re.compile(r"(.+)#(?=page|window)(?:page=(\d+))?,?(?:window=(\d+),(\d+),(\d+),(\d+))?")
 if TYPE_CHECKING:
     from tifffile import TiffFile
 
@@ -43,6 +45,51 @@ _SECRET = re.compile(
 )  # names of what a query has of a signature, by the stores and servers that are in use
 _ADDRESS = re.compile(r"\b([A-Za-z][A-Za-z0-9+.-]*:/{1,2})([^\s/?#@'\"<>]*@)?([^\s?#'\"<>]*)(\?[^\s'\"<>]*)?")
 _locations: dict[str, str] = {}  # where what is shown of an address is fetched from, with its credentials or signature
+
+
+class ScanPart(PosixPath):
+    """`FILE#page=2` or `FILE#page=1,window=100,200,4000,4000`: the path of a file of which one page, or a window of
+    one, is meant. Pages count from 1, pixels as the page stores them."""
+
+    def __fspath__(self) -> str:
+        return self._groups()[0]
+
+    def __reduce__(self) -> tuple[type["ScanPart"], tuple[str]]:
+        return ScanPart, (str(self),)
+
+    @property
+    def page(self) -> int | None:
+        """From 1; None: the first picture."""
+        page = self._groups()[1]
+        return int(page) if page else None
+
+    @property
+    def window(self) -> Window | None:
+        """Of the page; None: all of it."""
+        col, row, width, height = self._groups()[2:]
+        return (int(col), int(row), int(width), int(height)) if col else None
+
+    def _groups(self) -> tuple[str, ...]:
+        match = _PART.fullmatch(str(self))
+        assert match is not None, f"{self} names no part of a scan: `is_scan_part` tells"
+        return match.groups()
+
+
+def is_scan_part(text: str) -> bool:
+    return _PART.fullmatch(text) is not None
+
+
+def whole_file(text: str) -> str:
+    """The file without what is said of its part."""
+    match = _PART.fullmatch(text) if "#" in text else None
+    return match.group(1) if match else text
+
+
+def part_text(file: str, page: int | None, window: Window | None) -> str:
+    """What `ScanPart` reads."""
+    parts = [f"page={page}"] if page else []
+    parts += [f"window={','.join(map(str, window))}"] if window else []
+    return f"{file}#{','.join(parts)}" if parts else file
 
 
 def public_address(text: str) -> str:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
 from functools import cached_property
 from itertools import product
 from math import lcm
@@ -13,17 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.errors import MeasurementError
 from measure.scans.cache import LostPart, OpenedPicture, SegmentCache, Segments
 from measure.scans.compression import earlier_step_dn
-from measure.scans.file_checks import first_bytes, no_picture_error
-from measure.scans.jpeg import JPEG_START, open_jpeg
 from measure.scans.metadata import Pitch, Samples
 from measure.scans.parallel import map_in_threads
-from measure.scans.png import PNG_START, open_png
-from measure.scans.remote import Address, scan_path
-from measure.scans.scan_part import ScanPart
-from measure.scans.tiff import TIFF_STARTS, open_tiff
 from measure.scans.tiff_segments import RawRows
 from measure.tone.curve import LINEAR, Tone
 
@@ -361,50 +353,6 @@ def _reduction_steps(factor: int) -> tuple[int, ...]:
     if factor % 2 == 0:
         return 2, *_reduction_steps(factor // 2)
     return (factor,) if factor > 1 else ()
-
-
-def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
-    """Opens a TIFF, BigTIFF, JPEG or PNG file. Its first bytes give the format, not its name.
-
-    Parameters
-    ----------
-    path : of a file, or an address as `Address` has it.
-    max_pixels : how many a scan may have; None: the limits of `check_size`.
-
-    Raises
-    ------
-    MeasurementError
-        For a file that is missing, empty, truncated or no such picture; the message says what to do.
-    UnreachableError
-        For an address that does not answer.
-
-    Examples
-    --------
-    >>> with open_scan("scans/0001.tif") as scan:
-    ...     grey = scan.window(100, 200, 64, 64)
-    """
-    path = scan_path(path)
-    start = first_bytes(path)
-    if isinstance(path, ScanPart) and (path.page or 1) > 1 and start[:4] not in TIFF_STARTS:
-        raise MeasurementError(f"{path}: such a file has one page: take `page` out of images.csv")
-    opened = _opened_picture(path, start, max_pixels)
-    segments = opened.segments
-    is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px
-    if isinstance(path, Address) and is_one:
-        whole = "the file has its picture in one piece, and was fetched whole: of tiles, most would not be"
-        opened = replace(opened, notes=(*opened.notes, whole))
-    return Scan(path, segments, opened.pitch, opened)
-
-
-def _opened_picture(path: Path, start: bytes, max_pixels: int | None) -> OpenedPicture:
-    """start: the file's first bytes, by which its format is told."""
-    if start[:4] in TIFF_STARTS:
-        return open_tiff(path, max_pixels)
-    if start.startswith(JPEG_START):
-        return open_jpeg(path, max_pixels)
-    if start.startswith(PNG_START):
-        return open_png(path, max_pixels)
-    raise no_picture_error(path, start)
 
 
 def weighted(samples: Samples | Array, weights: Sequence[float]) -> Array:

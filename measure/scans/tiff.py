@@ -17,20 +17,21 @@ from tifffile import TiffFile, TiffPage
 
 from measure.errors import MeasurementError
 from measure.scans.cache import OpenedPicture, Segments
-from measure.scans.file_checks import DECODING_ERRORS, check_size, damage_error
 from measure.scans.jpeg import rounding_step_dn
 from measure.scans.metadata import (
+    DECODING_ERRORS,
     JPEG_COMPRESSIONS,
     WHITE_IS_ZERO,
     Radiometry,
+    check_size,
+    damage_error,
     exif_tags,
     orientation_notes,
     orientation_tag,
     page_radiometry,
     tag_pitch,
 )
-from measure.scans.remote import Address, tiff_file
-from measure.scans.scan_part import ScanPart
+from measure.scans.remote import Address, ScanPart, tiff_file
 from measure.scans.tiff_segments import RawRows, TiffSegments
 from measure.tone.declared import ColourTags
 

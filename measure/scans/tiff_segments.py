@@ -12,9 +12,15 @@ from tifffile import TIFF, TiffFile, TiffPage
 from tifffile.tifffile import jpeg_decode_colorspace
 
 from measure.scans.cache import LostPart, Place
-from measure.scans.file_checks import DECODING_ERRORS, damage_error, unsupported_error
 from measure.scans.jpeg import decode_checked
-from measure.scans.metadata import JPEG_COMPRESSIONS, Radiometry, Samples
+from measure.scans.metadata import (
+    DECODING_ERRORS,
+    JPEG_COMPRESSIONS,
+    Radiometry,
+    Samples,
+    damage_error,
+    unsupported_error,
+)
 from measure.scans.remote import Address
 
 _PLAIN = 1

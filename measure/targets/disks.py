@@ -168,7 +168,7 @@ def fit_disk(
     if narrow.reason or not disk.is_spoilt:
         return narrow
     agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
-    return narrow if agree else replace(narrow, weakness=disk.reason.told(f"with more ground: {disk.reason}"))
+    return narrow if agree else replace(narrow, weakness=disk.reason.reword(f"with more ground: {disk.reason}"))
 
 
 def _fit_by_margin(

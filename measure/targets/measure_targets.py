@@ -73,7 +73,7 @@ def search_targets(
                 near.append(index)
         result.near.append(near)
         none = Reason(f"nothing like it within {prediction.search_px:.0f} px of its place", Code.NOT_FOUND)
-        result.why_none.append(NO_REASON if near else Reason.joined((none, why)))
+        result.why_none.append(NO_REASON if near else Reason.combine((none, why)))
     if polarity == "auto":
         _keep_common_polarity(result)
     return result
@@ -422,7 +422,7 @@ def _compared(rows: list[_Row]) -> list[_Row]:
     reasons = doubts([disk for _, disk in observed], [row.prediction.pixel_from_disk for row, _ in observed])
     doubt = {id(row): reason for (row, _), reason in zip(observed, reasons, strict=True) if reason}
     return [
-        replace(row, status=Status.WEAK, reason=Reason.joined((row.reason, doubt[id(row)])))
+        replace(row, status=Status.WEAK, reason=Reason.combine((row.reason, doubt[id(row)])))
         if id(row) in doubt
         else row
         for row in rows

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.scans.scan import Scan, open_scan
+from measure.scans.opening import open_scan
+from measure.scans.scan import Scan
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX
 
 Array = NDArray[np.float64]
@@ -180,10 +181,10 @@ def _first_of_place(places: Array) -> Mask:
 def _spread(features: Features, size_px: Array, count: int) -> Indices:
     """Indices of the strongest features of every cell in turn, until there are enough."""
     cell = np.floor(features.places_px / size_px * _CELLS).astype(np.intp) @ np.array([1, _CELLS])
-    return in_turn(cell, features.strengths)[:count]
+    return interleave_groups(cell, features.strengths)[:count]
 
 
-def in_turn(group: Indices, strengths: Array) -> Indices:
+def interleave_groups(group: Indices, strengths: Array) -> Indices:
     """The order that takes the strongest of every group, then the second of every group, and so on."""
     order = np.lexsort((-strengths, group))
     _, starts = np.unique(group[order], return_index=True)

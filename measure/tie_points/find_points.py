@@ -1,21 +1,309 @@
-"""Natural points: the same points of the terrain in three frames or more, without any target."""
+"""Natural points measured in all scans that show them, and what speaks against them.
 
+Candidates are measured batch by batch, patches that do not overlap, until enough have come out well. A point is judged
+by its own pictures and by comparison with all others.
+"""
+
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain, combinations, compress
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
 
-from measure.flags import NO_REASON, Code, Reason, Status
+from measure.errors import MeasurementError
+from measure.flags import NO_REASON, POINT_REFUSED, Code, Reason, Status
+from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkMeasurement
+from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import Features, TieFrame
-from measure.tie_points.measurement import TiePoint, measure_points
-from measure.tie_points.tracks import Shared, find_all_features, find_candidates, verify_pairs
-from measure.tie_points.verification import FEWEST_PAIRS
+from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Bending, Matched, Piece, bending_variance, match_pieces
+from measure.tie_points.tracks import (
+    Shared,
+    TieCandidate,
+    candidates_with_radius,
+    find_all_features,
+    find_candidates,
+    unreachable,
+    verify_pairs,
+)
+from measure.tie_points.verification import FEWEST_PAIRS, epipolar_outliers, neighbour_outliers
 
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Window = tuple[NDArray[np.float32], tuple[int, int]]
+Windows = dict[int, Window | Reason]  # by frame; or why there is none
+
+_RADII_PX = (RADIUS_PX, 21, 30)  # of patches: where the texture is too weak for one, of twice its area
+_WIDEST_PX = 2.0 * _RADII_PX[-1]
+_LEAST_BATCH = 4  # part of the points wanted: every batch goes through all scans
+_FINE_PX = 1.0  # how far measured points may lie off their epipolar lines for the lens
+_CHUNK = 16  # points that a worker gets at a time
+_OFF_LINES = Reason("the point lies off the epipolar lines of the other scans, unlike its neighbours", Code.OTHER_SCANS)
+_UNLIKE_NEIGHBOURS = Reason(
+    "the points about it map elsewhere from scan to scan: ground that repeats itself may have been mistaken",
+    Code.OTHER_SCANS,
+)
+_UNEVEN = Reason(
+    "parts of the picture about the point move unlike each other: it is no plane piece of ground", Code.OTHER_SCANS
+)
+_OTHER_PICTURE = Reason(
+    "the picture about the point is unlike that in the other scans: something else", Code.OTHER_SCANS
+)
+_PRECISE_PX = 0.125  # rms length of the error of the weakest measured point: half a pixel is four times as much
 Progress = Callable[[str, int, int], None]
 
 _FEWEST_IMAGES = 3  # two frames cannot contradict each other along the line of sight
+
+
+@dataclass(eq=False)
+class TiePoint:
+    """A candidate as measured: what was matched, by frame, and what speaks against it."""
+
+    candidate: TieCandidate
+    matched: dict[int, Matched]
+    unmatched: dict[int, Reason]
+    refused: dict[int, Reason] = field(default_factory=dict)
+
+    def separation(self, frame: int) -> Array:
+        """(2, 2) covariance of the point in a frame if it is the reference's point exactly, px."""
+        linear = self.matched[frame].scan_from_patch[:, :2]
+        own, reference = self.matched[frame].covariance_px2, self.matched[self.candidate.reference].covariance_px2
+        return np.asarray(own + linear @ reference @ linear.T)
+
+    def error_px(self, frame: int) -> float:
+        """The rms length of its error in a frame, against the place that defines it."""
+        return float(np.sqrt(np.trace(self.separation(frame))))
+
+    def is_sharp(self, frame: int) -> bool:
+        """Whether the texture fixes it as well as a measured point is to be."""
+        return self.error_px(frame) <= _PRECISE_PX
+
+    @property
+    def standing(self) -> list[int]:
+        """The frames in which nothing speaks against it."""
+        return [frame for frame in self.matched if frame not in self.refused and frame not in self.unmatched]
+
+
+def measure_points(
+    frames: Sequence[TieFrame],
+    sizes_px: Sequence[tuple[int, int]],
+    candidates: Sequence[TieCandidate],
+    wanted: int,
+    fewest: int,
+    workers: Executor | None,
+) -> list[TiePoint]:
+    """Candidates measured in scans of these sizes, the first of them first, until so many stand sharply in at least
+    `fewest` scans; none behind the last one wanted. Where too few do, those that are not sharp make room for wider
+    patches.
+
+    No two patches overlap: the errors of neighbours would be correlated, and the adjustment takes them for independent.
+    A candidate beside one that could not be matched still has its chance; not one beside a point that is refused by
+    comparison with others, for with more of these it may stand again.
+    """
+    points, matched, sharp = list[TiePoint](), list[TiePoint](), np.zeros(0, dtype=bool)
+    for radius_px in _RADII_PX:
+        left = candidates_with_radius(candidates, radius_px, frames, sizes_px, fewest)
+        if not left or sharp.sum() >= wanted:
+            break
+        settled = [bool(own or point.refused) and bool(point.matched) for own, point in zip(sharp, points, strict=True)]
+        matched, points, sharp = list(compress(matched, settled)), list(compress(points, settled)), sharp[settled]
+        while left and sharp.sum() < wanted:
+            missing = max(wanted - int(sharp.sum()), wanted // _LEAST_BATCH)
+            chosen, left = _apart(left, [point.candidate for point in matched if point.matched], missing)
+            windows = _windows(frames, chosen, workers)
+            with_windows = list(zip(chosen, windows, strict=True))
+            matched += map_or_replace(workers, partial(_point, fewest), with_windows, _lost_point, _CHUNK)
+            points = _straightened(matched)
+            _judge(frames, points)
+            sharp = np.array([sum(map(point.is_sharp, point.standing)) >= fewest for point in points], dtype=bool)
+    return points[: int(np.searchsorted(np.cumsum(sharp), wanted)) + 1]
+
+
+def _apart(
+    candidates: Sequence[TieCandidate], measured: Sequence[TieCandidate], most: int
+) -> tuple[list[TieCandidate], list[TieCandidate]]:
+    """The first candidates whose patches overlap in no frame, neither with each other nor with those that
+    are measured; and the candidates left that may come later."""
+    taken, chosen = _Taken(measured), _Taken()
+    left = []
+    for candidate in candidates:
+        if taken.touches(candidate):
+            continue
+        if len(chosen.members) == most or chosen.touches(candidate):
+            left.append(candidate)
+        else:
+            chosen.add(candidate)
+    return chosen.members, left
+
+
+class _Taken:
+    """Where patches lie already, by frame and by squares as wide as the widest patch."""
+
+    def __init__(self, members: Sequence[TieCandidate] = ()) -> None:
+        self.members: list[TieCandidate] = []
+        self.places: dict[tuple[int, int, int], list[tuple[Array, int]]] = defaultdict(list)
+        for member in members:
+            self.add(member)
+
+    def add(self, candidate: TieCandidate) -> None:
+        self.members.append(candidate)
+        for frame, matrix in candidate.maps.items():
+            col, row = np.floor(matrix[:, 2] / _WIDEST_PX).astype(int)
+            self.places[frame, col, row].append((matrix[:, 2], candidate.radius_px))
+
+    def touches(self, candidate: TieCandidate) -> bool:
+        """Whether its patch overlaps one of these in some frame."""
+        for frame, matrix in candidate.maps.items():
+            place = matrix[:, 2]
+            col, row = np.floor(place / _WIDEST_PX).astype(int)
+            near = [self.places.get((frame, col + i, row + j), ()) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+            for other, radius_px in chain.from_iterable(near):
+                if np.hypot(*(place - other)) < candidate.radius_px + radius_px:
+                    return True
+        return False
+
+
+def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate], workers: Executor | None) -> list[Windows]:
+    """The windows of every candidate by frame; each scan is opened once, by one worker."""
+    windows: list[Windows] = [{} for _ in candidates]
+    shown = [[k for k, candidate in enumerate(candidates) if i in candidate.maps] for i in range(len(frames))]
+    task = [
+        (frame, [(candidates[k].maps[i], candidates[k].radius_px) for k in own])
+        for i, (frame, own) in enumerate(zip(frames, shown, strict=True))
+    ]
+    for i, found in enumerate(map_or_replace(workers, _read_windows, task, lambda _, why: unreachable(why))):
+        for number, k in enumerate(shown[i]):
+            windows[k][i] = found if isinstance(found, Reason) else found[number]
+    return windows
+
+
+def _read_windows(task: tuple[TieFrame, Sequence[tuple[Array, int]]]) -> list[Window] | Reason:
+    """About places in one scan, by their maps and radii, read from top to bottom."""
+    frame, patches = task
+    windows: dict[int, Window] = {}
+    try:
+        with frame.open() as scan:
+            for k in sorted(range(len(patches)), key=lambda k: patches[k][0][1, 2]):
+                matrix, radius_px = patches[k]
+                half = int(np.ceil(radius_px * np.linalg.norm(matrix[:, :2], 2))) + SPARE_PX
+                col0, row0 = (int(value) - half for value in np.round(matrix[:, 2]))
+                windows[k] = (scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0))
+    except MeasurementError as error:
+        return unreachable(str(error))
+    return [windows[k] for k in range(len(patches))]
+
+
+def _lost_point(task: tuple[TieCandidate, Windows], why: str) -> TiePoint:
+    return TiePoint(task[0], {}, {i: unreachable(why) for i in task[0].maps})
+
+
+def _point(fewest: int, task: tuple[TieCandidate, Windows]) -> TiePoint:
+    """The candidate measured; a frame that cannot be matched is left out where enough others remain."""
+    candidate, windows = task
+    failed = {i: window for i, window in windows.items() if isinstance(window, Reason)}
+    shown = {i: window for i, window in windows.items() if not isinstance(window, Reason)}
+    members, unmatched = sorted(candidate.maps), dict[int, Reason]()
+    while True:
+        if not failed:
+            pieces = [Piece(*shown[i], candidate.maps[i]) for i in members]
+            reference = members.index(candidate.reference)
+            matched = dict(zip(members, match_pieces(pieces, reference, candidate.radius_px), strict=True))
+            failed = {i: piece.reason for i, piece in matched.items() if piece.reason}
+            if not failed:
+                return TiePoint(candidate, matched, unmatched)
+        unmatched |= failed
+        left = [i for i in members if i not in failed]
+        if candidate.reference in failed or len(left) < fewest:
+            first = next(iter(failed.values()))
+            alike = first.reword(f"cannot be matched: {first} in another scan")
+            return TiePoint(candidate, {}, {i: unmatched.get(i, alike) for i in candidate.maps})
+        members, failed = left, {}
+
+
+def _straightened(points: Sequence[TiePoint]) -> list[TiePoint]:
+    """The points with their places freed of the ground's bending, as far as all points together tell of it."""
+    known: dict[tuple[int, int], list[Bending]] = defaultdict(list)
+    for point in points:
+        for frame, piece in point.matched.items():
+            if piece.bending is not None and piece.unevenness >= POINT_REFUSED:
+                known[point.candidate.reference, frame].append(piece.bending)
+    variances = {pair: bending_variance(bendings) for pair, bendings in known.items()}
+    nothing = np.zeros((6, 6))
+    return [
+        replace(
+            point,
+            matched={
+                frame: _straight(piece, variances.get((point.candidate.reference, frame), nothing))
+                for frame, piece in point.matched.items()
+            },
+            refused={},
+        )
+        for point in points
+    ]
+
+
+def _straight(piece: Matched, variance: Array) -> Matched:
+    if piece.bending is None:
+        return piece
+    shift, covariance = piece.bending.estimated(variance)
+    linear = piece.scan_from_patch[:, :2]
+    return replace(
+        piece,
+        center_px=piece.center_px - linear @ shift,
+        covariance_px2=piece.covariance_px2 + linear @ covariance @ linear.T,
+    )
+
+
+def _judge(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
+    """What speaks against the points, each compared with all others."""
+    for point in points:
+        point.refused = {frame: _UNEVEN for frame in point.standing if point.matched[frame].unevenness < POINT_REFUSED}
+    _refuse_strange_pictures(points)
+    _refuse_contradictions(frames, points, partial(epipolar_outliers, tolerance=_FINE_PX), _OFF_LINES)
+    _refuse_contradictions(frames, points, neighbour_outliers, _UNLIKE_NEIGHBOURS)
+
+
+def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
+    """Where a frame differs from the others' common picture as it does in hardly any other point of it."""
+    strangeness: dict[int, list[tuple[TiePoint, float]]] = defaultdict(list)
+    for point in points:
+        for frame in point.standing:
+            others = [point.matched[other].variance for other in point.standing if other != frame]
+            if others:
+                strangeness[frame].append((point, float(np.log(point.matched[frame].variance / np.mean(others)))))
+    for frame, rows in strangeness.items():
+        values = np.array([value for _, value in rows])
+        limit = np.median(values) - float(ndtri(POINT_REFUSED)) * robust_scale(values)
+        for point, value in rows:
+            if value > limit:
+                point.refused[frame] = _OTHER_PICTURE
+
+
+def _refuse_contradictions(
+    frames: Sequence[TieFrame], points: Sequence[TiePoint], differ: Callable[[Array, Array], Mask], reason: Reason
+) -> None:
+    """Where two frames contradict each other in a point, unlike the points about it: differ tells which do of the
+    places (n, 2) of points in both. It is then wrong in the frame that all its contradictions have in common, or, where
+    it cannot be told, in all."""
+    against: dict[int, list[set[int]]] = defaultdict(list)
+    for i, j in combinations(range(len(frames)), 2):
+        both = [k for k, point in enumerate(points) if i in point.standing and j in point.standing]
+        first, second = (
+            frames[frame].camera_px(np.array([points[k].matched[frame].center_px for k in both]).reshape(-1, 2))
+            for frame in (i, j)
+        )
+        for k in np.array(both, dtype=int)[differ(first, second)]:
+            against[int(k)].append({i, j})
+    for k, pairs in against.items():
+        common = set.intersection(*pairs)
+        wrong = common if len(pairs) > 1 and len(common) == 1 else set(points[k].standing)
+        for frame in wrong:
+            points[k].refused[frame] = reason
 
 
 @dataclass(frozen=True)
@@ -117,7 +405,7 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
     elif not point.is_sharp(frame):
         message = f"the texture fixes it to {point.error_px(frame):.2f} px only"
         status, reason = Status.WEAK, Reason(message, Code.IMPRECISE)
-    covariance = Covariance.of_noise(piece.covariance_px2)
+    covariance = Covariance.from_noise(piece.covariance_px2)
     return MarkMeasurement(name, "tie", piece.center_px, covariance, status, reason, quality)
 
 

@@ -19,7 +19,7 @@ from measure.errors import MeasurementError
 from measure.flags import NO_REASON, POINT_REFUSED, Cause, Code, Reason, Status
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.parallel import map_or_replace
-from measure.tie_points.features import Features, TieFrame, find_features, in_turn, shared_features
+from measure.tie_points.features import Features, TieFrame, find_features, interleave_groups, shared_features
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
 from measure.tie_points.verification import neighbour_outliers
 
@@ -66,15 +66,15 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
     readable = [(part, each) for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Features)]
     parts, features = [part for part, _ in readable], [each for _, each in readable]
     marks: dict[str, list[MarkMeasurement]] = {part.image: [] for part in parts}
-    shared: dict[tuple[int, int], _Shared] = {}
+    shared: dict[tuple[int, int], _SharedFeatures] = {}
     number, problems = 0, dict[str, Reason]()
     for i, j in combinations(range(len(parts)), 2):
-        shared[i, j] = _shared(features[i], features[j])
+        shared[i, j] = _match_features(features[i], features[j])
         second_from_first = shared[i, j].second_from_first
         if second_from_first is None:
             continue
         both = features[i], features[j]
-        found, refused = _joined((parts[i], parts[j]), both, second_from_first, wanted, workers)
+        found, refused = _measure_pair((parts[i], parts[j]), both, second_from_first, wanted, workers)
         for pair in found:
             number += 1
             for part, matched in zip((parts[i], parts[j]), pair, strict=True):
@@ -99,7 +99,7 @@ def _out_of_reach(why: str) -> Reason:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shared:
+class _SharedFeatures:
     """alike: how many features two scans share; agree: how many of them one similarity explains. second_from_first:
     (2, 3) affine map of pixels through these; None where too few agree."""
 
@@ -108,10 +108,10 @@ class _Shared:
     second_from_first: Array | None
 
 
-def _shared(first: Features, second: Features) -> _Shared:
+def _match_features(first: Features, second: Features) -> _SharedFeatures:
     pairs = shared_features(first, second)
     if len(pairs) < _FEWEST:
-        return _Shared(len(pairs), 0, None)
+        return _SharedFeatures(len(pairs), 0, None)
     here, there = first.places_px[pairs[:, 0]], second.places_px[pairs[:, 1]]
     within_px = _AGREE_PX * max(first.reduction, second.reduction)
     cv2.setRNGSeed(0)
@@ -120,8 +120,8 @@ def _shared(first: Features, second: Features) -> _Shared:
     )
     agree = np.zeros(len(pairs), dtype=bool) if inside is None else inside.ravel() > 0
     if agree.sum() < _FEWEST:
-        return _Shared(len(pairs), int(agree.sum()), None)
-    return _Shared(len(pairs), int(agree.sum()), _affine(here[agree], there[agree]))
+        return _SharedFeatures(len(pairs), int(agree.sum()), None)
+    return _SharedFeatures(len(pairs), int(agree.sum()), _affine(here[agree], there[agree]))
 
 
 def _affine(here: Array, there: Array) -> Array:
@@ -130,7 +130,7 @@ def _affine(here: Array, there: Array) -> Array:
     return np.asarray(np.linalg.lstsq(design, there, rcond=None)[0].T)
 
 
-def _joined(
+def _measure_pair(
     both: tuple[TieFrame, TieFrame],
     features: tuple[Features, Features],
     second_from_first: Array,
@@ -167,7 +167,7 @@ def _places(
     cell_px = max(float(np.sqrt(np.prod(np.ptp(here, axis=0) + 1.0) / wanted)), float(_APART_PX))
     cell = np.floor((here - here.min(axis=0)) / cell_px).astype(np.intp) @ np.array([1, 10000])
     chosen = list[int]()
-    for k in in_turn(cell, first.textures[common]).tolist():
+    for k in interleave_groups(cell, first.textures[common]).tolist():
         if all(np.hypot(*(here[k] - here[other_k])) >= _APART_PX for other_k in chosen):
             chosen.append(k)
         if len(chosen) == _TRIED * wanted:
@@ -211,7 +211,7 @@ def _mark(name: str, matched: Matched) -> MarkMeasurement:
     if error_px > _SHARP_PX:
         status = Status.WEAK
         reason = Reason(f"the texture fixes it to {error_px:.2f} px only", Code.IMPRECISE)
-    covariance = Covariance.of_noise(matched.covariance_px2)
+    covariance = Covariance.from_noise(matched.covariance_px2)
     covariance = covariance.plus(Cause.INTERPOLATION, _INTERPOLATION_PX**2 * np.eye(2))
     return MarkMeasurement(name, "join", matched.center_px, covariance, status, reason, quality)
 
@@ -228,7 +228,7 @@ def _few(one: TieFrame, other: TieFrame, found: int, refused: Counter[str]) -> R
 
 def _unjoined(
     parts: Sequence[TieFrame],
-    shared: Mapping[tuple[int, int], _Shared],
+    shared: Mapping[tuple[int, int], _SharedFeatures],
     marks: Mapping[str, Sequence[MarkMeasurement]],
 ) -> Iterator[tuple[str, Reason]]:
     """Every scan that nothing joins to the others, and why."""

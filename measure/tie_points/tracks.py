@@ -19,7 +19,7 @@ from measure.errors import MeasurementError
 from measure.flags import Code, Reason
 from measure.noise.robust_estimation import least_distances
 from measure.scans.parallel import map_or_replace
-from measure.tie_points.features import Features, TieFrame, find_features, in_turn, shared_features
+from measure.tie_points.features import Features, TieFrame, find_features, interleave_groups, shared_features
 from measure.tie_points.multi_image import RADIUS_PX
 from measure.tie_points.verification import epipolar_inliers
 
@@ -127,7 +127,7 @@ def verify_pairs(
     shared = {}
     both = [(i, j) for i, j in combinations(range(len(frames)), 2) if frames[i].frame != frames[j].frame]
     pairs_of = [(features[i], features[j]) for i, j in both]
-    found = map_or_replace(workers, _shared, pairs_of, lambda *_: np.zeros((0, 2), np.intp))
+    found = map_or_replace(workers, _match_pair, pairs_of, lambda *_: np.zeros((0, 2), np.intp))
     for (i, j), pairs in zip(both, found, strict=True):
         first = frames[i].camera_px(features[i].places_px[pairs[:, 0]])
         second = frames[j].camera_px(features[j].places_px[pairs[:, 1]])
@@ -135,7 +135,7 @@ def verify_pairs(
     return shared
 
 
-def _shared(pair: tuple[Features, Features]) -> Indices:
+def _match_pair(pair: tuple[Features, Features]) -> Indices:
     return shared_features(*pair)
 
 
@@ -160,7 +160,7 @@ def find_candidates(
         found.append(candidate)
         cells.append((reference * 1000 + col) * 1000 + row)
         textures.append(min(features[frame].textures[feature] for frame, feature in track.items()))
-    return [found[k] for k in in_turn(np.array(cells, np.intp), np.array(textures))] if found else []
+    return [found[k] for k in interleave_groups(np.array(cells, np.intp), np.array(textures))] if found else []
 
 
 def candidates_with_radius(

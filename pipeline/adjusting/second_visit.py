@@ -12,8 +12,8 @@ from adjust.problem.result import Adjustment
 from measure.fiducials.frame_checks import without_lost
 from measure.flags import Code, Reason, Status
 from measure.results import ON_FILM, MarkMeasurement
+from measure.scans.opening import open_scan
 from measure.scans.remote import fetch_location, scan_path
-from measure.scans.scan import open_scan
 from measure.targets.measure_targets import TargetPrediction
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings

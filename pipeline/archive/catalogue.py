@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.head import ScanHead, read_head
+from measure.scans.opening import ScanHead, read_head
 from measure.scans.remote import Address, list_addresses
 from pipeline.archive.identity import content_hash, parts_hash
 from pipeline.errors import InputError

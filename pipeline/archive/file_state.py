@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from measure.errors import MissingError, UnreachableError
-from measure.scans.remote import Address
-from measure.scans.scan_part import whole_file
+from measure.scans.remote import Address, whole_file
 
 
 class FileState(NamedTuple):  # archives have many

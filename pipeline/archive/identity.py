@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
-from measure.scans.file_checks import DECODING_ERRORS
-from measure.scans.remote import Address, tiff_file
-from measure.scans.scan import Scan, open_scan
-from measure.scans.scan_part import whole_file
+from measure.scans.metadata import DECODING_ERRORS
+from measure.scans.opening import open_scan
+from measure.scans.remote import Address, tiff_file, whole_file
+from measure.scans.scan import Scan
 from pipeline.results.fingerprints import of_scan
 
 _HEAD_BYTES = 1 << 16

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from measure.errors import MeasurementError
-from measure.scans.head import ScanHead
+from measure.scans.opening import ScanHead
 from measure.scans.remote import Address, is_address, scan_path
 from pipeline.archive.catalogue import Catalogue, Group, catalogue
 from pipeline.archive.sampling import library, name_cameras

@@ -10,7 +10,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.frame_chain import FrameChain

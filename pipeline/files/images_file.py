@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from adjust.problem.network import Exterior
-from measure.scans.scan_part import Window
+from measure.scans.remote import Window
 from pipeline.errors import InputError
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import Row, read_csv

@@ -83,7 +83,7 @@ class Project:
 
     def open_scan(self, name: str) -> "Scan":
         """The scan of an image. Raises MeasurementError where it cannot be read."""
-        from measure.scans.scan import open_scan
+        from measure.scans.opening import open_scan
 
         return open_scan(self.scans[name], self.max_pixels)
 

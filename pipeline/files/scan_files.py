@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.remote import find_addresses, is_address, public_text, scan_path
-from measure.scans.scan_part import part_text
+from measure.scans.remote import find_addresses, is_address, part_text, public_text, scan_path
 from pipeline.errors import InputError
 from pipeline.files.images_file import GivenImages
 from pipeline.files.scan_patterns import each_once, found_names

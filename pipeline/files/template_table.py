@@ -120,7 +120,7 @@ def _of_pixels(table: Table, key: str, shape: tuple[int, ...]) -> Array | None:
 
 
 def _image(table: Table, key: str) -> Array:
-    from measure.scans.scan import open_scan
+    from measure.scans.opening import open_scan
 
     try:
         with open_scan(table.path_of(key)) as chip:

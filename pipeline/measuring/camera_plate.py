@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from measure.annotations.fields import CAMERA, fields_of
-from measure.annotations.line import Line
+from measure.annotations.fields import CAMERA, Line, find_fields
 from measure.flags import Code, Reason
 from pipeline.files.camera_file import CameraFile
 from pipeline.results.measured_scan import MeasuredScan
@@ -15,7 +14,7 @@ _MAKERS = ("Wild", "Zeiss", "Jena", "Fairchild")
 
 def plate_of(lines: Sequence[Line]) -> dict[str, str]:
     """Maker, number and principal distance in mm, as far as one plate says them."""
-    found = {name: {field.value for field in fields_of(lines) if field.name == name} - {""} for name in CAMERA}
+    found = {name: {field.value for field in find_fields(lines) if field.name == name} - {""} for name in CAMERA}
     return {name: next(iter(values)) for name, values in found.items() if len(values) == 1}
 
 

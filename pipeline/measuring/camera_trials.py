@@ -17,10 +17,10 @@ from measure.fiducials.camera_recognition import likeness
 from measure.fiducials.frame import Frame
 from measure.fiducials.options import FiducialOptions
 from measure.flags import CAMERA_BY_CHANCE
-from measure.marks.frame_border import at_border
+from measure.marks.frame_border import limit_to_frame
 from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.scans.scan import Scan, open_scan
-from measure.scans.scan_views import thumbnail
+from measure.scans.opening import open_scan, thumbnail
+from measure.scans.scan import Scan
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_answer import CLOSE, Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, is_whole_plate, plate_of
@@ -79,7 +79,7 @@ def _as_seen(layout: FiducialLayout) -> FiducialLayout:
     """With the drawings of wings known within the frame alone. What is left of a mark beyond the frame's edge is hardly
     more than a corner, and answers to many a thing: it is taken as drawn."""
     half_mm = np.array(layout.frame_mm) / 2
-    pairs = zip(layout.marks, at_border(layout).marks, strict=True)
+    pairs = zip(layout.marks, limit_to_frame(layout).marks, strict=True)
     marks = tuple(seen if (np.abs(given.xy_mm) < half_mm).all() else given for given, seen in pairs)
     return replace(layout, marks=marks)
 

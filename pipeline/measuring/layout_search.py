@@ -11,8 +11,8 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon, thinnest_mm
+from measure.scans.opening import thumbnail
 from measure.scans.scan import Scan
-from measure.scans.scan_views import thumbnail
 
 _LARGEST_PX = 1600  # of what is searched: of aerial film a seventh of a millimetre, about as wide as fine lines
 _COARSE_PX = 1024  # the same while the pitch is sought: fine lines are half a pixel wide then

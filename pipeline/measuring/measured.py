@@ -18,10 +18,9 @@ from measure.flags import Code, Reason, Status
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement, MarkMeasurement, moved_frame
-from measure.scans.remote import public_text
+from measure.scans.opening import crop_scan
+from measure.scans.remote import ScanPart, Window, public_text
 from measure.scans.scan import Scan
-from measure.scans.scan_part import ScanPart, Window
-from measure.scans.scan_views import crop_scan
 from pipeline.errors import InputError, what_to_do
 from pipeline.measuring.camera_model import misplaced_principal_point
 from pipeline.measuring.handed_out import Submits, results_of

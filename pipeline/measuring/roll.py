@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from measure.annotations.line import KnownLine, Line, without_numbers
+from measure.annotations.fields import KnownLine, Line, masked_text
 from measure.annotations.orientation_from_text import bounded, line_score
 from measure.fiducials.scan_orientation import DECIDED, TOLD
 from measure.flags import Status
@@ -103,7 +103,7 @@ def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:
     recurring = [
         (known, line)
         for known, line in seen
-        if sum(known.side == other.side and known.is_seen_in(again) for other, again in seen) > 1
+        if sum(known.side == other.side and known.matches(again) for other, again in seen) > 1
     ]
     best: dict[str, tuple[KnownLine, Line]] = {}
     for known, line in sorted(recurring, key=lambda each: -each[1].lead):
@@ -113,7 +113,7 @@ def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:
 
 def _known(frame: FrameMeasurement, line: Line) -> KnownLine | None:
     """The line as others of its roll may have it; None where too little is written in it."""
-    letters = without_numbers(line.text)
+    letters = masked_text(line.text)
     if frame.pixel_from_camera is None or frame.pose is None or len(letters) < _LEAST or not letters.strip("0"):
         return None
     matrix = frame.pixel_from_camera

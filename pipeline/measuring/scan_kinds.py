@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from measure.errors import MeasurementError
-from measure.scans.head import read_head
+from measure.scans.opening import read_head
 from pipeline.errors import InputError
 from pipeline.measuring.camera_answer import Identification
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from adjust.problem.camera import Distortion, Prior
 from adjust.problem.network import Exterior
-from measure.annotations.line import KnownLine
+from measure.annotations.fields import KnownLine
 from measure.errors import MissingError
 from measure.fiducials.options import FiducialOptions
 from measure.results import Pose
@@ -83,7 +83,7 @@ class ScanTask:
         """The scan. Raises MeasurementError where it cannot be read."""
         if not self.scan:
             raise MissingError(_NO_SCAN)
-        from measure.scans.scan import open_scan
+        from measure.scans.opening import open_scan
 
         return open_scan(scan_path(self.scan), self.max_pixels).replace_name(self.name)
 

@@ -125,4 +125,4 @@ def _judged_mark(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
         )
     alone = "" if verdict.others else ", and no other picture tells whether it does so on the sheet"
     reason = Reason(f"{how}{alone}; the chance that any right one does is {verdict.chance:.1g}", Code.OFF_PLACE)
-    return replace(mark, status=Status.WEAK, reason=Reason.joined((mark.reason, reason)))
+    return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, reason)))

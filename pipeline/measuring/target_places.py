@@ -48,7 +48,7 @@ def _judged(mark: MarkMeasurement, verdicts: Mapping[str, tuple[float, float]]) 
         wrong = Reason(f"another mark, or the point's coordinates are wrong: {how}", Code.OFF_PLACE)
         return replace(mark, status=Status.REJECTED, reason=wrong)
     reason = Reason(f"{how}, as one of {1.0 / chance:.0f} right ones does", Code.OFF_PLACE)
-    return replace(mark, status=Status.WEAK, reason=Reason.joined((mark.reason, reason)))
+    return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, reason)))
 
 
 def target_places(field: Field, model: ImageModel, scan: MeasuredScan) -> TargetPlaces:

@@ -10,7 +10,7 @@ import numpy as np
 
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, Polygon
 from measure.results import MEASURE_REVISION
-from measure.scans.head import declared_tone
+from measure.scans.opening import declared_tone
 from measure.tone.curve import Tone, ToneInformation, power, srgb
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project

@@ -26,7 +26,7 @@ def problems_of(frame: Frame, with_pose: bool) -> Iterator[Problem]:
     yield from _problems_of(frame)
 
 
-def without_numbers(sentence: str) -> str:
+def masked_text(sentence: str) -> str:
     """The same of sentences that differ by their numbers alone."""
     return _NUMBER.sub("#", sentence)
 
@@ -94,7 +94,7 @@ def _reasons(lost: list[Mark]) -> str:
     first."""
     alike: dict[str, list[Mark]] = {}
     for mark in lost:
-        alike.setdefault(f"{mark.status}: {without_numbers(mark.reason)}", []).append(mark)
+        alike.setdefault(f"{mark.status}: {masked_text(mark.reason)}", []).append(mark)
     return "; ".join(_told(marks) for marks in list(alike.values())[:LISTED])
 
 

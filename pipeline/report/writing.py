@@ -2,7 +2,7 @@
 
 from markupsafe import Markup
 
-from measure.annotations.line import Line
+from measure.annotations.fields import Line
 from measure.geometry import up_from_camera
 from pipeline.drawing import svg
 from pipeline.results.measured_scan import MeasuredScan

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from measure.errors import MeasurementError
+from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
-from measure.scans.scan import open_scan
 from pipeline.archive.file_state import file_state
 from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError

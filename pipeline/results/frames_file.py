@@ -4,8 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from measure.annotations.fields import Field, fields_of
-from measure.annotations.line import Line
+from measure.annotations.fields import Field, Line, find_fields
 from measure.results import FrameMeasurement
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.atomic import write_atomically
@@ -34,7 +33,7 @@ def for_images(scans: Iterable[MeasuredScan], names: Sequence[str]) -> Mapping[s
 def _rows(frame: FrameMeasurement) -> list[tuple[str, ...]]:
     rows = list[tuple[str, ...]]()
     lines = frame.writing or ()
-    fields = fields_of(lines)
+    fields = find_fields(lines)
     for line in lines:
         own = [field for field in fields if field.line is line] or [Field("text", line.text, "", line)]
         col, row = line.center_px
@@ -45,6 +44,6 @@ def _rows(frame: FrameMeasurement) -> list[tuple[str, ...]]:
 
 def said(lines: Sequence[Line], names: Sequence[str]) -> dict[str, str]:
     """The fields of these names that lines of writing say, as far as one line says them, or several alike."""
-    fields = fields_of(lines)
+    fields = find_fields(lines)
     values = {name: {field.value for field in fields if field.name == name} for name in names}
     return {name: next(iter(own)) for name, own in values.items() if len(own) == 1 and "" not in own}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.annotations.line import Line, Reading
+from measure.annotations.fields import Line, Reading
 from measure.flags import Cause, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, srgb

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from measure.errors import MeasurementError
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
-from measure.scans.scan import Scan, open_scan
+from measure.scans.opening import open_scan
+from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
 

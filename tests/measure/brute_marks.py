@@ -8,7 +8,8 @@ from drawn import in_strips, pixel_means
 from numpy.typing import NDArray
 
 from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring
-from measure.scans.scan import Scan, open_scan
+from measure.scans.opening import open_scan
+from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]

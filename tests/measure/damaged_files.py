@@ -16,7 +16,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.measurement import measure_fiducials
 from measure.flags import Status
 from measure.results import FrameMeasurement
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 
 Damage = Callable[[bytearray, np.random.Generator], None]
 

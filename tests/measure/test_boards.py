@@ -30,7 +30,7 @@ from measure.boards.specs import (
 )
 from measure.flags import Status
 from measure.results import Covariance, MarkMeasurement
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 
 Array = NDArray[np.float64]
 WIDTH, HEIGHT = 320, 260
@@ -497,7 +497,7 @@ def test_coma_is_told_from_noise_by_what_neighbours_share(coma_px: float, moves:
         name = f"r{row}c{column}"
         marks.append(
             MarkMeasurement(
-                name, "target", center, Covariance.of_noise(1e-4 * np.eye(2)), Status.MEASURED, quality=quality
+                name, "target", center, Covariance.from_noise(1e-4 * np.eye(2)), Status.MEASURED, quality=quality
             )
         )
     (settled,) = one_definition([marks])

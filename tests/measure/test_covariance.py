@@ -10,7 +10,7 @@ from measure.results import Covariance, MarkMeasurement
 def test_the_covariance_of_a_mark_is_the_sum_of_its_causes() -> None:
     noise = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
     tone = np.array([[1e-4, 0.0], [0.0, 0.0]])
-    known = Covariance.of_noise(noise).plus(Cause.TONE, tone).plus(Cause.TONE, tone)
+    known = Covariance.from_noise(noise).plus(Cause.TONE, tone).plus(Cause.TONE, tone)
     mark = MarkMeasurement("1", "fiducial", np.zeros(2), known, Status.MEASURED)
     np.testing.assert_allclose(np.asarray(mark.covariance_px2), noise + 2 * tone)
     film = replace(mark, covariance=known.plus(Cause.FILM, 0.01 * np.eye(2)))
@@ -27,7 +27,7 @@ def test_causes_are_told_in_their_order_and_those_that_add_nothing_are_not() -> 
 
 def test_a_stretched_place_stretches_every_cause() -> None:
     stretch = np.array([[2.0, 1.0], [0.0, 1.0]])
-    known = Covariance.of_noise(np.diag([1.0, 2.0])).plus(Cause.TONE, np.diag([0.0, 1.0]))
+    known = Covariance.from_noise(np.diag([1.0, 2.0])).plus(Cause.TONE, np.diag([0.0, 1.0]))
     moved = known.through(stretch)
     np.testing.assert_allclose(moved.px2, stretch @ known.px2 @ stretch.T)
     np.testing.assert_allclose(moved.parts[Cause.TONE], [[1.0, 1.0], [1.0, 1.0]])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from measure.errors import MeasurementError
 from measure.fiducials.frame_checks import with_damage
 from measure.flags import Status
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 
 CASES = 20  # of each damage in each kind of file, in the slow study
 LONGEST_S = 20.0  # of the processor

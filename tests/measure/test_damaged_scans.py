@@ -13,8 +13,8 @@ import tifffile
 from stored_picture import HEIGHT, WIDTH, picture
 
 from measure.errors import MeasurementError
+from measure.scans.opening import open_scan
 from measure.scans.parallel import map_in_threads
-from measure.scans.scan import open_scan
 
 
 def set_tag(path: Path, tag: int, value: Any) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from measure.scans.head import declared_tone
+from measure.scans.opening import declared_tone
 from measure.tone.curve import Tone
 from measure.tone.declared import curve_of_profile
 

@@ -75,7 +75,7 @@ def test_targets_are_odd_by_more_than_noise_and_what_all_differ_by(share: float,
             shape, blur = 3 * (vectors * np.exp(values)) @ vectors.T, float(np.sqrt(max(1.5 + look[4], 0.1)))
             contrast = float(np.exp(look[3])) * CONTRAST
             sloping = SecondPlace(of_slope.normal(0, 0.1, 2), 0.01 * np.eye(2))
-            known = Covariance.of_noise(0.001 * np.eye(2))
+            known = Covariance.from_noise(0.001 * np.eye(2))
             disks.append(FittedDisk(np.zeros(2), known, shape, contrast, 100.0, blur, 0.0, noise, sloping))
         weak += [bool(reason) for reason in doubts(disks, [3 * np.eye(2)] * 25)]
         odd += is_odd.tolist()

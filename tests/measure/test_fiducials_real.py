@@ -14,7 +14,8 @@ from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, r
 from measure.results import FrameMeasurement
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
-from measure.scans.scan import Scan, open_scan
+from measure.scans.opening import open_scan
+from measure.scans.scan import Scan
 
 SCANS = DATA / "film_scans"
 pytestmark = needs("film_scans")

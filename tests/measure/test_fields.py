@@ -2,8 +2,7 @@
 
 import pytest
 
-from measure.annotations.fields import fields_of, is_of_film, is_plate, signs
-from measure.annotations.line import Line, Reading
+from measure.annotations.fields import Line, Reading, find_fields, is_of_film, is_plate, signs
 
 
 def line(text: str) -> Line:
@@ -11,7 +10,7 @@ def line(text: str) -> Line:
 
 
 def said(*texts: str) -> dict[str, str]:
-    return {field.name: field.value for field in fields_of([line(text) for text in texts])}
+    return {field.name: field.value for field in find_fields([line(text) for text in texts])}
 
 
 @pytest.mark.parametrize(

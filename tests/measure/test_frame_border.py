@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
-from measure.marks.frame_border import at_border, known_outline_mm
+from measure.marks.frame_border import known_outline_mm, limit_to_frame
 from measure.marks.shapes import FiducialLayout, MarkShape, Point, Polygon, turned_part
 
 HALF_MM, WEDGE_MM, SIDES = 8.0, 7.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
@@ -116,10 +116,13 @@ def test_a_notch_claims_no_more_than_the_landscape_in_it_allows() -> None:
 
 
 def test_what_is_known_of_a_drawing_ends_at_the_frame() -> None:
-    (wedge, *_), (notch, *_) = at_border(layout(WEDGE, WEDGE_MM)).marks, at_border(layout(NOTCH, HALF_MM)).marks
+    (wedge, *_), (notch, *_) = (
+        limit_to_frame(layout(WEDGE, WEDGE_MM)).marks,
+        limit_to_frame(layout(NOTCH, HALF_MM)).marks,
+    )
     inner = layout(((0.0, 0.0), (0.8, 0.3), (0.8, -0.3)), WEDGE_MM)
     assert isinstance(wedge.mark, MarkShape)
     assert isinstance(notch.mark, MarkShape)
     assert known_outline_mm(wedge.mark)[:, 0].max() == pytest.approx(0.9)
     assert known_outline_mm(notch.mark)[:, 0].min() == pytest.approx(0.1)
-    assert at_border(inner) == inner
+    assert limit_to_frame(inner) == inner

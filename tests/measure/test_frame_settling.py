@@ -64,7 +64,7 @@ def test_a_faint_mark_in_plain_noise_is_measured_with_the_standard_deviation_tha
     frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
     sighting = frame.sightings[0]
     assert sighting.fit is not None
-    known = Covariance.of_noise(0.2**2 * np.eye(2))
+    known = Covariance.from_noise(0.2**2 * np.eye(2))
     for is_white, status in ((True, Status.MEASURED), (False, Status.WEAK)):
         fit = replace(sighting.fit, place_covariance=known, covariance_is_white=is_white)
         one = replace(frame, sightings=(replace(sighting, fit=fit), *frame.sightings[1:]))

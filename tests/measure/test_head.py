@@ -9,8 +9,7 @@ import tifffile
 
 from measure.errors import MeasurementError
 from measure.scans import jpeg
-from measure.scans.head import read_head
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan, read_head
 
 GREY = np.random.default_rng(5).integers(0, 255, (60, 90)).astype(np.uint8)
 COLOUR = np.stack([GREY, 255 - GREY, GREY // 2], axis=-1)

@@ -52,7 +52,9 @@ def frames_of(
         bent = scanner_mm * PX_PER_MM * np.column_stack([x * y, -(x**2)])
         centers = made @ linear.T + matrix[:, 2] + rng.normal(0.0, scatter, made.shape) + bent
         marks = tuple(
-            MarkMeasurement(mark.id, "fiducial", center, Covariance.of_noise(sigma_px**2 * np.eye(2)), Status.MEASURED)
+            MarkMeasurement(
+                mark.id, "fiducial", center, Covariance.from_noise(sigma_px**2 * np.eye(2)), Status.MEASURED
+            )
             for mark, center in zip(layout.marks, centers, strict=True)
         )
         frames.append(FrameMeasurement(str(number), marks, Pose(pose, True), matrix))

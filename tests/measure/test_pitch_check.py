@@ -19,7 +19,7 @@ def frame(across_um: float, down_um: float) -> FrameMeasurement:
     matrix = np.array([[0.0, 1000.0 / across_um, 5000.0], [1000.0 / down_um, 0.0, 5000.0]])
     marks = [
         MarkMeasurement(
-            mark.id, "fiducial", matrix @ (*mark.xy_mm, 1.0), Covariance.of_noise(np.eye(2)), Status.MEASURED
+            mark.id, "fiducial", matrix @ (*mark.xy_mm, 1.0), Covariance.from_noise(np.eye(2)), Status.MEASURED
         )
         for mark in layout(1.0).marks
     ]
@@ -55,7 +55,7 @@ def test_right_pitches_are_called_wrong_as_rarely_as_is_said() -> None:
         design = np.column_stack([given, np.ones(len(given))])
         matrix = np.asarray(np.linalg.lstsq(design, true * (50.0, -50.0), rcond=None)[0].T, float)
         seen = [
-            MarkMeasurement(mark.id, "fiducial", np.zeros(2), Covariance.of_noise(np.eye(2)), Status.MEASURED)
+            MarkMeasurement(mark.id, "fiducial", np.zeros(2), Covariance.from_noise(np.eye(2)), Status.MEASURED)
             for mark in marks
         ]
         small = FiducialLayout(tuple(marks), (33.0, 24.0))

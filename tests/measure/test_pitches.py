@@ -27,7 +27,7 @@ from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.stages import _pitch_to_try
 from measure.marks.shapes import MarkShape
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 
 AERIAL = ((106.0, -106.0), (-106.0, -106.0), (-106.0, 106.0), (106.0, 106.0))
 # A frame of 14 mm with a hundredth of the usual tolerances bends as little as one of 140 mm.

@@ -16,7 +16,8 @@ from measure.scans.cache import WholePicture
 from measure.scans.compression import covariance_of_compression
 from measure.scans.jpeg import UNKNOWN_DN, rounding_step_dn
 from measure.scans.metadata import NO_TAGS
-from measure.scans.scan import Scan, open_scan
+from measure.scans.opening import open_scan
+from measure.scans.scan import Scan
 
 # Annex K of ITU-T T.81, luminance, the first 15 in zigzag order: what "quality 50" is.
 COARSE = (16, 11, 12, 14, 12, 10, 16, 14, 13, 14, 18, 17, 16, 19, 24)

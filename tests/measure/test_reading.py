@@ -9,7 +9,7 @@ from brute_marks import Array, written_scan
 
 from measure.annotations import detect_text as networks_module
 from measure.annotations.detect_text import Networks, networks
-from measure.annotations.line import Line
+from measure.annotations.fields import Line
 from measure.annotations.read import read_writing
 
 SIZE_PX = 640

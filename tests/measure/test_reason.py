@@ -58,11 +58,11 @@ def nodes_of_files_with(text: str) -> Iterator[tuple[Path, ast.AST]]:
 
 def test_joined_reasons_keep_their_codes_once_each() -> None:
     faint, covered = Reason("it is faint", Code.CONTRAST), Reason("half of it is gone", Code.COVERED, Code.CONTRAST)
-    both = Reason.joined((faint, NO_REASON, covered))
+    both = Reason.combine((faint, NO_REASON, covered))
     assert both == "it is faint; half of it is gone"
     assert both.codes == (Code.CONTRAST, Code.COVERED)
     assert both.code == "contrast covered"
-    assert not Reason.joined((NO_REASON, NO_REASON))
+    assert not Reason.combine((NO_REASON, NO_REASON))
 
 
 def test_a_reason_survives_processes_and_files() -> None:

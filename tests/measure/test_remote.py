@@ -15,9 +15,8 @@ from range_server import RangeServer, range_server
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
 from measure.scans import remote
-from measure.scans.head import declared_tone
+from measure.scans.opening import declared_tone, open_scan
 from measure.scans.remote import Address, scan_path
-from measure.scans.scan import open_scan
 
 SIDE_PX, TILE_PX = 2304, 128
 LAYOUTS: dict[str, dict[str, Any]] = {

@@ -13,7 +13,7 @@ import tifffile
 from stored_picture import HEIGHT, WIDTH, picture, whole
 
 from measure.errors import MeasurementError
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from stored_picture import HEIGHT, WIDTH, picture
 
 from measure.scans.cache import SegmentCache
+from measure.scans.opening import open_scan
 from measure.scans.parallel import map_in_threads
-from measure.scans.scan import open_scan
 from measure.targets.block_search import Block, Patches, search_blocks
 
 

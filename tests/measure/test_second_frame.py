@@ -12,7 +12,7 @@ from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.second_frame import second_frame
 from measure.results import moved_frame
-from measure.scans.scan_views import crop_scan
+from measure.scans.opening import crop_scan
 
 
 @pytest.mark.parametrize(("second", "is_named"), [("0", True), ("90", True), (None, False)])

@@ -40,7 +40,7 @@ def frame_of(
         center = linear @ (np.array(place) + (off_mm or {}).get(point, (0.0, 0.0))) + 700.0
         noisy = center + rng.normal(0.0, SIGMA_PX, 2)
         marks.append(
-            MarkMeasurement(point, "fiducial", noisy, Covariance.of_noise(SIGMA_PX**2 * np.eye(2)), Status.MEASURED)
+            MarkMeasurement(point, "fiducial", noisy, Covariance.from_noise(SIGMA_PX**2 * np.eye(2)), Status.MEASURED)
         )
     return FrameMeasurement(name, tuple(marks), None, np.column_stack([linear, [700.0, 700.0]]))
 

@@ -10,7 +10,7 @@ import pytest
 from brute_marks import Array, written_scan
 from drawn_frames import PITCH_UM, RING_CROSS, frame_picture, layout_of, pixel_from_camera
 
-from measure.annotations.line import KnownLine, Line, Reading, of_one_face
+from measure.annotations.fields import KnownLine, Line, Reading, read_from_one_face
 from measure.annotations.orientation_from_text import main_pose, side_in_camera, writing_likelihoods
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions, Reads
@@ -111,8 +111,8 @@ def test_lines_are_read_from_the_face_that_most_reads_from() -> None:
     odd = line("E.S.T.", "180m", "top", share=0.95)
     right = line("DEVELOPMENT", "180", "top")
     assert odd.pose == "180m"
-    assert not any(each.pose.endswith("m") for each in of_one_face([odd, right]))
-    assert [each.text for each in of_one_face([odd, right])] == ["DEVELOPMENT", "E.S.T."]
+    assert not any(each.pose.endswith("m") for each in read_from_one_face([odd, right]))
+    assert [each.text for each in read_from_one_face([odd, right])] == ["DEVELOPMENT", "E.S.T."]
 
 
 def written_frame() -> Array:
@@ -189,8 +189,8 @@ def test_a_frame_that_lies_otherwise_is_read_as_a_whole(pose: str, tmp_path: Pat
 
 
 def test_a_known_line_is_one_that_says_the_same_and_lies_so_plainly() -> None:
-    assert TITLE.is_seen_in(line("RUN 20  CANBERRA  16.5.68", "90", "left"))
-    assert not TITLE.is_seen_in(line("RUN 20  CANBERRA  16.5.68", "90m", "left"))
-    assert not TITLE.is_seen_in(line("RUN 20  CANBERRA  16.5.68", "270", "left"))
-    assert not TITLE.is_seen_in(line("PROPERTY OF THE ARCHIVE", "90", "left"))
-    assert not TITLE.is_seen_in(line("RUN 20  CANBERRA  16.5.68", "90", "left", share=0.9))
+    assert TITLE.matches(line("RUN 20  CANBERRA  16.5.68", "90", "left"))
+    assert not TITLE.matches(line("RUN 20  CANBERRA  16.5.68", "90m", "left"))
+    assert not TITLE.matches(line("RUN 20  CANBERRA  16.5.68", "270", "left"))
+    assert not TITLE.matches(line("PROPERTY OF THE ARCHIVE", "90", "left"))
+    assert not TITLE.matches(line("RUN 20  CANBERRA  16.5.68", "90", "left", share=0.9))

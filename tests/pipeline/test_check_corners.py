@@ -22,7 +22,8 @@ from measure.boards.specs import (
     aruco_dictionary,
 )
 from measure.errors import MissingError
-from measure.scans.scan import Scan, open_scan
+from measure.scans.opening import open_scan
+from measure.scans.scan import Scan
 from pipeline.cli import run
 from pipeline.opencv_check.opencv_calibration import ImagePoints, OpenCvCalibration, calibrate
 from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners, detector_name, find_points

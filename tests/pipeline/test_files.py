@@ -255,7 +255,7 @@ def test_images_file_in_degrees_with_or_without_ending(tmp_path: Path) -> None:
 def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) -> None:
     covariance = np.array([[0.0004, 0.0001], [0.0001, 0.0009]])
     marks = (
-        MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), Covariance.of_noise(covariance), Status.MEASURED),
+        MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), Covariance.from_noise(covariance), Status.MEASURED),
         MarkMeasurement("7", "target", None, None, Status.ABSENT, Reason('outside, "far" off', Code.OUTSIDE)),
     )
     path = tmp_path / "comparator.csv"
@@ -273,7 +273,7 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
 
 
 def test_a_measurement_is_read_back_with_its_reasons_and_the_causes_of_its_covariances(tmp_path: Path) -> None:
-    known = Covariance.of_noise(np.array([[4e-4, 1e-4], [1e-4, 9e-4]])).plus(Cause.TONE, np.diag([1e-4, 0.0]))
+    known = Covariance.from_noise(np.array([[4e-4, 1e-4], [1e-4, 9e-4]])).plus(Cause.TONE, np.diag([1e-4, 0.0]))
     weak = Reason("half of it is gone", Code.COVERED, Code.SIZE)
     mark = MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), known, Status.WEAK, weak)
     bent = Reason("the film is bent.", Code.BENT_FRAME)

@@ -11,7 +11,7 @@ import pytest
 from drawn_project import PROJECT, write_project
 from single_scans import measure_scan
 
-from measure.annotations.line import Line, Reading
+from measure.annotations.fields import Line, Reading
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, sampled_curve, srgb

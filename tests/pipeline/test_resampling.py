@@ -16,7 +16,7 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import Film
 from adjust.problem.camera import Distortion
 from measure.errors import MeasurementError
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 from pipeline.cli import run
 from pipeline.resampling.canvas import canvas_of, scan_places
 from pipeline.resampling.frame_chain import FrameChain, Lens

@@ -13,7 +13,7 @@ import tifffile
 
 from measure.boards.specs import ChessboardSpec, CircleGridSpec
 from measure.marks import shapes
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera

@@ -58,9 +58,9 @@ def measured(rng: np.random.Generator, project: Project, name: str, wrong: dict[
         angle = rng.uniform(0.0, 6.28)
         off = wrong.get(id, 0.0) * np.array([np.cos(angle), np.sin(angle)])
         marks.append(
-            MarkMeasurement(id, "target", place + off, Covariance.of_noise(NOISE_PX**2 * np.eye(2)), Status.MEASURED)
+            MarkMeasurement(id, "target", place + off, Covariance.from_noise(NOISE_PX**2 * np.eye(2)), Status.MEASURED)
         )
-    fiducial = MarkMeasurement("r4c4", "fiducial", np.zeros(2), Covariance.of_noise(np.eye(2)), Status.MEASURED)
+    fiducial = MarkMeasurement("r4c4", "fiducial", np.zeros(2), Covariance.from_noise(np.eye(2)), Status.MEASURED)
     return MeasuredScan(name, WIDTH, HEIGHT, (5.0, 5.0), FrameMeasurement(name, (fiducial, *marks)))
 
 

@@ -9,7 +9,7 @@ import pytest
 import tifffile
 from drawn_project import write_project
 
-from measure.scans.scan import open_scan
+from measure.scans.opening import open_scan
 from pipeline.archive.measurement import fingerprints_of, read_measurement
 from pipeline.archive.store import Store
 from pipeline.archive.thumbnails import ThumbnailStore, thumbnails_path

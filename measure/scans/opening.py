@@ -1,0 +1,245 @@
+"""Scans opened by the format of their first bytes, their heads alone, and scans that are made of a scan."""
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.errors import MeasurementError
+from measure.scans.cache import LostPart, OpenedPicture, Place, WholePicture
+from measure.scans.jpeg import JPEG_START, jpeg_colour_tags, jpeg_pitch, open_jpeg, picture_form
+from measure.scans.metadata import (
+    DECODING_ERRORS,
+    Pitch,
+    Samples,
+    check_size,
+    damage_error,
+    first_bytes,
+    no_picture_error,
+)
+from measure.scans.parallel import map_in_threads
+from measure.scans.png import PNG_START, open_png, png_colour_tags, png_form, png_pitch
+from measure.scans.remote import Address, ScanPart, Window, scan_path
+from measure.scans.scan import Scan
+from measure.scans.tiff import TIFF_STARTS, open_tiff, tiff_colour_tags
+from measure.tone.curve import Tone
+from measure.tone.declared import tone_of_tags
+
+Array = NDArray[np.float32]
+_HEADERS_BYTES = 1 << 18  # of a JPEG or PNG file, before its picture: profiles and Exif blocks take less
+_END_BYTES = 1 << 16  # in which nearly every JPEG or PNG file that is whole has its end marker
+_BAND_PX = 1 << 18  # of the window that are read at a time
+_FULL_SCALE_DN = 65535.0
+_GREY_BAND_PX = 1 << 20  # of the scan that is held in grey at a time, about
+
+
+def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
+    """Opens a TIFF, BigTIFF, JPEG or PNG file. Its first bytes give the format, not its name.
+
+    Parameters
+    ----------
+    path : of a file, or an address as `Address` has it.
+    max_pixels : how many a scan may have; None: the limits of `check_size`.
+
+    Raises
+    ------
+    MeasurementError
+        For a file that is missing, empty, truncated or no such picture; the message says what to do.
+    UnreachableError
+        For an address that does not answer.
+
+    Examples
+    --------
+    >>> with open_scan("scans/0001.tif") as scan:
+    ...     grey = scan.window(100, 200, 64, 64)
+    """
+    path = scan_path(path)
+    start = first_bytes(path)
+    if isinstance(path, ScanPart) and (path.page or 1) > 1 and start[:4] not in TIFF_STARTS:
+        raise MeasurementError(f"{path}: such a file has one page: take `page` out of images.csv")
+    opened = _opened_picture(path, start, max_pixels)
+    segments = opened.segments
+    is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px
+    if isinstance(path, Address) and is_one:
+        whole = "the file has its picture in one piece, and was fetched whole: of tiles, most would not be"
+        opened = replace(opened, notes=(*opened.notes, whole))
+    return Scan(path, segments, opened.pitch, opened)
+
+
+def _opened_picture(path: Path, start: bytes, max_pixels: int | None) -> OpenedPicture:
+    """start: the file's first bytes, by which its format is told."""
+    if start[:4] in TIFF_STARTS:
+        return open_tiff(path, max_pixels)
+    if start.startswith(JPEG_START):
+        return open_jpeg(path, max_pixels)
+    if start.startswith(PNG_START):
+        return open_png(path, max_pixels)
+    raise no_picture_error(path, start)
+
+
+@dataclass(frozen=True)
+class ScanHead:
+    """file_format: TIFF, JPEG or PNG; bits: of a sample, as they are measured; notes: what is unusual, a sentence
+    each."""
+
+    file_format: str
+    width_px: int
+    height_px: int
+    channels: int
+    bits: int
+    pitch: Pitch
+    notes: tuple[str, ...] = ()
+
+
+def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
+    """Reads the head of a scan file: some kilobytes, however large the file is.
+
+    Parameters
+    ----------
+    max_pixels : as `open_scan` takes it.
+
+    Raises
+    ------
+    MeasurementError
+        For a file that cannot be opened as a scan, as far as its head and its length show. Damage of a JPEG or PNG
+        picture shows only when it is decoded.
+    """
+    start = first_bytes(path)
+    if start[:4] in TIFF_STARTS:
+        opened = open_tiff(path, max_pixels)
+        segments, notes = opened.segments, (*opened.problems, *opened.notes)
+        segments.close()
+        bits = int(segments.full_scale_dn + 1).bit_length() - 1
+        return ScanHead("TIFF", segments.width_px, segments.height_px, segments.channels, bits, opened.pitch, notes)
+    if not start.startswith((JPEG_START, PNG_START)):
+        raise no_picture_error(path, start)
+    data, end = _head_and_end(path)
+    if start.startswith(JPEG_START):
+        form, marker, pitch = picture_form(data), b"\xff\xd9", jpeg_pitch(data)
+        file_format = "JPEG"
+    else:
+        form, marker, pitch = png_form(data), b"IEND", png_pitch(data)
+        file_format = "PNG"
+    if form is None or 0 in form:
+        raise damage_error(path, "its header is cut short")
+    if marker not in end:
+        open_scan(path, max_pixels).close()  # which says whether it stands before something else
+    width, height, channels, bits = form
+    check_size(path, "a picture", (width, height), width * height * channels, path.stat().st_size, max_pixels)
+    return ScanHead(file_format, width, height, min(channels, 3), bits, pitch)
+
+
+def declared_tone(path: Path) -> Tone | None:
+    """The tone curve that a file declares.
+
+    Returns
+    -------
+    None where the file says nothing that can be used. Nothing is raised for what it holds.
+    """
+    try:
+        with path.open("rb") as opened:
+            start = opened.read(16)
+        if start[:2] in (b"II", b"MM"):
+            return tone_of_tags(tiff_colour_tags(path))
+        return tone_of_tags(png_colour_tags(path) if start.startswith(PNG_START) else jpeg_colour_tags(path))
+    except (*DECODING_ERRORS, zlib.error):
+        return None
+
+
+def _head_and_end(path: Path) -> tuple[bytes, bytes]:
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEADERS_BYTES)
+            file.seek(max(path.stat().st_size - _END_BYTES, 0))
+            return head, file.read()
+    except OSError as error:
+        raise MeasurementError(
+            f"{path} cannot be read: {error.strerror}; check that it is a file you may read"
+        ) from error
+
+
+def crop_scan(scan: Scan, window: Window) -> Scan:
+    """A window of a scan as a scan of its own, whose pixels count from the window's first one.
+
+    Parameters
+    ----------
+    scan : stays open as long as the window is read.
+
+    Raises
+    ------
+    ValueError
+        For a window that does not lie in the scan.
+    """
+    col, row, width, height = window
+    if min(width, height) < 1 or min(col, row) < 0 or col + width > scan.width_px or row + height > scan.height_px:
+        raise ValueError(
+            f"the window {col} {row} {width} {height} does not lie in {scan.width_px} x {scan.height_px} px"
+        )
+    pitch, segments = Pitch(scan.pitch_um, scan.pitch_note), WindowSegments(scan, window)
+    opened = OpenedPicture(segments, pitch, scan.notes, scan.problems, orientation=scan.orientation)
+    view = Scan(scan.path, segments, pitch, opened).replace_name(scan.name)
+    return view.replace_tone(scan.tone)
+
+
+class WindowSegments:
+    """A window of a scan in bands of rows, as `Segments` has it."""
+
+    def __init__(self, scan: Scan, window: Window) -> None:
+        self._scan = scan
+        self._col0, self._row0, self.width_px, self.height_px = window
+        self.segment_width_px = self.width_px
+        self.segment_height_px = min(max(_BAND_PX // self.width_px, 1), self.height_px)
+        self.channels = scan.channels
+        self.full_scale_dn = scan.full_scale_dn
+        self.sample_bytes = scan.samples_dtype().itemsize
+        self.rounding_step_dn = scan.rounding_step_dn
+
+    @property
+    def lost(self) -> Sequence[LostPart]:
+        return tuple(
+            LostPart(part.col0 - self._col0, part.row0 - self._row0, part.width, part.height, part.why)
+            for part in self._scan.lost
+        )
+
+    def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
+        return {}
+
+    def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
+        """A band of rows."""
+        first = row * self.segment_height_px
+        height = min(self.segment_height_px, self.height_px - first)
+        return self._scan.samples(self._col0, self._row0 + first, self.width_px, height)
+
+    def close(self) -> None:
+        """The scan is another's to close."""
+
+
+def thumbnail(scan: Scan, largest_px: int) -> Scan:
+    """The scan's grey values at 16 bits, area-averaged until no side is longer than largest_px. Its pitch is the
+    file's, times as much as a pixel has become longer."""
+    shrunk = max(max(scan.width_px, scan.height_px) / largest_px, 1.0)
+    grey, unit = _reduced(scan, int(shrunk)), _FULL_SCALE_DN / scan.full_scale_dn
+    size = round(scan.width_px / shrunk), round(scan.height_px / shrunk)
+    same = size == grey.shape[::-1]
+    samples = grey if same else np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint16)
+    pitch = Pitch(None if scan.pitch_um is None else (shrunk * scan.pitch_um[0], shrunk * scan.pitch_um[1]))
+    picture = WholePicture(samples[:, :, None], scan.rounding_step_dn * unit / shrunk)
+    return Scan(scan.path, picture, pitch)
+
+
+def _reduced(scan: Scan, factor: int) -> NDArray[np.uint16]:
+    """Grey values at 16 bits, averaged by a whole factor: band by band, so that colours are never held of all of it."""
+    unit = np.float32(_FULL_SCALE_DN / scan.full_scale_dn)
+    grey = np.empty((scan.height_px // factor, scan.width_px // factor), np.uint16)
+    rows = max(_GREY_BAND_PX // scan.width_px // factor, 1)
+
+    def fill(row: int) -> None:
+        band = grey[row : row + rows]
+        band[:] = np.rint(unit * scan.reduced_window(factor, 0, row, grey.shape[1], len(band)))
+
+    map_in_threads(fill, range(0, len(grey), rows))
+    return grey
