@@ -193,9 +193,9 @@ LINES = (
         "self.vpv / self.conditions",
         "adjust/test_adjust_reference.py",
     ),
-    Broken("adjust/choices/comparison.py", "chi / freedom)) if", "chi)) if", "adjust/test_comparison.py"),
+    Broken("adjust/quality/lens_comparison.py", "chi / freedom)) if", "chi)) if", "adjust/test_comparison.py"),
     Broken(
-        "adjust/undetermined/datum.py",
+        "adjust/rank_defect/datum.py",
         "sum(axis=1).mean())) or 1.0",
         "sum(axis=1).max())) or 1.0",
         "adjust/test_datum.py",

@@ -1,5 +1,5 @@
-"""How often `adjust.choices.comparison` says drift: of calibrations that are alike, and of ones that differ by 2, 3, 5
-sigmas.
+"""How often `adjust.quality.lens_comparison` says drift: of calibrations that are alike, and of
+ones that differ by 2, 3, 5 sigmas.
 
     python benchmarks/compare_power.py [pairs] [--series | --adjustment]
 
@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.choices.comparison import CameraCalibration, compare
 from adjust.problem.camera import Distortion
+from adjust.quality.lens_comparison import CameraCalibration, compare
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.initial_values.resection import Pose
-from adjust.target_names.naming import Names, name_marks
+from adjust.target_identification.naming import Names, name_marks
 
 Array = NDArray[np.float64]
 

@@ -27,13 +27,13 @@ ADJUST_FROM_THE_GROUND_UP = (
     "functional_model",
     "problem",
     "least_squares",
-    "undetermined",
+    "rank_defect",
     "validation",
     "initial_values",
     "quality",
     "solution",
-    "target_names",
-    "choices",
+    "target_identification",
+    "model_selection",
 )  # folders, and the files at the root
 TYPES_ALONE = {"_typeshed"}  # known to type checkers, and not to Python
 LOADED_BY_OTHERS = {"s3fs"}  # by fsspec, for addresses of its scheme

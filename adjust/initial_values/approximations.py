@@ -11,7 +11,7 @@ from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.projection import folded_over
 from adjust.functional_model.rotation import angles_from_rotation, angles_near
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.closed_form import KnownField, taper
+from adjust.initial_values.dlt import KnownField, taper
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.initial_values.frames import Frames, frames_of
 from adjust.initial_values.joined_frames import Film, joined_frames, whole_frames

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.closed_form import KnownField, orient_together
+from adjust.initial_values.dlt import KnownField, orient_together
 from adjust.initial_values.intersection import intersect
 from adjust.initial_values.resection import Pose, resect, three_point_poses
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.initial_values.closed_form import KnownField, principal_distance_together
+from adjust.initial_values.dlt import KnownField, principal_distance_together
 from adjust.initial_values.resection import Resection, refine, resect
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.initial_values.p3p import triple_poses
 from adjust.initial_values.pose_refinement import BEHIND, refined_poses, squared_residuals
-from adjust.initial_values.three_points import triple_poses
 
 Array = NDArray[np.float64]
 Count = TypeVar("Count", int, NDArray[np.intp])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.projection import camera_from_ray, ideal_from_observed, rays
-from adjust.initial_values.closed_form import KnownField
+from adjust.initial_values.dlt import KnownField
 from adjust.initial_values.resection import resect
 from adjust.problem.camera import Distortion
 

@@ -115,7 +115,7 @@ class Problem:
     by_elements: distortion is that of the observed camera point and not of the adjusted one, so that every observation
     is an explicit function of the unknowns (adjustment by elements, of indirect observations).
     pseudo_observed: positions of free unknowns that are held near their given values, and by which standard deviations
-    (see `undetermined.flat_valleys`): no observations, and none of what the result tells of these.
+    (see `rank_defect.flat_valleys`): no observations, and none of what the result tells of these.
     """
 
     network: Network

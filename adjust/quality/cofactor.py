@@ -11,7 +11,7 @@ from adjust.functional_model.rotation import vector_by_angles
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.problem import Problem, State
-from adjust.undetermined.datum import free_motion
+from adjust.rank_defect.datum import free_motion
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -18,6 +18,8 @@ from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment, Cofactor, VarianceFactor
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
+from adjust.rank_defect.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
+from adjust.rank_defect.datum_choice import chosen_coordinates, chosen_points, with_held
 from adjust.solution.assessment import RunAssessment, conditions_of, redundancy_of, variance_of
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
 from adjust.solution.coordinate_blunders import Slip, far_points, few_points, freed, slips
@@ -25,8 +27,6 @@ from adjust.solution.left_out_images import fitting, with_lens, without_images
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import with_plausibility
 from adjust.solution.reweighting import Run, again, run
-from adjust.undetermined.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
-from adjust.undetermined.datum_choice import chosen_coordinates, chosen_points, with_held
 from adjust.validation import validate
 
 __all__ = ["Datum", "Method", "Options", "adjust", "adjust_problem", "with_datum"]

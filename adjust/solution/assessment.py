@@ -31,11 +31,11 @@ from adjust.quality.snooping import contradictions, search, suspects
 from adjust.quality.suspicions import is_gross, swapped_numbers, unchecked_orientations
 from adjust.quality.variance_components import factor_sigmas
 from adjust.quality.variance_factor import variance_factor
+from adjust.rank_defect.diagnosis import undetermined, weak_directions
+from adjust.rank_defect.flat_valleys import held_directions, inseparable
+from adjust.rank_defect.scanner_directions import hardly_told
 from adjust.solution.explanations import Explained, explain
 from adjust.solution.reweighting import ROUNDS, Run
-from adjust.undetermined.diagnosis import undetermined, weak_directions
-from adjust.undetermined.flat_valleys import held_directions, inseparable
-from adjust.undetermined.scanner_directions import hardly_told
 
 
 def conditions_of(run: Run, cofactor: Cofactor) -> int:

@@ -25,11 +25,11 @@ from adjust.least_squares.numbering import Numbering
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.result import Explanation
 from adjust.quality.snooping import Contradiction, Search, contradictions, rest_without, search
+from adjust.rank_defect.diagnosis import singular_directions
 from adjust.solution.explanation_words import noise_words, sentence
 from adjust.solution.model_hypotheses import ModelHypothesis, apart, model_hypotheses
 from adjust.solution.noise_hypothesis import AddedNoise, added_noise
 from adjust.solution.reweighting import Run, again
-from adjust.undetermined.diagnosis import singular_directions
 
 Array = NDArray[np.float64]
 

@@ -21,15 +21,15 @@ from adjust.quality.reliability import Misfits, misfits, statistics
 from adjust.quality.reweighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
 from adjust.quality.snooping import Contradiction, contradictions, limits, search
 from adjust.quality.variance_components import refined_factors
-from adjust.solution.options import Options
-from adjust.undetermined.diagnosis import singular_directions
-from adjust.undetermined.flat_valleys import (
+from adjust.rank_defect.diagnosis import singular_directions
+from adjust.rank_defect.flat_valleys import (
     REACHES,
     edge_motions,
     is_contradicted,
     pseudo_square_sum,
     unresolved,
 )
+from adjust.solution.options import Options
 
 ROUNDS = 30  # of robust estimation, of variance components or of data snooping at most
 ITERATIONS_A_ROUND = 8  # of the adjustments whose weights robust estimation is to change anyway

@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from adjust.choices.candidates import Candidate
-from adjust.choices.model_choice import Choice, choose
-from adjust.choices.models import Model
+from adjust.model_selection.candidates import Candidate
+from adjust.model_selection.model_choice import Choice, choose
+from adjust.model_selection.models import Model
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.adjusting.scanners import with_scanner_names
 from pipeline.files.project_file import Project

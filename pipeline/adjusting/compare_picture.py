@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from adjust.choices.comparison import Comparison
+from adjust.quality.lens_comparison import Comparison
 from pipeline.drawing import svg
 
 Array = NDArray[np.float64]

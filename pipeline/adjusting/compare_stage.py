@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from adjust.choices.comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
 from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import Parameter
+from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
 from pipeline.adjusting.compare_picture import draw_comparison
 from pipeline.errors import InputError
 from pipeline.results.adjustment_reader import calibrated_lens, read_adjustment, read_own_covariance

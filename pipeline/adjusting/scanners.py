@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from adjust.choices.scanner_choice import choose_bends, with_bends
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
+from adjust.model_selection.scanner_choice import choose_bends, with_bends
 from adjust.problem.network import Network
 from adjust.problem.result import Adjustment
 from pipeline.errors import InputError

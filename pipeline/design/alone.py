@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from adjust.choices.planning import plan
 from adjust.problem.camera import Camera, Fiducial, Prior
 from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import Options
+from adjust.solution.planning import plan
 from pipeline.design.expected import INTERIOR, Expected
 from pipeline.design.setup import planned_network
 

@@ -7,13 +7,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.choices.planning import Plan, plan
 from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import ideal_from_observed
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import Options
+from adjust.solution.planning import Plan, plan
 from pipeline.design.reliability import PlannedReliability, planned_reliability
 from pipeline.design.setup import Setup, planned_network
 from pipeline.report.lens import Lens, displacement

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.choices.planning import Plan
 from adjust.problem.parameter import Parameter
+from adjust.solution.planning import Plan
 
 UM_PER_MM = 1000.0
 IN_MM = ("target", "tie", "fiducial", "datum", "scanner")

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.choices.lens_conversion import ConvertedLens, convert_lens
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
+from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
 from adjust.problem.camera import Distortion, Prior
 from adjust.problem.parameter import Parameter
 from pipeline.errors import InputError

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.choices.lens_conversion import convert_lens, frame_grid_mm
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
 from adjust.functional_model.projection import camera_from_ray, ideal_from_observed
 from adjust.problem.camera import Distortion
 from pipeline.exchange.block import Block, Frame

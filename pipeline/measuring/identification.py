@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from adjust.initial_values.resection import MAX_TRIPLES
-from adjust.target_names.unnamed_marks import chance_of_a_mark, density_about, log10_of_agreement
+from adjust.target_identification.unnamed_marks import chance_of_a_mark, density_about, log10_of_agreement
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from adjust.functional_model.projection import ImageModel
-from adjust.target_names.naming import Names, name_coded, name_marks
+from adjust.target_identification.naming import Names, name_coded, name_marks
 from measure.targets.block_search import Candidate
 from measure.targets.measure_targets import TargetPrediction
 from pipeline.files.camera_file import CameraFile

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.choices.lens_conversion import convert_lens
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens_conversion import convert_lens
 from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem

@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.choices.model_choice import choose
 from adjust.errors import AdjustmentError
 from adjust.functional_model.board import board_form
 from adjust.initial_values.approximations import approximate
+from adjust.model_selection.model_choice import choose
 from adjust.problem.camera import Camera, Distortion, Prior
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.images import adjusted_places

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from adjust.choices.comparison import CameraCalibration, compare, sigmas
 from adjust.errors import AdjustmentError
 from adjust.problem.camera import Distortion
+from adjust.quality.lens_comparison import CameraCalibration, compare, sigmas
 
 Array = NDArray[np.float64]
 

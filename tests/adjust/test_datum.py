@@ -16,8 +16,8 @@ from adjust.problem.camera import Fiducial, Prior
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Image, Network, ObjectPoint
 from adjust.problem.problem import number
 from adjust.problem.result import Adjustment
+from adjust.rank_defect.datum import object_datum
 from adjust.solution.adjustment import Datum, Options, adjust
-from adjust.undetermined.datum import object_datum
 
 Array = NDArray[np.float64]
 

@@ -22,8 +22,8 @@ from adjust.problem.camera import Fiducial, Prior
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.problem.problem import number
+from adjust.rank_defect import diagnosis
 from adjust.solution.adjustment import adjust
-from adjust.undetermined import diagnosis
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from simulated import ATTITUDES, STATIONS, Truth, camera_point, field_points, rotation, simulated
 
-from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
 from adjust.least_squares.numbering import Numbering
@@ -18,6 +17,7 @@ from adjust.problem.observations import Distance
 from adjust.problem.problem import number
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.planning import plan
 
 Array = NDArray[np.float64]
 

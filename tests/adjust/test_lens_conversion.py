@@ -8,9 +8,9 @@ import pytest
 from lens_networks import LENSES, network_of
 from numpy.typing import NDArray
 
-from adjust.choices.lens_conversion import convert_lens
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens_conversion import convert_lens
 from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Distortion, Prior
 from adjust.problem.network import Network

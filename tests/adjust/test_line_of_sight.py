@@ -9,11 +9,11 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 from simulated import Truth, camera_point, field_points, simulated, start_of
 
-from adjust.choices.planning import plan
 from adjust.functional_model.line_of_sight import EARTH_RADIUS_M, sight_vectors
 from adjust.problem.images import approximate_image
 from adjust.problem.network import LineOfSight, Network
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.planning import plan
 
 Array = NDArray[np.float64]
 

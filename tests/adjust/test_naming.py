@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import rotation_from_vector
-from adjust.target_names.naming import Names, name_marks
+from adjust.target_identification.naming import Names, name_marks
 
 Array = NDArray[np.float64]
 

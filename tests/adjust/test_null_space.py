@@ -9,8 +9,8 @@ from simulated import field_points
 from adjust.linear_algebra.factor import BlockFactors, DenseBlocks, Factor
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.sparse_factor import Triangle
+from adjust.rank_defect import null_space
 from adjust.solution.adjustment import Options, adjust
-from adjust.undetermined import null_space
 
 
 def triangle(rng: np.random.Generator, singular: Array) -> Array:

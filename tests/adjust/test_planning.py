@@ -7,12 +7,12 @@ import pytest
 from reference_cases import CAMERA, approximations_of, load, network_of, own_name
 from simulated import simulated
 
-from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
 from adjust.problem.camera import Camera, Fiducial, Prior
 from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import Datum, Options, adjust
+from adjust.solution.planning import plan
 
 TARGETS: tuple[ObservationKind, ...] = ("target",) * 5
 FIDUCIALS: tuple[ObservationKind, ...] = ("fiducial",) * 3

@@ -8,8 +8,8 @@ import pytest
 from bent_scans import MIDDLE_MM, RESEAU_MM, films, in_a_bent_scanner
 from simulated import STATIONS, Truth, field_points, simulated
 
-from adjust.choices.scanner_choice import choose_bends, with_bends
 from adjust.initial_values.approximations import approximate
+from adjust.model_selection.scanner_choice import choose_bends, with_bends
 from adjust.problem.network import Approximations, Network
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from adjust.choices.lens_conversion import ConvertedLens, convert_lens
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
 from adjust.functional_model.projection import camera_from_ray
 from adjust.problem.camera import Distortion
 from pipeline.opencv_check.opencv_model import (

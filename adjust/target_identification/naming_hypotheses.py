@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from adjust.initial_values.p3p import triple_poses
 from adjust.initial_values.pose_refinement import refined_poses
-from adjust.initial_values.three_points import triple_poses
-from adjust.target_names.unnamed_marks import Marks
+from adjust.target_identification.unnamed_marks import Marks
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

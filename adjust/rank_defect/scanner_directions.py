@@ -11,7 +11,7 @@ from adjust.linear_algebra.factor import Factor
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import Cofactor
-from adjust.undetermined.directions import Lead
+from adjust.rank_defect.directions import Lead
 
 SCANNER_RANK = -2
 INTERIOR = ("c", "x0", "y0")

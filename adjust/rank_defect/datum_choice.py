@@ -11,8 +11,8 @@ from adjust.problem.camera import Prior
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter, object_coordinate
 from adjust.problem.problem import Problem
-from adjust.undetermined.datum import FLAT, ObjectDatum, free_coordinates, object_datum
-from adjust.undetermined.directions import DATUM_LEADS
+from adjust.rank_defect.datum import FLAT, ObjectDatum, free_coordinates, object_datum
+from adjust.rank_defect.directions import DATUM_LEADS
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -3,8 +3,8 @@ observations.
 
 Every candidate is adjusted with the same weights. Of two of which one contains the other, the F-test of their sums of
 squares says whether the richer one is needed; any two are compared by Akaike's criterion; and all by how well they
-predict points that had no part in their fit (`adjust.choices.cross_validation`). Chosen is the simplest model that no
-richer one is significantly better than.
+predict points that had no part in their fit (`adjust.model_selection.cross_validation`). Chosen is the simplest model that
+no richer one is significantly better than.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,19 +12,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from adjust.choices.candidates import Candidate, Nested, nested_tests, simplest_sufficient
-from adjust.choices.choice_reasons import reasons, verdict
-from adjust.choices.cross_validation import approximations_of, cross_validate, folds
-from adjust.choices.models import Bends, Model, given_model, left_by, lenses, transformations
-from adjust.choices.scanner_choice import choose_bends
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
+from adjust.model_selection.candidates import Candidate, Nested, nested_tests, simplest_sufficient
+from adjust.model_selection.choice_reasons import reasons, verdict
+from adjust.model_selection.cross_validation import approximations_of, cross_validate, folds
+from adjust.model_selection.models import Bends, Model, given_model, left_by, lenses, transformations
+from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Network
 from adjust.problem.parameter import description
 from adjust.problem.result import Adjustment
 from adjust.quality.reweighting import NO_WEIGHT
+from adjust.rank_defect.datum_choice import with_held
 from adjust.solution.adjustment import Options, adjust
-from adjust.undetermined.datum_choice import with_held
 
 HIGH_CORRELATION = 0.95
 ROUNDS = 3  # of choosing distortion, bends and transformation in turns

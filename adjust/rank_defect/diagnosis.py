@@ -10,12 +10,12 @@ from adjust.linear_algebra.factor import Factor
 from adjust.problem.parameter import Parameter, description
 from adjust.problem.problem import Problem, State
 from adjust.problem.result import NullDirection
-from adjust.undetermined.datum import free_coordinates, object_datum
-from adjust.undetermined.directions import camera_leads, datum_sentence, field_of, following
-from adjust.undetermined.flat_valleys import trading_off
-from adjust.undetermined.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
-from adjust.undetermined.own_directions import many_sentence, own_sentence, unnamed_sentence
-from adjust.undetermined.scanner_directions import scanner_leads
+from adjust.rank_defect.datum import free_coordinates, object_datum
+from adjust.rank_defect.directions import camera_leads, datum_sentence, field_of, following
+from adjust.rank_defect.flat_valleys import trading_off
+from adjust.rank_defect.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
+from adjust.rank_defect.own_directions import many_sentence, own_sentence, unnamed_sentence
+from adjust.rank_defect.scanner_directions import scanner_leads
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import rotation_from_vector
-from adjust.target_names.unnamed_marks import Marks, log10_of_agreement
+from adjust.target_identification.unnamed_marks import Marks, log10_of_agreement
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from adjust.choices.cross_validation import CrossValidation
-from adjust.choices.models import Model
+from adjust.model_selection.cross_validation import CrossValidation
+from adjust.model_selection.models import Model
 from adjust.quality.significance import LEVEL
 
 DECISIVE = 10.0  # difference of AICc from which on the worse model has essentially no support (Burnham and Anderson)

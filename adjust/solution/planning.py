@@ -19,8 +19,8 @@ from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment, NullDirection
 from adjust.quality.cofactor import free_cofactor
+from adjust.rank_defect.null_space import null_vectors
 from adjust.solution.adjustment import Options, adjust_problem, with_datum
-from adjust.undetermined.null_space import null_vectors
 from adjust.validation import validate_plan
 
 Array = NDArray[np.float64]

@@ -18,9 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.initial_values.resection import Pose, resect
-from adjust.target_names.naming_growth import OF_POSE, Grown, View, grow, log10_of_chance
-from adjust.target_names.naming_hypotheses import Cluster, Poses, clusters, mark_triples, point_triples, promising
-from adjust.target_names.unnamed_marks import Marks
+from adjust.target_identification.naming_growth import OF_POSE, Grown, View, grow, log10_of_chance
+from adjust.target_identification.naming_hypotheses import (
+    Cluster,
+    Poses,
+    clusters,
+    mark_triples,
+    point_triples,
+    promising,
+)
+from adjust.target_identification.unnamed_marks import Marks
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from adjust.functional_model.sight import Sight
 from adjust.initial_values import block, principal_distance
 from adjust.initial_values.approximations import approximate
 from adjust.initial_values.block import resected
-from adjust.initial_values.closed_form import KnownField, orient_together, principal_distance_together
+from adjust.initial_values.dlt import KnownField, orient_together, principal_distance_together
 from adjust.initial_values.resection import Pose
 
 Array = NDArray[np.float64]

@@ -21,7 +21,7 @@ from adjust.problem.network import Network, Scanner
 from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment
 from adjust.quality.significance import LEVEL
-from adjust.undetermined.scanner_directions import HARDLY, poses_of, untold_sentences
+from adjust.rank_defect.scanner_directions import HARDLY, poses_of, untold_sentences
 
 Array = NDArray[np.float64]
 

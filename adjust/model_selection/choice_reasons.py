@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import chdtri
 
-from adjust.choices.candidates import Candidate, Nested, f_test
-from adjust.choices.models import Model
+from adjust.model_selection.candidates import Candidate, Nested, f_test
+from adjust.model_selection.models import Model
 from adjust.quality.significance import LEVEL
 
 
