@@ -1,9 +1,9 @@
 from .errors import AdjustmentError as AdjustmentError
+from .functional_model.lens import Distortion as Distortion
+from .functional_model.lens import Prior as Prior
 from .initial_values.approximations import approximate as approximate
 from .problem.camera import Camera as Camera
-from .problem.camera import Distortion as Distortion
 from .problem.camera import Fiducial as Fiducial
-from .problem.camera import Prior as Prior
 from .problem.network import Approximations as Approximations
 from .problem.network import Exterior as Exterior
 from .problem.network import Image as Image

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import fewest_marks, marks_needed
-from adjust.problem.camera import Camera, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network
 from adjust.problem.observations import Observations
 from adjust.problem.parameter import Parameter, description

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.camera import Distortion
+from adjust.functional_model.lens import Distortion
 from adjust.quality.lens_comparison import CameraCalibration, compare
 
 Array = NDArray[np.float64]

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import Distance, ObservationKind, Observations
 from adjust.solution.adjustment import Options, adjust

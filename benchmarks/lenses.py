@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Board, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust

@@ -29,7 +29,7 @@ from large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, known
 from numpy.typing import NDArray
 from scale import ONE_THREAD, measured
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]

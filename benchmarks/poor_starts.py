@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
 from adjust.functional_model.transformation import Film
-from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment

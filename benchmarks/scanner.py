@@ -18,9 +18,9 @@ from bent_scans import MIDDLE_MM, films, in_a_bent_scanner
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
+from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
 from adjust.model_selection.scanner_choice import choose_bends
-from adjust.problem.camera import Prior
 from adjust.problem.network import Approximations, Network
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust

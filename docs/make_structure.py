@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.condition_equations import compute, derivatives
 from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class Settings(Protocol):
-    """What a family is told beside its parameters; see `adjust.problem.camera.Distortion`."""
+    """What a family is told beside its parameters; see `adjust.functional_model.lens.Distortion`."""
 
     @property
     def decentering(self) -> str: ...

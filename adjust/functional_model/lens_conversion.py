@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from adjust.errors import AdjustmentError
 from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import family, parameter_names
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.projection import camera_from_ray, ideal_from_observed
-from adjust.problem.camera import Distortion
 
 Array = NDArray[np.float64]
 

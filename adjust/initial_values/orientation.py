@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError, UnorientedError
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.block import Block, extend, intersected, known_field, resected
 from adjust.initial_values.model_formation import orient_free_model, typical_residual
 from adjust.initial_values.resection import Pose, image_distances
 from adjust.initial_values.vertical_block import orient_vertical_block
-from adjust.problem.camera import Prior
 from adjust.problem.network import Exterior, Network
 from adjust.problem.observations import Distance
 

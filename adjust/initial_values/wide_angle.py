@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.projection import camera_from_ray, ideal_from_observed, rays
 from adjust.initial_values.dlt import KnownField
 from adjust.initial_values.resection import resect
-from adjust.problem.camera import Distortion
 
 Array = NDArray[np.float64]
 

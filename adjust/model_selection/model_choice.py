@@ -3,8 +3,8 @@ observations.
 
 Every candidate is adjusted with the same weights. Of two of which one contains the other, the F-test of their sums of
 squares says whether the richer one is needed; any two are compared by Akaike's criterion; and all by how well they
-predict points that had no part in their fit (`adjust.model_selection.cross_validation`). Chosen is the simplest model that
-no richer one is significantly better than.
+predict points that had no part in their fit (`adjust.model_selection.cross_validation`). Chosen is the simplest model
+that no richer one is significantly better than.
 """
 
 from collections.abc import Callable, Mapping

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.functional_model.families import family, parameter_names
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import is_left
 from adjust.functional_model.transformation import marks_needed
 from adjust.model_selection.scanner_choice import with_terms
-from adjust.problem.camera import Prior
 from adjust.problem.network import Network, Transformation
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
-from adjust.problem.camera import Prior
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network, Scanner
 from adjust.problem.parameter import Parameter

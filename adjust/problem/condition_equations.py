@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.correction import Imaged
 from adjust.functional_model.distortion import equations_of
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.line_of_sight import SightVectors, sight_vectors
 from adjust.functional_model.projection import camera_from_image, imaged_ray, rays
 from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, of_each, product, zeros
-from adjust.problem.camera import Distortion
 from adjust.problem.problem import Films, Part, Problem, State
 
 Array = NDArray[np.float64]

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.board import board_form
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.line_of_sight import STRAIGHT as STRAIGHT
 from adjust.functional_model.line_of_sight import LineOfSight as LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND, Bend, is_term
 from adjust.functional_model.transformation import film_kind
-from adjust.problem.camera import Camera, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.observations import Calibration, Distance, Observations
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import Approximations, Board, Image, Network, ObjectPoint
 from adjust.problem.unknowns import Unknowns
 

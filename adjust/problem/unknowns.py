@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from adjust.errors import AdjustmentError
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.problem.camera import Camera, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
 

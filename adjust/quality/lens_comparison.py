@@ -19,8 +19,8 @@ from scipy.special import fdtrc
 from adjust.errors import AdjustmentError
 from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.projection import ideal_from_observed
-from adjust.problem.camera import Distortion
 
 Array = NDArray[np.float64]
 Use = Literal["space", "flat"]

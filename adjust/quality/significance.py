@@ -19,7 +19,8 @@ from scipy.special import chdtrc, fdtrc, ndtr, stdtr
 
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family
-from adjust.problem.camera import Camera, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Board, Scanner
 from adjust.problem.parameter import Kind, Parameter
 from adjust.problem.result import Adjustment, GivenGroup

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import DatumError
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter, object_coordinate
 from adjust.problem.problem import Problem

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment

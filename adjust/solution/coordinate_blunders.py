@@ -8,11 +8,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.frames import frames_of
 from adjust.initial_values.intersection import intersect
 from adjust.initial_values.resection import Pose, image_distances
-from adjust.problem.camera import Prior
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.functional_model.families import parameter_names
-from adjust.problem.camera import Camera, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.added_terms import DECENTERING, RADIAL
 from adjust.functional_model.families import EXTENDED, family
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import is_left
-from adjust.problem.camera import Camera, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Board, Image, Network, Scanner
 from adjust.problem.problem import Problem, State, number
 from adjust.solution.image_groups import two_groups

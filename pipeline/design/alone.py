@@ -9,7 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import Options
 from adjust.solution.planning import plan

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import smooth_terms
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.problem import network
-from adjust.problem.camera import Camera, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.observations import Distance, ObservationKind, Observations
 from pipeline.adjusting.network import FEWEST_TARGETS

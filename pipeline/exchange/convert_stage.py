@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
-from adjust.problem.camera import Distortion, Prior
 from adjust.problem.parameter import Parameter
 from pipeline.errors import InputError
 from pipeline.exchange.export_stage import README, check_folder, publish

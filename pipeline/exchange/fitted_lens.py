@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
 from adjust.functional_model.projection import camera_from_ray, ideal_from_observed
-from adjust.problem.camera import Distortion
 from pipeline.exchange.block import Block, Frame
 from pipeline.exchange.convention import ExportOptions
 from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, fixed, opencv_values

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.camera import Distortion, Prior
+from adjust.functional_model.lens import Distortion, Prior
 from pipeline.errors import InputError
 from pipeline.exchange.incoming import ForeignPose, ImportOptions
 from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD

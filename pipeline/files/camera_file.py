@@ -10,7 +10,8 @@ from typing import cast, get_args
 import numpy as np
 
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
-from adjust.problem.camera import Camera, Decentering, Distortion, Fiducial, Prior
+from adjust.functional_model.lens import Decentering, Distortion, Prior
+from adjust.problem.camera import Camera, Fiducial
 from measure.marks import shapes
 from pipeline.errors import InputError
 from pipeline.files.camera_units import check_units

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Mapping
 
 from adjust.functional_model.families import family
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from measure.marks import shapes
 from pipeline.files.camera_file import NO_MARK, CameraFile, GivenFiducial, written_place_text
 from pipeline.files.learned_table import LearnedFrom

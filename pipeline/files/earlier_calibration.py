@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
 from pipeline.results.adjustment_reader import Covariance, covariance_path, read_adjustment, read_covariance

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, read_csv

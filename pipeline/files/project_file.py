@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, cast, get_args
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from measure.fiducials.options import ANY_FILM, BelievedFilm, Reads
 from measure.geometry import POSES

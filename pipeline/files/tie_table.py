@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from pipeline.text.tables import Table
 

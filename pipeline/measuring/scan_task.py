@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adjust.problem.camera import Distortion, Prior
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Exterior
 from measure.annotations.fields import KnownLine
 from measure.errors import MissingError

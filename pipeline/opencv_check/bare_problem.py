@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations

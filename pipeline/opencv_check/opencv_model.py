@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
-from adjust.problem.camera import Distortion, Prior
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.displacement import Displacement
 from adjust.functional_model.displacement import displacement as lens_displacement
 from adjust.functional_model.families import family, parameter_names
-from adjust.problem.camera import Distortion
+from adjust.functional_model.lens import Distortion
 from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
 from pipeline.report.data import Json

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.projection import camera_from_ray, ideal_from_observed
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.problem.camera import Distortion
 from pipeline.results.adjustment_reader import calibrated_lens
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
 from pipeline.results.measured_scan import MeasuredScan

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family, parameter_names
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import EXTERIOR_NAMES, Board, Image, ObjectPoint, Scanner
 from adjust.problem.parameter import Kind, Parameter

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.problem.camera import Distortion
 from adjust.problem.parameter import (
     Parameter,
     parameter_from_text,

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Image, Network, Scanner, Transformation
 from adjust.problem.observations import Observations
 

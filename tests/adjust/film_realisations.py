@@ -7,8 +7,9 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Approximations, Image, Network, Transformation
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment

@@ -13,7 +13,8 @@ from simulated import (
     film_parameters,
 )
 
-from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.probabilities import Probabilities

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
 from adjust.errors import AdjustmentError
-from adjust.problem.camera import Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Fiducial
 from adjust.problem.network import Exterior, Network, ObjectPoint
 from adjust.solution.adjustment import adjust
 

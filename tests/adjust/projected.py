@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Image, Network, ObjectPoint, Transformation
 from adjust.problem.observations import ObservationKind, Observations
 

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from reference_cases import CAMERA, Case, approximations_of, network_of, own_name
 
-from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.condition_equations import computed_observations
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.problem import number

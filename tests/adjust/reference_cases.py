@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from simulated import STATIONS, Truth, field_points, simulated
 
-from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Approximations, Network, ObjectPoint, Transformation
 
 Array = NDArray[np.float64]

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.camera import Camera, Decentering, Distortion, Fiducial, Prior
+from adjust.functional_model.lens import Decentering, Distortion, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Approximations, Image, Network, ObjectPoint, Transformation
 from adjust.problem.observations import Observations
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from reference_cases import CAMERA, Case, approximations_of, load, network_of, own_name
 
-from adjust.problem.camera import Distortion, Prior
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Network
 from adjust.problem.observations import Observations
 from adjust.problem.result import Adjustment

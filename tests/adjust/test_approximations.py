@@ -11,8 +11,8 @@ from reference_cases import load, network_of
 from scipy.spatial.transform import Rotation
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Distortion, Prior
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Exterior, Network, ObjectPoint, Transformation
 from adjust.problem.observations import Observations
 from adjust.solution.adjustment import adjust

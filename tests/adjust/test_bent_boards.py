@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.board import board_form
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
 from adjust.model_selection.model_choice import choose
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.images import adjusted_places
 from adjust.problem.network import Board, Image, Network, ObjectPoint

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from real_data import DATA, needs
 from scipy.io import loadmat
 
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from real_data import DATA, needs
 
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import Options, adjust

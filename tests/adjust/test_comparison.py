@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
-from adjust.problem.camera import Distortion
+from adjust.functional_model.lens import Distortion
 from adjust.quality.lens_comparison import CameraCalibration, compare, sigmas
 
 Array = NDArray[np.float64]

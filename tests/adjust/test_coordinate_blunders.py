@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Prior
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust

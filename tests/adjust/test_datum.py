@@ -9,10 +9,11 @@ from reference_cases import approximations_of, load, network_of
 from simulated import Truth, rotation, simulated
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import angles_from_rotation
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Fiducial, Prior
+from adjust.problem.camera import Fiducial
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Image, Network, ObjectPoint
 from adjust.problem.problem import number
 from adjust.problem.result import Adjustment

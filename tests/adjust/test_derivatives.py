@@ -11,9 +11,9 @@ from simulated import KINDS, Truth, simulated
 
 from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Decentering, Distortion, Prior
 from adjust.functional_model.projection import rays
 from adjust.functional_model.rotation import rotation_from_angles, rotation_from_vector, vector_by_angles
-from adjust.problem.camera import Decentering, Distortion, Prior
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.network import Transformation
 from adjust.problem.problem import Problem, number

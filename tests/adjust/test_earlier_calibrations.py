@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from simulated import field_points, simulated
 
 from adjust.errors import AdjustmentError
-from adjust.problem.camera import Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Fiducial
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.observations import Calibration, Observations
 from adjust.problem.parameter import Parameter

@@ -7,7 +7,7 @@ import pytest
 from misfits import KINDS, NOTHING, Effects, Kind, drawn, network, outcome, said, scene
 
 from adjust.errors import AdjustmentError
-from adjust.problem.camera import Distortion, Prior
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Network
 from adjust.solution.adjustment import adjust
 

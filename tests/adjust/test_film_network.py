@@ -20,8 +20,8 @@ from simulated import (
 )
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Prior
 from adjust.problem.network import Network, Transformation
 from adjust.problem.observations import Observations
 from adjust.problem.result import Adjustment

@@ -8,8 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.projection import ideal_from_observed
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.problem.result import Adjustment

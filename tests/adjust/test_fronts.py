@@ -11,6 +11,7 @@ from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from scipy.sparse.linalg import splu
 from simulated import Truth, simulated
 
+from adjust.functional_model.lens import Prior
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import WhitenedRows, prior_root_weights
@@ -18,7 +19,7 @@ from adjust.linear_algebra import elimination, fronts, sparse_factor
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.fronts import Fronts, fronts_of
-from adjust.problem.camera import Fiducial, Prior
+from adjust.problem.camera import Fiducial
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.problem.problem import number

@@ -9,9 +9,9 @@ from scipy.optimize import least_squares
 from simulated import ATTITUDES, STATIONS, Truth, camera_point, field_points, rotation, simulated
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
 from adjust.least_squares.numbering import Numbering
-from adjust.problem.camera import Prior
 from adjust.problem.network import Exterior, Network, ObjectPoint
 from adjust.problem.observations import Distance
 from adjust.problem.problem import number

@@ -9,7 +9,7 @@ from mishaps import MISHAPS, sentences
 from null_directions import AXES, CATALOGUE, DEFORMATIONS, DISTANCE
 from setups import CONVERGENT, Setup, given
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import Approximations, Exterior, Network, Transformation
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from simulated import Truth, field_points, simulated
 
+from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Prior
 from adjust.problem.network import Network, ObjectPoint
 from adjust.solution.adjustment import adjust
 from adjust.solution.options import Options

@@ -8,8 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.solution.adjustment import Options, adjust

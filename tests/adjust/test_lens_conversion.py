@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.lens_conversion import convert_lens
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Distortion, Prior
 from adjust.problem.network import Network
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust

@@ -7,9 +7,9 @@ import pytest
 from lens_networks import LENSES, R0_MM, network_of
 
 from adjust.functional_model.families import family, parameter_names
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.projection import camera_from_ray, folded_over, ideal_from_observed
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Distortion
 from adjust.solution.adjustment import adjust
 
 

@@ -8,12 +8,12 @@ from bent_scans import MARKS_MM, films
 from numpy.typing import NDArray
 from simulated import HALF_MM, Truth, field_points, simulated
 
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
 from adjust.model_selection.candidates import Candidate, f_test, nested_tests, simplest_sufficient
 from adjust.model_selection.cross_validation import CrossValidation, cross_validate, folds
 from adjust.model_selection.model_choice import Choice, choose, weighed
 from adjust.model_selection.models import Model, lenses
-from adjust.problem.camera import Distortion, Prior
 from adjust.problem.network import Network, ObjectPoint, Transformation
 from adjust.quality.reweighting import WeightFunction
 from adjust.solution.adjustment import Options, adjust

@@ -9,7 +9,8 @@ import pytest
 from simulated import Truth, simulated
 
 from adjust.errors import AdjustmentError
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.solution.adjustment import Datum, Options, adjust

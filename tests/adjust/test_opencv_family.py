@@ -12,11 +12,12 @@ from simulated import Truth, camera_point, field_points, simulated
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.projection import ImageModel, camera_from_ray, ideal_from_observed
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.functional_model.transformation import Film
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.images import adjusted_image, approximate_image
 from adjust.problem.network import Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations

@@ -8,7 +8,8 @@ from reference_cases import CAMERA, approximations_of, load, network_of, own_nam
 from simulated import simulated
 
 from adjust.errors import AdjustmentError
-from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import Datum, Options, adjust

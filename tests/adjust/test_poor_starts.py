@@ -7,8 +7,8 @@ import pytest
 from reference_cases import approximations_of, load, network_of, own_name
 from simulated import Truth, field_points, simulated
 
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
-from adjust.problem.camera import Prior
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.solution.adjustment import Options, adjust
 

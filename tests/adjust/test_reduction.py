@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import Approximations, LineOfSight, Network, ObjectPoint
 from adjust.problem.reduction import Reduction
 from adjust.problem.result import Adjustment

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy import special
 from simulated import Truth, field_points, simulated
 
-from adjust.problem.camera import Camera, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Exterior, Network
 from adjust.problem.observations import Calibration, ObservationKind
 from adjust.problem.parameter import Parameter

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import Bend, carriage_terms, smooth_terms
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Prior
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network, Scanner, Transformation
 from adjust.problem.result import Adjustment

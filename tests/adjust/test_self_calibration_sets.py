@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
-from adjust.problem.camera import Distortion
+from adjust.functional_model.lens import Distortion
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from simulated import Truth, field_points, simulated
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import Network
 from adjust.problem.result import Adjustment
 from adjust.quality.significance import group_tests, parameter_tests

@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
-from adjust.problem.camera import Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Fiducial
 from adjust.problem.network import Approximations, Network
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust

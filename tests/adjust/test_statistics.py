@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from simulated import Truth, field_points, simulated
 
-from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Exterior, Network
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.result import Adjustment

@@ -8,8 +8,9 @@ import pytest
 from dense_adjustment import solve_densely
 from simulated import Truth, field_points, simulated
 
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.problem.camera import Camera, Distortion, Prior
+from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.solution.adjustment import adjust

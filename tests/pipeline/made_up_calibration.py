@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.parameter import Parameter

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import Network
 
 

@@ -13,7 +13,7 @@ import pytest
 from setups import Setup, vertical
 from two_cameras import two_cameras
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from adjust.problem.parameter import Parameter
 from adjust.problem.result import Adjustment, Residuals

@@ -9,7 +9,7 @@ import pytest
 from simulated_project import write_project
 from test_bent_boards import BENDS_MM, bent_board, network_of
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 
 

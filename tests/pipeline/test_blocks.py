@@ -11,8 +11,8 @@ from exported_project import IMAGES, PITCH_MM, POINTS, TRUTH, camera_mm, ideal_m
 from numpy.typing import NDArray
 from simulated import FIDUCIALS, affine, rotation
 
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.transformation import Film
-from adjust.problem.camera import Distortion, Prior
 from adjust.problem.network import ObjectPoint
 from measure.flags import Status
 from pipeline.blocks.block_stage import written_block

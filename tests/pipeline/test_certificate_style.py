@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adjust.functional_model.families import parameter_names
-from adjust.problem.camera import Distortion
+from adjust.functional_model.lens import Distortion
 from adjust.problem.parameter import Parameter
 from pipeline.exchange.certificate import fit, read_certificate
 from pipeline.report.certificate import ANGLES_DEG, certificate_view

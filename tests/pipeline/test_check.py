@@ -13,8 +13,9 @@ from lens_networks import LENSES, network_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Camera, Distortion, Fiducial, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import Options, adjust

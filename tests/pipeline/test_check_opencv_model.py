@@ -6,9 +6,9 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
 from adjust.functional_model.projection import camera_from_ray
-from adjust.problem.camera import Distortion
 from pipeline.opencv_check.opencv_model import (
     FISHEYE,
     NAMES,

@@ -9,7 +9,7 @@ import pytest
 from simulated import Truth, field_points, simulated
 from simulated_project import write_project
 
-from adjust.problem.camera import Distortion, Prior
+from adjust.functional_model.lens import Distortion, Prior
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 
 

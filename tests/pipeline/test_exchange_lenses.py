@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from simulated_project import write_project
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.projection import camera_from_ray
-from adjust.problem.camera import Prior
 from pipeline.cli import DONE, WRONG_INPUT, run
 from pipeline.files.camera_file import CameraFile, read_camera
 

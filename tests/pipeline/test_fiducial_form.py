@@ -8,8 +8,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Camera, Fiducial, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Image, Network
 from adjust.problem.observations import ObservationKind, Observations

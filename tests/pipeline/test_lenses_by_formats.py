@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from simulated import affine, comparator_point, simulated
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.projection import camera_from_ray
-from adjust.problem.camera import Distortion, Prior
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.exchange.convention import IMPORTED
 from pipeline.files.camera_file import CameraFile, read_camera

@@ -9,7 +9,7 @@ import pytest
 from in_process import Loses
 from scipy.spatial.distance import pdist
 
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from measure.flags import Code, Status
 from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, measure_ties

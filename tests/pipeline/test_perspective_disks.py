@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
-from adjust.problem.camera import Distortion
 from pipeline.measuring.perspective_disks import across, disk_images, disk_normals, eccentricity_mm, plane_normal
 from pipeline.rendered.scene_file import read_scene
 from pipeline.results.comparator_file import pixel_from_comparator

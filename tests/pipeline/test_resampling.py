@@ -13,8 +13,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion
 from adjust.functional_model.transformation import Film
-from adjust.problem.camera import Distortion
 from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from pipeline.cli import run

@@ -17,7 +17,7 @@ from kept_scans import keep_scans
 from test_command_line import replaced, results, rewritten_scans
 
 from adjust.errors import AdjustmentError
-from adjust.problem.camera import Prior
+from adjust.functional_model.lens import Prior
 from measure.errors import MeasurementError
 from measure.flags import Status
 from pipeline import stages

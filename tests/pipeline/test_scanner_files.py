@@ -12,8 +12,8 @@ from bent_scans import films
 from simulated_project import write_project
 from small_scene import OBLIQUE, SCANNER, scene
 
+from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Prior
 from adjust.problem.network import Network, Scanner
 from adjust.solution.adjustment import adjust
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
