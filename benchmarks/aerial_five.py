@@ -1,6 +1,6 @@
 """Five rendered aerial frames, measured and adjusted, against their truth.
 
-python benchmarks/aerial_five.py [FOLDER] [SCENE.toml]
+python -m benchmarks aerial_five [FOLDER] [SCENE.toml]
 """
 
 import resource

@@ -1,6 +1,6 @@
 """Many frames of eight fiducials alone, adjusted by `reseau adjust` and reported: time and memory on one core.
 
-    python benchmarks/archive_adjust.py [FRAMES] [SEED]
+    python -m benchmarks archive_adjust [FRAMES] [SEED]
 
 The fiducials lie up to 10 um beside their given places; every frame has an affine film and scan of its own, and marks
 that scatter by 2 um. Each command runs in a process of its own.
@@ -12,8 +12,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-from archive_scale import told_of
-from archive_stand_ins import CAMERA, FIDUCIALS
+
+from benchmarks.archive_scale import told_of
+from benchmarks.archive_stand_ins import CAMERA, FIDUCIALS
 
 _OFF_MM, _SCATTER_MM, _STRETCH = 0.01, 0.002, 3e-4
 _A_FOLDER = 500

@@ -1,6 +1,6 @@
 """What is measured again after what change: six small drawn frames, counted by the store's results.
 
-python benchmarks/archive_changes.py
+python -m benchmarks archive_changes
 """
 
 import os

@@ -1,6 +1,6 @@
 """Kills -9 of the parent and of workers at random moments of a run of 200 stand-in scans: each time it goes on.
 
-    python benchmarks/archive_kills.py [KILLS] [SEED]
+    python -m benchmarks archive_kills [KILLS] [SEED]
 
 At the end the store is held against that of an undisturbed run, all but times, and scans that were begun more than once
 are counted.
@@ -17,8 +17,7 @@ from collections import Counter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from archive_stand_ins import use, write_project
-
+from benchmarks.archive_stand_ins import use, write_project
 from pipeline.archive.judging import judged_records, latest
 from pipeline.archive.store import Store
 

@@ -1,6 +1,6 @@
 """Real measurings of many scans by `reseau measure`: scans an hour, CPU and memory a scan.
 
-    python benchmarks/archive_real.py [SCANS] [--workers 2] [--side 2400] [--folder DIR]
+    python -m benchmarks archive_real [SCANS] [--workers 2] [--side 2400] [--folder DIR]
 
 The scans are drawn anew, each with a place and grain of its own: tiled TIFF files of grainy film with eight
 ring-crosses, some 3 MB each at 2400 px. They are drawn first, and a line tells how many there are; then the command's
@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
-from object_measuring import PITCH_UM, camera_text, drawn_frame
 
+from benchmarks.object_measuring import PITCH_UM, camera_text, drawn_frame
 from pipeline.files.camera_file import read_camera
 
 _A_FOLDER = 500

@@ -1,6 +1,6 @@
 """The report of fifty thousand scans: its size, and what making it and a frame's page takes.
 
-    python benchmarks/archive_report.py [SCANS]
+    python -m benchmarks archive_report [SCANS]
 
 Stand-ins for measured scans, every hundredth with a fiducial lost, are put into a store as `reseau measure` would;
 then `reseau report` runs in a process of its own.
@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from archive_scale import told_of
-from archive_stand_ins import stand_in, write_project
-
+from benchmarks.archive_scale import told_of
+from benchmarks.archive_stand_ins import stand_in, write_project
 from measure.flags import Code, Reason, Status
 from measure.results import MarkMeasurement
 from pipeline.archive.file_state import Identity, file_state

@@ -1,6 +1,6 @@
 """Fifty thousand scans through the archive: memory, the store's share of a scan's time, status, and nothing to do.
 
-    python benchmarks/archive_scale.py [SCANS]
+    python -m benchmarks archive_scale [SCANS]
 
 Stand-ins for the measuring of a scan, so that only the rest is timed; two processes. Each command runs in a process of
 its own, whose largest memory and CPU time are printed.
@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from archive_stand_ins import use, write_project
+from benchmarks.archive_stand_ins import use, write_project
 
 _COMMANDS = {
     "measure": ["measure"],

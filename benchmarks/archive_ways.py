@@ -1,7 +1,7 @@
 """The same scans measured in one process, in two shards that are merged, and by a Dask cluster of which a worker is
 killed: whether comparator.csv is the same, byte for byte.
 
-    python benchmarks/archive_ways.py [SCANS]
+    python -m benchmarks archive_ways [SCANS]
 """
 
 import os
@@ -14,8 +14,8 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from archive_kills import workers
-from archive_real import draw, results
+from benchmarks.archive_kills import workers
+from benchmarks.archive_real import draw, results
 
 _SIDE_PX = 1200
 

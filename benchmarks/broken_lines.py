@@ -1,6 +1,6 @@
 """Whether the tests notice: forty lines of core logic broken on purpose, one at a time, then the tests of it run.
 
-    python benchmarks/broken_lines.py [word]
+    python -m benchmarks broken_lines [word]
 
 word: only lines whose file's path holds it. Each is broken in a copy of the project, so nothing here is touched. Tests
 that fail without it, too, have caught nothing.

@@ -1,6 +1,6 @@
 """The camera library's files, made from calibration reports.
 
-python benchmarks/camera_library.py REPORTS_FOLDER OUT_FOLDER
+python -m benchmarks camera_library REPORTS_FOLDER OUT_FOLDER
 
 The folder holds usgs_reports.csv (a line a report: camera, focal length, coordinates and separations of the marks),
 cameras.json and OSL_1785.json (single cameras, written out). What is typed there has errors, and some cameras of a
@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mark_drawings import (
+
+from benchmarks.mark_drawings import (
     ALIKE_CORNERS,
     ALIKE_SIDES,
     CHECK,
@@ -50,7 +51,6 @@ from mark_drawings import (
     WILD_RING_SIDES,
     WINGS,
 )
-
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
 
 # Numbered as in the reports of the US Geological Survey, x' to the right and y' up. Their form, as in OSL/1785, has the

@@ -1,7 +1,7 @@
 """Which camera `reseau cameras --scan` takes real scans for, and what that takes: CPU seconds and peak memory of the
 whole command, each scan in a process of its own.
 
-python benchmarks/cameras_of_scans.py [SCAN ...] [--pitch UM]
+python -m benchmarks cameras_of_scans [SCAN ...] [--pitch UM]
 
 Without scans: the aerial and the reseau frames of ../shared/data, the latter at no pitch, for their files say none.
 """

@@ -1,7 +1,7 @@
 """Poses of frames measured by pictures of marks from one scan alone, as the review page tries clicks: how often a wrong
 pose is called decided, and how often the true one is ruled out.
 
-python benchmarks/clicked_trials.py [--scenes 12] [--first 0]
+python -m benchmarks clicked_trials [--scenes 12] [--first 0]
 
 Four like crosses on a landscape, in three frames that lie alike and one turned by 90 degrees. They are clicked in the
 second; writing is stamped beside a mark of one frame or two. The first and the last are measured by these pictures. No

@@ -1,6 +1,6 @@
 """A rendered block of 32 frames over relief without any orientation: through COLMAP and one adjustment, and alone.
 
-python benchmarks/colmap_block.py FOLDER [SEED...]
+python -m benchmarks colmap_block FOLDER [SEED...]
 
 Renders 4 strips of 8 frames (60 % and 40 % overlap, 1:10,000, relief 60 m rms, six poses, films of their own), runs
 `reseau measure` for the fiducials, marks 12 control points in every frame that shows them (true places with 0.3 px of

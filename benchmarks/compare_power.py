@@ -1,7 +1,7 @@
 """How often `adjust.quality.lens_comparison` says drift: of calibrations that are alike, and of
 ones that differ by 2, 3, 5 sigmas.
 
-    python benchmarks/compare_power.py [pairs] [--series | --adjustment]
+    python -m benchmarks compare_power [pairs] [--series | --adjustment]
 
 --series: of four calibrations whose c changes steadily. --adjustment: how often an adjustment says so of an earlier
 calibration that is an observation of it, by `pairs` of simulated networks each.

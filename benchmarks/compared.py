@@ -1,6 +1,6 @@
 """Marks measured by reseau and by other methods in the same pictures, against their truth.
 
-PYTHONPATH=tests/measure python benchmarks/compared.py [MARKS] [SETTING ...] [--kind KIND ...] [--blur BLUR ...]
+python -m benchmarks compared [MARKS] [SETTING ...] [--kind KIND ...] [--blur BLUR ...]
     [--hipp PYTHON] [--keep FILE]
 
 MARKS: of every cell, those of cameras of eight; 104 where none is given. SETTING: of the names below; all where none is
@@ -19,11 +19,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from kept_rows import KeptRows
-from measured_marks import CONTRAST, GROUND, drawn, measured
 from numpy.typing import NDArray
-from other_methods import METHODS, Template, hipp
 from true_marks import KIND, KINDS, Kind, TrueMark, some_mark
+
+from benchmarks.kept_rows import KeptRows
+from benchmarks.measured_marks import CONTRAST, GROUND, drawn, measured
+from benchmarks.other_methods import METHODS, Template, hipp
 
 Array = NDArray[np.float64]
 

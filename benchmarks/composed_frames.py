@@ -1,6 +1,6 @@
 """Notches, blocks, curves and triangles of real cameras: learned, found in any pose and measured.
 
-python benchmarks/composed_frames.py MARKS_FOLDER OUT.jsonl [--frames 8] [--first 0]
+python -m benchmarks composed_frames MARKS_FOLDER OUT.jsonl [--frames 8] [--first 0]
 
 A folder of four crops (L, T, R, B) is one camera. Frames are put together from them: each crop at its side of a
 textured square, its own landscape (what is lighter than Otsu's threshold) exchanged for another, averaged over a few
@@ -20,9 +20,9 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from search import OUTCOMES, POSE_OUTCOMES, judged, lines, print_table
-from search_frames import Case
 
+from benchmarks.search import OUTCOMES, POSE_OUTCOMES, judged, lines, print_table
+from benchmarks.search_frames import Case
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.marks.templates import cut, template_of

@@ -1,6 +1,6 @@
 """The tables and figures of docs/design-study.md.
 
-python benchmarks/design_study.py [FOLDER]
+python -m benchmarks design_study [FOLDER]
 
 The expected precision of fiducial marks, interior orientation and distortion, the study that Torlegård announces: "for
 various testfields, cameras and photogrammetric network design"; and Juhl's table and figures 1 and 2.

@@ -1,7 +1,7 @@
 """How many good marks are doubted: true marks on clean frames, whose error is below three of their standard deviations,
 that are called `weak`, by all rules together.
 
-python benchmarks/doubted_marks.py OUT.jsonl [--rounds 1] [--seed 1] [--first 0]
+python -m benchmarks doubted_marks OUT.jsonl [--rounds 1] [--seed 1] [--first 0]
 
 Every kind of mark at pitches of 7, 20 and 60 um, with radii of 5 to 150 px and 10 to 500 times the noise: two frames of
 eight marks each, on film that scatters them by 3 um, of a camera whose marks are given to 5 um. One line a pair of
@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from search import lines
 from true_marks import Kind, TrueMark
 
+from benchmarks.search import lines
 from measure.fiducials.across_frames import judged
 from measure.fiducials.constellation import Placement
 from measure.fiducials.measure_frame import measure_frame

@@ -1,6 +1,6 @@
 """Marks and disks among dust: against those whose dust is known, alone and in frames, and small ones.
 
-PYTHONPATH=tests/measure python benchmarks/dust.py [MARKS] [STUDY ...] [--kind KIND ...] [--seed SEED] [--keep FILE]
+python -m benchmarks dust [MARKS] [STUDY ...] [--kind KIND ...] [--seed SEED] [--keep FILE]
 
 MARKS: of every cell, of small disks frames of 25; 160 where none is given. STUDY: one or more of the names below; all
 where none is given. --keep: rows of the tables are written there, and those that stand in it are not made anew.
@@ -13,10 +13,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from dusty_marks import BLUR_PX, DUST_SNR, DustyMark, frame_of_disks, frame_of_marks, lone_mark
-from kept_rows import KeptRows
-from measured_marks import Cell, drawn
 from true_marks import KIND, KINDS, Kind, some_mark
+
+from benchmarks.dusty_marks import BLUR_PX, DUST_SNR, DustyMark, frame_of_disks, frame_of_marks, lone_mark
+from benchmarks.kept_rows import KeptRows
+from benchmarks.measured_marks import Cell, drawn
 
 DUST = (0.01, 0.03, 0.05)
 SEED = 20

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from drawn import scan_of
-from measured_marks import CONTRAST, GROUND, Found, measured
 from numpy.typing import NDArray
 from true_marks import KIND, Kind, TrueMark, some_mark
 
+from benchmarks.measured_marks import CONTRAST, GROUND, Found, measured
 from measure.fiducials.constellation import Placement
 from measure.fiducials.mark_fit import options_for
 from measure.fiducials.measure_frame import measure_frame

@@ -1,10 +1,10 @@
 """Faint marks in frames whose other marks are plainly there, against their truth and the Cramér-Rao bound.
 
-PYTHONPATH=tests/measure python benchmarks/faint_marks.py [FRAMES] [--kind KIND ...] [--seed SEED] [--keep FILE]
+python -m benchmarks faint_marks [FRAMES] [--kind KIND ...] [--seed SEED] [--keep FILE]
 
 FRAMES: of every cell, each with three faint marks; 40 where none is given. Eight marks of one kind stand in a frame
 of 60 mm (10 px a mm), their blurs alike to 5 %: five have 20 times the contrast of the noise, three the SNR of a cell.
-The pictures and bounds are those of `benchmarks/marks.py`, the placements those of `benchmarks/dust.py`; what measures
+The pictures and bounds are those of `marks`, the placements those of `dust`; what measures
 is what `reseau measure` runs, `measure.fiducials.measure_frame.measure_frame`. Ellipses are targets, and in no frame.
 """
 
@@ -15,12 +15,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from dusty_marks import BLUR_SPREAD, PX_PER_MM, about_right, frame_layout
-from kept_rows import KeptRows
-from measured_marks import CONTRAST, GROUND, Cell, Found, best_errors
 from numpy.typing import NDArray
 from true_marks import KINDS, Kind, TrueMark, some_mark
 
+from benchmarks.dusty_marks import BLUR_SPREAD, PX_PER_MM, about_right, frame_layout
+from benchmarks.kept_rows import KeptRows
+from benchmarks.measured_marks import CONTRAST, GROUND, Cell, Found, best_errors
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout

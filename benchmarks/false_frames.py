@@ -1,6 +1,6 @@
 """How often a scan without the camera's marks is taken for one of its frames.
 
-python benchmarks/false_frames.py [--frames 60] [--first 0] [--seed 11]
+python -m benchmarks false_frames [--frames 60] [--first 0] [--seed 11]
 
 The frames of `search.py`, every other one painted without its marks and searched for its own camera, and the rest with
 their marks, but searched for a camera with marks of another kind. Whatever is found is false. The pitch is given, right
@@ -14,8 +14,8 @@ from itertools import count
 from pathlib import Path
 
 import numpy as np
-from search_frames import PITCH_UM, Case, draw_case
 
+from benchmarks.search_frames import PITCH_UM, Case, draw_case
 from measure.fiducials.measurement import measure_fiducials
 from measure.flags import Status
 from measure.scans.cache import WholePicture

@@ -1,6 +1,6 @@
 """What measuring the fiducials of one scan takes of the processor.
 
-    python benchmarks/fiducial_times.py [--size 11500] [--rounds 5]
+    python -m benchmarks fiducial_times [--size 11500] [--rounds 5]
 
 A large scan with eight marks, 16 bit in LZW tiles, as `large_scans` renders it; one of an archive, 2400 px, as
 `archive_real` draws it, in light and with its tone curve not known; and a small frame of four marks in a pose that is
@@ -32,14 +32,14 @@ import tifffile
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "measure"))
 
 import numpy as np
-from archive_real import draw
 from drawn_frames import NUMBERED, PITCH_UM, frame_picture, pixel_from_camera
-from large_scans import FRAME_MM, Storage, rendered
 
 import measure.fiducials.mark_fit
 import measure.fiducials.measurement
 import measure.fiducials.stages
 import measure.matching.match
+from benchmarks.archive_real import draw
+from benchmarks.large_scans import FRAME_MM, Storage, rendered
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch

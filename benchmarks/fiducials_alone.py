@@ -1,6 +1,6 @@
 """Claimed against realised standard deviations of frames that show fiducials alone, for every film transformation.
 
-PYTHONPATH=.:tests/adjust python benchmarks/fiducials_alone.py [TRIALS [SEED]]
+python -m benchmarks fiducials_alone [TRIALS [SEED]]
 
 In every trial the true places of the marks, the films and the noise are drawn anew; the given coordinates stay. Dense
 normal equations of all trials at once stand for the adjustment; some trials of every row go through `adjust` and the

@@ -1,6 +1,6 @@
 """Gross errors of ten standard deviations: how many are found and named, one at a time and two at once.
 
-PYTHONPATH=tests/adjust python benchmarks/gross_errors.py [PLACES]
+python -m benchmarks gross_errors [PLACES]
 
 The five-image case (ten control points, eight fiducials), with given fiducials of 5 um and control of 0.05 m, for
 with priors of 1 mm, or fixed points, no error of that kind could be seen or be made. Every run draws all errors anew.

@@ -1,6 +1,6 @@
 """What each heuristic brings: the same pictures measured with it, and with it switched off.
 
-OPENBLAS_NUM_THREADS=1 PYTHONPATH=tests/measure python benchmarks/heuristics.py [--only NAME] [--count 24]
+python -m benchmarks heuristics [--only NAME] [--count 24]
 
 Each row is one heuristic: the figure that it is there for, with it and without.
 """
@@ -13,9 +13,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from dusty_marks import frame_of_disks
-from faint_marks import drawn_frame, measured_faint
-from large_networks import strip
 from numpy.typing import NDArray
 from true_marks import KIND
 
@@ -23,6 +20,9 @@ import measure.fiducials.measure_frame as frame_measurement
 import measure.targets.measure_targets as targets
 from adjust.linear_algebra import fronts
 from adjust.solution.adjustment import adjust
+from benchmarks.dusty_marks import frame_of_disks
+from benchmarks.faint_marks import drawn_frame, measured_faint
+from benchmarks.large_networks import strip
 from measure.flags import NO_REASON
 
 Array = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """Marks named with no orientation, by simulated frames: how many are right, refused and wrong, and how long it takes.
 
-python benchmarks/identification.py [--frames 50] [--points 20 100 500] [--shares 0 10 20] [--seed 1] [--unknown]
+python -m benchmarks identification [--frames 50] [--points 20 100 500] [--shares 0 10 20] [--seed 1] [--unknown]
 
 Fields of 20, 100 and 500 points, in a plane (jittered lattice) and in space (at random in a box); a frame from a random
 side and distance, turned at random; 0, 10 or 20 % of the points missing and as many marks that are none; the principal

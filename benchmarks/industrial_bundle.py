@@ -1,6 +1,6 @@
 """An industrial bundle with a fixed second zero r0 against its published result: 115 images, 150 unknown points.
 
-    python benchmarks/industrial_bundle.py FOLDER
+    python -m benchmarks industrial_bundle FOLDER
 
 FOLDER holds example.ior, .eor, .obc, .phc and .scale of JAICOV (github.com/applied-geodesy/bundle-adjustment, folder
 JAICOV/example), which are those of AICON 3D Studio; its own protocol, example.htm, has the published figures below.

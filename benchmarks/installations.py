@@ -1,7 +1,7 @@
 """What users install: wheel and sdist, each in fresh environments with the lowest versions that pyproject.toml promises
 and with the newest, on each Python. The demonstration runs there, and then, with all extras, every command.
 
-    python benchmarks/installations.py [--only wheel|sdist] [--versions lowest|newest] [PYTHON...]
+    python -m benchmarks installations [--only wheel|sdist] [--versions lowest|newest] [PYTHON...]
 
 PYTHON: interpreters; by default every python3.11 and newer on the PATH. What is committed is built. A lower bound must
 be a version that there is. Ends with 1 where anything fails.

@@ -1,6 +1,6 @@
 """Frames scanned in halves: claimed against realised standard deviations of what joins them, by many adjustments.
 
-    python benchmarks/joins.py [--runs 200] [--pictures]
+    python -m benchmarks joins [--runs 200] [--pictures]
 
 Four frames of known points, each in two halves with films of their own, errors drawn anew in every run (seed 0 and on).
 --pictures: rendered frames instead, whose joins are measured: their errors beside their standard deviations.

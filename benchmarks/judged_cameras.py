@@ -1,7 +1,7 @@
 """What judging a camera's frames together finds, by simulated places: marks that are off, bent frames, given
 coordinates and scanners that are; and how often it tells what is not.
 
-PYTHONPATH=tests/measure python benchmarks/judged_cameras.py [CAMERAS] [--seed 1]
+python -m benchmarks judged_cameras [CAMERAS] [--seed 1]
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Time and memory of reading large scans, beside one decode by tifffile.
 
-python benchmarks/large_scans.py [--size 11500]
+python -m benchmarks large_scans [--size 11500]
 
 One frame with eight fiducials and 210 disks is rendered, stored in every way, and read by turns, in one process:
 whole by tifffile, in eight windows about the marks, reduced to a quarter of its side or 3000 px, searched for disks,

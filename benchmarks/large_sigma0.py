@@ -1,6 +1,6 @@
 """What makes sigma0 too large, planted into networks of a digital camera: what is said of it.
 
-PYTHONPATH=tests/adjust python benchmarks/large_sigma0.py [NETWORKS] [TIMES] [KIND...]
+python -m benchmarks large_sigma0 [NETWORKS] [TIMES] [KIND...]
 
 NETWORKS (20) of every kind, anew for every seed, flat boards and deep fields; the effect TIMES (3) as large as its test
 detects with a probability of 0.80 at 0.001; five times as many with nothing planted. named: the kind is named, and

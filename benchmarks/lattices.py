@@ -1,6 +1,6 @@
 """Time of measuring a réseau.
 
-PYTHONPATH=tests/measure python benchmarks/lattices.py [SIDE ...] [--seed 3]
+python -m benchmarks lattices [SIDE ...] [--seed 3]
 
 A lattice of SIDE x SIDE dark crosses (5, 13 and 33 where none is given), 32 px wide and 100 px apart, blurred, each off
 by 0.1 px, is drawn on an uneven ground with white noise (a fifteenth of a cross's contrast) and measured as `reseau

@@ -1,7 +1,7 @@
 """Lens families and bent boards: claimed against realised standard deviations, and projections beside mrcal's.
 
-    python benchmarks/lenses.py [SETS]          # sets of errors a case, 200 by default; about a minute for 40
-    python benchmarks/lenses.py mrcal           # the bend of a board beside mrcal 2.2 (Debian's package)
+    python -m benchmarks lenses [SETS]          # sets of errors a case, 200 by default; about a minute for 40
+    python -m benchmarks lenses mrcal           # the bend of a board beside mrcal 2.2 (Debian's package)
 
 The images are those of the renderer, which has its own formulas, or OpenCV's; a board is bent as mrcal bends it.
 """

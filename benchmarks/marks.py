@@ -1,6 +1,6 @@
 """Marks measured against their truth: the Cramér-Rao bound, honesty of the standard deviations.
 
-PYTHONPATH=tests/measure python benchmarks/marks.py [MARKS] [STUDY ...] [--kind KIND ...] [--keep FILE]
+python -m benchmarks marks [MARKS] [STUDY ...] [--kind KIND ...] [--keep FILE]
 
 MARKS: of every cell; 100 where none is given, 2000 for a full run. STUDY: one or more of the names below; all where
 none is given. --keep: rows of the tables are written there, and those that stand in it are not made anew, so that a
@@ -20,8 +20,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from kept_rows import KeptRows
-from measured_marks import CONTRAST, GROUND, Cell, best_errors, drawn, measured, start_off
 from numpy.typing import NDArray
 from true_marks import (
     KIND,
@@ -34,6 +32,8 @@ from true_marks import (
     whitened_rms,
 )
 
+from benchmarks.kept_rows import KeptRows
+from benchmarks.measured_marks import CONTRAST, GROUND, Cell, best_errors, drawn, measured, start_off
 from measure.scans.jpeg import rounding_step_dn
 
 Array = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """Claimed against realised standard deviations: reference cases adjusted with errors drawn anew, many times.
 
-PYTHONPATH=tests/adjust python benchmarks/monte_carlo.py [RUNS]
+python -m benchmarks monte_carlo [RUNS]
 
 For every kind of parameter: the rms error over the rms of the a-posteriori standard deviations, on the average over the
 parameters of the kind and for the least and the most favourable of them. v'Pv against chi-square (Kolmogorov and

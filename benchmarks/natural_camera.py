@@ -1,6 +1,6 @@
 """Cameras calibrated by natural points alone, against the truth: are their standard deviations honest?
 
-python benchmarks/natural_camera.py [SEEDS] [PITCH_UM]
+python -m benchmarks natural_camera [SEEDS] [PITCH_UM]
 
 The scene juhl_natural with other ground, other grain and other errors of what is given in every seed. The lens is
 judged: of the principal distance and the principal point, frames with parallel axes over flat ground say nothing, or

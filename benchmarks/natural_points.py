@@ -1,6 +1,6 @@
 """Natural points on rendered terrain, against the truth of the same scene.
 
-python benchmarks/natural_points.py [PITCH_UM]
+python -m benchmarks natural_points [PITCH_UM]
 
 Three or four aerial frames crosswise, 1:10,000, one turned by 180 degrees and one mirrored. The truth of a point is the
 ray through it in the frame that defines it, led to the terrain and projected into the other frames. A pitch of 80 um

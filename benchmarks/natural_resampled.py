@@ -1,6 +1,6 @@
 """Natural points of real ground: aerial photographs re-sampled into frames whose geometry is known.
 
-python benchmarks/natural_resampled.py SCANS_FOLDER
+python -m benchmarks natural_resampled SCANS_FOLDER
 
 The inner part of every scan, freed of most of its own grain by a Gaussian of a pixel, is laid on hilly terrain and
 photographed anew by the four frames of natural_points.py, at a pixel to a pixel (200 um, 1140 px). Every frame has a
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from natural_points import CONDITIONS, HEADING, figures, scene
 from numpy.typing import NDArray
 
+from benchmarks.natural_points import CONDITIONS, HEADING, figures, scene
 from synthetic_images.background import Background
 from synthetic_images.film import FrameGeometry
 from synthetic_images.frame import make_frame

@@ -1,6 +1,6 @@
 """What measuring a whole scan takes of a tiled TIFF file on a server, with overviews or without.
 
-    python benchmarks/object_measuring.py [--side 11500] [--seed 1]
+    python -m benchmarks object_measuring [--side 11500] [--seed 1]
 
 The frame has the eight ring-crosses of an aerial camera on grainy film, in the scan's middle or so far off it that one
 is sought first; the server counts requests and bytes.

@@ -1,7 +1,7 @@
 """reseau, OpenCV, mrcal and COLMAP in turn: CPU seconds of calibrations, and what each solves of gross errors.
 
-python benchmarks/peers.py [boards] [bundles] [gross] [commands] [VIEWS ...]     tables, all where none is named
-python benchmarks/peers.py one PROGRAM VIEWS flat|relief given|free PERCENT     one measurement
+python -m benchmarks peers [boards] [bundles] [gross] [commands] [VIEWS ...]     tables, all where none is named
+python -m benchmarks peers one PROGRAM VIEWS flat|relief given|free PERCENT     one measurement
 
 Every measurement is a process of its own with one thread; in each of five rounds the programs follow one another, and
 medians and ranges are told. Nobody gets orientations. c is given half a percent off, or not at all: then mrcal, which
@@ -25,12 +25,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, known
 from numpy.typing import NDArray
-from scale import ONE_THREAD, measured
 
 from adjust.functional_model.lens import Prior
 from adjust.solution.adjustment import Options, adjust
+from benchmarks.large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, known
+from benchmarks.scale import ONE_THREAD, measured
 
 Array = NDArray[np.float64]
 Figures = dict[str, Any]

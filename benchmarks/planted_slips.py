@@ -1,6 +1,6 @@
 """Slips of whole networks (mirrored points, another unit, y down, another c, exchanged frames): what is said of them.
 
-PYTHONPATH=tests/adjust python benchmarks/planted_slips.py [NETWORKS]
+python -m benchmarks planted_slips [NETWORKS]
 
 Networks of four images and 14 to 30 control points of 5 cm, anew for every seed; one row a kind of slip. named: the
 slip is named, and nothing else blamed. unnamed: nothing is blamed. misleading: something else is blamed.

@@ -1,6 +1,6 @@
 """From how poor a start the adjustment still finds its minimum, or from none: five kinds of networks.
 
-python benchmarks/poor_starts.py [RUNS]
+python -m benchmarks poor_starts [RUNS]
 
 Attitudes are turned by 30 degrees about random axes, stations shifted by 20 % of their distance in random directions,
 the principal distance is wrong by 20 %, and unknown points by 20 % of their distance. The right minimum is that from

@@ -1,7 +1,7 @@
 """Frames measured with their pose left open and with it set: whatever is found with the true pose set must be found
 with `pose = "auto"`, of every kind of mark.
 
-python benchmarks/pose_left_open.py OUT.jsonl [--frames 300] [--first 0] [--seed 1] [--pitch 28] [--auto]
+python -m benchmarks pose_left_open OUT.jsonl [--frames 300] [--first 0] [--seed 1] [--pitch 28] [--auto]
 
 One line a frame is added to OUT.jsonl, and frames that stand there already are left out. Then the table of all its
 lines is printed: how many marks are found with the true pose set, with the pose that auto took set, and with auto; how
@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from search import lines
-from search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, Case, case_of, draw_case
 
+from benchmarks.search import lines
+from benchmarks.search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, Case, case_of, draw_case
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polarity, polygon, turned

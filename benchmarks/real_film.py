@@ -1,6 +1,6 @@
 """Every fiducial of the real film at hand, mark by mark: the ground on which a change of `measure` is judged.
 
-    python benchmarks/real_film.py DATA [--keep FILE.json] [--against FILE.json] [--frame NAME] [--tone linear]
+    python -m benchmarks real_film DATA [--keep FILE.json] [--against FILE.json] [--frame NAME] [--tone linear]
 
 DATA is the folder of real scans: film_scans/aerial, reseau, reseau_sharpened, coarse, and film_rendered. Each scan is
 measured alone, with its orientation open, and checked as a camera of one frame. A row a scan: marks found, `measured`,
@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from reencoded_scans import CAMERAS
 
+from benchmarks.reencoded_scans import CAMERAS
 from measure.fiducials.across_frames import judged
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions

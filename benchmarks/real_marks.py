@@ -1,6 +1,6 @@
 """How well real marks repeat: chips re-sampled by known shifts, and the colour channels of scans against one another.
 
-python benchmarks/real_marks.py MARKS_FOLDER [SCANS_FOLDER]
+python -m benchmarks real_marks MARKS_FOLDER [SCANS_FOLDER]
 
 Every picture below MARKS_FOLDER is a mark at full resolution. Means over FOLD x FOLD of its pixels, begun at each of
 them in turn, are pictures of the same mark shifted by known parts of a pixel; the first is the template of the others.

@@ -1,6 +1,6 @@
 """Real scans stored anew by other tone curves: their marks have to stay where they are.
 
-    python benchmarks/reencoded_scans.py FOLDER [--linear] [--frame NAME]
+    python -m benchmarks reencoded_scans FOLDER [--linear] [--frame NAME]
 
 FOLDER holds the frames of aerial film (film_scans/aerial of the test data). Each is decoded and coded anew, in 16 bits,
 by light = code ** 2.2 and by its inverse, so that what the scanner coded with one curve now has three. Every copy is

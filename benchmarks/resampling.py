@@ -1,6 +1,6 @@
 """What resampling does to a picture: marks shifted, noise and sharpness lost, beside other programs' interpolations.
 
-    python benchmarks/resampling.py [side_px] [--large]
+    python -m benchmarks resampling [side_px] [--large]
 
 The picture is of known formula, turned by 0.37 degrees at a scale of 0.9985. --large: time and peak memory of a scan of
 side_px (11,500; 23,000 takes some five minutes), 16 bit, in strips, that lies turned by 90 degrees, each program in a

@@ -2,7 +2,7 @@
 decisions lead to the right marks? Are the rows that change those decided about, and no others? How many keys does it
 take, and how long?
 
-    python benchmarks/review_faults.py [SEED] [FOLDER]
+    python -m benchmarks review_faults [SEED] [FOLDER]
 
 The person is a rule: shown a mark, it accepts what lies where the mark was drawn, places a mark that is seen elsewhere,
 rejects what was measured where none is seen, and else says that it is not there. Truth is the renderer's. FOLDER: where
@@ -26,8 +26,8 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 from playwright.sync_api import Page, sync_playwright
-from review_load import START
 
+from benchmarks.review_load import START
 from measure.geometry import POSES
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene

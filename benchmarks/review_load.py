@@ -1,8 +1,8 @@
 """A review in a real browser: how soon the next mark is there, what the server takes, and how many keys and seconds
 deciding takes.
 
-    python benchmarks/review_load.py [FRAMES] [SIDE_PX]
-    python benchmarks/review_load.py --archive [SCANS] [DECIDED]
+    python -m benchmarks review_load [FRAMES] [SIDE_PX]
+    python -m benchmarks review_load --archive [SCANS] [DECIDED]
 
 Renders FRAMES (20) tiled scans of SIDE_PX (11500) with four ring-crosses each, of which one is scratched, measures
 them, and goes through all of them with one key a mark. With --archive: a store of SCANS (50000) stand-ins, each with a
@@ -23,10 +23,11 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
-from archive_stand_ins import write_project
 from imagecodecs import zlib_encode
 from numpy.typing import NDArray
 from playwright.sync_api import Page, sync_playwright
+
+from benchmarks.archive_stand_ins import write_project
 
 TILE_PX = 256
 PITCH_UM = 20.0

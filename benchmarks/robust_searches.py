@@ -1,6 +1,6 @@
 """The searches for approximate orientations among gross errors, beside OpenCV's RANSAC and USAC.
 
-OPENBLAS_NUM_THREADS=1 python benchmarks/robust_searches.py [--count 60]
+python -m benchmarks robust_searches [--count 60]
 
 Orientations of aerial images from 12 or 40 points of which a share is somewhere else in the frame. Right is an
 orientation under which the true points lie where they were seen to 10 standard deviations (one image), or that is right

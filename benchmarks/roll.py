@@ -1,6 +1,6 @@
 """What reading costs on the frames of a roll: a few of them as wholes, on the others the line that shows how they lie.
 
-python benchmarks/roll.py [FRAMES] [TURNED]
+python -m benchmarks roll [FRAMES] [TURNED]
 
 FRAMES frames of one camera whose four marks are alike, with the titles of the roll, a number of their own, and other
 grain and dust; TURNED of them were laid on the scanner otherwise. Each is measured with nothing read, with the known
@@ -14,8 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from writing import AT_MM, FRAME_MM, PITCH_UM, line, scene, stored
 
+from benchmarks.writing import AT_MM, FRAME_MM, PITCH_UM, line, scene, stored
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.geometry import POSES

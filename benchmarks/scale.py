@@ -1,9 +1,9 @@
 """Time and memory of large adjustments beside OpenCV, SciPy and Ceres, each in a process of its own with one thread.
 
-python benchmarks/scale.py                      the whole table
-python benchmarks/scale.py known reseau 200     one measurement: task, program, views
-python benchmarks/scale.py known start 200      approximations; "nothing": without a principal distance, and adjusted
-python benchmarks/scale.py unknown ceres 200 20000
+python -m benchmarks scale                      the whole table
+python -m benchmarks scale known reseau 200     one measurement: task, program, views
+python -m benchmarks scale known start 200      approximations; "nothing": without a principal distance, and adjusted
+python -m benchmarks scale unknown ceres 200 20000
 
 A single measurement is of as many threads as OPENBLAS_NUM_THREADS says.
 
@@ -22,7 +22,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from large_networks import CONTROL_EVERY, FLIP, FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, known, strip, unknown
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_array, diags_array
@@ -35,6 +34,7 @@ from adjust.least_squares.numbering import Numbering
 from adjust.problem.network import Exterior
 from adjust.problem.problem import ABSENT, number
 from adjust.solution.adjustment import adjust
+from benchmarks.large_networks import CONTROL_EVERY, FLIP, FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, known, strip, unknown
 
 Array = NDArray[np.float64]
 Figures = dict[str, Any]

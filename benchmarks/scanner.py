@@ -1,6 +1,6 @@
 """A scanner's bend apart from films and fiducial marks: claimed against realised standard deviations, and what is told.
 
-PYTHONPATH=tests/adjust python benchmarks/scanner.py [NETWORKS]
+python -m benchmarks scanner [NETWORKS]
 
 Networks simulated with errors drawn anew, each adjusted with the terms of a bend beside everything else: frames in two
 poses, in four, and convergent photographs of targets. For every setup: the rms error over the rms of the claimed

@@ -1,6 +1,6 @@
 """Methods of scikit-image in the place of the program's own, on the same pictures and points, whose truth is known.
 
-OPENBLAS_NUM_THREADS=1 PYTHONPATH=tests/measure python benchmarks/scikit_image.py [--only NAME] [--count 24]
+python -m benchmarks scikit_image [--only NAME] [--count 24]
 
 Each row is one method: what it is for, its figure, and that of what is used in its place.
 """
@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 from drawn import scan_of
-from measured_marks import CONTRAST, GROUND, drawn, measured, start_off
 from numpy.typing import NDArray
 from skimage.feature import blob_log, corner_subpix, peak_local_max
 from skimage.filters import threshold_local
@@ -28,6 +27,7 @@ from true_marks import KIND, TrueMark, some_mark
 
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
+from benchmarks.measured_marks import CONTRAST, GROUND, drawn, measured, start_off
 from measure.boards.corners import junction
 from measure.detection.response_layers import peaks
 from measure.fiducials.interior_orientation import outliers

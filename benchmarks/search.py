@@ -1,6 +1,6 @@
 """Search and pose in rendered frames, against their truth.
 
-python benchmarks/search.py OUT.jsonl [--frames 600] [--first 0] [--seed 1]
+python -m benchmarks search OUT.jsonl [--frames 600] [--first 0] [--seed 1]
 
 One line a frame is added to OUT.jsonl, and frames that stand there already are left out, so that a run can be
 continued; two runs, each with frames of its own, may share the file. Then the tables of all its lines are printed. With
@@ -16,8 +16,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from search_frames import KINDS, SYMMETRIES, Case, draw_case
 
+from benchmarks.search_frames import KINDS, SYMMETRIES, Case, draw_case
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from lone_frames import image_of, lone_frame, painted
 from numpy.typing import NDArray
 
+from benchmarks.lone_frames import image_of, lone_frame, painted
 from measure.marks.shapes import (
     Disk,
     FiducialLayout,

@@ -1,6 +1,6 @@
 """Marks measured through unknown tone curves, against their truth.
 
-    python benchmarks/tone_curves.py [--frames 60] [--first 0] [--seed 1] [--keep FILE] [--every 50] [--scans 1]
+    python -m benchmarks tone_curves [--frames 60] [--first 0] [--seed 1] [--keep FILE] [--every 50] [--scans 1]
 
 Frames as `tone_frames` draws them: seven kinds of marks; gamma 1, 1.8, 2.2, sRGB and an S-curve; 16 and 8 bit and JPEG
 of quality 60 to 95; signal-to-noise 8 to 100; turned by up to 3 degrees; uneven focus, vignetting, a stamp over a mark,
@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tone_frames import KINDS, PITCH_UM, TIPS, Case, draw_case
 
+from benchmarks.tone_frames import KINDS, PITCH_UM, TIPS, Case, draw_case
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Cause, Status

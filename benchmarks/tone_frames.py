@@ -8,9 +8,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from lone_frames import fiducials_of, image_of, lone_frame, painted
 from numpy.typing import NDArray
 
+from benchmarks.lone_frames import fiducials_of, image_of, lone_frame, painted
 from measure.marks.shapes import (
     FiducialLayout,
     LayoutMark,

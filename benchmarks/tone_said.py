@@ -1,6 +1,6 @@
 """What the tips of folders say of the tone curve where they are matched by the true one, against what they claim.
 
-    PYTHONPATH=tests/measure python benchmarks/tone_said.py [--folders 45] [--scans 3] [--seed 7] [--stored JPEG]
+    python -m benchmarks tone_said [--folders 45] [--scans 3] [--seed 7] [--stored JPEG]
 
 Folders as `tone_curves --scans 8` has them, some scans of each. At the true curve marks should want no other: told is
 how far the curve that they do want moves the tips along their axes, over its standard deviation, rms and mean, for
@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from tone_frames import PITCH_UM, STORED, TIPS, Case, draw_case
 
+from benchmarks.tone_frames import PITCH_UM, STORED, TIPS, Case, draw_case
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame_edges import told_by_edges
 from measure.fiducials.frame_sighter import FrameSighter

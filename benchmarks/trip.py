@@ -1,7 +1,7 @@
 """The trip of a scan file to a row of comparator.csv: the modules that its calls go through, each where it is first
 entered, and which are entered again from one that they have called.
 
-Run: python benchmarks/trip.py. It measures a small drawn frame of four ring-crosses and a scan of nothing but grain, in
+Run: python -m benchmarks trip. It measures a small drawn frame of four ring-crosses and a scan of nothing but grain, in
 which every way of looking is tried, and follows every call.
 """
 

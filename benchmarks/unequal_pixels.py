@@ -1,6 +1,6 @@
 """Frames of an aerial camera with faint marks, in scans whose pixels are longer one way than the other.
 
-python benchmarks/unequal_pixels.py [--frames 24] [--first 0] [--seed 1]
+python -m benchmarks unequal_pixels [--frames 24] [--first 0] [--seed 1]
 
 Four plain diagonal crosses at the corners of a square of 212 mm, as Wild cameras have them, a pixel wide, on pads,
 among dust, scratches and hairs on grainy film. Their contrast is that of lines 3 to 8 times the scanner's noise on a
@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from lone_frames import fiducials_of, image_of, lone_frame, painted
 from numpy.typing import NDArray
 
+from benchmarks.lone_frames import fiducials_of, image_of, lone_frame, painted
 from measure.fiducials.measurement import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import FrameMeasurement

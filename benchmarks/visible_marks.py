@@ -1,6 +1,6 @@
 """Which marks of the study of the search anybody can see, from the pictures' own truth and without `measure`.
 
-python benchmarks/visible_marks.py OUT.jsonl [--seed 1]
+python -m benchmarks visible_marks OUT.jsonl [--seed 1]
 
 Every frame of `search.py`'s OUT.jsonl is painted once more without its marks: the difference is what the marks add to
 the picture, and what is left is the ground that hides them. A filter matched to a mark's own picture, at its known
@@ -18,8 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from search import OUTCOMES, lines
-from search_frames import Case, draw_case
+
+from benchmarks.search import OUTCOMES, lines
+from benchmarks.search_frames import Case, draw_case
 
 Array = NDArray[np.float64]
 

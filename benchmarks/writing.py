@@ -1,6 +1,6 @@
 """The pose by what is written, in rendered frames, against their truth.
 
-python benchmarks/writing.py [FRAMES] [WITHOUT] [ROWS.jsonl]
+python -m benchmarks writing [FRAMES] [WITHOUT] [ROWS.jsonl]
 
 Frames of four marks alike, in all poses, of every background, negatives too, blurred, grainy, compressed. Titles of 6
 to 40 characters stand beside one side, among them words that are the same upside down or in a mirror; on some a plate
@@ -18,10 +18,10 @@ from typing import Any, get_args
 
 import cv2
 import numpy as np
-from lone_frames import fiducials_of, image_of, lone_frame, painted
-from search_frames import SIDES
-from writing_lines import ALIKE, line_text
 
+from benchmarks.lone_frames import fiducials_of, image_of, lone_frame, painted
+from benchmarks.search_frames import SIDES
+from benchmarks.writing_lines import ALIKE, line_text
 from measure.annotations.fields import Line, Reading, is_plate
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions

@@ -1,6 +1,6 @@
 """Lines of writing, read alone: how often the way they read best is the right one, by how much better it reads.
 
-python benchmarks/writing_lines.py [SCANS] [FIRST]
+python -m benchmarks writing_lines [SCANS] [FIRST]
 
 Four lines a scan, one at each side, as films have them: titles, dates, heights, numbers, plates, names, words that are
 the same upside down or in a mirror; in all fonts, 8 to 30 px high, blurred, grainy, faint, compressed, light or dark,

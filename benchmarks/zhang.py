@@ -1,7 +1,7 @@
 """Zhang's five pictures with skew against his published result: 256 corners of 64 squares in each.
 
-    python benchmarks/zhang.py FOLDER           # his corners
-    python benchmarks/zhang.py FOLDER pictures  # corners measured in CalibIm1.png to CalibIm5.png, too
+    python -m benchmarks zhang FOLDER           # his corners
+    python -m benchmarks zhang FOLDER pictures  # corners measured in CalibIm1.png to CalibIm5.png, too
 
 FOLDER holds Model.txt and data1.txt to data5.txt of his page (Z. Zhang, A flexible new technique for camera
 calibration, PAMI 22, 2000), also in github.com/imagingbook/imagingbook-calibrate, beside his result. Nothing is
