@@ -38,7 +38,7 @@ LINES = (
         "measure/test_mark_comparison.py",
     ),
     Broken(
-        "measure/fiducials/frame_sighter.py",
+        "measure/fiducials/measure_frame.py",
         "place_covariance.plus(cause, px2)",
         "place_covariance",
         "measure/test_frame_settling.py",

@@ -118,7 +118,7 @@ def frame_of_marks(kind: Kind, share: float, count: int, rng: np.random.Generato
     scan = Scan(Path("dusty.tif"), WholePicture(frame), NO_TAGS)
     result = measure_frame(scan, layout, about_right(linear, middle, sign, count, rng), FiducialOptions())
     found = []
-    for index, (sighting, (*_, corner)) in enumerate(zip(result.sightings, parts, strict=True)):
+    for index, (sighting, (*_, corner)) in enumerate(zip(result.detections, parts, strict=True)):
         status, reason = result.verdict(index)
         flagged = "" if status is Status.MEASURED else reason
         fit = sighting.fit

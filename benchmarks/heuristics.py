@@ -82,7 +82,7 @@ def _lone(disks: Sequence[Any], _predicted: Sequence[Array]) -> list[Any]:
 
 Study = Callable[[int], str]
 SWITCHED: dict[str, tuple[Study, Any, str, Any]] = {
-    "faint marks": (faint, frame_measurement, "look_for_faint", lambda _sighter, _reach_px: None),
+    "faint marks": (faint, frame_measurement, "detect_faint_marks", lambda frame, _reach_px: frame),
     "dusty disks": (dusty_disks, targets, "doubts", _lone),
     "fronts": (one_front, fronts, "FRONT_COST", 1e30),
 }

@@ -8,7 +8,7 @@ run may be stopped and go on, or be shared out by --kind among processes.
 
 The pictures are drawn by `synthetic_images` (exact areas, blurred before they are averaged over pixels); the bounds are
 from differences of the same pictures. What is measured with is what `reseau measure` calls:
-`measure.fiducials.mark_fit.sight`, and `measure.targets.disks.fit_disk` for the ellipse.
+`measure.fiducials.mark_fit.detect_mark`, and `measure.targets.disks.fit_disk` for the ellipse.
 """
 
 import argparse

@@ -7,9 +7,9 @@ from drawn import scan_of
 from numpy.typing import NDArray
 from true_marks import ALL_MOVES, TrueMark
 
-from measure.detection.prediction import MarkPrediction
+from measure.detection.localisation import MarkPrediction
 from measure.fiducials.frame import CLEAR_DAMAGE
-from measure.fiducials.mark_fit import sight
+from measure.fiducials.mark_fit import detect_mark
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Cause
 from measure.targets.disks import fit_disk
@@ -119,7 +119,7 @@ def measured(
     polarity = 1 if grey_is_light(mark, grey) else -1
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
     options = FiducialOptions().match
-    fit = sight(scan, MarkPrediction(mark.kind.shape, start, SEARCH_PX, polarity), options, frame_sigma).fit
+    fit = detect_mark(scan, MarkPrediction(mark.kind.shape, start, SEARCH_PX, polarity), options, frame_sigma).fit
     if fit is None:
         return None
     unlike_drawing_px2 = fit.place_covariance.parts.get(Cause.UNLIKE_DRAWING, np.zeros((2, 2)))

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from benchmarks.tone_frames import PITCH_UM, STORED, TIPS, Case, draw_case
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame_edges import told_by_edges
-from measure.fiducials.frame_sighter import FrameSighter
-from measure.fiducials.mark_fit import sight
+from measure.fiducials.frame import Frame
+from measure.fiducials.frame_edges import edge_tone_information
+from measure.fiducials.mark_fit import detect_mark
 from measure.fiducials.options import FiducialOptions
 from measure.marks.frame_border import limit_to_frame
 from measure.tone.curve import Tone, ToneInformation
@@ -45,19 +45,19 @@ def said_by_scan(case: Case) -> Said | None:
     scan = case.scan.replace_tone(Tone(curve, covariance=1e-12 * np.eye(5)))
     places = np.array([case.centers_px[mark.id] for mark in layout.marks])
     design = np.array([[*mark.xy_mm, 1.0] for mark in layout.marks])
-    frame = np.linalg.lstsq(design, places, rcond=None)[0].T
-    placement = Placement(case.pose, frame, 1.0, len(places), 1, 1, (PITCH_UM / 1000,) * 2)
-    sighter = FrameSighter(scan, layout, placement, FiducialOptions(pose=case.pose))
+    matrix = np.linalg.lstsq(design, places, rcond=None)[0].T
+    placement = Placement(case.pose, matrix, 1.0, len(places), 1, 1, (PITCH_UM / 1000,) * 2)
+    frame = Frame.from_placement(scan, layout, placement, FiducialOptions(pose=case.pose))
     said, outwards, codes_seen = [], [], []
     for index, mark in enumerate(layout.marks):
-        fit = sight(scan, sighter.expected(index, _SEARCH_PX), sighter.options.match, _FRAME_SIGMA).fit
+        fit = detect_mark(scan, frame.prediction(index, _SEARCH_PX), frame.options.match, _FRAME_SIGMA).fit
         if fit is not None and fit.tone is not None and fit.tone.information.count:
             said.append(fit.tone.information)
             outwards.append(-case.inward[mark.id] @ fit.tone.on_place)
             codes_seen += [fit.tone.least, fit.tone.greatest]
     if not said:
         return None
-    edges = [] if scan.is_lossy else told_by_edges(scan, layout, frame, None)
+    edges = [] if scan.is_lossy else edge_tone_information(scan, layout, matrix, None)
     seen = (codes > max(min(codes_seen), 0.005)) & (codes < max(codes_seen))
     return [*said, *edges], np.mean(outwards, axis=0), departures(codes[seen], curve[seen])
 

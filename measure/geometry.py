@@ -37,3 +37,8 @@ def quarter_turned(image: Grid, turn: Array) -> Grid:
     turned = image if whole[0, 0] else image.T
     across, down = whole.sum(axis=1)
     return np.ascontiguousarray(turned[:: int(down), :: int(across)])
+
+
+def linear_scale(matrix: Array) -> float:
+    """The scale of a transformation (2, 2) or (2, 3), the mean of both directions: the root of its determinant."""
+    return float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))

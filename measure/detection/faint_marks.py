@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.detection.candidates import detail_px
-from measure.detection.prediction import MarkPrediction
+from measure.detection.localisation import MarkPrediction
 from measure.flags import NO_REASON, Cause
 from measure.marks.rendering import extent_px, picture
 from measure.matching.window import FAINT, Coding
@@ -45,31 +45,35 @@ _FINEST_PX = 16.0  # of a mark's lines: what is wider is sought in a picture tha
 @dataclass(frozen=True, eq=False)
 class FaintMark:
     """fit: the mark; its significance is in standard deviations of what the texture about it answers, and its
-    covariance comes from that texture. chance: how many answers as strong and as near the texture alone would give."""
+    covariance comes from that texture. false_alarms: how many answers as strong and as near the
+    texture alone would give."""
 
     fit: MarkFit
-    chance: float
+    false_alarms: float
 
     @property
     def sigma_px(self) -> float:
-        """The standard deviation of where it is seen, in the direction in which that is known least."""
+        """The standard deviation of its place, in the direction in which that is known least."""
         parts = self.fit.place_covariance.parts
-        seen_px2 = sum((part for cause, part in parts.items() if cause != Cause.OWN_TURN), np.zeros((2, 2)))
-        return float(np.sqrt(np.linalg.eigvalsh(seen_px2)[-1]))
+        place_px2 = sum((part for cause, part in parts.items() if cause != Cause.OWN_TURN), np.zeros((2, 2)))
+        return float(np.sqrt(np.linalg.eigvalsh(place_px2)[-1]))
 
 
-def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
+def detect_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
     """The strongest response to the mark within the search radius of its predicted place, None where there is no
     contrast by any curve that the scan's may be.
 
     extreme_dn: the lightest or darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as
     light or as dark it does not show.
     """
-    seen = [_found(scan.replace_tone(curve), expected, extreme_dn, blur_px) for curve in scan.tone.plausible_curves]
-    both = [each for each in seen if each is not None]
-    if len(both) < len(seen):
+    by_curve = [
+        _detect_by_curve(scan.replace_tone(curve), expected, extreme_dn, blur_px)
+        for curve in scan.tone.plausible_curves
+    ]
+    both = [each for each in by_curve if each is not None]
+    if len(both) < len(by_curve):
         return None
-    less_sure = max(both, key=lambda each: each.chance)
+    less_sure = max(both, key=lambda each: each.false_alarms)
     centers = np.array([each.fit.center_px for each in both])
     half, center = (centers[0] - centers[-1]) / 2, centers.mean(axis=0)
     fit = replace(
@@ -78,10 +82,10 @@ def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px:
         pixel_from_mark=np.column_stack([less_sure.fit.pixel_from_mark[:, :2], center]),
         place_covariance=less_sure.fit.place_covariance.plus(Cause.TONE, np.outer(half, half)),
     )
-    return FaintMark(fit, less_sure.chance)
+    return FaintMark(fit, less_sure.false_alarms)
 
 
-def _found(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
+def _detect_by_curve(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
     """By the scan's one curve."""
     field = _Field(scan, expected, extreme_dn, blur_px)
     first = field.response(field.predicted)
@@ -92,9 +96,9 @@ def _found(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: flo
         response = field.response(center)
         top = response.top(center)
         if np.hypot(*(top - center)) < _SETTLED_PX:
-            return field.seen(response, center)
+            return field.faint_mark(response, center)
         center = top
-    return field.seen(field.response(center), center)
+    return field.faint_mark(field.response(center), center)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +214,7 @@ class _Field:
         shown = picture(self.mark, pixel_from_mark, size, size, self.blur_px / self.step)
         return np.asarray(shown - cv2.GaussianBlur(shown, (0, 0), self.coarse_px), dtype=float)
 
-    def seen(self, response: _Response, center: Array) -> FaintMark | None:
+    def faint_mark(self, response: _Response, center: Array) -> FaintMark | None:
         """What the response at the mark's place is worth, against what the texture about it answers."""
         (row, col), patch = response.pixel(center), response.patch(center)
         height = float(response.value[row, col])
@@ -250,7 +254,9 @@ class _Field:
             likeness=min(height / float(np.linalg.norm(self.detail[patch][lit > _LINE / 5 * lit.max()])), 1.0),
             significance=height / scatter,
         )
-        return FaintMark(fit, _chance(height / scatter, slopes / scatter**2, max(distance_px, _LEAST_DISTANCE_PX)))
+        return FaintMark(
+            fit, _false_alarms(height / scatter, slopes / scatter**2, max(distance_px, _LEAST_DISTANCE_PX))
+        )
 
     def _leaning_px2(self, response: _Response, center: Array) -> Array:
         """What the place of a mark whose lines lie to one side of its point takes from a turn and a size that are not
@@ -275,7 +281,7 @@ def _reduced(picture: NDArray[np.floating], step: int) -> NDArray[np.floating]:
     return picture if step == 1 else np.asarray(means(picture[..., None], step)[..., 0])
 
 
-def _chance(strength: float, slopes: Array, radius_px: float) -> float:
+def _false_alarms(strength: float, slopes: Array, radius_px: float) -> float:
     """How many maxima of at least this strength a Gaussian field of unit variance has in a circle, slopes (2, 2) being
     the covariance of its gradient: Adler's expected Euler characteristic of the excursion set."""
     density = np.sqrt(np.linalg.det(slopes)) * (2 * np.pi) ** -1.5 * strength * np.exp(-(strength**2) / 2)

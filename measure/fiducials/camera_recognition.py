@@ -8,12 +8,11 @@ import numpy as np
 from scipy.special import comb
 
 from measure.detection.candidates import Effort
-from measure.detection.first_look import seen as sight_of_mark
+from measure.detection.localisation import localise
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.frame_sighter import FrameSighter
 from measure.fiducials.hypotheses import PitchHypothesis
-from measure.fiducials.measure_frame import look_at_frame
+from measure.fiducials.measure_frame import detect_frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch
 from measure.flags import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
@@ -59,7 +58,7 @@ def seen(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.
             break
         enlarged = _enlarged(placement, times)
         if answered.expected <= CAMERA_BY_CHANCE or _may_be_there(scan, layout, enlarged):
-            frame = look_at_frame(scan, layout, enlarged, _LOOK)
+            frame = detect_frame(scan, layout, enlarged, _LOOK)
             if frame.accepted:
                 return frame
     return None
@@ -68,12 +67,10 @@ def seen(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.
 def _may_be_there(scan: Scan, layout: FiducialLayout, placement: Placement) -> bool:
     """Whether noise hardly makes three of the marks look like themselves as much as they do. A fit takes ten times as
     long as to see that."""
-    sighter = FrameSighter(scan, layout, placement, _LOOK)
-    looks = [
-        sight_of_mark(scan, sighter.expected(index, sighter.first_search_px)) for index in range(len(layout.marks))
-    ]
-    chances = np.sort([1.0 if look is None else look[1] for look in looks])[:_AT_LEAST]
-    return bool(comb(len(looks), len(chances)) * chances.prod() <= CAMERA_BY_NOISE)
+    frame = Frame.from_placement(scan, layout, placement, _LOOK)
+    peaks = [localise(scan, frame.prediction(index, frame.first_search_px)) for index in range(len(layout.marks))]
+    false_alarms = np.sort([1.0 if peak is None else peak[1] for peak in peaks])[:_AT_LEAST]
+    return bool(comb(len(peaks), len(false_alarms)) * false_alarms.prod() <= CAMERA_BY_NOISE)
 
 
 def _enlarged(placement: Placement, times: float) -> Placement:

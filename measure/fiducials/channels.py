@@ -1,20 +1,48 @@
 """The combination of a colour scan's channels in which the marks stand out most."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.detection.localisation import highest_peak
+from measure.fiducials.frame import Frame
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
 from measure.matching.match import mark_window
-from measure.scans.scan import Scan
+from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 
 Array = NDArray[np.float64]
 
 _MARGIN_PX = 4.0  # of ground about a mark, from which its offset and slopes are told
 _BLUR_PX = 0.8  # of a mark's picture: what a match begins with
+_CLEAR_PEAK = 0.25  # correlation of marks before they are fitted, where the fitted likeness is that of clear ones
+_TRIALS = 6  # marks that the channels are chosen from
 _SHRINK = 0.1  # of the noise covariance towards a multiple of the unit matrix: few pixels know it badly
+
+
+def choose_channels(frame: Frame) -> Frame:
+    """Choose the channels of a colour scan: that in which some marks correlate best, then from these marks the best
+    combination. Where no mark is drawn light or dark, the polarity is that of the combination."""
+    if frame.scan.channels == 1:
+        return frame
+    marks = frame.layout.marks
+    places = []
+    for index in range(0, len(marks), max(1, len(marks) // _TRIALS)):
+        expected = frame.prediction(index, frame.first_search_px)
+        peaks = [
+            highest_peak(frame.scan, replace(expected, weights=weights)) for weights in (LUMINANCE, *SINGLE_CHANNELS)
+        ]
+        place, height = max(peaks, key=lambda peak: peak[1])
+        if height > _CLEAR_PEAK:
+            places.append((expected.mark, expected.moved(place).pixel_from_mark, expected.polarity))
+    unsaid = all(mark.mark.polarity == "auto" for mark in marks)
+    best = best_weights(frame.scan, places, (1, -1) if unsaid else (1,))
+    if best is None:
+        return frame
+    weights, sign = best
+    return replace(frame, weights=weights, placement=replace(frame.placement, polarity=sign * frame.placement.polarity))
 
 
 def best_weights(
@@ -48,13 +76,13 @@ def best_weights(
         return None
     discriminant = np.linalg.solve(covariance, contrast)
 
-    def told(sign: int) -> float:
+    def contrast_over_noise(sign: int) -> float:
         """The contrast over its noise."""
         weights = np.maximum(sign * discriminant, 0.0)
         return float(sign * weights @ contrast / np.sqrt(max(weights @ covariance @ weights, 1e-300)))
 
-    best = max(signs, key=told)
-    if not told(best) > 0:
+    best = max(signs, key=contrast_over_noise)
+    if not contrast_over_noise(best) > 0:
         return None
     weights = np.maximum(best * discriminant, 0.0)
     return tuple(float(weight) for weight in weights / weights.sum()), best

@@ -1,19 +1,20 @@
-"""The faint marks of a frame: looked for once more where the marks that agree put them."""
+"""The faint marks of a frame: detected where the marks that agree put them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.detection.faint_marks import FaintMark, find_faint
-from measure.detection.prediction import MarkPrediction
-from measure.fiducials.frame_sighter import FrameSighter
-from measure.fiducials.mark_fit import Sighting
+from measure.detection.faint_marks import FaintMark, detect_faint
+from measure.detection.localisation import MarkPrediction
+from measure.fiducials.frame import Frame
+from measure.fiducials.mark_fit import Detection
 from measure.flags import NO_REASON, TEXTURE_LIKE_A_FAINT_MARK, Code, Reason
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FrameCorner, Mark
 from measure.results import MarkFit
+from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ _REACH = 4.0  # times the scatter of the others, a median: nearly five standard 
 _NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
 _EXTREMES = (0.5, 99.5)  # per cent: of the darkest and lightest grey values about all marks, or about one
 _SURROUND = 6.0  # times as far about each as it reaches itself: enough of the scan to tell how dark or light it can be
-_LOOKED_AT = 8  # marks that agree: these tell how light or dark marks are
+_TYPICAL = 8  # marks that agree: these tell how light or dark marks are
 _SHOWS = 1 / 3  # of the others' contrast: ground that leaves less to a mark hides it
 
 
@@ -39,111 +40,108 @@ class Ground:
     sigma_dn: float
 
 
-def look_for_faint(sighter: FrameSighter, reach_px: float) -> None:
-    """Look again at every mark that is not clear, or does not lie where the others put it: what stands out of its
+def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
+    """Detect every mark once more that is not clear, or does not lie where the others put it: what stands out of its
     texture there is this mark, the film being deformed where it lies off. A clear one may be a pattern beside it.
     """
-    near = sighter.belongs & (sighter.misfit_mm() <= _NEAR * max(sighter.scatter_mm(), sighter.options.film_sigma_mm))
+    near = frame.inliers & (frame.misfit_mm <= _NEAR * max(frame.scatter_mm, frame.options.film_sigma_mm))
     faint = [
-        (index, sighting)
-        for index, sighting in enumerate(sighter.sightings)
-        if sighting is not None and sighting.inside and not (sighter.clear(index) and near[index])
-        if not isinstance(sighter.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
+        index
+        for index, detection in enumerate(frame.detections)
+        if detection.inside and not (frame.is_clear(index) and near[index])
+        if not isinstance(frame.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
     ]
-    agreeing = {
-        index: sighting.fit
-        for index, sighting in enumerate(sighter.sightings)
-        if sighter.belongs[index] and sighting is not None and sighting.fit
-    }
+    agreeing = {index: fit for index, fit in enumerate(frame.fits) if fit}
     if not faint or not agreeing:
-        return
+        return frame
     # The marks that agree tell both better than a faint mark does itself.
     blur_px = float(np.median([fit.blur_px for fit in agreeing.values()]))
     usual_dn = float(np.median([abs(fit.stored_contrast_dn) for fit in agreeing.values()]))
-    extremes = _extremes_dn(sighter)
-    reached = _reached_dn(sighter, agreeing)
-    for index, sighting in faint:
-        expected = sighter.expected(index, reach_px)
+    extremes, reached = _extremes_dn(frame), _reached_dn(frame, agreeing)
+    detections, certain = {}, frame.certain.copy()
+    for index in faint:
+        expected = frame.prediction(index, reach_px)
         extreme_dn = float(extremes[int(expected.polarity > 0)])
-        seen = find_faint(sighter.scan, expected, extreme_dn, blur_px)
-        known = seen is not None and seen.sigma_px <= _FAINT_SIGMA_PX
-        certain = seen is not None and _is_certain(sighter, seen)
-        ground = _ground(sighter, expected, (extreme_dn, reached.get(expected.polarity, extreme_dn)))
-        unseen = reason_unseen(ground, usual_dn, reach_px, seen, certain)
-        _take(sighter, index, sighting, seen if certain and known else None, unseen)
+        mark = detect_faint(frame.scan, expected, extreme_dn, blur_px)
+        is_certain = mark is not None and _is_certain(frame.scan, mark)
+        ground = _ground(frame, expected, (extreme_dn, reached.get(expected.polarity, extreme_dn)))
+        why_not = reason_not_found(ground, usual_dn, reach_px, mark, is_certain)
+        known = mark if is_certain and mark is not None and mark.sigma_px <= _FAINT_SIGMA_PX else None
+        detections[index], certain[index] = _decide(frame, index, known, why_not)
+    return replace(frame.replace_detections(detections), certain=certain)
 
 
-def faint_reach_px(sighter: FrameSighter) -> float:
+def faint_reach_px(frame: Frame) -> float:
     """How far a faint mark can be from where many others put it."""
-    return min(sighter.gate_px, max(_REACH * sighter.scatter_mm() / float(sighter.pitch.mean()), _LEAST_REACH_PX))
+    return min(frame.gate_px, max(_REACH * frame.scatter_mm / float(frame.pitch_mm.mean()), _LEAST_REACH_PX))
 
 
-def _extremes_dn(sighter: FrameSighter) -> Array:
+def _extremes_dn(frame: Frame) -> Array:
     """The darkest and the lightest grey values about the marks: they are spread over the scan, and no more of it has
     to be read."""
-    expected = [
-        sighter.expected(index, 0.0)
-        for index, sighting in enumerate(sighter.sightings)
-        if sighting is not None and sighting.inside
-    ]
-    grey = [_about(sighter, each.mark, each.pixel_from_mark, _SURROUND).ravel() for each in expected]
+    inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
+    expected = [frame.prediction(index, 0.0) for index in inside]
+    grey = [_grey_about(frame, each.mark, each.pixel_from_mark, _SURROUND).ravel() for each in expected]
     return np.asarray(np.percentile(np.concatenate(grey), _EXTREMES))
 
 
-def _reached_dn(sighter: FrameSighter, agreeing: Mapping[int, MarkFit]) -> dict[int, float]:
+def _reached_dn(frame: Frame, agreeing: Mapping[int, MarkFit]) -> dict[int, float]:
     """How light, or dark, the marks that agree are: in a scan without lights they pass its extreme."""
     reached: dict[int, list[float]] = {}
-    for index, fit in list(agreeing.items())[:_LOOKED_AT]:
+    for index, fit in list(agreeing.items())[:_TYPICAL]:
         is_light = fit.contrast_dn > 0
-        grey = _about(sighter, sighter.layout.marks[index].mark, fit.pixel_from_mark)
+        grey = _grey_about(frame, frame.layout.marks[index].mark, fit.pixel_from_mark)
         reached.setdefault(1 if is_light else -1, []).append(float(np.percentile(grey, _EXTREMES[int(is_light)])))
     return {polarity: float(np.median(tones)) for polarity, tones in reached.items()}
 
 
-def _ground(sighter: FrameSighter, expected: MarkPrediction, tones_dn: Sequence[float]) -> Ground:
+def _ground(frame: Frame, expected: MarkPrediction, tones_dn: Sequence[float]) -> Ground:
     """About a mark's place; tones_dn: grey values that a mark can have."""
-    grey = _about(sighter, expected.mark, expected.pixel_from_mark)
+    grey = _grey_about(frame, expected.mark, expected.pixel_from_mark)
     room_dn = max(*(expected.polarity * (tone_dn - float(np.median(grey))) for tone_dn in tones_dn), 0.0)
     return Ground(expected.polarity > 0, room_dn, float(grey.std()))
 
 
-def _about(sighter: FrameSighter, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Array:
+def _grey_about(frame: Frame, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Array:
     """The grey values about a mark's place, as far as it reaches or so many times as far."""
     center = pixel_from_mark[:, 2]
     least, greatest = (center + times * (corner - center) for corner in extent_px(mark, pixel_from_mark))
     low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
-    window = sighter.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), sighter.weights)
+    window = frame.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), frame.weights)
     return np.asarray(window, dtype=float)
 
 
-def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark | None, unseen: Reason) -> None:
-    """Keep a clear fit where what was seen is the same mark; else what was seen counts, or that nothing was. Texture
-    does not feign what was seen; but where a clear fit lies elsewhere, either may be the mark."""
-    clear, away = sighter.clear(index), np.inf
-    if seen is not None and sighting.fit is not None:
-        away = float(np.hypot(*(sighting.fit.center_px - seen.fit.center_px)))
-    # That the same pixels answer twice proves nothing of a clear mark that agreed with the others anyway.
-    again = clear and bool(sighter.belongs[index]) and away <= _SAME_PX
-    sighter.certain[index] = seen is not None and (bool(sighter.certain[index]) or not again)
-    if seen is None and not clear:
-        sighter.sightings[index] = Sighting(sighting.predicted_px, True, None, unseen)
-    elif seen is not None and (not clear or away > _SAME_PX):
-        told = Reason(f"{away:.0f} px from it something looks like it, too", Code.AMBIGUOUS) if clear else NO_REASON
-        sighter.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, told)
+def _decide(frame: Frame, index: int, mark: FaintMark | None, why_not: Reason) -> tuple[Detection, bool]:
+    """The detection of a mark, and whether it is certain. A clear fit stays where the faint mark is the same one; else
+    the faint mark counts, or that there is none. Texture does not feign it; but where a clear fit lies elsewhere,
+    either may be the mark."""
+    before, is_clear = frame.detections[index], frame.is_clear(index)
+    if mark is None:
+        return before if is_clear else Detection(before.predicted_px, True, None, why_not), False
+    away_px = np.inf if before.fit is None else float(np.hypot(*(before.fit.center_px - mark.fit.center_px)))
+    if is_clear and away_px <= _SAME_PX:
+        # That the same pixels answer twice proves nothing of a clear mark that agreed with the others anyway.
+        return before, bool(frame.certain[index]) or not frame.inliers[index]
+    reason = NO_REASON
+    if is_clear:
+        reason = Reason(f"{away_px:.0f} px from it something looks like it, too", Code.AMBIGUOUS)
+    return Detection(before.predicted_px, True, mark.fit, reason), True
 
 
-def _is_certain(sighter: FrameSighter, seen: FaintMark) -> bool:
+def _is_certain(scan: Scan, mark: FaintMark) -> bool:
     """Whether neither texture nor rounding feigns it."""
-    strong = abs(seen.fit.stored_contrast_dn) >= _FAINT_CONTRAST * sighter.scan.full_scale_dn
-    return seen.chance <= TEXTURE_LIKE_A_FAINT_MARK and strong
+    strong = abs(mark.fit.stored_contrast_dn) >= _FAINT_CONTRAST * scan.full_scale_dn
+    return mark.false_alarms <= TEXTURE_LIKE_A_FAINT_MARK and strong
 
 
-def reason_unseen(ground: Ground, usual_dn: float, reach_px: float, seen: FaintMark | None, certain: bool) -> Reason:
+def reason_not_found(
+    ground: Ground, usual_dn: float, reach_px: float, mark: FaintMark | None, is_certain: bool
+) -> Reason:
     """A sentence, the first that holds: ground as dark as anything in the scan leaves a dark mark no room; too little
     of it shows to give its place; what answers is no more than rounding; texture hides it.
 
-    usual_dn: by which the other marks change their ground. seen: the strongest answer within reach_px, and certain
-    whether chance would not make it.
+    usual_dn: by which the other marks change their ground. mark: the strongest answer within reach_px; is_certain:
+    whether it is no false alarm.
     """
     if ground.room_dn < _SHOWS * usual_dn:
         shade = "light" if ground.is_light else "dark"
@@ -152,18 +150,18 @@ def reason_unseen(ground: Ground, usual_dn: float, reach_px: float, seen: FaintM
             f"others by {usual_dn:.0f}",
             Code.GROUND,
         )
-    if seen is not None and certain:
+    if mark is not None and is_certain:
         return Reason(
-            f"only {1 - seen.fit.damaged_fraction:.0%} of it shows: that gives its place to {seen.sigma_px:.1f} px "
+            f"only {1 - mark.fit.damaged_fraction:.0%} of it shows: that gives its place to {mark.sigma_px:.1f} px "
             "only",
             Code.COVERED,
         )
     within = f"within {reach_px:.0f} px of its place"
     could = min(ground.room_dn, usual_dn)
-    if seen is not None and abs(seen.fit.stored_contrast_dn) < _SHOWS * could:
+    if mark is not None and abs(mark.fit.stored_contrast_dn) < _SHOWS * could:
         return Reason(
             f"nothing {within} looks like it: what does so most changes the ground by "
-            f"{_grey(abs(seen.fit.stored_contrast_dn))}, where the mark could by {could:.0f}",
+            f"{_grey(abs(mark.fit.stored_contrast_dn))}, where the mark could by {could:.0f}",
             Code.NOT_FOUND,
         )
     return Reason(

@@ -1,23 +1,30 @@
-"""One frame in one placement: its marks as they were seen, and those told apart that do not belong."""
+"""One frame of a scan as a value: its marks as detected, those that agree, and the interior orientation by these."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from measure.fiducials.constellation import Placement
-from measure.fiducials.mark_fit import Sighting
-from measure.fiducials.options import SCATTER_MM
-from measure.flags import LARGE_ERROR, NO_REASON, Code, Reason, Status
+from measure.detection.localisation import MarkPrediction
+from measure.fiducials.constellation import NARROW, Placement, sign_of
+from measure.fiducials.interior_orientation import fit_frame, outliers
+from measure.fiducials.mark_fit import Detection
+from measure.fiducials.options import CLICK_SIGMA_PX, SCATTER_MM, FiducialOptions
+from measure.flags import LARGE_ERROR, NO_REASON, Cause, Code, Reason, Status
+from measure.geometry import up_from_camera
+from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.results import MarkFit
+from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR
 from measure.tone.estimate import FrameTone
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+MANY = 6  # marks that agree and tell where a faint one must be
 CLEAR_LIKENESS = 0.5  # below it a mark's picture has more in it that is not the mark
 CLEAR_DAMAGE = 0.25  # of a mark: with more of it gone, what is left may be another's
 _CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak
@@ -30,56 +37,166 @@ _MOST_UNLIKE = 0.03  # of a mark that its drawing may lack: with more gone, what
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _LEAST_SCATTER_MM = 2 * SCATTER_MM  # of few marks, which may agree by chance better than film keeps them
 _SAME_MARK_PX = 5.0  # two fits of one mark lie nearer to one another, two marks do not: each is some 14 px large
+_REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
+_CLICK_REACH_PX = 6 * CLICK_SIGMA_PX  # about a click: its sigma three times, and as much for who points less well
+
+
+def first_search_px(
+    placement: Placement, layout: FiducialLayout, options: FiducialOptions, tolerance: float = 1.0
+) -> float:
+    """The search radius about where a placement puts a mark; tolerance: a share of how far it may lie off."""
+    search_px = tolerance * options.search_mm(layout) / float(np.mean(placement.pitch_mm))
+    return _REDUCED_PX * placement.reduction + search_px
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """camera_mm: (n, 2) given. belongs: (n,) marks that were found and agree. misfit_mm: (n,) how far each mark found
-    is from where the frame puts it, nan without one; scatter_mm: the median of those that belong. pixel_from_camera:
-    (2, 3), the placement's own where fewer than two marks belong. part: whether the scan shows a part of it only."""
+    """A frame of n marks in one placement, as far as it is measured: each step of measuring makes another value.
 
+    scan: seen through the tone curve by which its marks were fitted. pixel_from_camera: (2, 3), the placement's own
+    where fewer than two marks agree; linear_sigma: the standard deviation of its rotation (rad), scale, stretch and
+    shear, inf before. detections: of all marks. inliers: (n,) marks that were found and agree; certain: (n,) those that
+    stand out so much of their texture that they need not. weights: of the channels. tone: the curve by its marks.
+    """
+
+    scan: Scan
+    layout: FiducialLayout
+    options: FiducialOptions
     placement: Placement
-    camera_mm: Array
-    sightings: tuple[Sighting, ...]
-    belongs: Mask
-    misfit_mm: Array
-    scatter_mm: float
     pixel_from_camera: Array
-    weights: tuple[float, ...] | None
+    detections: tuple[Detection, ...]
+    inliers: Mask
+    certain: Mask
+    linear_sigma: float = np.inf
+    weights: tuple[float, ...] | None = None
     tone: FrameTone = field(default_factory=lambda: FrameTone(LINEAR))
-    part: bool = False
+
+    @classmethod
+    def from_placement(
+        cls, scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions
+    ) -> "Frame":
+        """The frame before any of its marks is detected."""
+        none = np.zeros(len(layout.marks), dtype=bool)
+        places = placement.places_px(np.array([mark.xy_mm for mark in layout.marks]))
+        detections = tuple(Detection(place, False, None) for place in places)
+        tone = FrameTone(scan.tone)
+        return cls(
+            scan, layout, options, placement, placement.pixel_from_camera, detections, none, none.copy(), tone=tone
+        )
+
+    @cached_property
+    def camera_mm(self) -> Array:
+        """(n, 2) given."""
+        return np.array([mark.xy_mm for mark in self.layout.marks])
+
+    @property
+    def pitch_mm(self) -> Array:
+        """(2,) of a pixel."""
+        return np.asarray(self.placement.pitch_mm)
+
+    @property
+    def gate_px(self) -> float:
+        """The search radius where the other marks predict a mark."""
+        return self.options.gate_mm / float(self.pitch_mm.mean())
+
+    @property
+    def first_search_px(self) -> float:
+        """The search radius where only the placement predicts a mark."""
+        return first_search_px(self.placement, self.layout, self.options)
+
+    @property
+    def near_px(self) -> float:
+        """The same on film that is hardly deformed."""
+        return first_search_px(self.placement, self.layout, self.options, NARROW)
+
+    @cached_property
+    def predicted_px(self) -> Array:
+        """(n, 2) where the interior orientation puts the marks."""
+        return np.asarray(self.camera_mm @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2])
+
+    @cached_property
+    def misfit_mm(self) -> Array:
+        """(n,) how far each mark found is from where the frame puts it, nan without one."""
+        places = [np.full(2, np.nan) if each.fit is None else each.fit.center_px for each in self.detections]
+        return np.asarray(np.hypot(*((np.array(places) - self.predicted_px) * self.pitch_mm).T))
+
+    @property
+    def scatter_mm(self) -> float:
+        """The median misfit of the inliers; 0 where there is none."""
+        return float(np.median(self.misfit_mm[self.inliers])) if self.inliers.any() else 0.0
+
+    def prediction(self, index: int, search_px: float) -> MarkPrediction:
+        """A mark where the frame puts it now, or where a person sees it: then no farther off than that one points."""
+        mark, place = self.layout.marks[index], self.predicted_px[index]
+        for click in self.options.clicks:
+            if click.point == mark.id:
+                place, search_px = np.array([click.col_px, click.row_px]), min(search_px, _CLICK_REACH_PX)
+        start = np.column_stack([self.pixel_from_camera[:, :2], place])
+        sign = sign_of(mark.mark, self.placement.polarity)
+        return MarkPrediction(mark.mark, start, search_px, sign, self.weights, self.placement.surroundings)
+
+    def is_clear(self, index: int) -> bool:
+        """Whether a mark is plainly there, be it where the others put it or not."""
+        fit = self.detections[index].fit
+        return fit is not None and fit.likeness >= CLEAR_LIKENESS
+
+    @property
+    def is_certain_of_places(self) -> bool:
+        """Whether so many marks agree, some of them clear ones, that they tell where every other must be."""
+        return bool(self.inliers.sum() >= MANY and self._clear >= MANY / 2)
+
+    def replace_detections(self, changed: Mapping[int, Detection]) -> "Frame":
+        """The frame with other detections of some marks, by index."""
+        return replace(self, detections=tuple(changed.get(index, each) for index, each in enumerate(self.detections)))
+
+    def replace_fits(self, changed: Mapping[int, MarkFit]) -> "Frame":
+        """The frame with other fits of some marks, by index."""
+        return self.replace_detections(
+            {index: replace(self.detections[index], fit=fit) for index, fit in changed.items()}
+        )
+
+    def add_reason(self, index: int, reason: Reason) -> "Frame":
+        """The frame with one more reason why a mark may be wrong."""
+        detection = self.detections[index]
+        return self.replace_detections({index: replace(detection, reason=Reason.combine((detection.reason, reason)))})
+
+    def add_covariance(self, index: int, cause: Cause, px2: Array) -> "Frame":
+        """The frame with a covariance (2, 2) added to a cause for the place of a mark that was found."""
+        fit = self.detections[index].fit
+        if fit is None:
+            return self
+        return self.replace_fits({index: replace(fit, place_covariance=fit.place_covariance.plus(cause, px2))})
 
     @property
     def fits(self) -> list[MarkFit | None]:
-        """The fits of the marks that belong."""
-        return [s.fit if ok else None for s, ok in zip(self.sightings, self.belongs, strict=True)]
+        """The fits of the inliers."""
+        return [s.fit if ok else None for s, ok in zip(self.detections, self.inliers, strict=True)]
 
     @property
     def fitted_placement(self) -> Placement:
-        """Where the marks that belong put the frame."""
+        """Where the inliers put the frame."""
         return replace(self.placement, pixel_from_camera=self.pixel_from_camera)
 
     @property
     def all_clear(self) -> bool:
-        """Whether every mark that belongs is plainly there."""
+        """Whether every inlier is plainly there."""
         return all(fit is None or fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
 
     @property
     def missed_px(self) -> list[Array]:
         """Where the frame puts the marks in the scan that were not found."""
-        places = [self.pixel_from_camera @ (*xy, 1.0) for xy in self.camera_mm]
-        missed = [s.inside and not ok for s, ok in zip(self.sightings, self.belongs, strict=True)]
-        return [np.asarray(place) for place, gone in zip(places, missed, strict=True) if gone]
+        inside = np.array([detection.inside for detection in self.detections])
+        return list(self.predicted_px[inside & ~self.inliers])
 
     @property
     def inside(self) -> int:
         """How many marks it puts within the scan."""
-        return sum(sighting.inside for sighting in self.sightings)
+        return sum(detection.inside for detection in self.detections)
 
     @property
     def agrees(self) -> bool:
         """Whether enough marks agree, clear or not: three, and three in ten of those in the scan."""
-        return int(self.belongs.sum()) >= max(self._least, int(np.ceil(_AGREEING_SHARE * self.inside)))
+        return int(self.inliers.sum()) >= max(self._least, int(np.ceil(_AGREEING_SHARE * self.inside)))
 
     @property
     def accepted(self) -> bool:
@@ -89,7 +206,7 @@ class Frame:
     @property
     def unblemished(self) -> list[int]:
         """The marks that are measured, where the others have them."""
-        near = self.belongs & (self.misfit_mm <= _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM))
+        near = self.inliers & (self.misfit_mm <= _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM))
         return [index for index in np.flatnonzero(near).tolist() if self.verdict(index)[0] is Status.MEASURED]
 
     @property
@@ -106,12 +223,12 @@ class Frame:
     @property
     def is_whole(self) -> bool:
         """Whether every mark that lies in the scan was plainly seen where the others put it."""
-        return self.accepted and int(self.belongs.sum()) == self.inside and self.all_clear
+        return self.accepted and int(self.inliers.sum()) == self.inside and self.all_clear
 
     @property
     def is_complete(self) -> bool:
         """Whether it needs no other search: every mark plainly seen where the others put it."""
-        return bool(self.accepted and len(self.belongs) >= _CHECKED and self.belongs.all() and self.all_clear)
+        return bool(self.accepted and len(self.inliers) >= _CHECKED and self.inliers.all() and self.all_clear)
 
     @property
     def _clear(self) -> int:
@@ -120,7 +237,7 @@ class Frame:
 
     @property
     def _least(self) -> int:
-        return 2 if self.part else max(min(_AGREEING, len(self.sightings)), 2)
+        return 2 if self.options.part else max(min(_AGREEING, len(self.detections)), 2)
 
     def has_all_of(self, other: "Frame") -> bool:
         """Whether the marks of the other frame are some of this one's, under other names: a frame moved on by the
@@ -138,21 +255,21 @@ class Frame:
         return float(np.median(fractions)) if len(fractions) >= _CHECKED else 0.0
 
     def misfit(self, ids: Sequence[str]) -> str:
-        """A sentence for a frame that is not accepted. ids: of its marks, in the order of the sightings."""
-        found = f"{int(self.belongs.sum())} of {len(self.sightings)} marks were found where the others put them"
+        """A sentence for a frame that is not accepted. ids: of its marks, in the order of the detections."""
+        found = f"{int(self.inliers.sum())} of {len(self.detections)} marks were found where the others put them"
         if not self.agrees:
-            return f"the constellation does not fit: only {found}{self._told_outside(ids)}"
+            return f"the constellation does not fit: only {found}{self._marks_outside(ids)}"
         return (
             f"{found}, but only {self._clear} of them look plainly like their drawings, where {self._least} have to: "
             "compare the drawings with the scan, or say by which curve it stores light (tone)"
         )
 
-    def _told_outside(self, ids: Sequence[str]) -> str:
+    def _marks_outside(self, ids: Sequence[str]) -> str:
         """A part of a sentence on marks that the others put outside of the scan."""
         outside = [
-            id for id, sighting in zip(ids, self.sightings, strict=True) if Code.OUTSIDE in sighting.reason.codes
+            id for id, detection in zip(ids, self.detections, strict=True) if Code.OUTSIDE in detection.reason.codes
         ]
-        if not outside or self.belongs.sum() < 2:
+        if not outside or self.inliers.sum() < 2:
             return ""
         return (
             f", and these put {', '.join(outside)} outside of the scan: scan the whole frame, or say by part_of in "
@@ -161,11 +278,11 @@ class Frame:
 
     def verdict(self, index: int) -> tuple[Status, Reason]:
         """What became of a mark that was fitted, by its picture: where it lies beside the others tells of the frame."""
-        fit = self.sightings[index].fit
-        if fit is None or not self.belongs[index]:
-            off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.belongs.sum())} marks put it"
+        fit = self.detections[index].fit
+        if fit is None or not self.inliers[index]:
+            off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.inliers.sum())} marks put it"
             return Status.REJECTED, Reason(f"what was measured lies {off}", Code.OFF_PLACE)
-        reasons = [self.sightings[index].reason]
+        reasons = [self.detections[index].reason]
         if fit.likeness < CLEAR_LIKENESS:
             reasons.append(Reason(f"it correlates with its drawing by only {fit.likeness:.2f}", Code.LIKENESS))
         if fit.snr < _CLEAR_SNR:
@@ -173,8 +290,8 @@ class Frame:
         if fit.damaged_fraction > CLEAR_DAMAGE + min(self._unlike_drawing, _MOST_UNLIKE):
             reasons.append(Reason(f"{fit.damaged_fraction:.0%} of it is damaged", Code.COVERED))
         elif fit.lost_fraction > _MOST_LOST:
-            told = f"{fit.lost_fraction:.0%} of what tells its place in one direction is damaged"
-            reasons.append(Reason(told, Code.COVERED))
+            lost = f"{fit.lost_fraction:.0%} of what tells its place in one direction is damaged"
+            reasons.append(Reason(lost, Code.COVERED))
         sigma_px = largest_sigma_px(fit.covariance_px2)
         is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX
         if may_be_wrong(fit.covariance_px2) and not is_plain:
@@ -191,3 +308,25 @@ def may_be_wrong(covariance_px2: Array) -> bool:
 def largest_sigma_px(covariance_px2: Array) -> float:
     """In the direction in which it is largest."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance_px2)[-1]))
+
+
+def orient_frame(frame: Frame) -> Frame:
+    """Separate inliers from gross errors and estimate the interior orientation from the inliers."""
+    found = np.array([each.fit is not None for each in frame.detections])
+    inliers = found.copy()
+    if found.sum() < 2:
+        return replace(frame, inliers=inliers)
+    index = np.flatnonzero(found)
+    fits = [frame.detections[i].fit for i in index]
+    up = np.array([fit.center_px for fit in fits if fit]) * frame.pitch_mm * (1.0, -1.0)
+    traces = np.array([np.trace(fit.covariance_px2) for fit in fits if fit])
+    given = np.array([min(*frame.layout.marks[i].sigma_mm, MOST_GIVEN_SIGMA_MM) for i in index])
+    sigma = np.sqrt(traces / 2 * frame.pitch_mm.mean() ** 2 + given**2 + frame.options.film_sigma_mm**2)
+    clicked = {click.point for click in frame.options.clicks}
+    known = frame.certain | [mark.id in clicked for mark in frame.layout.marks]
+    turn, camera = up_from_camera(frame.placement.pose), frame.camera_mm
+    out = outliers(camera[index], up, sigma, turn, frame.options.gate_mm) & ~known[index]
+    inliers[index[out]] = False
+    fit = fit_frame(camera[index[~out]], up[~out], sigma[~out], turn)
+    pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / frame.pitch_mm[:, None]
+    return replace(frame, inliers=inliers, pixel_from_camera=pixel_from_camera, linear_sigma=fit.linear_sigma)

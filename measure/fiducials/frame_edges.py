@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout, FrameCorner, LayoutMark
-from measure.matching.frame_edge import Course, edge_along, said_by_edges
+from measure.matching.frame_edge import Course, edge_along, pool_edge_tones
 from measure.scans.scan import Scan
 from measure.tone.curve import ToneInformation
 
@@ -24,7 +24,7 @@ _SEARCH_MM = 0.3  # about where the frame's size puts its edge
 _SHARE_PX, _FEWEST = 8.0, 5  # of an edge that a profile is of, and how many an edge has at least
 
 
-def told_by_edges(
+def edge_tone_information(
     scan: Scan, layout: FiducialLayout, pixel_from_camera: Array, weights: Sequence[float] | None
 ) -> list[ToneInformation]:
     """None or one, of all pieces of edge that are seen as straight lines; pixel_from_camera (2, 3): of the frame."""
@@ -48,7 +48,7 @@ def told_by_edges(
         edge = edge_along(course, (0.0, length_mm * px_per_mm), _SEARCH_MM * px_per_mm, 0, count)
         if edge is not None and edge.tone is not None:
             told.append(edge.tone)
-    return [said_by_edges(told, scan.tone)] if told else []
+    return [pool_edge_tones(told, scan.tone)] if told else []
 
 
 def _pieces(layout: FiducialLayout) -> Iterator[tuple[Array, Array, Array, float]]:

@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from measure.flags import MARK_UNLIKE_THE_OTHERS
 from measure.matching.models import PIXEL_VARIANCE_PX2
-from measure.results import MarkFit, OwnShape
+from measure.results import MarkFit
 
 Array = NDArray[np.float64]
 # The standard deviation of a figure from mark to mark, by the variance that so many marks show beyond their own.
@@ -53,7 +53,7 @@ class SharedBlur:
     def is_borne_out_by(self, fit: MarkFit) -> bool:
         """Whether a match that took it as an observation comes out with such a blur: noise moves the estimate from an
         observation by the root of what it takes from its variance."""
-        moved = _log_seen_px(fit.blur_px) - _log_seen_px(self.blur_px)
+        moved = _log_total_px(fit.blur_px) - _log_total_px(self.blur_px)
         off = abs(moved) / np.sqrt(max(self.sigma**2 - fit.blur_sigma**2, 1e-12))
         return bool(fit.blur_sigma < self.sigma and 2 * ndtr(-off) >= MARK_UNLIKE_THE_OTHERS)
 
@@ -61,14 +61,14 @@ class SharedBlur:
 def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
     """For each mark what the others tell of its blur, None where they need not, for its own picture tells it well and
     it is as theirs, or where they are too few."""
-    own = np.array([_log_seen_px(fit.blur_px) for fit in fits])
+    own = np.array([_log_total_px(fit.blur_px) for fit in fits])
     sigma = np.array([fit.blur_sigma for fit in fits])
-    told_by_others = _told_by_others(own, sigma, _blur_spread, _FEWEST_BLURS)
+    expected_blurs = _expect_from_others(own, sigma, _blur_spread, _FEWEST_BLURS)
     return [
         None
-        if told is None or not (told.differs or own_sigma > _TELLING)
-        else SharedBlur(_without_pixel(told.value), told.sigma, told.differs)
-        for told, own_sigma in zip(told_by_others, sigma.tolist(), strict=True)
+        if expected is None or not (expected.differs or own_sigma > _TELLING)
+        else SharedBlur(_without_pixel(expected.value), expected.sigma, expected.differs)
+        for expected, own_sigma in zip(expected_blurs, sigma.tolist(), strict=True)
     ]
 
 
@@ -124,9 +124,9 @@ class Touch:
 def touch_of_round(shape: SharedShape, radius_px: float, px_per_mm: float, is_damaged: bool) -> Touch:
     """Of a round mark, by its size."""
     spread = _SPECK_MM2 * px_per_mm**2 / radius_px**2
-    prior, said = spread**2, float(shape.sigma[0]) ** 2
-    moved = _AS_MUCH * radius_px * abs(float(shape.off[0])) * prior / (prior + said)
-    sigma = _AS_MUCH * radius_px * float(np.sqrt(prior * said / (prior + said)))
+    prior, measured = spread**2, float(shape.sigma[0]) ** 2
+    moved = _AS_MUCH * radius_px * abs(float(shape.off[0])) * prior / (prior + measured)
+    sigma = _AS_MUCH * radius_px * float(np.sqrt(prior * measured / (prior + measured)))
     return Touch(shape.touched(spread, is_damaged), moved, sigma)
 
 
@@ -136,39 +136,38 @@ def touch_of_edges(shape: SharedShape, on_place: Array, middle_px: float, is_dam
     return Touch(shape.touched(_TOUCHED_PX / middle_px, is_damaged), float(np.hypot(*(on_place @ shape.off))), 0.0)
 
 
-def shared_sizes(fits: Sequence[MarkFit], linear: Array) -> list[SharedShape | None]:
-    """The size of each mark beside the others', of marks that are drawn alike and tell their own; None where they are
-    too few. linear: (2, 2) px per mm, of the frame."""
-    own = np.array([np.log(np.linalg.det(fit.pixel_from_mark[:, :2]) / np.linalg.det(linear)) / 2 for fit in fits])
-    return _beside_others(own[:, None], np.array([[fit.size_sigma] for fit in fits]))
+def shared_shapes(own: Array, sigma: Array) -> list[SharedShape | None]:
+    """Compare the shapes of marks that are drawn alike, or are all held by the frame.
 
+    Parameters
+    ----------
+    own, sigma : (n, k) of each mark the logarithm of its size, and where the frame held it its rotation (rad), with
+        their standard deviations, inf where a mark does not tell it.
 
-def shared_shapes(shapes: Sequence[OwnShape]) -> list[SharedShape | None]:
-    """The same of marks whose sizes and rotations the frame gave, by what their own pictures say of them."""
-    return _beside_others(np.array([shape.change for shape in shapes]), np.array([shape.sigma for shape in shapes]))
-
-
-def _beside_others(own: Array, sigma: Array) -> list[SharedShape | None]:
-    """own, sigma (n, k): each mark's figures."""
-    told = [_told_by_sound(*pair) for pair in zip(own.T, sigma.T, strict=True)]
+    Returns
+    -------
+    Each mark's shape beside that of the others, None where these are too few.
+    """
+    columns = [_expect_from_sound(*pair) for pair in zip(own.T, sigma.T, strict=True)]
     result: list[SharedShape | None] = []
-    for figures, sigmas, each in zip(own, sigma, zip(*told, strict=True), strict=True):
-        known = [one for one in each if one is not None]
-        if len(known) < len(figures):
+    for figures, sigmas, each in zip(own, sigma, zip(*columns, strict=True), strict=True):
+        expected = [one for one in each if one is not None]
+        if len(expected) < len(figures):
             result.append(None)
             continue
-        off, beside = figures - [one.value for one in known], np.hypot(sigmas, [one.sigma for one in known])
-        result.append(SharedShape(off, beside, any(one.differs for one in known)))
+        off = figures - [one.value for one in expected]
+        off_sigma = np.hypot(sigmas, [one.sigma for one in expected])
+        result.append(SharedShape(off, off_sigma, any(one.differs for one in expected)))
     return result
 
 
-def _told_by_sound(own: Array, sigma: Array) -> "list[_Told | None]":
-    """For each mark what the others tell of one figure of its shape: those alone that do not differ themselves, where
-    these are enough."""
-    told = _told_by_others(own, sigma, _size_spread, _FEWEST_SHAPES)
-    odd = np.array([each is not None and each.differs for each in told])
-    without = _told_by_others(own, np.where(odd, np.inf, sigma), _size_spread, _FEWEST_SHAPES)
-    return [first if is_odd else again or first for first, again, is_odd in zip(told, without, odd, strict=True)]
+def _expect_from_sound(own: Array, sigma: Array) -> "list[_Expected | None]":
+    """For each mark what the others let expect of one figure of its shape: those alone that do not differ themselves,
+    where these are enough."""
+    every = _expect_from_others(own, sigma, _size_spread, _FEWEST_SHAPES)
+    odd = np.array([each is not None and each.differs for each in every])
+    sound = _expect_from_others(own, np.where(odd, np.inf, sigma), _size_spread, _FEWEST_SHAPES)
+    return [first if is_odd else again or first for first, again, is_odd in zip(every, sound, odd, strict=True)]
 
 
 def _blur_spread(shown: float, marks: int) -> float:
@@ -179,7 +178,7 @@ def _size_spread(shown: float, marks: int) -> float:
     return float(np.sqrt((_BEFORE * _SIZE_SPREAD**2 + (marks - 1) * shown) / (_BEFORE + marks - 1)))
 
 
-def _log_seen_px(blur_px: float) -> float:
+def _log_total_px(blur_px: float) -> float:
     """The logarithm of a blur with the pixel's share."""
     return float(np.log(blur_px**2 + PIXEL_VARIANCE_PX2) / 2)
 
@@ -189,31 +188,31 @@ def _without_pixel(log_seen_px: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Told:
-    """value: what the others tell, and sigma, its standard deviation for one more mark. differs: whether the mark's own
-    figure is another, by more than chance."""
+class _Expected:
+    """value: what the others let expect, and sigma, its standard deviation for one more mark. differs: whether the
+    mark's own figure is another, by more than chance."""
 
     value: float
     sigma: float
     differs: bool
 
 
-def _told_by_others(own: Array, sigma: Array, spread: _Spread, fewest: int) -> list[_Told | None]:
-    """For each mark what the others tell, None where they are fewer than so many.
+def _expect_from_others(own: Array, sigma: Array, spread: _Spread, fewest: int) -> list[_Expected | None]:
+    """For each mark what the others let expect, None where they are fewer than so many.
 
     own, sigma (n,): each mark's figure and its standard deviation, infinite where it has none.
     """
-    return [_told(own, sigma, index, spread, fewest) for index in range(len(own))]
+    return [_expect(own, sigma, index, spread, fewest) for index in range(len(own))]
 
 
-def _told(own: Array, sigma: Array, index: int, spread: _Spread, fewest: int) -> _Told | None:
+def _expect(own: Array, sigma: Array, index: int, spread: _Spread, fewest: int) -> _Expected | None:
     others = np.isfinite(sigma) & (np.arange(len(own)) != index)
     if others.sum() < fewest:
         return None
     mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
     predicted = float(np.hypot(mean_sigma, apart))
     off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
-    return _Told(mean, predicted, bool(2 * ndtr(-off) * len(own) < MARK_UNLIKE_THE_OTHERS))
+    return _Expected(mean, predicted, bool(2 * ndtr(-off) * len(own) < MARK_UNLIKE_THE_OTHERS))
 
 
 def _mean(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:

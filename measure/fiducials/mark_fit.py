@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.detection.first_look import seen
-from measure.detection.prediction import MarkPrediction
+from measure.detection.localisation import MarkPrediction, localise
 from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
@@ -32,50 +31,57 @@ _DRAWN_SIGMA = 0.04  # of a drawing that is true in part only: its angles (rad) 
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """What was seen where a mark was predicted: predicted_px (2,); fit is None where nothing could be fitted, and
-    reason says why. inside: whether the scan shows the predicted place: it lies in it, and its file gives the pixels.
-    chance: the expected number of places about it that noise makes look as much like the mark. closer: whether it was
-    seen at a closer look only, where the other marks put it."""
+class Detection:
+    """A mark detected where it was predicted, or why it was not.
+
+    predicted_px (2,); fit: None where nothing could be fitted, and reason says why. inside: whether the scan shows the
+    predicted place: it lies in it, and its file gives the pixels. false_alarms: the expected number of places about it
+    that noise makes look as much like the mark. closer: whether it was found at a closer look only, where the other
+    marks put it.
+    """
 
     predicted_px: Array
     inside: bool
     fit: MarkFit | None
     reason: Reason = NO_REASON
-    chance: float = 1.0
+    false_alarms: float = 1.0
     closer: bool = False
 
 
-def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None) -> Sighting:
-    """Look for the mark within the search radius of its predicted place and match it there; without a radius, match it
-    at that place.
+def detect_mark(
+    scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None
+) -> Detection:
+    """Localise a mark within the search radius of its predicted place and fit it there.
 
-    frame_sigma: standard deviation of the predicted rotation (rad), scale, stretch and shear, where a frame fitted to
-    all marks gives them.
+    Parameters
+    ----------
+    expected : the predicted place; without a search radius the mark is fitted at that place.
+    frame_sigma : standard deviation of the predicted rotation (rad), scale, stretch and shear, where a frame fitted to
+        all marks gives them.
     """
     predicted = expected.center_px.copy()
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
     if not inside:
-        return Sighting(predicted, False, None, Reason("its place is outside of the scan", Code.OUTSIDE))
-    fit, chance = _fitted(scan, expected, options, frame_sigma)
+        return Detection(predicted, False, None, Reason("its place is outside of the scan", Code.OUTSIDE))
+    fit, false_alarms = _localise_and_fit(scan, expected, options, frame_sigma)
     if lost := _lost(scan, expected if fit is None or not fit.converged else expected.moved(fit.center_px)):
-        return Sighting(predicted, False, None, lost)
+        return Detection(predicted, False, None, lost)
     if fit is None:
-        return Sighting(predicted, True, None, nothing_within(expected.search_px))
+        return Detection(predicted, True, None, not_found(expected.search_px))
     if not fit.converged:
-        return Sighting(predicted, True, None, fit.reason)
+        return Detection(predicted, True, None, fit.reason)
     reason = _unlike(fit, expected, scan.full_scale_dn)
     if reason:
-        return Sighting(predicted, True, None, reason)
+        return Detection(predicted, True, None, reason)
     loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
     fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     if fit.tone is not None:
         alike = tone_variance(scan.rounding_step_dn, fit.stored_contrast_dn)
         fit = replace(fit, tone=replace(fit.tone, information=replace(fit.tone.information, common_variance=alike)))
-    return Sighting(predicted, True, fit, chance=chance)
+    return Detection(predicted, True, fit, false_alarms=false_alarms)
 
 
-def nothing_within(search_px: float) -> Reason:
+def not_found(search_px: float) -> Reason:
     """Why a mark was not found."""
     return Reason(f"nothing within {search_px:.0f} px of its place looks like it", Code.NOT_FOUND)
 
@@ -105,7 +111,7 @@ def _unlike(fit: MarkFit, expected: MarkPrediction, full_scale_dn: float) -> Rea
     return NO_REASON
 
 
-def _fitted(
+def _localise_and_fit(
     scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None
 ) -> tuple[MarkFit | None, float]:
     """The mark matched where it looks most like itself, and the expected number of places that noise makes look so;
@@ -115,15 +121,15 @@ def _fitted(
         return fit_frame_corner(
             scan, mark, expected.pixel_from_mark, expected.search_px, expected.polarity, expected.weights
         ), 1.0
-    look = seen(scan, expected) if expected.search_px > 0 else (expected.center_px, 0.0)
-    if look is None:
+    peak = localise(scan, expected) if expected.search_px > 0 else (expected.center_px, 0.0)
+    if peak is None:
         return None, 1.0
-    center_px, chance = look
-    fit = _matched(scan, expected, center_px, options, frame_sigma)
+    center_px, false_alarms = peak
+    fit = _fit_from(scan, expected, center_px, options, frame_sigma)
     # Along its edges a slim wedge looks like itself: a fit that runs away along them begins anew from where it came to.
-    if leans_on_frame(mark) and _ran_away(fit, center_px, options) and _is_near(fit, expected):
-        fit = _matched(scan, expected, fit.center_px, options, frame_sigma)
-    return fit, chance
+    if is_held_by_frame(mark) and _ran_away(fit, center_px, options) and _is_near(fit, expected):
+        fit = _fit_from(scan, expected, fit.center_px, options, frame_sigma)
+    return fit, false_alarms
 
 
 def _ran_away(fit: MarkFit, start_px: Array, options: MatchOptions) -> bool:
@@ -135,13 +141,13 @@ def _is_near(fit: MarkFit, expected: MarkPrediction) -> bool:
     return bool(np.hypot(*(fit.center_px - expected.center_px)) <= expected.search_px)
 
 
-def _matched(
+def _fit_from(
     scan: Scan, expected: MarkPrediction, center_px: Array, options: MatchOptions, frame_sigma: float | None
 ) -> MarkFit:
     """The mark matched from a place."""
     mark, start = expected.mark, expected.moved(center_px).pixel_from_mark
-    seen_in = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
-    window = read_window(seen_in, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
+    coded = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
+    window = read_window(coded, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
     if expected.surroundings.robust and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
         window = window.exclude(pixels_beyond_edge(window.grey, mark, inner))
@@ -158,7 +164,7 @@ def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) ->
             margin_px=max(options.margin_px, _SOLID_MARGIN_PX),
             margin_blurs=max(options.margin_blurs, _SOLID_MARGIN_BLURS),
         )
-    leans = leans_on_frame(mark)
+    leans = is_held_by_frame(mark)
     if frame_sigma is None:
         return replace(options, freedom="shift") if leans else options
     if not leans and np.allclose(_one_sided_px(mark, np.eye(2)), 0.0):
@@ -173,13 +179,13 @@ def _is_solid(mark: Mark) -> bool:
     return isinstance(mark, MarkShape) and all(isinstance(part, Polygon | Disk) for part in mark.parts)
 
 
-def leans_on_frame(mark: Mark) -> bool:
+def is_held_by_frame(mark: Mark) -> bool:
     """Whether the mark's own picture may not tell its scale from its place, as a wedge's or a notch's edges do not, nor
     a chip of them: then rotation and scale come from the other marks."""
     return isinstance(mark, MarkTemplate) or all(isinstance(part, Polygon) for part in mark.parts)
 
 
-def strained_px(mark: Mark, fitted: Array, linear: Array, sigma: float) -> float:
+def strain_error_px(mark: Mark, fitted: Array, linear: Array, sigma: float) -> float:
     """How far about a mark may be off because it was fitted with the stretch and shear of fitted (2, 2) instead of
     those of linear, of that standard deviation: by as much as they move what of its drawing lies to one side."""
     change = linear @ np.linalg.inv(fitted) - np.eye(2)

@@ -105,7 +105,7 @@ def _rename(search: FrameSearch, frame: Frame, pose: Pose) -> tuple[Frame, Pose]
     no more than assumed."""
     if pose.name == frame.placement.pose:
         return frame, pose
-    renamed = rename_frame(search.scan, search.layout, frame, pose.name, search.options)
+    renamed = rename_frame(search.scan, frame, pose.name)
     if renamed is not frame:
         return renamed, pose
     against = f"fewer of the marks agree in pose {pose.name} than in pose {frame.placement.pose}, which is assumed."

@@ -75,10 +75,10 @@ def _predicted_frame(scan: Scan, layout: FiducialLayout, frame: Frame, why: Reas
     """Of a frame that may well be none: its marks where they would lie."""
     marks = tuple(
         MarkMeasurement(mark.id, "fiducial", place, None, Status.PREDICTED, why)
-        if sighting.inside
-        else MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, sighting.reason)
-        for mark, sighting, place in zip(
-            layout.marks, frame.sightings, frame.fitted_placement.places_px(frame.camera_mm), strict=True
+        if detection.inside
+        else MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, detection.reason)
+        for mark, detection, place in zip(
+            layout.marks, frame.detections, frame.fitted_placement.places_px(frame.camera_mm), strict=True
         )
     )
     return FrameMeasurement(scan.name, marks, weights=frame.weights)
@@ -92,7 +92,7 @@ def _problems(scan: Scan, frame: Frame, pitch_um: tuple[float, float] | None) ->
     if abs(per_mm[0] * given[0] / (per_mm[1] * given[1]) - 1) > 2 * AFFINITY_SIGMA:
         told = _stretch(scan, 1000 / per_mm[0], 1000 / per_mm[1], pitch_um)
         problems.append(Reason(told, Code.PITCH))
-    used = int(frame.belongs.sum())
+    used = int(frame.inliers.sum())
     if used <= 3:
         kind = "an affine transformation" if used == 3 else "a similarity"
         told = f"{kind} on {used} fiducials has no redundancy: no check."
@@ -117,12 +117,12 @@ def _stretch(scan: Scan, wide_um: float, tall_um: float, pitch_um: tuple[float, 
 
 
 def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasurement:
-    sighting = frame.sightings[index]
-    fit = sighting.fit
-    if not sighting.inside:
-        return MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, sighting.reason)
+    detection = frame.detections[index]
+    fit = detection.fit
+    if not detection.inside:
+        return MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, detection.reason)
     if fit is None:
-        return MarkMeasurement(mark.id, "fiducial", sighting.predicted_px, None, Status.PREDICTED, sighting.reason)
+        return MarkMeasurement(mark.id, "fiducial", detection.predicted_px, None, Status.PREDICTED, detection.reason)
     quality = {
         "snr": fit.snr,
         "contrast_dn": fit.contrast_dn,

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from measure.annotations.fields import Line
 from measure.annotations.orientation_from_text import line_score, main_pose, writing_likelihoods
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame
-from measure.fiducials.frame_sighter import first_search_px
+from measure.fiducials.frame import Frame, first_search_px
 from measure.fiducials.interior_orientation import FrameFit, fit_frame
 from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions
 from measure.fiducials.orientation_pictures import Drawings, Shown, Site

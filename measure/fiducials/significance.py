@@ -11,11 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-from measure.detection.first_look import strongest
-from measure.detection.prediction import MarkPrediction
-from measure.fiducials.constellation import sign_of
-from measure.fiducials.frame import CLEAR_LIKENESS, Frame
-from measure.fiducials.frame_sighter import first_search_px
+from measure.detection.localisation import highest_peak
+from measure.fiducials.frame import CLEAR_LIKENESS, Frame, first_search_px
 from measure.fiducials.search import FrameSearch
 from measure.flags import FRAME_BY_CHANCE, NO_FRAME, NO_REASON, Code, Reason
 from measure.scans.scan import Scan
@@ -39,15 +36,15 @@ def doubt(search: FrameSearch, frame: Frame) -> Reason:
     of its marks may be clear."""
     if frame.placement.surroundings.robust:
         return NO_REASON
-    inside = [index for index, sighting in enumerate(frame.sightings) if sighting.inside]
+    inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
     clear = {
         index: fit.center_px
         for index, fit in enumerate(frame.fits)
         if fit
         and fit.likeness >= CLEAR_LIKENESS
-        and not frame.sightings[index].closer  # those were seen for the others
+        and not frame.detections[index].closer  # those were seen for the others
     }
-    if frame.belongs.sum() >= _SURE:
+    if frame.inliers.sum() >= _SURE:
         return NO_REASON
     if len(clear) == len(inside):
         return _by_the_scan(search, frame, clear)
@@ -120,11 +117,7 @@ def _by_places_beside(search: FrameSearch, frame: Frame, inside: Sequence[int], 
 
 def _response(search: FrameSearch, frame: Frame, index: int, place: Array, radius_px: float) -> float:
     """How strongly a mark, by index, answers at most within a radius of a place in the scan."""
-    mark = search.layout.marks[index].mark
-    start = np.column_stack([frame.pixel_from_camera[:, :2], place])
-    sign = sign_of(mark, frame.placement.polarity)
-    expected = MarkPrediction(mark, start, radius_px, sign, frame.weights, frame.placement.surroundings)
-    return strongest(search.scan, expected)[1]
+    return highest_peak(search.scan, frame.prediction(index, radius_px).moved(place))[1]
 
 
 def _share(hits: int, places: int) -> float:

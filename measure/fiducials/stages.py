@@ -188,7 +188,7 @@ def best_of(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
     if sure:
         return max(sure, key=lambda frame: frame.measured)
     accepted = [frame for frame in frames if frame.accepted]
-    return accepted[0] if accepted else max(frames, key=lambda frame: int(frame.belongs.sum()))
+    return accepted[0] if accepted else max(frames, key=lambda frame: int(frame.inliers.sum()))
 
 
 def _is_outdone(search: FrameSearch, frame: Frame, placements: Sequence[Placement]) -> bool:
@@ -200,12 +200,12 @@ def _as_its_pictures_say(search: FrameSearch, placement: Placement) -> Frame:
     """The frame in a placement. At the right place in a wrong pose unlike marks are not found under one another's
     names: where that is so, the pictures there decide the pose, and the frame is measured in it."""
     frame = measure_frame(search.scan, search.layout, placement, search.options)
-    if frame.accepted or not frame.belongs.any() or search.options.pose != "auto":
+    if frame.accepted or not frame.inliers.any() or search.options.pose != "auto":
         return frame
     pose = likeliest_pose(search, frame)
     if not pose.decided or pose.name == placement.pose:
         return frame
-    return rename_frame(search.scan, search.layout, frame, pose.name, search.options)
+    return rename_frame(search.scan, frame, pose.name)
 
 
 def _in_spite_of_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Seen:
@@ -227,7 +227,7 @@ def _at_a_closer_look(search: FrameSearch, hypotheses: Hypotheses, tried: int) -
         frames = [frame for frame in _in_its_likeliest_poses(search, place) if frame.agrees]
         if frames:
             as_measured = min(expected_where_seen(search, frame, _seen_px(frame)) for frame in frames)
-            most = max(frames, key=lambda frame: frame.belongs.sum())
+            most = max(frames, key=lambda frame: frame.inliers.sum())
             seen.append((2 * tried * min(as_measured, search.expected_alike(place)), most))
     return found, sorted(seen, key=_expected)
 
@@ -240,12 +240,12 @@ def _in_its_likeliest_poses(search: FrameSearch, placement: Placement) -> list[F
     """The frame in a placement, and in the pose that its pictures like best, for faint marks are not seen under one
     another's names, though they say not surely which these are."""
     frame = measure_frame(search.scan, search.layout, placement, search.options)
-    if search.options.pose != "auto" or not frame.belongs.any():
+    if search.options.pose != "auto" or not frame.inliers.any():
         return [frame]
     pose = likeliest_pose(search, frame)
     if pose.name == placement.pose:
         return [frame]
-    return [frame, rename_frame(search.scan, search.layout, frame, pose.name, search.options)]
+    return [frame, rename_frame(search.scan, frame, pose.name)]
 
 
 def _seen_px(frame: Frame) -> dict[int, Array]:
@@ -275,9 +275,9 @@ def _pitch_to_try(unsure: Sequence[Frame]) -> str:
     """A clause about the frame of most marks among those that chance may have made."""
     if not unsure:
         return ""
-    best = max(unsure, key=lambda frame: (frame.measured, int(frame.belongs.sum())))
+    best = max(unsure, key=lambda frame: (frame.measured, int(frame.inliers.sum())))
     pair = ", ".join(f"{um:.2f}" for um in 1000 / np.hypot(*best.pixel_from_camera[:, :2].T))
-    seen = f"under another pitch {int(best.belongs.sum())} of them lie as they should, which may be chance"
+    seen = f"under another pitch {int(best.inliers.sum())} of them lie as they should, which may be chance"
     return f"; {seen}: try pitch_um = [{pair}]"
 
 
@@ -286,7 +286,7 @@ def _too_faint(likeliest: tuple[float, Frame] | None) -> str:
     if likeliest is None or likeliest[0] >= 1:
         return ""
     expected, frame = likeliest
-    seen = f"{int(frame.belongs.sum())} marks that are hardly there lie as they should"
+    seen = f"{int(frame.inliers.sum())} marks that are hardly there lie as they should"
     by_chance = f"where chance makes {expected:.1g} such frames"
     return f"; {seen}, {by_chance}: no other pitch tells them from it, click those that you see in reseau review"
 

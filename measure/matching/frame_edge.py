@@ -138,7 +138,7 @@ def edge_along(
     return _line(course.scan, middle[good], place, steps, good, len(middle))
 
 
-def said_by_edges(edges: Sequence[EdgeTone], tone: Tone) -> ToneInformation:
+def pool_edge_tones(edges: Sequence[EdgeTone], tone: Tone) -> ToneInformation:
     """What several of them say of the curve by which they were fitted, known as well as the scatter of their profiles
     says, and that from edge to edge: what is alike along an edge, a landscape or what JPEG made of it, counts once."""
     scores, normal, floor = (
@@ -350,7 +350,7 @@ def _corner_tone(first: Edge, second: Edge, by_first: Array, by_second: Array, t
     if first.tone is None or second.tone is None:
         return None
     return MarkTone(
-        said_by_edges([first.tone, second.tone], tone),
+        pool_edge_tones([first.tone, second.tone], tone),
         by_first @ first.tone.on_line + by_second @ second.tone.on_line,
         min(first.tone.least, second.tone.least),
         max(first.tone.greatest, second.tone.greatest),

@@ -26,7 +26,7 @@ class Stand:
 
     def __init__(self, name: str) -> None:
         self.name, self.is_complete, self.accepted, self.measured = name, False, False, 0
-        self.belongs, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
+        self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
 
     def misfit(self, ids: Sequence[str]) -> str:
         return f"not {self.name}"

@@ -7,8 +7,8 @@ from drawn_frames import layout_of, paint
 from scipy.ndimage import gaussian_filter
 
 from measure.detection.correlation import CLOSE
-from measure.detection.prediction import MarkPrediction
-from measure.fiducials.mark_fit import sight
+from measure.detection.localisation import MarkPrediction
+from measure.fiducials.mark_fit import detect_mark
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import MarkShape, cross, polygon
@@ -25,7 +25,7 @@ def test_a_wing_is_measured_whose_base_is_the_frames_edge() -> None:
     grey = GROUND + 5500.0 * brute_picture(WING, place, 121, 121, 1.0)
     grey[:, 84:] = EDGE
     grey += np.random.default_rng(1).normal(0.0, NOISE, grey.shape)
-    seen = sight(scan_of(grey), MarkPrediction(WING, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
+    seen = detect_mark(scan_of(grey), MarkPrediction(WING, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
     assert seen.fit is not None
     assert np.hypot(*(seen.fit.center_px - place[:, 2])) < 0.2
 
@@ -37,7 +37,7 @@ def test_a_faint_light_cross_is_measured_whose_dark_pad_ends_beside_it_in_a_ligh
     landscape = 30000.0 + 6000.0 * gaussian_filter(rng.normal(size=(121, 121)), 3.0) * 10.0
     grey = np.where(np.hypot(col - 60.3, row - 59.7) < 20.0, 4000.0, landscape)
     grey += 3500.0 * brute_picture(mark, place, 121, 121, 0.7) + rng.normal(0.0, 900.0, grey.shape)
-    seen = sight(scan_of(grey), MarkPrediction(mark, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
+    seen = detect_mark(scan_of(grey), MarkPrediction(mark, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
     assert seen.fit is not None, seen.reason
     assert np.hypot(*(seen.fit.center_px - place[:, 2])) < 0.3
 

@@ -77,7 +77,7 @@ def frame_of(scan: Scan, layout: FiducialLayout) -> Frame:
 def test_three_plain_dots_of_four_are_no_chance() -> None:
     scan = scan_of(picture(DOTS, "0", hidden=1))
     frame = frame_of(scan, DOTS)
-    assert frame.belongs.tolist() == [True, False, True, True]
+    assert frame.inliers.tolist() == [True, False, True, True]
     assert doubt(FrameSearch(scan, DOTS, OPTIONS), frame) == ""
 
 
@@ -88,7 +88,7 @@ def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -
     frame = frame_of(scan, layout)
     moved_on = placement("0").pixel_from_camera - np.array([[0.0, 0.0, 7.0 * PX_PER_MM], [0.0, 0.0, 0.0]])
     other = measure_frame(scan, layout, replace(placement("0"), pixel_from_camera=moved_on), OPTIONS)
-    assert (int(frame.belongs.sum()), int(other.belongs.sum())) == (7, 4)
+    assert (int(frame.inliers.sum()), int(other.inliers.sum())) == (7, 4)
     assert frame.has_all_of(other)
     assert not other.has_all_of(frame)
     assert not frame.has_all_of(frame)
@@ -124,7 +124,7 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
     scan = scan_of(strewn(np.concatenate([elsewhere[free], as_marks[1:]])))
     frame = frame_of(scan, DOTS)
-    assert frame.belongs.tolist() == [False, True, True, True]
+    assert frame.inliers.tolist() == [False, True, True, True]
     sentence = doubt(FrameSearch(scan, DOTS, OPTIONS), frame)
     assert "of 64 places beside them look as much like marks: chance finds as many with a probability of" in sentence
 
@@ -162,7 +162,7 @@ def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
     ids = [tuple(Disk((0.9, 0.4 * k - 0.4), 0.12) for k in range(count)) for count in range(4)]
     layout = layout_of([MarkShape((*dot(0.2), *dots), "light") for dots in ids], CORNERS, (16.0, 16.0))
     scan = scan_of(picture(layout, "90"))
-    frame = replace(frame_of(scan, layout), belongs=np.array([True, False, False, False]))
+    frame = replace(frame_of(scan, layout), inliers=np.array([True, False, False, False]))
     pose = decide_pose(scan, layout, [placement(pose) for pose in POSES], frame, OPTIONS)
     assert (pose.name, pose.decided) == ("90", True)
 

@@ -5,8 +5,8 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, TrueMark, some_mark, whitened_rms
 
-from measure.detection.prediction import MarkPrediction
-from measure.fiducials.mark_fit import sight
+from measure.detection.localisation import MarkPrediction
+from measure.fiducials.mark_fit import detect_mark
 from measure.fiducials.options import FiducialOptions
 from measure.matching.saturation import censored, clipped_sides, noise_scale
 from measure.results import MarkFit
@@ -24,7 +24,7 @@ def dark_mark(name: str, beyond: float, snr: float, rng: np.random.Generator) ->
 def sighted(mark: TrueMark, grey: np.ndarray, polarity: int = -1) -> MarkFit:
     start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
-    fit = sight(
+    fit = detect_mark(
         scan_of(grey), MarkPrediction(mark.kind.shape, start, 3.0, polarity), FiducialOptions().match, frame_sigma
     ).fit
     assert fit is not None
@@ -110,7 +110,9 @@ def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
         sides = clipped_sides(scan, 0, 0, mark.size, mark.size, None)
         np.testing.assert_array_equal(sides == 1, np.rint(natural) >= 250)
         start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
-        fit = sight(scan, MarkPrediction(mark.kind.shape, start, 3.0, -1), FiducialOptions().match, mark.kind.known).fit
+        fit = detect_mark(
+            scan, MarkPrediction(mark.kind.shape, start, 3.0, -1), FiducialOptions().match, mark.kind.known
+        ).fit
         assert fit is not None
         error = fit.center_px - mark.place[:, 2]
         assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand

@@ -10,10 +10,10 @@ from drawn import scan_of
 from drawn_frames import layout_of, paint
 
 from measure.detection.correlation import CLOSE, WIDE, Surroundings
-from measure.fiducials import frame_sighter
+from measure.fiducials import measure_frame
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame_sighter import FrameSighter
-from measure.fiducials.mark_fit import Sighting
+from measure.fiducials.frame import Frame
+from measure.fiducials.mark_fit import Detection
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
@@ -64,11 +64,13 @@ def test_at_a_closer_look_marks_are_taken_that_noise_seldom_makes_for_all_togeth
 ) -> None:
     faint = cast(MarkFit, SimpleNamespace(likeness=0.1, significance=3.0))
     monkeypatch.setattr(
-        frame_sighter, "sight", lambda _, expected, __: Sighting(expected.center_px, True, faint, chance=chance)
+        measure_frame,
+        "detect_mark",
+        lambda _, expected, __: Detection(expected.center_px, True, faint, false_alarms=chance),
     )
     matrix = placed(PX_PER_MM, (MIDDLE_PX, MIDDLE_PX))
     layout = layout_of([wing(*place) for place in PLACES], PLACES, (2 * HALF_MM, 2 * HALF_MM))
     placement = Placement("0", matrix, 1.0, 4, 1, 1, (1 / PX_PER_MM,) * 2, surroundings)
-    sighter = FrameSighter(scan_of(np.zeros((300, 300))), layout, placement, FiducialOptions())
-    sighter.look(range(4), sighter.near_px)
-    assert [seen is not None and seen.fit is faint for seen in sighter.sightings] == [is_taken] * 4
+    frame = Frame.from_placement(scan_of(np.zeros((300, 300))), layout, placement, FiducialOptions())
+    frame = measure_frame._detect(frame, range(4), frame.near_px)
+    assert [detection.fit is faint for detection in frame.detections] == [is_taken] * 4

@@ -6,8 +6,8 @@ import numpy as np
 from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
-from measure.detection.faint_marks import FaintMark, find_faint
-from measure.detection.prediction import MarkPrediction
+from measure.detection.faint_marks import FaintMark, detect_faint
+from measure.detection.localisation import MarkPrediction
 from measure.flags import Cause
 from measure.marks.shapes import Bar, MarkShape, cross, dot
 from measure.tone.curve import Tone, power
@@ -33,7 +33,7 @@ def places(seed: int) -> Array:
 def seen_at(grey: Array, predicted: Array, folder: Path) -> list[FaintMark | None]:
     with written_scan(grey, folder) as scan:
         return [
-            find_faint(scan, MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1), 0.0, 0.7)
+            detect_faint(scan, MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1), 0.0, 0.7)
             for place in predicted
         ]
 
@@ -47,7 +47,7 @@ def test_a_cross_of_the_grounds_own_contrast_is_measured_with_an_honest_sigma(tm
         grey[row0 : row0 + 51, col0 : col0 + 51] -= 5000 * shown
     for found, place in zip(seen_at(grey, np.rint(true), tmp_path), true, strict=True):
         assert found is not None
-        assert found.chance < 1e-4
+        assert found.false_alarms < 1e-4
         error = found.fit.center_px - place
         squares.append(float(error @ np.linalg.solve(found.fit.covariance_px2, error)) / 2)
     assert 0.7 < float(np.sqrt(np.mean(squares))) < 1.4
@@ -63,7 +63,7 @@ def test_a_mark_many_pixels_wide_is_sought_in_a_reduced_picture_with_an_honest_s
         grey -= 1000 * brute_picture(wide, np.column_stack([LINEAR, place]), side_px, side_px, 0.7)
         expected = MarkPrediction(wide, np.column_stack([LINEAR, [400.0, 400.0]]), 8.0, -1)
         with written_scan(grey, tmp_path) as scan:
-            found = find_faint(scan, expected, 0.0, 0.7)
+            found = detect_faint(scan, expected, 0.0, 0.7)
         assert found is not None
         errors.append(found.fit.center_px - place)
         squares.append(float(errors[-1] @ np.linalg.solve(found.fit.covariance_px2, errors[-1])) / 2)
@@ -83,7 +83,7 @@ def test_a_sharp_mark_to_one_side_of_its_point_may_be_turned_otherwise_than_the_
         grey -= 15000 * brute_picture(side, np.column_stack([turned, place]), grey.shape[1], grey.shape[0], 0.3)
         expected = MarkPrediction(side, np.column_stack([LINEAR, place + np.array([0.45, -0.4])]), 3.0, -1)
         with written_scan(grey, tmp_path) as scan:
-            found = find_faint(scan, expected, 0.0, 0.3)
+            found = detect_faint(scan, expected, 0.0, 0.3)
         assert found is not None
         assert Cause.OWN_TURN in found.fit.place_covariance.parts
         errors.append(found.fit.center_px - place)
@@ -103,12 +103,12 @@ def test_what_answers_at_the_edge_of_a_wide_search_is_placed_within_the_window(t
     with written_scan(grey, tmp_path) as scan:
         for off_px in np.arange(38.0, 42.0, 0.5):
             predicted = np.column_stack([LINEAR, place + np.array([off_px, 0.3])])
-            find_faint(scan, MarkPrediction(wide, predicted, 38.2, -1), 0.0, 0.7)
+            detect_faint(scan, MarkPrediction(wide, predicted, 38.2, -1), 0.0, 0.7)
 
 
 def test_bare_texture_answers_as_often_as_chance_says(tmp_path: Path) -> None:
     answers = [found for seed in range(2) for found in seen_at(textured(seed + 50), places(seed), tmp_path)]
-    chances = np.array([found.chance for found in answers if found is not None])
+    chances = np.array([found.false_alarms for found in answers if found is not None])
     assert (chances < 1e-3).sum() <= 1  # of fifty places
     assert 3 <= (chances < 0.1).sum() <= 22  # the strongest of those within three pixels, not one drawn blindly
 
@@ -126,8 +126,8 @@ def test_what_the_tone_curve_moves_a_faint_mark_by_is_in_its_covariance(tmp_path
     expected = MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1)
     with written_scan(grey, tmp_path) as scan:
         prior = Tone.unknown()
-        seen = find_faint(scan.replace_tone(prior), expected, 0.0, 0.7)
-        ends = [find_faint(scan.replace_tone(Tone(power(value))), expected, 0.0, 0.7) for value in (1.0, 2.2)]
+        seen = detect_faint(scan.replace_tone(prior), expected, 0.0, 0.7)
+        ends = [detect_faint(scan.replace_tone(Tone(power(value))), expected, 0.0, 0.7) for value in (1.0, 2.2)]
     assert seen is not None
     assert ends[0] is not None
     assert ends[1] is not None

@@ -6,9 +6,8 @@ from drawn import scan_of
 from scipy.ndimage import gaussian_filter
 from true_marks import KIND, some_mark
 
-from measure.detection.first_look import seen
-from measure.detection.prediction import MarkPrediction
-from measure.fiducials.mark_fit import sight
+from measure.detection.localisation import MarkPrediction, localise
+from measure.fiducials.mark_fit import detect_mark
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import MarkShape, cross, polygon
 
@@ -24,7 +23,8 @@ def test_noise_is_rarely_worth_a_fit_however_coarse_it_is(texture_px: float) -> 
         noise = rng.standard_normal((mark.size, mark.size))
         if texture_px:
             noise = gaussian_filter(noise, texture_px) * texture_px * 3
-        answers += seen(scan_of(GROUND + 3000 * noise), MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)) is not None
+        expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
+        answers += localise(scan_of(GROUND + 3000 * noise), expected) is not None
     assert answers <= 13  # of sixty at a twentieth, sharp or soft: more in one run of a thousand
 
 
@@ -34,7 +34,7 @@ def test_a_soft_mark_that_hardly_stands_out_of_the_noise_is_measured() -> None:
         mark = some_mark(KIND["gap cross"], 2.5, rng)
         grey = GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 5)
         start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
-        fit = sight(scan_of(grey), MarkPrediction(mark.kind.shape, start, 3.0, 1), FiducialOptions().match).fit
+        fit = detect_mark(scan_of(grey), MarkPrediction(mark.kind.shape, start, 3.0, 1), FiducialOptions().match).fit
         assert fit is not None
         error = fit.center_px - mark.place[:, 2]
         assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand
@@ -45,7 +45,7 @@ def test_a_line_far_thinner_than_a_pixel_is_not_seen_in_noise_and_warns_of_nothi
     mark = MarkShape(cross(1.5, 0.06), "dark")
     noise = np.random.default_rng(3).standard_normal((60, 60))
     place = np.array([[1.5, 0.0, 30.0], [0.0, -1.5, 30.0]])  # 0.67 mm a pixel
-    assert seen(scan_of(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1)) is None
+    assert localise(scan_of(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1)) is None
 
 
 def test_a_solid_mark_at_the_frames_border_is_seen_however_far_about_it_is_sought() -> None:
@@ -61,7 +61,7 @@ def test_a_solid_mark_at_the_frames_border_is_seen_however_far_about_it_is_sough
     scan = scan_of(light * ground + (1 - light) * border)
     for search_px in (5.0, 24.0):
         start = np.column_stack([place[:, :2], center + np.array([3.0, -2.0])])
-        look = seen(scan, MarkPrediction(block, start, search_px, -1))
+        look = localise(scan, MarkPrediction(block, start, search_px, -1))
         assert look is not None
         assert look[1] < 1e-3
         assert np.hypot(*(look[0] - center)) < 6.0

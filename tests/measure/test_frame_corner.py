@@ -9,7 +9,7 @@ from drawn import drawn, scan_of, transformed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from measure.fiducials.frame_edges import told_by_edges
+from measure.fiducials.frame_edges import edge_tone_information
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
@@ -120,10 +120,10 @@ def test_the_frames_edges_beside_its_marks_tell_the_curve(gamma: float) -> None:
     )
     scan = scan_of(65535 * (picture(5) / 65535) ** (1 / gamma))
     by_truth = Tone(power(gamma), covariance=np.eye(5))
-    (said,) = told_by_edges(scan.replace_tone(by_truth), marks, MATRIX, None)
+    (said,) = edge_tone_information(scan.replace_tone(by_truth), marks, MATRIX, None)
     assert said.sum_of_squares < 25  # of 5 figures
     other = by_truth.shift_to_power(gamma + 0.5)
-    (said,) = told_by_edges(scan.replace_tone(other), marks, MATRIX, None)
+    (said,) = edge_tone_information(scan.replace_tone(other), marks, MATRIX, None)
     prior = Tone(power(gamma + 0.5), covariance=4 * np.eye(5))
     found = prior.estimate([said]).tone
     value, sigma = found.equivalent_power(0.2, 0.5)

@@ -9,7 +9,6 @@ from true_marks import KIND, TrueMark, some_mark
 
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.frame_sighter import FrameSighter
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Cause, Status
@@ -49,7 +48,7 @@ def test_faint_marks_are_matched_with_the_others_blur() -> None:
     frame, marks = frame_of(np.random.default_rng(3), 2.5, 0.25)
     squares, to_bound = [], []
     for index in FAINT:
-        fit, (mark, corner) = frame.sightings[index].fit, marks[index]
+        fit, (mark, corner) = frame.detections[index].fit, marks[index]
         assert fit is not None
         assert frame.verdict(index)[0] is Status.WEAK
         error = fit.center_px - corner - mark.place[:, 2]
@@ -62,12 +61,12 @@ def test_faint_marks_are_matched_with_the_others_blur() -> None:
 def test_a_faint_mark_in_plain_noise_is_measured_with_the_standard_deviation_that_it_has() -> None:
     """In white noise a claim of 0.2 px is one; on a landscape it knows of the noise in part."""
     frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
-    sighting = frame.sightings[0]
-    assert sighting.fit is not None
+    detection = frame.detections[0]
+    assert detection.fit is not None
     known = Covariance.from_noise(0.2**2 * np.eye(2))
     for is_white, status in ((True, Status.MEASURED), (False, Status.WEAK)):
-        fit = replace(sighting.fit, place_covariance=known, covariance_is_white=is_white)
-        one = replace(frame, sightings=(replace(sighting, fit=fit), *frame.sightings[1:]))
+        fit = replace(detection.fit, place_covariance=known, covariance_is_white=is_white)
+        one = replace(frame, detections=(replace(detection, fit=fit), *frame.detections[1:]))
         assert one.verdict(0)[0] is status
 
 
@@ -75,12 +74,12 @@ def test_what_all_marks_lack_alike_is_the_drawings_and_no_damage() -> None:
     frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
 
     def status(own: float, others: float) -> Status:
-        sightings = [
+        detections = [
             replace(each, fit=replace(each.fit, damaged_fraction=own if index == 0 else others))
-            for index, each in enumerate(frame.sightings)
+            for index, each in enumerate(frame.detections)
             if each.fit is not None
         ]
-        return replace(frame, sightings=tuple(sightings)).verdict(0)[0]
+        return replace(frame, detections=tuple(detections)).verdict(0)[0]
 
     assert status(0.27, 0.0) is Status.WEAK
     assert status(0.27, 0.2) is Status.MEASURED
@@ -89,15 +88,10 @@ def test_what_all_marks_lack_alike_is_the_drawings_and_no_damage() -> None:
 
 def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause() -> None:
     frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
-    layout = tuple(LayoutMark(str(n), place, (0.005, 0.005), KIND["gap cross"].shape) for n, place in enumerate(PLACES))
-    scan = Scan(Path("even.tif"), WholePicture(np.zeros((SIDE_PX, SIDE_PX, 1), np.uint16)), NO_TAGS)
-    sighter = FrameSighter(scan, FiducialLayout(layout, (50.0, 50.0)), frame.placement, FiducialOptions())
-    sighter.sightings = list(frame.sightings)
-    before, added = frame.sightings[2].fit, np.array([[4e-3, 1e-3], [1e-3, 2e-3]])
+    before, added = frame.detections[2].fit, np.array([[4e-3, 1e-3], [1e-3, 2e-3]])
     assert before is not None
-    sighter.widen(2, Cause.TOUCHED, added)
-    sighter.widen(2, Cause.TOUCHED, added)
-    after = sighter.frame().sightings[2].fit
+    widened = frame.add_covariance(2, Cause.TOUCHED, added).add_covariance(2, Cause.TOUCHED, added)
+    after = widened.detections[2].fit
     assert after is not None
     np.testing.assert_allclose(after.covariance_px2 - before.covariance_px2, 2 * added, atol=1e-12)
     np.testing.assert_allclose(after.place_covariance.parts[Cause.TOUCHED], 2 * added, atol=1e-12)
@@ -105,21 +99,21 @@ def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause() -> None
 
 def test_a_mark_whose_place_hangs_on_a_remnant_is_weak_however_little_of_it_is_damaged() -> None:
     frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
-    sighting = frame.sightings[0]
-    assert sighting.fit is not None
+    detection = frame.detections[0]
+    assert detection.fit is not None
     for lost, status in ((0.5, Status.MEASURED), (0.95, Status.WEAK)):
-        one = replace(sighting, fit=replace(sighting.fit, damaged_fraction=0.05, lost_fraction=lost))
-        assert replace(frame, sightings=(one, *frame.sightings[1:])).verdict(0)[0] is status
+        one = replace(detection, fit=replace(detection.fit, damaged_fraction=0.05, lost_fraction=lost))
+        assert replace(frame, detections=(one, *frame.detections[1:])).verdict(0)[0] is status
 
 
 def test_a_frame_in_which_marks_lie_as_they_should_but_look_unlike_their_drawings_says_so() -> None:
     frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
     assert frame.accepted
     unlike = [
-        replace(sighting, fit=replace(sighting.fit, likeness=0.4)) if sighting.fit and number > 1 else sighting
-        for number, sighting in enumerate(frame.sightings)
+        replace(detection, fit=replace(detection.fit, likeness=0.4)) if detection.fit and number > 1 else detection
+        for number, detection in enumerate(frame.detections)
     ]
-    refused = replace(frame, sightings=tuple(unlike))
+    refused = replace(frame, detections=tuple(unlike))
     assert not refused.accepted
     assert refused.misfit("12345678").startswith(
         "8 of 8 marks were found where the others put them, but only 2 of them look"

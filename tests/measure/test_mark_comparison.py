@@ -12,10 +12,8 @@ from measure.fiducials.mark_comparison import (
     Touch,
     shared_blurs,
     shared_shapes,
-    shared_sizes,
     touch_of_round,
 )
-from measure.results import OwnShape
 
 PIXEL = 1 / 12
 
@@ -81,15 +79,15 @@ def test_too_few_marks_tell_nothing() -> None:
 
 
 def test_marks_of_one_size_are_rarely_doubted_and_another_size_is() -> None:
-    rng, linear = np.random.default_rng(2), np.array([[19.0, 2.0], [2.0, -19.0]])
+    rng = np.random.default_rng(2)
     doubted, found = 0, 0
     for _ in range(300):
         sigmas = rng.uniform(0.005, 0.05, 5)
         sizes = 1.08 * np.exp(rng.normal(0, np.hypot(sigmas, 0.014)))  # of all alike: the drawing's fault
-        told = shared_sizes(sized(sizes, sigmas, linear), linear)
+        told = shared_shapes(*sized(sizes, sigmas))
         doubted += any(size is not None and size.differs for size in told)
         sizes[0], sigmas[0] = 0.85, 0.02
-        odd = shared_sizes(sized(sizes, sigmas, linear), linear)[0]
+        odd = shared_shapes(*sized(sizes, sigmas))[0]
         found += odd is not None and odd.differs and abs(odd.ratio - 0.79) < 0.08
     assert doubted <= 12
     assert found > 270
@@ -137,23 +135,18 @@ def test_how_likely_a_touched_dot_is_far_off_is_what_drawing_at_random_finds() -
 
 
 def test_two_other_marks_tell_a_size_and_an_odd_one_does_not_spoil_the_others() -> None:
-    linear = np.diag([19.0, -19.0])
-    small = shared_sizes(sized(np.array([1.0, 1.002, 0.998, 0.9]), np.full(4, 0.01), linear), linear)
+    small = shared_shapes(*sized(np.array([1.0, 1.002, 0.998, 0.9]), np.full(4, 0.01)))
     assert [size is not None and size.differs for size in small] == [False, False, False, True]
     assert small[0] is not None
     assert abs(small[0].off[0]) < 0.01
-    assert all(shared_sizes(sized(np.array([1.0, 1.0, 0.95]), np.full(3, 0.01), linear), linear))
-    pair = shared_sizes(sized(np.array([1.0, 0.9]), np.array([0.01, 0.01]), linear), linear)
+    assert all(shared_shapes(*sized(np.array([1.0, 1.0, 0.95]), np.full(3, 0.01))))
+    pair = shared_shapes(*sized(np.array([1.0, 0.9]), np.array([0.01, 0.01])))
     assert pair == [None, None]
 
 
-def sized(sizes: Any, sigmas: Any, linear: Any) -> list[Any]:
-    """As matches have them, each turned otherwise."""
-    turns = [np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in np.arange(len(sizes))]
-    return [
-        SimpleNamespace(pixel_from_mark=np.column_stack([size * turn @ linear, np.zeros(2)]), size_sigma=sigma)
-        for size, turn, sigma in zip(sizes, turns, sigmas, strict=True)
-    ]
+def sized(sizes: Any, sigmas: Any) -> tuple[Any, Any]:
+    """Logarithms of sizes, and their standard deviations."""
+    return np.log(sizes)[:, None], np.asarray(sigmas)[:, None]
 
 
 def test_a_mark_with_another_shape_than_the_others_is_told_apart() -> None:
@@ -161,9 +154,8 @@ def test_a_mark_with_another_shape_than_the_others_is_told_apart() -> None:
     for _ in range(100):
         sigmas = rng.uniform(0.002, 0.01, (8, 2))
         changes = rng.normal(0.03, np.hypot(sigmas, 0.01))  # of all alike: the drawing's fault
-        shapes = [OwnShape(*each, np.eye(2)) for each in zip(changes, sigmas, strict=True)]
-        doubted += any(shape is not None and shape.differs for shape in shared_shapes(shapes))
-        odd = shared_shapes([OwnShape(changes[0] + (0.0, 0.1), sigmas[0], np.eye(2)), *shapes[1:]])[0]
+        doubted += any(shape is not None and shape.differs for shape in shared_shapes(changes, sigmas))
+        odd = shared_shapes(np.array([changes[0] + (0.0, 0.1), *changes[1:]]), sigmas)[0]
         found += odd is not None and odd.differs
     assert doubted <= 6
     assert found > 95

@@ -11,7 +11,7 @@ from drawn import scan_of
 from drawn_frames import CORNERS, PITCH_UM, frame_picture, layout_of, measured, paint, pixel_from_camera
 from scipy.ndimage import gaussian_filter
 
-from measure.detection.first_look import seen
+from measure.detection.localisation import localise
 from measure.fiducials import mark_fit
 from measure.fiducials.constellation import Placement
 from measure.fiducials.hypotheses import pitch_hypotheses
@@ -45,11 +45,11 @@ def test_a_frame_seen_as_its_mirror_image_is_renamed_as_it_lies(tmp_path: Path) 
         found = FrameSearch(scan, LEANING, OPTIONS).anywhere(pitch_hypotheses(scan, LEANING, PITCH, OPTIONS)[0])
         right = next(each for each in found if each.pose == "0")
         mirrored = measure_frame(scan, LEANING, right.posed("0m", right_mm(LEANING)), OPTIONS)
-        assert int(mirrored.belongs.sum()) < 4
-        frame = rename_frame(scan, LEANING, mirrored, "0", OPTIONS)
+        assert int(mirrored.inliers.sum()) < 4
+        frame = rename_frame(scan, mirrored, "0")
         assert frame.is_whole
         # It is not replaced by one with fewer marks.
-        assert rename_frame(scan, LEANING, frame, "0m", OPTIONS) is frame
+        assert rename_frame(scan, frame, "0m") is frame
 
 
 def right_mm(layout: FiducialLayout) -> Array:
@@ -94,11 +94,11 @@ def test_marks_that_were_found_are_renamed_and_not_sought_again(monkeypatch: pyt
     start = Placement("180", matrix, 1.0, 4, -1, 4, (1 / PX_PER_MM,) * 2)
     named_rightly = measure_frame(scan, BLOCKS, start, OPTIONS)
     named_wrongly = measure_frame(scan, BLOCKS, start.posed("0", right_mm(BLOCKS)), OPTIONS)
-    assert int(named_wrongly.belongs.sum()) == 4
-    monkeypatch.setattr(mark_fit, "seen", lambda scan, mark: seen(scan, mark) if mark.search_px < 2 else None)
-    frame = rename_frame(scan, BLOCKS, named_wrongly, "180", OPTIONS)
+    assert int(named_wrongly.inliers.sum()) == 4
+    monkeypatch.setattr(mark_fit, "localise", lambda scan, mark: localise(scan, mark) if mark.search_px < 2 else None)
+    frame = rename_frame(scan, named_wrongly, "180")
     assert frame.placement.pose == "180"
-    assert int(frame.belongs.sum()) == 4
+    assert int(frame.inliers.sum()) == 4
     for fit, true in zip(frame.fits, named_rightly.fits, strict=True):
         assert fit is not None
         assert true is not None

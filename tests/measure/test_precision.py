@@ -17,8 +17,8 @@ from true_marks import (
     whitened_rms,
 )
 
-from measure.detection.prediction import MarkPrediction
-from measure.fiducials.mark_fit import sight
+from measure.detection.localisation import MarkPrediction
+from measure.fiducials.mark_fit import detect_mark
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Cause
@@ -34,7 +34,7 @@ def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, rounding
     start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
     scan, options = scan_of(grey, rounding_step_dn=rounding_step_dn), FiducialOptions().match
-    fit = sight(scan, MarkPrediction(mark.kind.shape, start, 3.0, 1), options, frame_sigma).fit
+    fit = detect_mark(scan, MarkPrediction(mark.kind.shape, start, 3.0, 1), options, frame_sigma).fit
     assert fit is not None
     return fit
 
@@ -152,9 +152,9 @@ def test_lines_far_wider_than_the_mark_s_are_not_the_mark() -> None:
     wide, fine = (MarkShape(cross(1.5, line_mm)) for line_mm in (0.5, 0.03))
     mark = TrueMark(Kind("wide cross", wide), np.array([[10.0, 0.0, 40.3], [0.0, -10.0, 39.8]]), 81, 3.0)
     grey = 30 + 200 * mark.picture + np.random.default_rng(1).normal(0, 3, mark.picture.shape)
-    sighting = sight(scan_of(grey, 255), MarkPrediction(fine, mark.place, 3.0, 1), FiducialOptions().match)
-    assert sighting.fit is None
-    assert "far wider than the mark's lines" in sighting.reason
+    detection = detect_mark(scan_of(grey, 255), MarkPrediction(fine, mark.place, 3.0, 1), FiducialOptions().match)
+    assert detection.fit is None
+    assert "far wider than the mark's lines" in detection.reason
 
 
 def test_what_compression_makes_of_the_tone_curve_is_alike_in_all_marks() -> None:
@@ -164,7 +164,7 @@ def test_what_compression_makes_of_the_tone_curve_is_alike_in_all_marks() -> Non
     expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
     for step, alike in ((0.0, 0.0), (0.1, 0.35**2)):  # 3.5 times the step over the contrast
         scan = scan_of(grey, rounding_step_dn=step * CONTRAST).replace_tone(Tone.unknown())
-        fit = sight(scan, expected, FiducialOptions().match, mark.kind.known).fit
+        fit = detect_mark(scan, expected, FiducialOptions().match, mark.kind.known).fit
         assert fit is not None
         assert fit.tone is not None
         assert fit.tone.information.matrix.any()

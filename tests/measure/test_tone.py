@@ -7,8 +7,8 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 
-from measure.detection.prediction import MarkPrediction
-from measure.fiducials.mark_fit import options_for, sight
+from measure.detection.localisation import MarkPrediction
+from measure.fiducials.mark_fit import detect_mark, options_for
 from measure.marks.shapes import MarkShape, polygon
 from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.match import match
@@ -259,7 +259,7 @@ def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -
     for step_dn in (0.0, 12.0):
         scan = scan_of(code, 255, step_dn).replace_tone(Tone.unknown())
         expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
-        fit = sight(scan, expected, MatchOptions(linear_sigma=0.05), mark.kind.known).fit
+        fit = detect_mark(scan, expected, MatchOptions(linear_sigma=0.05), mark.kind.known).fit
         assert fit is not None
         assert fit.tone is not None
         told = [ToneInformation.pooled([fit.tone.information] * count).scanner_information for count in (1, 16)]

@@ -1,7 +1,10 @@
-"""Where near its predicted place a mark looks most like itself, at full or half resolution, and whether noise would
-look so."""
+"""A mark localised near its predicted place: where it looks most like itself, at full or half resolution, and how many
+places noise would make that look as much so."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +12,11 @@ from scipy import fft
 from scipy.special import ndtr
 
 from measure.detection.candidates import detail_px
-from measure.detection.correlation import correlation, variation
-from measure.detection.prediction import MarkPrediction
+from measure.detection.correlation import WIDE, Surroundings, correlation, variation
 from measure.detection.response_layers import highest
 from measure.flags import NOISE_LIKE_A_MARK
 from measure.marks.rendering import extent_px, known_picture
+from measure.marks.shapes import Mark
 from measure.matching.match import mark_window
 from measure.matching.window import FAINT
 from measure.scans.scan import Scan
@@ -26,24 +29,59 @@ _HALVED_PX = 6.0  # of the finest line: from there on half the resolution shows 
 _SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine line seen softly is another picture
 
 
-def seen(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None:
-    """Column and row of the scan within the search radius where the mark correlates best, to a part of a pixel, and the
-    expected number of places there that noise makes answer so well; None where noise would do so. Drawn sharp or soft,
-    whichever noise is less likely to answer so: a soft faint mark, drawn sharp, is no more than its noise."""
-    looks = [_Look(scan, expected, _SHARP_PX)]
-    if looks[0].chance > _SURE:
-        looks.append(_Look(scan, expected, _SOFT_PX))
-    best = min(looks, key=lambda look: look.chance)
-    return (best.center_px, best.chance) if best.chance <= NOISE_LIKE_A_MARK else None
+@dataclass(frozen=True, eq=False)
+class MarkPrediction:
+    """pixel_from_mark: (2, 3), its last column the predicted place. search_px: the radius about it within which the
+    mark is looked for. polarity: +1 for a mark lighter than its surroundings, -1 for a darker one. weights: of the
+    scan's channels, None for its own. surroundings: what about the mark counts where it is looked for."""
+
+    mark: Mark
+    pixel_from_mark: Array
+    search_px: float
+    polarity: int
+    weights: Sequence[float] | None = None
+    surroundings: Surroundings = WIDE
+
+    @property
+    def linear(self) -> Array:
+        """(2, 2) px per mm."""
+        return self.pixel_from_mark[:, :2]
+
+    @property
+    def center_px(self) -> Array:
+        """(2,) predicted."""
+        return self.pixel_from_mark[:, 2]
+
+    def moved(self, center_px: Array) -> Self:
+        """The same at another place."""
+        return replace(self, pixel_from_mark=np.column_stack([self.linear, center_px]))
 
 
-def strongest(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:
-    """Column and row of the scan within the search radius where the mark correlates best, and how well."""
-    look = _Look(scan, expected, _SHARP_PX)
-    return look.center_px, look.height
+def localise(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None:
+    """Find the highest correlation peak within the search radius.
+
+    The mark is drawn sharp or soft, whichever noise is less likely to feign: a soft faint mark, drawn sharp, is no more
+    than its noise.
+
+    Returns
+    -------
+    The peak's column and row in the scan, to a part of a pixel, and the expected number of false alarms; None where
+    noise would make as high a peak.
+    """
+    searches = [_PeakSearch(scan, expected, _SHARP_PX)]
+    if searches[0].false_alarms > _SURE:
+        searches.append(_PeakSearch(scan, expected, _SOFT_PX))
+    best = min(searches, key=lambda search: search.false_alarms)
+    return (best.center_px, best.false_alarms) if best.false_alarms <= NOISE_LIKE_A_MARK else None
 
 
-class _Look:
+def highest_peak(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:
+    """Column and row of the highest correlation peak within the search radius, and its height."""
+    search = _PeakSearch(scan, expected, _SHARP_PX)
+    return search.center_px, search.height
+
+
+class _PeakSearch:
     """center_px (2,): where the mark, drawn with that blur, correlates best; height: how well."""
 
     def __init__(self, scan: Scan, expected: MarkPrediction, blur_px: float) -> None:
@@ -81,8 +119,8 @@ class _Look:
         self.height = float(response[self._best])
 
     @cached_property
-    def chance(self) -> float:
-        """The expected number of places that noise makes answer so well. The correlation of two rows of numbers, each
+    def false_alarms(self) -> float:
+        """The expected number of peaks as high that noise makes. The correlation of two rows of numbers, each
         with its own autocorrelation, varies by the sum of the products of these over how many they are (Bartlett,
         1935); that sum is what one answers to the other at all offsets."""
         if self.height <= 0:
