@@ -15,6 +15,6 @@ from .problem.observations import Calibration as Calibration
 from .problem.observations import Distance as Distance
 from .problem.observations import Observations as Observations
 from .problem.parameter import Parameter as Parameter
-from .problem.result import Adjustment as Adjustment
 from .solution.adjustment import adjust as adjust
 from .solution.options import Options as Options
+from .solution.result import Adjustment as Adjustment

@@ -24,9 +24,9 @@ from adjust.functional_model.film_kinds import FilmKind
 from adjust.functional_model.transformation import film_kind
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Approximations, Transformation
-from adjust.problem.result import Adjustment
 from adjust.quality.variance_factor import LEAST_REDUNDANCY, NO_EVIDENCE, TOO_GOOD
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 from pipeline.report.fiducials import figure_of_films
 
 Array = NDArray[np.float64]

@@ -18,8 +18,9 @@ from scipy import special
 
 from adjust.problem.network import Network
 from adjust.problem.probabilities import Probabilities
-from adjust.problem.result import Adjustment, Suspect
+from adjust.quality.snooping import Suspect
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 
 SIGMAS = 10.0
 KINDS = ("fiducial", "datum", "control", "target")

@@ -17,8 +17,8 @@ from realisations import Exact, exact, realisation
 from reference_cases import CAMERA, load
 from scipy import stats
 
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -27,8 +27,8 @@ from adjust.functional_model.transformation import Film
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 Ended = tuple[str, int]

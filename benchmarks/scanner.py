@@ -22,8 +22,8 @@ from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
 from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Approximations, Network
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 Made = Callable[[np.random.Generator, Mapping[str, Prior]], tuple[Network, Approximations]]

@@ -19,9 +19,9 @@ from mishaps import MISHAPS, Mishap, sentences  # the tests' own networks
 from null_directions import AXES, CATALOGUE, Failure
 
 from adjust.functional_model.rotation import rotation_from_angles
+from adjust.problem.estimates import NullDirection
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter, description
-from adjust.problem.result import NullDirection
 from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.archive.archive_summary import archive_summary, shard_summary

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,11 @@ from adjust.least_squares.rows import WhitenedRows, of_cameras, prior_difference
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
+from adjust.problem.estimates import Termination
 from adjust.problem.further_observations import square_sum
 from adjust.problem.problem import Problem, State
-from adjust.problem.result import Iteration, Termination
+
+Indices = NDArray[np.intp]
 
 Array = NDArray[np.float64]
 
@@ -30,6 +33,19 @@ PROBE = 0.1  # part of a step over which its curvature is taken
 LARGEST_TURN = 0.75  # of a step's length that its second-order part may have
 SLOW = 0.5  # of the step before, above which a step shrinks slowly
 LARGEST_STRETCH = 10.0  # times as long as a step that an accelerated one may be
+
+
+class Iteration(NamedTuple):
+    """A step of the iteration: v'Pv after it, how far it moves what moves most, its damping, the attempts.
+
+    A step that would have increased v'Pv, or after which some point would have had no image, was tried again with more
+    damping (0: an undamped Gauss-Newton step).
+    """
+
+    vpv: float
+    largest_step_sigmas: float
+    damping: float
+    attempts: int
 
 
 @dataclass(frozen=True)

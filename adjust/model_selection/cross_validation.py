@@ -15,8 +15,8 @@ from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Kind, Parameter, object_coordinate
 from adjust.problem.problem import number
 from adjust.problem.reduction import Reduction
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, with_datum
+from adjust.solution.result import Adjustment
 from adjust.solution.reweighting import run
 from adjust.validation import validate
 

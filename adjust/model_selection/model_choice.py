@@ -21,10 +21,10 @@ from adjust.model_selection.models import Bends, Model, given_model, left_by, le
 from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Network
 from adjust.problem.parameter import description
-from adjust.problem.result import Adjustment
 from adjust.quality.reweighting import NO_WEIGHT
 from adjust.rank_defect.datum_choice import with_held
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 
 HIGH_CORRELATION = 0.95
 ROUNDS = 3  # of choosing distortion, bends and transformation in turns

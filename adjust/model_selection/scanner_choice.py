@@ -19,9 +19,9 @@ from adjust.functional_model.scanner import carriage_terms, smooth_terms
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network, Scanner
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment
 from adjust.quality.significance import LEVEL
 from adjust.rank_defect.scanner_directions import HARDLY, poses_of, untold_sentences
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

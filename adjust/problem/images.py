@@ -11,21 +11,21 @@ from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
+from adjust.problem.estimates import Estimates
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network
 from adjust.problem.parameter import Kind, Parameter
-from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
 
 
-def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
-    """An image with the values of an adjustment."""
-    network = adjustment.network
+def adjusted_image(estimates: Estimates, name: str) -> ImageModel:
+    """An image with the values of an estimates."""
+    network = estimates.network
     image = network.image_by_name[name]
     camera = network.camera_by_name[image.camera]
 
     def values(kind: Kind, owner: str, quantities: tuple[str, ...]) -> Array:
-        return adjustment.values_of(Parameter(kind, owner, "", each) for each in quantities)
+        return estimates.values_of(Parameter(kind, owner, "", each) for each in quantities)
 
     exterior = values("exterior", image.frame, EXTERIOR_NAMES)
     parameters = values("film", name, film_parameter_names(image.transformation))
@@ -36,24 +36,24 @@ def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
         parameters=values("interior", camera.name, parameter_names(camera.distortion.family)),
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
-        film=_film(network, image, parameters, name in adjustment.mirrored),
+        film=_film(network, image, parameters, name in estimates.mirrored),
         line_of_sight=network.line_of_sight,
         bend=bend,
         bend_parameters=values("scanner", image.scanner, bend.terms),
     )
 
 
-def adjusted_places(adjustment: Adjustment, points: Sequence[str]) -> Array:
-    """(n, 3) where object points are, with the values of an adjustment: those of a bent board off its plane."""
-    places = adjustment.values_of(Parameter.point(point, axis) for point in points for axis in "XYZ").reshape(-1, 3)
-    return places + lifted(adjustment, points)
+def adjusted_places(estimates: Estimates, points: Sequence[str]) -> Array:
+    """(n, 3) where object points are, with the values of an estimates: those of a bent board off its plane."""
+    places = estimates.values_of(Parameter.point(point, axis) for point in points for axis in "XYZ").reshape(-1, 3)
+    return places + lifted(estimates, points)
 
 
-def lifted(adjustment: Adjustment, points: Sequence[str]) -> Array:
+def lifted(estimates: Estimates, points: Sequence[str]) -> Array:
     """(n, 3) how far the bends of boards put object points beside their flat places."""
     offsets = np.zeros((len(points), 3))
-    for board in adjustment.network.boards:
-        bends = adjustment.values_of(Parameter.board(board.name, name) for name in BOARD_NAMES)
+    for board in estimates.network.boards:
+        bends = estimates.values_of(Parameter.board(board.name, name) for name in BOARD_NAMES)
         for row, point in enumerate(points):
             if point in board.places:
                 offsets[row] = bends @ board.lifted_by[point]

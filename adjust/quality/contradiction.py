@@ -7,6 +7,7 @@ the test of a block of errors (Baarda 1968; Förstner and Wrobel, Photogrammetri
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +17,42 @@ from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.problem.further_observations import ObservedCalibration
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
-from adjust.problem.result import Contradiction
 from adjust.quality.residuals import surplus
+
+Indices = NDArray[np.intp]
 
 Array = NDArray[np.float64]
 
 UNSEEN = 1e-6  # part of a direction's variance: where the others say so little, they say nothing
 
 
-def contradictions_of_groups(
+@dataclass(frozen=True, eq=False)
+class CalibrationTest:
+    """What the images say against observations that are correlated, as an earlier calibration's quantities are.
+
+    parameters (m,); difference (m,): where the images put each less where it was observed, with the a-posteriori sigma
+    (m,) of that; nan and inf where the images do not tell it. statistic: of all together, F with freedom and the other
+    observations' redundancy; probability: of as much where they do not contradict each other.
+    """
+
+    group: str
+    parameters: tuple[Parameter, ...]
+    difference: Array
+    sigma: Array
+    statistic: float
+    freedom: int
+    probability: float
+
+    @property
+    def direction(self) -> tuple[int, ...]:
+        """The quantities by number, those first in which both differ most in standard deviations of their own."""
+        size = np.where(np.isfinite(self.difference), np.abs(self.difference) / self.sigma, 0.0)
+        return tuple(np.argsort(-size, kind="stable").tolist())
+
+
+def calibration_tests(
     problem: Problem, state: State, rows: Sequence[Blocks], factor: Factor, vpv: float, redundancy: int
-) -> Iterator[Contradiction]:
+) -> Iterator[CalibrationTest]:
     """Of every earlier calibration of several quantities; rows, factor: as of the residuals, vpv and redundancy of the
     whole adjustment, whose other part tells sigma0."""
     for each, block in zip(problem.further, rows, strict=True):
@@ -47,7 +73,7 @@ def contradictions_of_groups(
         sigma = np.sqrt(variance * (along[:, seen] ** 2 / free[seen]).sum(axis=1))
         hidden = (along[:, ~seen] ** 2).sum(axis=1) > UNSEEN * np.diag(each.covariance)
         test = chi_square / freedom / variance
-        yield Contradiction(
+        yield CalibrationTest(
             group=each.group,
             parameters=each.parameters,
             difference=np.where(hidden, np.nan, difference),

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from adjust.functional_model.families import family
 from adjust.functional_model.rotation import rotation_from_angles, vector_by_angles
 from adjust.problem.camera import Camera
+from adjust.problem.estimates import Estimates
 from adjust.problem.network import EXTERIOR_NAMES, Network
 from adjust.problem.parameter import MANY, Parameter
-from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
 
@@ -47,14 +47,14 @@ class Correlation:
     remedy: str
 
 
-def correlations(adjustment: Adjustment, above: float = HIGH) -> tuple[Correlation, ...]:
+def correlations(estimates: Estimates, above: float = HIGH) -> tuple[Correlation, ...]:
     """The correlations above a limit between parameters of one camera, and between these and orientations of images.
 
     The highest first; none where there is no solution.
     """
-    if not adjustment.converged:
+    if not estimates.converged:
         return ()
-    found = [each for camera in adjustment.network.cameras for each in _of_camera(adjustment, camera, above)]
+    found = [each for camera in estimates.network.cameras for each in _of_camera(estimates, camera, above)]
     return tuple(sorted(found, key=lambda each: -abs(each.rho)))
 
 
@@ -69,22 +69,22 @@ class _Kind:
         return self.name + "'" * (self.group == "point")
 
 
-def _of_camera(adjustment: Adjustment, camera: Camera, above: float) -> Iterator[Correlation]:
-    kinds = [kind for kind in _kinds(camera) if _is_free(adjustment, Parameter.interior(camera.name, kind.name))]
+def _of_camera(estimates: Estimates, camera: Camera, above: float) -> Iterator[Correlation]:
+    kinds = [kind for kind in _kinds(camera) if _is_free(estimates, Parameter.interior(camera.name, kind.name))]
     if not kinds:
         return
     own = [Parameter.interior(camera.name, kind.name) for kind in kinds]
-    marks = _free_marks(adjustment, camera)
-    of_camera = _correlation(_held(adjustment.cofactor_of([*own, *marks]), len(own), _figure(adjustment, marks)))
-    known = _field_is_known(adjustment.network)
+    marks = _free_marks(estimates, camera)
+    of_camera = _correlation(_held(estimates.cofactor_of([*own, *marks]), len(own), _figure(estimates, marks)))
+    known = _field_is_known(estimates.network)
     for i, j in combinations(range(len(own)), 2):
         if abs(of_camera[i, j]) > above:
             yield _of_pair(camera.name, kinds[i], kinds[j], float(of_camera[i, j]), known)
-    frames = (image.frame for image in adjustment.network.images if image.camera == camera.name)
+    frames = (image.frame for image in estimates.network.images if image.camera == camera.name)
     images = list(dict.fromkeys(frames))
     rho = np.concatenate(
         [
-            _with_exteriors(adjustment, own, marks, images[i : i + IMAGES_AT_ONCE])
+            _with_exteriors(estimates, own, marks, images[i : i + IMAGES_AT_ONCE])
             for i in range(0, len(images), IMAGES_AT_ONCE)
         ]
     )
@@ -93,7 +93,7 @@ def _of_camera(adjustment: Adjustment, camera: Camera, above: float) -> Iterator
         if len(rows):
             of = [images[row] for row in rows]
             value = float(rho[rows, i, direction][np.argmax(np.abs(rho[rows, i, direction]))])
-            yield _of_images(adjustment, camera.name, kind, direction, of, len(images), value, known)
+            yield _of_images(estimates, camera.name, kind, direction, of, len(images), value, known)
 
 
 def _kinds(camera: Camera) -> list[_Kind]:
@@ -105,19 +105,19 @@ def _kinds(camera: Camera) -> list[_Kind]:
     return interior + [_Kind(name, groups.get(name, "other")) for name in of.parameters]
 
 
-def _is_free(adjustment: Adjustment, parameter: Parameter) -> bool:
-    return adjustment.has(parameter) and adjustment.sigma(parameter) > 0.0
+def _is_free(estimates: Estimates, parameter: Parameter) -> bool:
+    return estimates.has(parameter) and estimates.sigma(parameter) > 0.0
 
 
-def _free_marks(adjustment: Adjustment, camera: Camera) -> list[Parameter]:
+def _free_marks(estimates: Estimates, camera: Camera) -> list[Parameter]:
     """x and y of every fiducial that was estimated, x before y."""
     pairs = [[Parameter.fiducial(camera.name, id_, axis) for axis in "xy"] for id_ in camera.fiducials]
-    return [each for pair in pairs if all(_is_free(adjustment, one) for one in pair) for each in pair]
+    return [each for pair in pairs if all(_is_free(estimates, one) for one in pair) for each in pair]
 
 
-def _figure(adjustment: Adjustment, marks: Sequence[Parameter]) -> Array:
+def _figure(estimates: Estimates, marks: Sequence[Parameter]) -> Array:
     """Shift, rotation and scale (k, m) of fiducial coordinates (m,)."""
-    xy = adjustment.values_of(marks).reshape(-1, 2)
+    xy = estimates.values_of(marks).reshape(-1, 2)
     if len(xy) < 2:
         return np.zeros((0, len(marks)))
     x, y = (xy - xy.mean(axis=0)).T
@@ -145,21 +145,21 @@ def _correlation(cofactor: Array) -> Array:
     return np.asarray(cofactor / np.outer(scale, scale))
 
 
-def _with_exteriors(adjustment: Adjustment, own: list[Parameter], marks: list[Parameter], images: list[str]) -> Array:
+def _with_exteriors(estimates: Estimates, own: list[Parameter], marks: list[Parameter], images: list[str]) -> Array:
     """Correlations (images, k, 6) of k parameters with the six directions of every exterior orientation."""
     exterior = [Parameter.exterior(image, element) for image in images for element in EXTERIOR_NAMES]
-    cofactor = _held(adjustment.cofactor_of([*own, *marks, *exterior]), len(own), _figure(adjustment, marks))
+    cofactor = _held(estimates.cofactor_of([*own, *marks, *exterior]), len(own), _figure(estimates, marks))
     turn = np.eye(len(cofactor))
     for i, image in enumerate(images):
         at = slice(len(own) + 6 * i, len(own) + 6 * i + 6)
-        turn[at, at] = _in_camera_axes(adjustment, image)
+        turn[at, at] = _in_camera_axes(estimates, image)
     rho = _correlation(turn @ cofactor @ turn.T)[: len(own), len(own) :]
     return rho.reshape(len(own), len(images), 6).transpose(1, 0, 2)
 
 
-def _in_camera_axes(adjustment: Adjustment, image: str) -> Array:
+def _in_camera_axes(estimates: Estimates, image: str) -> Array:
     """The derivative (6, 6) of the six directions by the elements of an exterior orientation."""
-    angles = adjustment.values_of(Parameter.exterior(image, element) for element in EXTERIOR_NAMES[3:])
+    angles = estimates.values_of(Parameter.exterior(image, element) for element in EXTERIOR_NAMES[3:])
     turn = np.zeros((6, 6))
     turn[:3, :3] = rotation_from_angles(angles)
     turn[3:, 3:] = vector_by_angles(angles)
@@ -181,7 +181,7 @@ def _of_pair(camera: str, first: _Kind, second: _Kind, rho: float, known: bool) 
 
 
 def _of_images(
-    adjustment: Adjustment,
+    estimates: Estimates,
     camera: str,
     kind: _Kind,
     direction: int,
@@ -190,7 +190,7 @@ def _of_images(
     rho: float,
     known: bool,
 ) -> Correlation:
-    elements = _elements(adjustment, images, direction)
+    elements = _elements(estimates, images, direction)
     if len(images) == count:
         of = "all images" if count > 1 else f"image {images[0]}"
     else:
@@ -207,9 +207,9 @@ def _of_images(
     return Correlation((Parameter.interior(camera, kind.name), *exterior), rho, cause, remedy)
 
 
-def _elements(adjustment: Adjustment, images: list[str], direction: int) -> list[str]:
+def _elements(estimates: Estimates, images: list[str], direction: int) -> list[str]:
     """The elements of exterior orientations that have a share in a direction."""
-    shares = np.array([np.abs(_in_camera_axes(adjustment, image)[direction]) for image in images]).max(axis=0)
+    shares = np.array([np.abs(_in_camera_axes(estimates, image)[direction]) for image in images]).max(axis=0)
     return [name for name, share in zip(EXTERIOR_NAMES, shares, strict=True) if share > SHARE]
 
 

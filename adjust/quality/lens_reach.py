@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from adjust.functional_model.displacement import displacement
 from adjust.functional_model.families import parameter_names
 from adjust.problem.camera import Camera
+from adjust.problem.estimates import Estimates
 from adjust.problem.images import adjusted_image
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
 
@@ -38,19 +38,19 @@ class LensReach:
         return min(self.radius_mm / self.corner_mm, 1.0)
 
 
-def lens_reach(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float] | None) -> LensReach | None:
+def lens_reach(estimates: Estimates, camera: Camera, frame_mm: tuple[float, float] | None) -> LensReach | None:
     """None where nothing was observed. frame_mm: width and height; about 0 with fiducial marks, else from the top left
     corner of the scan.
     """
-    network = adjustment.network
+    network = estimates.network
     observations = network.observations
     farthest = [0.0]
-    principal_point = np.array([adjustment.value(Parameter.interior(camera.name, each)) for each in ("x0", "y0")])
+    principal_point = np.array([estimates.value(Parameter.interior(camera.name, each)) for each in ("x0", "y0")])
     of_image = np.array(observations.image)
     for image in network.images:
         rows = np.flatnonzero((of_image == image.name) & ~observations.is_fiducial)
         if image.camera == camera.name and len(rows):
-            camera_mm = adjusted_image(adjustment, image.name).camera_from_comparator(observations.xy_mm[rows])
+            camera_mm = adjusted_image(estimates, image.name).camera_from_comparator(observations.xy_mm[rows])
             farthest.append(float(np.linalg.norm(camera_mm - principal_point, axis=1).max()))
     radius_mm = max(farthest)
     if radius_mm == 0.0:
@@ -61,22 +61,22 @@ def lens_reach(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, fl
         left, top = (-width / 2.0, height / 2.0) if camera.fiducials else (0.0, 0.0)
         corners = (left, top - height), (left + width, top)
         corner_mm = float(np.linalg.norm(np.abs(np.array(corners) - principal_point).max(axis=0)))
-    within = max(_sigma_um(adjustment, camera, radius) for radius in np.linspace(0.0, radius_mm, RADII + 1)[1:])
-    beyond = _sigma_um(adjustment, camera, corner_mm) if np.isfinite(corner_mm) else np.nan
+    within = max(_sigma_um(estimates, camera, radius) for radius in np.linspace(0.0, radius_mm, RADII + 1)[1:])
+    beyond = _sigma_um(estimates, camera, corner_mm) if np.isfinite(corner_mm) else np.nan
     return LensReach(radius_mm, corner_mm, within, beyond, corners)
 
 
-def _sigma_um(adjustment: Adjustment, camera: Camera, radius_mm: float) -> float:
+def _sigma_um(estimates: Estimates, camera: Camera, radius_mm: float) -> float:
     """The largest standard deviation of the distortion at a radius, over all directions and along any."""
     names = parameter_names(camera.distortion.family)
     unknowns = [Parameter.interior(camera.name, each) for each in ("c", *names)]
-    interior = np.array([adjustment.value(Parameter.interior(camera.name, each)) for each in ("c", "x0", "y0")])
+    interior = np.array([estimates.value(Parameter.interior(camera.name, each)) for each in ("c", "x0", "y0")])
     angles = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     places = radius_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    values = np.array([adjustment.value(each) for each in unknowns[1:]])
+    values = np.array([estimates.value(each) for each in unknowns[1:]])
     moved = displacement(camera.distortion, interior, values, places)
     if not moved.imaged.all():
         return np.nan
     by = moved.by_unknowns_um
-    variances = np.linalg.eigvalsh(by @ adjustment.cofactor_of(unknowns) @ by.swapaxes(1, 2))[:, -1]
-    return adjustment.sigma0 * float(np.sqrt(max(variances.max(), 0.0)))
+    variances = np.linalg.eigvalsh(by @ estimates.cofactor_of(unknowns) @ by.swapaxes(1, 2))[:, -1]
+    return estimates.sigma0 * float(np.sqrt(max(variances.max(), 0.0)))

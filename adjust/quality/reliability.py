@@ -19,9 +19,9 @@ from adjust.least_squares.rows import prior_differences
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.small_matrices import applied, eigen, inverse, laid_out, product
 from adjust.problem.further_observations import FurtherObservation
+from adjust.problem.parameter import Parameter
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.problem import ABSENT, Problem
-from adjust.problem.result import OuterEffect, Reliability
 from adjust.problem.tested import Tested, TestedUnits
 
 Array = NDArray[np.float64]
@@ -31,6 +31,59 @@ Effects = tuple[Array, Callable[[int], str]]  # of errors on the cameras' parame
 
 UNCHECKED = 1e-9  # an observation of a smaller redundancy is not checked by any other
 UNCONTROLLED = 1e-4  # below this an error must be hundreds of standard deviations to be seen: told apart from the rest
+
+
+@dataclass(frozen=True)
+class OuterEffect:
+    """What the worst undetected error does to a camera parameter.
+
+    effect: in the parameter's unit, of an error of the smallest detectable size in `cause`; in_sigmas: over the
+    parameter's a-priori standard deviation.
+    """
+
+    parameter: Parameter
+    effect: float
+    in_sigmas: float
+    cause: str
+
+
+@dataclass(frozen=True, repr=False)
+class Reliability:
+    """How well the observations check each other: one row for everything that is tested.
+
+    All (N, 2) by coordinate; a quantity of one coordinate has zeros in the place of a second, and inf for errors. With
+    C the covariance given, Q_v the cofactor matrix of v, P the inverse of C, h one coordinate:
+    v: adjusted less given, sigma: the a-priori standard deviation, in mm, object units or rad. redundancy: diagonal of
+    Q_v P, with the weights that were used. w: h'P v / root(h'P Q_v P h), v / sigma_v where P is diagonal; 0 where
+    nothing checks the coordinate. tau: w / sigma0. smallest: the gross error that the test of the coordinate detects
+    with the probability `power`, delta0 / root(h'P Q_v P h); inf where nothing checks it. effect: how far an undetected
+    one moves any function of the unknowns at most, in its standard deviations. (Baarda's inner and outer reliability.)
+    statistic (N,): v'P (P Q_v P)^- P v of all coordinates together, chi-square of `sizes` (N,); smallest_together (N,):
+    the gross error of a pair in its least favourable direction.
+    An observation that has lost weight is tested as it was given, against all the others with the weights that these
+    have left.
+    outer: one entry a free camera parameter; unchecked: what no other observation checks, left out there.
+    """
+
+    probabilities: Probabilities
+    tested: tuple[Tested, ...]
+    v: Array
+    sigma: Array
+    redundancy: Array
+    w: Array
+    tau: Array
+    critical_tau: float
+    smallest: Array
+    effect: Array
+    statistic: Array
+    sizes: NDArray[np.intp]
+    smallest_together: Array
+    outer: tuple[OuterEffect, ...]
+    unchecked: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        worst = np.abs(self.w).max(initial=0.0)
+        return f"Reliability({len(self.tested)} tested, largest w {worst:.3g}, {len(self.unchecked)} unchecked)"
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Residuals of the observations, and their sums by group."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,15 +10,67 @@ from adjust.least_squares.rows import prior_differences
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.problem.further_observations import square_sum
 from adjust.problem.problem import ABSENT, Problem, State
-from adjust.problem.result import FurtherResidual, Group, Residuals
 from adjust.problem.tested import TestedUnits
 from adjust.quality.reliability import UNCHECKED, Misfits, redundancies, statistics
 from adjust.quality.reweighting import Weighting
+
+Indices = NDArray[np.intp]
 
 Array = NDArray[np.float64]
 
 UM_PER_MM = 1000.0
 NEARLY_ONE = 0.99  # redundancy of a group, below which its residuals say nothing of its standard deviations
+
+
+@dataclass(frozen=True, repr=False)
+class Residuals:
+    """One row an observation of the network, in its order.
+
+    v_mm (n, 2): adjusted less observed comparator coordinates; redundancy (n, 2): redundancy numbers of x and y;
+    w (n, 2): standardised residuals, v / sigma_v where the two coordinates are not correlated (see `Reliability`).
+    """
+
+    v_mm: Array
+    redundancy: Array
+    w: Array
+
+    def __repr__(self) -> str:
+        rms_um = 1000.0 * np.sqrt(np.mean(np.square(self.v_mm), axis=0)) if len(self.v_mm) else np.zeros(2)
+        return f"Residuals({len(self.v_mm)} of rms {rms_um[0]:.3g}, {rms_um[1]:.3g} um)"
+
+
+@dataclass(frozen=True)
+class FurtherResidual:
+    """One observation beside image points and single unknowns, a distance say, in the unit of what is observed.
+
+    group and name as in `FurtherObservation`; v: adjusted less observed; sigma: its a-priori standard deviation;
+    redundancy number; w: v / sigma_v; detectable: the smallest error that its own test finds (Baarda), inf unchecked.
+    """
+
+    group: str
+    name: str
+    observed: float
+    v: float
+    sigma: float
+    redundancy: float
+    w: float
+    detectable: float
+
+
+@dataclass(frozen=True)
+class Group:
+    """A kind of observation: its share of v'Pv over its redundancy (sigma0), rms in um per axis, redundancy.
+
+    sigma0 is 0 and means nothing where the redundancy is below 1: there is no check. `target`, `fiducial`: in the
+    comparator; `control`: given object coordinates, rms in millionths of the object unit; `datum`: given places of
+    fiducials (F5, F6); `interior`, `exterior`: given values of mixed units, rms 0; `distance`: rms 0. The first three
+    are always there.
+    """
+
+    sigma0: float
+    rms_x_um: float
+    rms_y_um: float
+    redundancy: float
 
 
 def residuals(v_mm: Array, found: Misfits | None, weighting: Weighting) -> Residuals:

@@ -21,9 +21,8 @@ from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera
-from adjust.problem.network import Board, Scanner
+from adjust.problem.estimates import Estimates, GivenGroup
 from adjust.problem.parameter import Kind, Parameter
-from adjust.problem.result import Adjustment, GivenGroup
 
 Array = NDArray[np.float64]
 
@@ -44,56 +43,61 @@ class SignificanceTest:
     p: float
 
     @property
+    def is_group(self) -> bool:
+        return len(self.parameters) > 1
+
+    @property
     def significant(self) -> bool:
         return self.p < LEVEL
 
 
-def parameter_tests(adjustment: Adjustment, camera: Camera) -> tuple[SignificanceTest, ...]:
-    """Of every parameter that was estimated: c, x0, y0 where a value is given, and the distortion's."""
-    if not _has_tests(adjustment, camera):
-        return ()
+def significance_tests(estimates: Estimates) -> dict[tuple[str, str], tuple[SignificanceTest, ...]]:
+    """Tests of every parameter that was estimated, then of groups of at least two.
+
+    Parameters
+    ----------
+    estimates : of a network; without a solution nothing is tested
+
+    Returns
+    -------
+    dict
+        By kind and owner. "interior": c, x0, y0 where a value is given, the distortion's parameters, every group of its
+        family, and "all" of them together. "scanner": the terms of the bend. "board": the bends along both axes.
+    """
+    if not estimates.converged:
+        return {}
+    network = estimates.network
+    cameras = (camera for camera in network.cameras if camera.name not in network.idle_cameras)
+    tests = {("interior", camera.name): _camera_tests(estimates, camera) for camera in cameras}
+    tests |= {
+        ("scanner", each.name): _term_tests(estimates, "scanner", each.name, each.terms) for each in network.scanners
+    }
+    for board in network.boards:
+        bends = dict(zip(BOARD_NAMES, board.bends, strict=True))
+        tests["board", board.name] = _term_tests(estimates, "board", board.name, bends)
+    return tests
+
+
+def _camera_tests(estimates: Estimates, camera: Camera) -> tuple[SignificanceTest, ...]:
     interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
-    tests = [_against_given(adjustment, camera.name, name, prior) for name, prior in interior.items()]
-    found = [test for test in tests if test is not None]
-    return (*found, *(_against_zero(adjustment, "interior", camera.name, name, (name,)) for name in _estimated(camera)))
-
-
-def group_tests(adjustment: Adjustment, camera: Camera) -> tuple[SignificanceTest, ...]:
-    """Of every group of the family of which at least two parameters were estimated, and of all of them together."""
-    if not _has_tests(adjustment, camera):
-        return ()
+    given = (_against_given(estimates, camera.name, name, prior) for name, prior in interior.items())
     estimated = _estimated(camera)
     groups = dict(family(camera.distortion.family).groups) | {"all": estimated}
     present = {name: tuple(each for each in members if each in estimated) for name, members in groups.items()}
     several = {name: members for name, members in present.items() if len(members) > 1}
     if len(several) == 2 and len(set(several.values())) == 1:
         del several["all"]
-    return tuple(_against_zero(adjustment, "interior", camera.name, name, members) for name, members in several.items())
+    tested = [(name, (name,)) for name in estimated] + list(several.items())
+    own = (_against_zero(estimates, "interior", camera.name, *each) for each in tested)
+    return (*filter(None, given), *own)
 
 
-def scanner_tests(adjustment: Adjustment, scanner: Scanner) -> tuple[SignificanceTest, ...]:
-    """Of every term of a scanner's bend that was estimated, and of all of them together."""
-    return _of_terms(adjustment, "scanner", scanner.name, scanner.terms)
-
-
-def board_tests(adjustment: Adjustment, board: Board) -> tuple[SignificanceTest, ...]:
-    """Of the bends of a board along each axis that were estimated, and of both together."""
-    return _of_terms(adjustment, "board", board.name, dict(zip(BOARD_NAMES, board.bends, strict=True)))
-
-
-def _of_terms(
-    adjustment: Adjustment, kind: Kind, owner: str, terms: Mapping[str, Prior]
+def _term_tests(
+    estimates: Estimates, kind: Kind, owner: str, terms: Mapping[str, Prior]
 ) -> tuple[SignificanceTest, ...]:
     estimated = tuple(name for name, prior in terms.items() if prior.sigma > 0.0)
-    if not adjustment.converged or not estimated:
-        return ()
-    several = {"all": estimated} if len(estimated) > 1 else {}
-    tested = {name: (name,) for name in estimated} | several
-    return tuple(_against_zero(adjustment, kind, owner, name, members) for name, members in tested.items())
-
-
-def _has_tests(adjustment: Adjustment, camera: Camera) -> bool:
-    return adjustment.converged and camera.name not in adjustment.network.idle_cameras
+    tested = [(name, (name,)) for name in estimated] + ([("all", estimated)] if len(estimated) > 1 else [])
+    return tuple(_against_zero(estimates, kind, owner, *each) for each in tested)
 
 
 def _estimated(camera: Camera) -> tuple[str, ...]:
@@ -102,36 +106,36 @@ def _estimated(camera: Camera) -> tuple[str, ...]:
     return tuple(name for name in names if name in given and given[name].sigma > 0.0)
 
 
-def _against_given(adjustment: Adjustment, camera: str, name: str, prior: Prior | None) -> SignificanceTest | None:
+def _against_given(estimates: Estimates, camera: str, name: str, prior: Prior | None) -> SignificanceTest | None:
     full = Parameter.interior(camera, name)
     if prior is None or prior.sigma == 0.0:
         return None
-    cofactor = float(adjustment.cofactor_of([full])[0, 0])
+    cofactor = float(estimates.cofactor_of([full])[0, 0])
     if np.isfinite(prior.sigma):
         given = prior.sigma**2
-        if GivenGroup("interior", camera) in adjustment.variance.left_out:
-            given /= adjustment.sigma0**2
+        if GivenGroup("interior", camera) in estimates.variance.left_out:
+            given /= estimates.sigma0**2
         redundancy = 1.0 - cofactor / given
         if redundancy < UNCHECKED:
             return None
         cofactor = given * redundancy
-    return _tested(adjustment, name, (name,), np.array([adjustment.value(full) - prior.value]), np.array([[cofactor]]))
+    return _tested(estimates, name, (name,), np.array([estimates.value(full) - prior.value]), np.array([[cofactor]]))
 
 
 def _against_zero(
-    adjustment: Adjustment, kind: Kind, owner: str, name: str, quantities: Sequence[str]
+    estimates: Estimates, kind: Kind, owner: str, name: str, quantities: Sequence[str]
 ) -> SignificanceTest:
     tested = [Parameter(kind, owner, "", each) for each in quantities]
-    return _tested(adjustment, name, tuple(quantities), adjustment.values_of(tested), adjustment.cofactor_of(tested))
+    return _tested(estimates, name, tuple(quantities), estimates.values_of(tested), estimates.cofactor_of(tested))
 
 
 def _tested(
-    adjustment: Adjustment, name: str, parameters: tuple[str, ...], difference: Array, cofactor: Array
+    estimates: Estimates, name: str, parameters: tuple[str, ...], difference: Array, cofactor: Array
 ) -> SignificanceTest:
     scale = np.sqrt(np.diag(cofactor))
     normalised = difference / scale
-    variance = adjustment.sigma0**2
-    r = adjustment.variance.redundancy
+    variance = estimates.sigma0**2
+    r = estimates.variance.redundancy
     if len(parameters) == 1:
         t = float(normalised[0]) / float(np.sqrt(variance))
         one_sided = stdtr(r, -abs(t)) if r > 0 else ndtr(-abs(t))

@@ -19,9 +19,8 @@ from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.linear_algebra.small_matrices import applied, eigen
 from adjust.problem.probabilities import Probabilities
-from adjust.problem.result import Reliability, Suspect
-from adjust.problem.tested import TestedUnits
-from adjust.quality.reliability import UNCHECKED, Misfits, statistics, unit_rows
+from adjust.problem.tested import Tested, TestedUnits
+from adjust.quality.reliability import UNCHECKED, Misfits, Reliability, statistics, unit_rows
 from adjust.quality.reweighting import Weighting, robust_scale
 
 Array = NDArray[np.float64]
@@ -36,6 +35,28 @@ MOST_SUSPECT = 0.25  # part of all that is tested: where more contradicts the re
 MOST_AT_ONCE = 60  # in one adjustment; the next one goes on
 MANY = 500  # image points: the median of so many is not moved by some gross errors
 RAISED = 1.02  # a scale that is larger by less is no other
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """An observation or given quantity that contradicts the others beyond chance, given the other suspects left out.
+
+    size: its coordinates that were tested together; statistic: chi-square with so many degrees of freedom; critical:
+    what chance reaches in 1 of 100 adjustments (`Probabilities.family`). w, tau: of its worst coordinate in the
+    adjustment as it stands; critical_tau: of tau. error: the gross error as the others see it, by coordinate, in mm,
+    object units or rad. alike: what could as well be wrong in its place. removed: the adjustment does without it.
+    """
+
+    tested: Tested
+    size: int
+    statistic: float
+    critical: float
+    w: float
+    tau: float
+    critical_tau: float
+    error: tuple[float, ...]
+    alike: tuple[str, ...]
+    removed: bool
 
 
 @dataclass(frozen=True)
@@ -81,7 +102,7 @@ def _impossible(numbering: Numbering, end: Linearised, error: Array) -> NDArray[
 
 
 @dataclass(frozen=True)
-class Contradiction:
+class GrossError:
     """A unit that contradicts the others, the other such units left out: its statistic, and what chance lets it reach.
 
     error (2,): the gross error as the others see it. alike: units that explain the contradiction as well.
@@ -94,7 +115,7 @@ class Contradiction:
     alike: tuple[int, ...]
 
 
-def contradictions(search: Search) -> list[Contradiction]:
+def contradictions(search: Search) -> list[GrossError]:
     """What contradicts the others beyond its limit, in the order in which it was found.
 
     Where the observations are worse than given, so that everything contradicts everything, limits are raised by their
@@ -278,20 +299,20 @@ def _joint(search: Search, covariance: _Covariance, chosen: Sequence[int]) -> tu
 
 def _contradiction(
     search: Search, covariance: _Covariance, chosen: Sequence[int], unit: int, limits: Array
-) -> Contradiction:
+) -> GrossError:
     errors, joint = _joint(search, covariance, chosen)
     at = chosen.index(unit)
     others = _without(search, covariance, [each for each in chosen if each != unit])
     near = np.flatnonzero((others > limits) & (others > joint[at] - TOLD_APART))
     alike = sorted((int(other) for other in near if other != unit), key=lambda other: -others[other])
     error = search.found.back[unit] @ errors[at]
-    return Contradiction(unit, float(joint[at]), float(limits[unit]), error, tuple(alike))
+    return GrossError(unit, float(joint[at]), float(limits[unit]), error, tuple(alike))
 
 
 def suspects(
     search: Search,
-    contradicting: Sequence[Contradiction],
-    removed: Sequence[Contradiction],
+    contradicting: Sequence[GrossError],
+    removed: Sequence[GrossError],
     result: Reliability,
     probabilities: Probabilities,
     redundancy: int,
@@ -304,7 +325,7 @@ def suspects(
     weakened = (search.weighting.weights < 1.0) & (tests.statistic > reach)
     for unit in map(int, np.flatnonzero(weakened)):
         measured = float(tests.statistic[unit]), float(reach[unit]), tests.error[unit]
-        entries[unit] = Contradiction(unit, *measured, known.get(unit, ()))
+        entries[unit] = GrossError(unit, *measured, known.get(unit, ()))
     count = int((tests.sizes > 0).sum())
     named = []
     for entry in sorted(entries.values(), key=lambda each: -each.statistic / each.limit):

@@ -16,8 +16,8 @@ from scipy.special import fdtr
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_differences
 from adjust.linear_algebra.factor import Factor
+from adjust.problem.estimates import GivenGroup, VarianceFactor
 from adjust.problem.problem import ABSENT, Problem, State
-from adjust.problem.result import GivenGroup, VarianceFactor
 from adjust.problem.tested import TestedUnits
 from adjust.quality.reweighting import Weighting
 

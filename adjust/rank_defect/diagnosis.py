@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.linear_algebra.factor import Factor
+from adjust.problem.estimates import NullDirection
 from adjust.problem.parameter import Parameter, description
 from adjust.problem.problem import Problem, State
-from adjust.problem.result import NullDirection
 from adjust.rank_defect.datum import free_coordinates, object_datum
 from adjust.rank_defect.directions import camera_leads, datum_sentence, field_of, following
 from adjust.rank_defect.flat_valleys import trading_off

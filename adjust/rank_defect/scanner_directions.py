@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.scanner import degree_of, is_left
 from adjust.linear_algebra.factor import Factor
+from adjust.problem.estimates import Cofactor
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
-from adjust.problem.result import Cofactor
 from adjust.rank_defect.directions import Lead
 
 SCANNER_RANK = -2

@@ -13,19 +13,19 @@ from adjust.initial_values.approximations import initial_values
 from adjust.least_squares.iteration import factorise
 from adjust.least_squares.malloc_tuning import keep_freed_memory
 from adjust.least_squares.numbering import Numbering
+from adjust.problem.estimates import Cofactor, VarianceFactor
 from adjust.problem.network import STRAIGHT, Approximations, Network
 from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
-from adjust.problem.result import Adjustment, Cofactor, VarianceFactor
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.rank_defect.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.rank_defect.datum_choice import chosen_coordinates, chosen_points, with_held
-from adjust.solution.assessment import RunAssessment, conditions_of, redundancy_of, variance_of
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
 from adjust.solution.coordinate_blunders import Slip, far_points, few_points, freed, slips
 from adjust.solution.left_out_images import fitting, with_lens, without_images
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import with_plausibility
+from adjust.solution.result import Adjustment, condition_count, redundancy_of_run, variance_of_run
 from adjust.solution.reweighting import Run, again, run
 from adjust.validation import validate
 
@@ -359,16 +359,15 @@ def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
 def _result(given: Problem, last: Run, members: Indices | None, options: Options) -> Adjustment:
     problem, state, weighting = last.problem, last.end.state, last.weighting
     plain = _cofactor(given, last, members)
-    redundancy = redundancy_of(last, plain)
-    variance = variance_of(last, redundancy)
+    redundancy = redundancy_of_run(last, plain)
+    variance = variance_of_run(last, redundancy)
     scaled = _with_given_apart(last, variance)
     cofactor = plain if scaled is last else _cofactor(given, scaled, members)
-    assessment = RunAssessment(last, scaled, cofactor, variance, options.probabilities)
     return Adjustment(
         network=problem.network,
         termination=last.solution.termination,
         iterations=len(last.solution.history),
-        conditions=conditions_of(last, plain),
+        conditions=condition_count(last, plain),
         unknowns=len(last.numbering.free),
         redundancy=redundancy,
         vpv=last.vpv,
@@ -376,7 +375,9 @@ def _result(given: Problem, last: Run, members: Indices | None, options: Options
         parameters=problem.unknowns.parameters,
         values=np.where(_meaningless(problem), np.nan, state.values),
         cofactor=cofactor,
-        assessment=assessment,
+        run=last,
+        scaled=scaled,
+        probabilities=options.probabilities,
         singular=last.singular if last.solution.termination == "singular" else (),
         history=last.solution.history,
         mirrored=problem.mirrored,

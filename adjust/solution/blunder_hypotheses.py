@@ -16,7 +16,7 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from adjust.initial_values.resection import Pose, image_distances
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
-from adjust.problem.result import Adjustment
 from adjust.solution.options import Options
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -23,13 +23,14 @@ from adjust.errors import AdjustmentError
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.probabilities import Probabilities
-from adjust.problem.result import Explanation
-from adjust.quality.snooping import Contradiction, Search, contradictions, rest_without, search
+from adjust.quality.snooping import GrossError, Search, contradictions, rest_without, search
 from adjust.rank_defect.diagnosis import singular_directions
 from adjust.solution.explanation_words import noise_words, sentence
 from adjust.solution.model_hypotheses import ModelHypothesis, apart, model_hypotheses
 from adjust.solution.noise_hypothesis import AddedNoise, added_noise
 from adjust.solution.reweighting import Run, again
+
+Indices = NDArray[np.intp]
 
 Array = NDArray[np.float64]
 
@@ -41,6 +42,21 @@ MOST_ADJUSTED = 4  # hypotheses of a round
 LEFT = 0.5  # of what v'Pv has beyond its redundancy that may remain of what is explained
 WORTH = 0.3  # of the largest fall, to the first order, from which on a hypothesis is adjusted
 STEPS = 20
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What makes residuals larger than the standard deviations given, beyond chance.
+
+    cause: in words with figures; remedy: what to do. kind: "radial", "decentering", "pixels", "groups", "board" or
+    "noise". p: probability of so much by chance; sigma0: without and with it in the model.
+    """
+
+    kind: str
+    cause: str
+    remedy: str
+    p: float
+    sigma0: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -112,7 +128,7 @@ class _Model:
         return bool(chdtrc(self.redundancy, self.vpv) < level)
 
     @cached_property
-    def contradicting(self) -> list[Contradiction]:
+    def contradicting(self) -> list[GrossError]:
         return contradictions(self._search) if self.has_suspects else []
 
     @cached_property

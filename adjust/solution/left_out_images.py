@@ -11,7 +11,7 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 
 FITTING = 3.0  # times sigma0 of the others, up to which the standardised residuals of an image agree with them
 FEWEST_RAYS = 2  # of a point that is not known

@@ -12,15 +12,16 @@ from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.condition_equations import blind_marks, computed_observations
+from adjust.problem.estimates import NullDirection
 from adjust.problem.further_observations import at_computed
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
-from adjust.problem.result import Adjustment, NullDirection
 from adjust.quality.cofactor import free_cofactor
 from adjust.rank_defect.null_space import null_vectors
 from adjust.solution.adjustment import Options, adjust_problem, with_datum
+from adjust.solution.result import Adjustment
 from adjust.validation import validate_plan
 
 Array = NDArray[np.float64]

@@ -16,9 +16,9 @@ from adjust.problem.camera import Camera
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment
 from adjust.solution.blunder_hypotheses import Tried, explains, mirrored_images, y_downward
 from adjust.solution.model_hypotheses import known_places
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -13,13 +13,13 @@ from adjust.least_squares.iteration import Linearised, Solution, iterate, linear
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.condition_equations import blind_marks
+from adjust.problem.estimates import NullDirection, Termination
 from adjust.problem.problem import Problem, State
-from adjust.problem.result import NullDirection, Termination
 from adjust.problem.tested import TestedUnits
 from adjust.quality.cofactor import free_cofactor
 from adjust.quality.reliability import Misfits, misfits, statistics
 from adjust.quality.reweighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
-from adjust.quality.snooping import Contradiction, contradictions, limits, search
+from adjust.quality.snooping import GrossError, contradictions, limits, search
 from adjust.quality.variance_components import refined_factors
 from adjust.rank_defect.diagnosis import singular_directions
 from adjust.rank_defect.flat_valleys import (
@@ -61,7 +61,7 @@ class Run:
     singular: tuple[NullDirection, ...]
     factor: Factor
     settled: bool = True
-    removed: tuple[Contradiction, ...] = ()
+    removed: tuple[GrossError, ...] = ()
 
     @cached_property
     def found(self) -> Misfits | None:
@@ -152,7 +152,7 @@ def _snooping(problem: Problem, options: Options, doubted: Collection[int]) -> R
     if doubted and last.found is not None:
         tests = statistics(last.found, last.weighting.weights)
         left_out = map(int, _units_of(TestedUnits(problem), doubted))
-        removed = (Contradiction(unit, float(tests.statistic[unit]), 0.0, tests.error[unit], ()) for unit in left_out)
+        removed = (GrossError(unit, float(tests.statistic[unit]), 0.0, tests.error[unit], ()) for unit in left_out)
         last = replace(last, removed=tuple(removed))
     last = _snooped(last, plain)
     if not options.groups:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import Network
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
 from pipeline.adjusting.scanners import with_scanners

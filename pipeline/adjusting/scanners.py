@@ -6,7 +6,7 @@ from dataclasses import replace
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
 from adjust.model_selection.scanner_choice import choose_bends, with_bends
 from adjust.problem.network import Network
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.project_file import Project

@@ -13,7 +13,7 @@ from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 from pipeline.opencv_check.opencv_calibration import ImagePoints, can_begin
 from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, Freedom
 

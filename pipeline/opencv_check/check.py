@@ -17,8 +17,8 @@ import numpy as np
 from adjust.errors import AdjustmentError
 from adjust.problem.camera import Camera
 from adjust.problem.parameter import Parameter, description
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate, calibrate_fisheye
 from pipeline.opencv_check.opencv_conversion import Converted, converted

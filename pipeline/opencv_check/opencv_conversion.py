@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens_conversion import convert_lens
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem
 from pipeline.opencv_check.opencv_model import FISHEYE, fixed, opencv_values, to_opencv_model
 

@@ -20,10 +20,10 @@ from adjust.problem.camera import Camera
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import EXTERIOR_NAMES, Board, Image, ObjectPoint, Scanner
 from adjust.problem.parameter import Kind, Parameter
-from adjust.problem.result import Adjustment, Contradiction, FurtherResidual
-from adjust.quality.correlation import correlations
-from adjust.quality.lens_reach import lens_reach
-from adjust.quality.significance import SignificanceTest, board_tests, group_tests, parameter_tests, scanner_tests
+from adjust.quality.contradiction import CalibrationTest
+from adjust.quality.residuals import FurtherResidual
+from adjust.quality.significance import SignificanceTest
+from adjust.solution.result import Adjustment
 from pipeline.results.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.results.covariance_arrays import covariance_arrays, covariance_note
 from pipeline.results.fingerprints import of_file
@@ -111,7 +111,7 @@ def adjustment_json(adjustment: Adjustment, frames_mm: Mapping[str, tuple[float,
                 "cause": each.cause,
                 "remedy": each.remedy,
             }
-            for each in correlations(adjustment)
+            for each in adjustment.correlations
         ],
         "warnings": list(adjustment.warnings),
         "notes": list(adjustment.notes),
@@ -164,7 +164,7 @@ def _texts(parameters: Sequence[Parameter]) -> list[str]:
 
 def _camera(adjustment: Adjustment, camera: Camera) -> Json:
     idle = camera.name in adjustment.network.idle_cameras
-    tests = {test.name: {"t": test.statistic, "p": test.p} for test in parameter_tests(adjustment, camera)}
+    tests, together = _single_and_together(adjustment, "interior", camera.name)
 
     def quantity(name: str, given: Prior | None) -> Json:
         known = _quantity(adjustment, Parameter.interior(camera.name, name), given)
@@ -181,7 +181,7 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
             "y": quantity("y0", camera.y0_mm),
         },
         "distortion": distortion,
-        "significance": [_group_test(test) for test in group_tests(adjustment, camera)],
+        "significance": together,
         "fiducials": {
             id: {
                 "x_mm": _quantity(adjustment, x, fiducial.x_mm),
@@ -196,9 +196,7 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
 
 def _lens_known(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float] | None) -> Json:
     """How far out the lens is known; nothing where there is no solution, or no target."""
-    if not adjustment.converged or camera.name in adjustment.network.idle_cameras:
-        return {}
-    reach = lens_reach(adjustment, camera, frame_mm)
+    reach = adjustment.lens_reach(camera, frame_mm)
     return {} if reach is None else {"lens_known": asdict(reach) | {"share": reach.share}}
 
 
@@ -216,7 +214,7 @@ def distortion_settings(distortion: Distortion) -> Json:
 
 def _scanner(adjustment: Adjustment, scanner: Scanner) -> Json:
     """How far the scanner puts a point beside its place, in mm, as products of Legendre polynomials over an extent."""
-    terms, together = _terms(adjustment, "scanner", scanner.name, scanner.terms, scanner_tests(adjustment, scanner))
+    terms, together = _terms(adjustment, "scanner", scanner.name, scanner.terms)
     extent = {"center_mm": list(scanner.center_mm), "half_mm": list(scanner.half_mm)}
     return {**extent, "terms": terms, "significance": together}
 
@@ -224,22 +222,25 @@ def _scanner(adjustment: Adjustment, scanner: Scanner) -> Json:
 def _board(adjustment: Adjustment, board: Board) -> Json:
     """How far the board's middle stands off its plane, in object units, along each axis; points: how many it has."""
     bends = dict(zip(BOARD_NAMES, board.bends, strict=True))
-    terms, together = _terms(adjustment, "board", board.name, bends, board_tests(adjustment, board))
+    terms, together = _terms(adjustment, "board", board.name, bends)
     return {"points": len(board.places), **terms, "significance": together}
 
 
-def _terms(
-    adjustment: Adjustment, kind: Kind, owner: str, terms: Mapping[str, Prior], of_terms: Sequence[SignificanceTest]
-) -> tuple[Json, list[Json]]:
+def _terms(adjustment: Adjustment, kind: Kind, owner: str, terms: Mapping[str, Prior]) -> tuple[Json, list[Json]]:
     """Every term with its test, and the test of all together."""
-    tests = {test.name: test for test in of_terms}
-    together = tests.pop("all", None)
+    tests, together = _single_and_together(adjustment, kind, owner)
     quantities = {
-        name: _quantity(adjustment, Parameter(kind, owner, "", name), prior)
-        | ({"t": tests[name].statistic, "p": tests[name].p} if name in tests else {})
+        name: _quantity(adjustment, Parameter(kind, owner, "", name), prior) | tests.get(name, {})
         for name, prior in terms.items()
     }
-    return quantities, [_group_test(together)] if together else []
+    return quantities, together
+
+
+def _single_and_together(adjustment: Adjustment, kind: Kind, owner: str) -> tuple[dict[str, Json], list[Json]]:
+    """Tests of significance: of single parameters by name, and of groups."""
+    tests = adjustment.significance.get((kind, owner), ())
+    single = {test.name: {"t": test.statistic, "p": test.p} for test in tests if not test.is_group}
+    return single, [_group_test(test) for test in tests if test.is_group]
 
 
 def _group_test(test: SignificanceTest) -> Json:
@@ -366,7 +367,7 @@ def _named(adjustment: Adjustment, group: str) -> list[Json]:
     ]
 
 
-def _contradiction(test: Contradiction) -> Json:
+def _contradiction(test: CalibrationTest) -> Json:
     """An earlier calibration as a whole: whether the images contradict it, and in what, the most telling first."""
     return {
         "F": test.statistic,

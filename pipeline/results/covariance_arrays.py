@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

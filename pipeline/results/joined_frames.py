@@ -11,7 +11,7 @@ from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Image, Network
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from adjust.problem.result import Adjustment, Reliability, Suspect
 from adjust.problem.tested import Tested
+from adjust.quality.reliability import Reliability
+from adjust.quality.snooping import Suspect
+from adjust.solution.result import Adjustment
 
 Json = dict[str, Any]
 

@@ -12,7 +12,7 @@ from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Approximations, Image, Network, Transformation
 from adjust.problem.observations import ObservationKind, Observations
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,8 @@ from simulated import STATIONS, field_points
 
 from adjust.problem.network import Approximations, Network
 from adjust.problem.observations import Observations
-from adjust.problem.result import Adjustment
-from adjust.quality.correlation import correlations
 from adjust.solution.adjustment import Options
+from adjust.solution.result import Adjustment
 
 
 def sentences(result: Adjustment) -> list[str]:
@@ -19,7 +18,7 @@ def sentences(result: Adjustment) -> list[str]:
     return [
         *(f"{each.cause} {each.remedy}" for each in result.singular),
         *result.warnings,
-        *(f"{each.cause} {each.remedy}" for each in correlations(result)),
+        *(f"{each.cause} {each.remedy}" for each in result.correlations),
     ]
 
 

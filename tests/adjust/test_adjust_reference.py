@@ -10,8 +10,8 @@ from reference_cases import CAMERA, Case, approximations_of, load, network_of, o
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Network
 from adjust.problem.observations import Observations
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 
 CASES = (
     "i_five_images_affine_reduced",

@@ -20,8 +20,8 @@ from adjust.problem.network import Board, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import number
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
 from adjust.problem.network import Network, ObjectPoint
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,6 @@ from mishaps import MISHAPS, sentences
 from setups import CONVERGENT, FREE, Setup, given, vertical
 from simulated import STATIONS
 
-from adjust.quality.correlation import correlations
 from adjust.solution.adjustment import adjust
 
 LOW_RELIEF = Setup(vertical(0.0, 0.0, 0.0, 0.0), relief=20.0, prior=1.0)
@@ -18,7 +17,7 @@ def test_flying_height_and_principal_distance_are_told() -> None:
     """With fixed fiducials nothing is taken out: the correlation is that of the cofactor matrix."""
     network, start = LOW_RELIEF.network()
     result = adjust(given(network, {"x": 0.0, "y": 0.0}), start)
-    first = correlations(result)[0]
+    first = result.correlations[0]
     assert [each.text for each in first.parameters] == ["IO.K.c", "EO.*.Z0"]
     assert "c of camera K and Z0 of all images are correlated by" in first.cause
     assert "flying height and principal distance trade off" in first.cause
@@ -34,7 +33,7 @@ def test_the_datum_of_the_fiducials_does_not_hide_a_correlation() -> None:
     """Priors of 1 mm, of 0.1 mm or of 10 mm on fiducials that no image contradicts: the same correlations."""
     network, start = LOW_RELIEF.network()
     found = [
-        correlations(adjust(given(network, {"x": s, "y": s, "c": FREE, "x0": FREE, "y0": FREE}), start))
+        adjust(given(network, {"x": s, "y": s, "c": FREE, "x0": FREE, "y0": FREE}), start).correlations
         for s in (0.1, 1.0, 10.0)
     ]
     assert [each.parameters for each in found[0]] == [each.parameters for each in found[2]]
@@ -47,7 +46,7 @@ def test_the_remedy_lowers_the_correlation() -> None:
     """Relief of 500 m, and images tilted by 20 degrees: c and Z0 are no longer told."""
     tilted = replace(LOW_RELIEF, attitudes=CONVERGENT, relief=500.0)
     for setup, told in ((LOW_RELIEF, True), (tilted, False)):
-        pairs = [each.parameters[0].text for each in correlations(adjust(*setup.network()))]
+        pairs = [each.parameters[0].text for each in adjust(*setup.network()).correlations]
         assert ("IO.K.c" in pairs) == told
 
 
@@ -58,13 +57,13 @@ def test_a_wider_field_tells_the_principal_point_from_tilts_and_decentering() ->
     points = np.random.default_rng(4).uniform(-1.0, 1.0, (20, 3)) * [1100.0, 1100.0, 300.0]
     free = {"k3": FREE, "p1": FREE, "p2": FREE}
     wide = Setup(vertical(0.0, 0.0, 0.0, 0.0), prior=10.0, points=points, distortion=free)
-    assert correlations(adjust(*wide.network())) == ()
+    assert adjust(*wide.network()).correlations == ()
 
 
 def test_a_turn_of_the_camera_about_its_axis_changes_nothing() -> None:
     """Directions are those of the camera: kappa of 90 degrees takes X0 for Y0 and leaves the correlation."""
     one, other = (
-        list(correlations(adjust(*Setup(vertical(k), STATIONS[:1], 20.0, prior=1.0).network())))
+        list(adjust(*Setup(vertical(k), STATIONS[:1], 20.0, prior=1.0).network()).correlations)
         for k in (0.0, np.pi / 2)
     )
     by_x0 = [next(each for each in found if each.parameters[0].text == "IO.K.x0") for found in (one, other)]
@@ -73,7 +72,7 @@ def test_a_turn_of_the_camera_about_its_axis_changes_nothing() -> None:
 
 def test_powers_of_the_radius_and_decentering_are_told() -> None:
     setup = Setup(CONVERGENT, prior=1.0, distortion={"k3": FREE, "k5": FREE, "k7": FREE})
-    found = correlations(adjust(*setup.network()))
+    found = adjust(*setup.network()).correlations
     powers = [each for each in found if each.parameters[0].text.startswith("IO.K.k")]
     assert powers
     assert all("neighbouring powers of the radius" in each.cause for each in powers)
@@ -81,4 +80,4 @@ def test_powers_of_the_radius_and_decentering_are_told() -> None:
 
 
 def test_nothing_is_told_without_a_solution() -> None:
-    assert correlations(adjust(*Setup(CONVERGENT).network())) == ()
+    assert adjust(*Setup(CONVERGENT).network()).correlations == ()

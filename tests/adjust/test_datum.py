@@ -16,9 +16,9 @@ from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Fiducial
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Image, Network, ObjectPoint
 from adjust.problem.problem import number
-from adjust.problem.result import Adjustment
 from adjust.rank_defect.datum import object_datum
 from adjust.solution.adjustment import Datum, Options, adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,9 @@ from adjust.problem.camera import Fiducial
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.observations import Calibration, Observations
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment, Contradiction
+from adjust.quality.contradiction import CalibrationTest
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 
 def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, Approximations], ...]:
@@ -224,7 +225,7 @@ def test_a_contradiction_is_told_beside_what_the_marks_show() -> None:
     c, x0 = (calibration.parameters.index(Parameter.interior("K", name)) for name in ("c", "x0"))
     along_x = np.array([each.quantity in ("x0", "x") for each in calibration.parameters])
 
-    def found(change: NDArray[np.float64]) -> Contradiction:
+    def found(change: NDArray[np.float64]) -> CalibrationTest:
         given = with_calibration(b, replace(calibration, values=calibration.values + change))
         (told,) = adjust(given, start_b).contradictions
         return told

@@ -24,8 +24,8 @@ from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
 from adjust.problem.network import Network, Transformation
 from adjust.problem.observations import Observations
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,8 @@ from adjust.functional_model.projection import ideal_from_observed
 from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
-from adjust.problem.result import Adjustment
-from adjust.quality.lens_reach import lens_reach
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 
@@ -167,7 +166,7 @@ def test_how_far_out_the_lens_is_known() -> None:
     """The outermost corner of the board against the picture's, and a standard deviation that grows beyond."""
     result = adjust(board_network(0, EIGHT))
     camera = result.network.cameras[0]
-    reach = lens_reach(result, camera, (float(FRAME_MM[0]), float(FRAME_MM[1])))
+    reach = result.lens_reach(camera, (float(FRAME_MM[0]), float(FRAME_MM[1])))
     assert reach is not None
     x0, y0 = result.value("IO.cam.x0"), result.value("IO.cam.y0")
     offsets = result.network.observations.xy_mm - (x0, y0)
@@ -176,6 +175,6 @@ def test_how_far_out_the_lens_is_known() -> None:
     assert reach.share == pytest.approx(reach.radius_mm / reach.corner_mm)
     assert reach.sigma_um < 3.0
     assert not reach.corner_sigma_um < 20.0
-    unknown = lens_reach(result, camera, None)
+    unknown = result.lens_reach(camera)
     assert unknown is not None
     assert np.isnan(unknown.corner_mm)

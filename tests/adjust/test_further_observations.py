@@ -15,9 +15,9 @@ from adjust.least_squares.numbering import Numbering
 from adjust.problem.network import Exterior, Network, ObjectPoint
 from adjust.problem.observations import Distance
 from adjust.problem.problem import number
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.planning import plan
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

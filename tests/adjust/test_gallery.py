@@ -11,8 +11,8 @@ from setups import CONVERGENT, Setup, given
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import Approximations, Exterior, Network, Transformation
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
     "Shift x": [

@@ -14,8 +14,8 @@ from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.lens_conversion import convert_lens
 from adjust.initial_values.approximations import approximate
 from adjust.problem.network import Network
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

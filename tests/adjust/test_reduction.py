@@ -10,8 +10,8 @@ from simulated import Truth, field_points, simulated
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import Approximations, LineOfSight, Network, ObjectPoint
 from adjust.problem.reduction import Reduction
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Datum, Options, adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -15,8 +15,9 @@ from adjust.problem.network import Approximations, Exterior, Network
 from adjust.problem.observations import Calibration, ObservationKind
 from adjust.problem.parameter import Parameter
 from adjust.problem.probabilities import Probabilities
-from adjust.problem.result import Adjustment, Reliability
+from adjust.quality.reliability import Reliability
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,8 @@ from adjust.functional_model.scanner import Bend, carriage_terms, smooth_terms
 from adjust.initial_values.approximations import approximate
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network, Scanner, Transformation
-from adjust.problem.result import Adjustment
-from adjust.quality.significance import scanner_tests
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 
@@ -196,7 +195,7 @@ def test_claimed_sigmas_are_realised() -> None:
 def test_the_bend_is_tested_for_significance() -> None:
     network = films([0.0, 90.0, 180.0, 270.0], {"a20": 0.02}, free("a20", "b02"), np.random.default_rng(2))
     result = solved(network)
-    tests = {test.name: test for test in scanner_tests(result, network.scanners[0])}
+    tests = {test.name: test for test in result.significance["scanner", network.scanners[0].name]}
     assert tests["a20"].p < 1e-6
     assert tests["b02"].p > 0.01
     without = solved(replace(network, scanners=(Scanner("S"),)))

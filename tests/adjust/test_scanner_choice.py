@@ -11,8 +11,8 @@ from simulated import STATIONS, Truth, field_points, simulated
 from adjust.initial_values.approximations import approximate
 from adjust.model_selection.scanner_choice import choose_bends, with_bends
 from adjust.problem.network import Approximations, Network
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 QUARTERS = [0.0, 90.0, 180.0, 270.0]
 

@@ -9,9 +9,9 @@ from simulated import Truth, field_points, simulated
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import Network
-from adjust.problem.result import Adjustment
-from adjust.quality.significance import group_tests, parameter_tests
+from adjust.quality.significance import SignificanceTest
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 
 FREE = dict.fromkeys(("k3", "k5", "p1", "p2"), np.inf)
 
@@ -22,10 +22,13 @@ def with_free(network: Network, *names: str) -> Network:
     return replace(network, cameras=(replace(camera, distortion=distortion),))
 
 
+def significance_of(adjustment: Adjustment) -> dict[str, SignificanceTest]:
+    camera = adjustment.network.cameras[0].name
+    return {test.name: test for test in adjustment.significance["interior", camera]}
+
+
 def p_of(adjustment: Adjustment) -> dict[str, float]:
-    camera = adjustment.network.cameras[0]
-    tests = [*parameter_tests(adjustment, camera), *group_tests(adjustment, camera)]
-    return {test.name: test.p for test in tests}
+    return {name: test.p for name, test in significance_of(adjustment).items()}
 
 
 def test_a_pairs_f_test_is_that_of_the_adjustments_with_and_without_it() -> None:
@@ -34,8 +37,7 @@ def test_a_pairs_f_test_is_that_of_the_adjustments_with_and_without_it() -> None
     network, start = simulated(np.random.default_rng(4), truth, points=field_points(np.random.default_rng(1), 20))
     both, without = (adjust(with_free(network, *names), start) for names in (("k3", "p1", "p2"), ("k3",)))
     f = (without.vpv - both.vpv) / 2 / both.sigma0**2
-    camera = both.network.cameras[0]
-    pair = next(test for test in group_tests(both, camera) if test.name == "decentering")
+    pair = significance_of(both)["decentering"]
     assert pair.parameters == ("p1", "p2")
     assert pair.statistic == pytest.approx(f, rel=1e-3)
     assert pair.p == pytest.approx(stats.f.sf(f, 2, both.redundancy), rel=1e-2)
@@ -65,10 +67,8 @@ def test_superfluous_parameters_have_evenly_spread_p() -> None:
 def test_what_is_fixed_or_without_a_solution_is_not_tested() -> None:
     network, start = simulated(np.random.default_rng(2))
     result = adjust(network, start)
-    assert {test.name for test in parameter_tests(result, network.cameras[0])} == {"c", "x0", "y0"}
-    assert group_tests(result, network.cameras[0]) == ()
-    diverged = replace(result, termination="diverged")
-    assert parameter_tests(diverged, network.cameras[0]) == ()
+    assert set(significance_of(result)) == {"c", "x0", "y0"}
+    assert replace(result, termination="diverged").significance == {}
 
 
 def test_sets_are_tested_by_degree() -> None:
@@ -77,7 +77,7 @@ def test_sets_are_tested_by_degree() -> None:
     free = dict.fromkeys(truth.distortion, np.inf)
     network, start = simulated(np.random.default_rng(3), truth, points=points, free=free)
     result = adjust(network, start)
-    tests = {test.name: test for test in group_tests(result, network.cameras[0])}
+    tests = {name: test for name, test in significance_of(result).items() if test.is_group}
     assert list(tests) == ["degree 2", "degree 3", "degree 4", "all"]
     assert tests["degree 3"].significant
     assert tests["all"].significant

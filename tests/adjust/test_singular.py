@@ -11,8 +11,8 @@ from simulated import Truth, field_points, simulated
 from adjust.problem.network import Network
 from adjust.problem.observations import Observations
 from adjust.problem.parameter import CODES
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Datum, Options, adjust
+from adjust.solution.result import Adjustment
 
 SINGULAR = ("K2D_vert0", "K3D_conv", "U3D_vert0", "H2D_vertcross")
 

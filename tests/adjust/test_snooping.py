@@ -10,8 +10,8 @@ from simulated import Truth, field_points, simulated
 from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Fiducial
 from adjust.problem.network import Approximations, Network
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

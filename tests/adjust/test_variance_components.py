@@ -14,8 +14,8 @@ from adjust.least_squares.rows import prior_root_weights
 from adjust.problem.condition_equations import compute, derivatives
 from adjust.problem.network import Approximations, Network
 from adjust.problem.problem import State, number
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

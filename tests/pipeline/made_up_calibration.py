@@ -6,29 +6,21 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Distortion, Prior
+from adjust.least_squares.iteration import Iteration
 from adjust.problem.camera import Camera, Fiducial
+from adjust.problem.estimates import NullDirection, VarianceFactor
 from adjust.problem.network import Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import (
-    Adjustment,
-    Contradiction,
-    Explanation,
-    FurtherResidual,
-    Group,
-    Iteration,
-    NullDirection,
-    Reliability,
-    Residuals,
-    Suspect,
-    VarianceFactor,
-)
+from adjust.problem.probabilities import Probabilities
+from adjust.quality.residuals import Group, Residuals
+from adjust.solution.result import Adjustment
 from measure.flags import Cause, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline.report import ReportData, Thumbnail
@@ -89,24 +81,19 @@ class Dense:
         return self.matrix[groups[:, :, None], groups[:, None, :]]
 
 
-@dataclass(frozen=True)
-class Told:
-    """What is told of the observations, all of it there beforehand."""
+@dataclass(frozen=True, repr=False)
+class MadeUpAdjustment(Adjustment):
+    """Without a run: what it says of its observations is there beforehand, by the property's name."""
 
-    residuals: Residuals
-    groups: Mapping[str, Group]
-    further: tuple[FurtherResidual, ...] = ()
-    contradictions: tuple[Contradiction, ...] = ()
-    variance_sigmas: Mapping[str, float] = field(default_factory=dict)
-    reliability: Reliability | None = None
-    suspects: tuple[Suspect, ...] = ()
-    explanations: tuple[Explanation, ...] = ()
-    warnings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    known: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        nothing = dict.fromkeys(("further", "contradictions", "suspects", "explanations", "warnings", "notes"), ())
+        self.__dict__.update({**nothing, "reliability": None, "variance_sigmas": {}, **self.known})
 
 
 @cache
-def adjustment() -> Adjustment:
+def adjustment() -> MadeUpAdjustment:
     """Converged, sigma0 within its bounds, no observation suspect; f2 is mirrored, its film sheared."""
     rng = np.random.default_rng(7)
     ids, targets_mm = tuple(str(i + 1) for i in range(POINTS)), rng.uniform(-100.0, 100.0, (POINTS, 2))
@@ -119,7 +106,11 @@ def adjustment() -> Adjustment:
     correlation = np.eye(len(parameters))
     c, k3 = (parameters.index(Parameter.interior(CAMERA, name)) for name in ("c", "k3"))
     correlation[c, k3] = correlation[k3, c] = -0.95
-    return Adjustment(
+    return MadeUpAdjustment(
+        run=cast(Any, None),
+        scaled=cast(Any, None),
+        probabilities=Probabilities(),
+        mirrored=frozenset(),
         network=network,
         termination="converged",
         iterations=6,
@@ -131,14 +122,14 @@ def adjustment() -> Adjustment:
         parameters=parameters,
         values=values,
         cofactor=Dense(correlation * np.outer(sigmas, sigmas)),
-        assessment=Told(
-            Residuals(v, redundancy, w),
-            groups={
+        known={
+            "residuals": Residuals(v, redundancy, w),
+            "groups": {
                 "target": Group(1.02, 3.1, 3.2, 190.0),
                 "fiducial": Group(0.97, 2.2, 2.1, 67.0),
                 "control": Group(0.0, 0.0, 0.0, 0.0),
             },
-        ),
+        },
         singular=(),
         history=(
             Iteration(4.1e6, 5e4, 1e-3, 2),

@@ -16,8 +16,9 @@ from two_cameras import two_cameras
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from adjust.problem.parameter import Parameter
-from adjust.problem.result import Adjustment, Residuals
+from adjust.quality.residuals import Residuals
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
 from pipeline.results import covariance_arrays
 from pipeline.results.adjustment_file import write_adjustment
@@ -90,10 +91,10 @@ def test_residuals_stand_in_the_scan_and_in_the_camera(adjustment: Adjustment, p
 def test_w_is_the_larger_of_the_two_axes_with_its_sign(adjustment: Adjustment, tmp_path: Path) -> None:
     w = adjustment.residuals.w.copy()
     w[0], w[1], w[2] = (1.0, -2.5), (np.nan, 0.5), (np.nan, np.nan)
-    told = made_up_calibration.Told(
-        Residuals(adjustment.residuals.v_mm, adjustment.residuals.redundancy, w), adjustment.groups
-    )
-    write_adjustment(replace(adjustment, assessment=told), tmp_path / "adjustment.json")
+    residuals = Residuals(adjustment.residuals.v_mm, adjustment.residuals.redundancy, w)
+    made_up = made_up_calibration.adjustment()
+    changed = replace(made_up, known={**made_up.known, "residuals": residuals})
+    write_adjustment(changed, tmp_path / "adjustment.json")
     rows = read_adjustment(tmp_path / "adjustment.json")["residuals"]
     assert [row["w"] for row in rows[:3]] == [-2.5, 0.5, None]
 

@@ -14,8 +14,8 @@ from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Image, Network
 from adjust.problem.observations import ObservationKind, Observations
-from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 from pipeline.report.fiducials import Figure, figure_of_films
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from test_cases import write_project
 from adjust.errors import AdjustmentError
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.network import EXTERIOR_NAMES
-from adjust.problem.result import Adjustment
+from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project

@@ -1,0 +1,211 @@
+"""The result of an adjustment: estimates, residuals and their tests, messages; each computed where it is asked for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.least_squares.iteration import Iteration
+from adjust.problem.camera import Camera
+from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
+from adjust.problem.probabilities import Probabilities
+from adjust.problem.tested import TestedUnits
+from adjust.quality.contradiction import CalibrationTest, calibration_tests
+from adjust.quality.correlation import Correlation, correlations
+from adjust.quality.lens_reach import LensReach, lens_reach
+from adjust.quality.reliability import Misfits, Reliability, reliability
+from adjust.quality.residuals import FurtherResidual, Group, Residuals, further_residuals, groups, residuals
+from adjust.quality.significance import SignificanceTest, significance_tests
+from adjust.quality.snooping import Suspect, contradictions, search, suspects
+from adjust.quality.variance_components import factor_sigmas
+from adjust.quality.variance_factor import variance_factor
+from adjust.rank_defect.flat_valleys import held_directions, inseparable
+from adjust.solution.explanations import Explained, Explanation, explain
+from adjust.solution.reweighting import Run
+from adjust.solution.warnings import run_warnings
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, repr=False)
+class Adjustment(Estimates):
+    """An adjusted network and what its observations say of it.
+
+    run: the last adjustment, in reduced coordinates; scaled: the same with the priors that the cofactor matrix has.
+    weights (n,): the factors that robust estimation left on the weights of the observations, 1 without it.
+    variance_factors: the factors found for the variances of groups, where asked for.
+    remarks: on how the adjustment came about, the first of the warnings.
+    slips: sentences on given points so far off that the observations do not agree, or have no solution, for them.
+    left_out: by name, the images for which no orientation was found, and why; the network is that of the others.
+    misread: sentences on images that are mirrored; what else there seems to be is theirs.
+    unused: notes on what was given and has no part, the first of the notes.
+    """
+
+    run: Run
+    scaled: Run
+    probabilities: Probabilities
+    iterations: int
+    conditions: int
+    unknowns: int
+    redundancy: int
+    vpv: float
+    singular: tuple[NullDirection, ...]
+    history: tuple[Iteration, ...]
+    weights: Array = field(default_factory=lambda: np.empty(0))
+    variance_factors: Mapping[str, float] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    slips: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    misread: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        return residuals(self.run.end.v_mm, self._misfits, self.run.weighting)
+
+    @cached_property
+    def groups(self) -> Mapping[str, Group]:
+        """The kinds of observations, with their share of v'Pv."""
+        run = self.run
+        return groups(run.problem, run.end.state, run.end.v_mm, self._misfits, run.weighting, self.further)
+
+    @cached_property
+    def further(self) -> tuple[FurtherResidual, ...]:
+        """The residuals of distances and the like."""
+        run, delta = self.run, self.probabilities.noncentrality(1)
+        of_state = run.problem, run.end.state, run.end.rows.further
+        return tuple(further_residuals(*of_state, run.solution.factor, delta))
+
+    @cached_property
+    def contradictions(self) -> tuple[CalibrationTest, ...]:
+        """What the images say against earlier calibrations as wholes."""
+        run = self.run
+        if not run.has_solution or not run.problem.further:
+            return ()
+        of_state = run.problem, run.end.state, run.end.rows.further
+        vpv = self.variance.sigma0**2 * self.variance.redundancy
+        return tuple(calibration_tests(*of_state, run.factor, vpv, round(self.variance.redundancy)))
+
+    @cached_property
+    def variance_sigmas(self) -> Mapping[str, float]:
+        """The standard deviations of the variance factors."""
+        run, found = self.run, self._misfits
+        if found is None or not run.weighting.factors:
+            return {}
+        return factor_sigmas(run.numbering, run.end, run.factor, found, run.weighting)
+
+    @cached_property
+    def reliability(self) -> Reliability | None:
+        """Baarda's inner and outer reliability; None where there is no solution."""
+        return _reliability(self.run, self.variance, self.probabilities)
+
+    @cached_property
+    def correlations(self) -> tuple[Correlation, ...]:
+        """High correlations of cameras' parameters, the highest first."""
+        return correlations(self)
+
+    @cached_property
+    def significance(self) -> Mapping[tuple[str, str], tuple[SignificanceTest, ...]]:
+        """Tests by kind ("interior", "scanner", "board") and owner, of single parameters, then of groups."""
+        return significance_tests(self)
+
+    def lens_reach(self, camera: Camera, frame_mm: tuple[float, float] | None = None) -> LensReach | None:
+        """How far out the lens of a camera is known; None without a solution or without targets.
+
+        Parameters
+        ----------
+        camera : of the network
+        frame_mm : width and height of the picture in mm, None where they are not known
+        """
+        has_lens = self.converged and camera.name not in self.network.idle_cameras
+        return lens_reach(self, camera, frame_mm) if has_lens else None
+
+    @cached_property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """What contradicts the others, the worst first: beside what explains the residuals of all."""
+        if self.misread:
+            return ()
+        run, variance = self._explained.run, self.variance
+        if run is not self.run:
+            variance = variance_of_run(run, redundancy_of_run(run, self.cofactor))
+        tested = _reliability(run, variance, self.probabilities) if run is not self.run else self.reliability
+        found = run.found if run.has_solution else None
+        if found is None or tested is None:
+            return ()
+        tests = search(run.numbering, run.end, run.factor, found, run.weighting, self.probabilities)
+        gross = contradictions(tests)
+        return suspects(tests, gross, run.removed, tested, self.probabilities, round(variance.redundancy))
+
+    @cached_property
+    def explanations(self) -> tuple[Explanation, ...]:
+        """Of a sigma0 that is too large; suspects are then those of an adjustment with them in the model."""
+        return () if self.misread else self._explained.explanations
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should look at; where slips kept it from a solution, all else there seems to be is theirs."""
+        left_out = (f"Left out of the adjustment: {reason}" for reason in self.left_out.values())
+        own = () if self.slips and not self.converged else run_warnings(self.scaled, self.cofactor, self.residuals)
+        return (*self.misread, *self.slips, *left_out, *self.remarks, *own)
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What is worth knowing and needs no action."""
+        run = self.run
+        found = inseparable(run.problem, run.end.state, self.cofactor.variances) if run.converged else ()
+        return (*self.unused, *found)
+
+    @cached_property
+    def _explained(self) -> Explained:
+        return explain(self.run, redundancy_of_run(self.run, self.cofactor), self.probabilities)
+
+    @property
+    def _misfits(self) -> Misfits | None:
+        return self.run.found if self.run.has_solution else None
+
+    def __repr__(self) -> str:
+        return (
+            f"Adjustment({self.termination} after {self.iterations} iterations: {self.conditions} conditions, "
+            f"{self.unknowns} unknowns, redundancy {self.redundancy}, sigma0 {self.sigma0:.3f})"
+        )
+
+    def _repr_html_(self) -> str:
+        """The cameras' parameters, as a notebook shows them."""
+        rows = "".join(
+            f"<tr><td>{escape(each.label)}</td><td>{self.value(each):.7g}</td><td>{self.sigma(each):.2g}</td></tr>"
+            for each in self.parameters
+            if each.kind == "interior"
+        )
+        head = "<tr><th>parameter</th><th>value</th><th>sigma</th></tr>"
+        return f"<p>{escape(repr(self))}</p><table>{head}{rows}</table>"
+
+
+def condition_count(run: Run, cofactor: Cofactor) -> int:
+    """Equations, without what the adjustment does without; with what pseudo-observations determine."""
+    problem = run.problem
+    further = sum(len(each.observed) for each in problem.further)
+    held = held_directions(problem, cofactor.variances) if problem.pseudo_observed else 0
+    return int(TestedUnits(problem).sizes[run.weighting.used].sum()) + further + held
+
+
+def redundancy_of_run(run: Run, cofactor: Cofactor) -> int:
+    """Equations less unknowns."""
+    return condition_count(run, cofactor) - len(run.numbering.free)
+
+
+def variance_of_run(run: Run, redundancy: int) -> VarianceFactor:
+    """sigma0 and what it comes from; redundancy: of all."""
+    factor = run.solution.factor
+    if factor is None:
+        return VarianceFactor(float(np.sqrt(run.vpv / redundancy)) if redundancy > 0 else 1.0, max(redundancy, 0))
+    return variance_factor(run.numbering, run.end.state, factor, run.weighting, run.vpv, redundancy)
+
+
+def _reliability(run: Run, variance: VarianceFactor, probabilities: Probabilities) -> Reliability | None:
+    if run.found is None or not run.has_solution:
+        return None
+    at, weights = (run.numbering, run.end, run.factor, run.found), run.weighting.weights
+    return reliability(*at, weights, variance.sigma0, round(variance.redundancy), probabilities)

@@ -1,0 +1,174 @@
+"""Warnings about a result: what its user should look at, and what to do."""
+
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.transformation import marks_needed
+from adjust.least_squares.iteration import factorise
+from adjust.problem.condition_equations import computed_observations
+from adjust.problem.estimates import Cofactor
+from adjust.problem.observations import Observations
+from adjust.problem.parameter import description
+from adjust.problem.problem import Problem
+from adjust.quality.residuals import Residuals
+from adjust.rank_defect.diagnosis import undetermined, weak_directions
+from adjust.rank_defect.scanner_directions import hardly_told
+from adjust.solution.reweighting import ROUNDS, Run
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+GROSS = 20.0  # a-priori standard deviations from which on a residual can be that of another mark
+NEARER = 0.5  # of the distance of two marks that each may lie from where the other is expected
+UNCHECKED = 1e-6  # redundancy of all targets of an image that is none
+
+
+def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals) -> list[str]:
+    """Sentences on an adjustment: how it ended, what is weak, swapped numbers, images without a check."""
+    problem, observations = run.problem, run.problem.network.observations
+    unchecked = _unchecked_orientations(observations, residuals) if run.converged else []
+    return [
+        *_termination(run),
+        *_weak_parameters(run, cofactor),
+        *_points_without_image(problem),
+        *_films_by_targets(problem),
+        *_swapped_numbers(run, residuals),
+        *unchecked,
+    ]
+
+
+def _termination(run: Run) -> Iterator[str]:
+    termination = run.solution.termination
+    if termination == "iteration limit":
+        yield (
+            f"The iteration did not stand still within {len(run.solution.history)} steps: the values are not final. "
+            f"The largest residuals are those of {_largest_residuals(run)}."
+        )
+    if termination == "diverged":
+        yield (
+            f"The iteration diverged: it came to no minimum. Look for wrong point numbers and wrong approximations; "
+            f"the largest residuals are those of {_largest_residuals(run)}."
+        )
+        yield from (f"Where it ended, the equations are singular: {each.cause}" for each in run.singular)
+    if not run.settled:
+        yield (
+            f"The weights did not settle within {ROUNDS} rounds of robust estimation, variance components or data "
+            f"snooping."
+        )
+
+
+def _largest_residuals(run: Run) -> str:
+    observations = run.numbering.problem.network.observations
+    size = np.abs(run.end.v_mm).max(axis=1)
+    rows = np.argsort(-size)[:3]
+    return ", ".join(
+        f"{observations.kind[i]} {observations.point[i]} in image {observations.image[i]} ({size[i]:.3g} mm)"
+        for i in rows
+    )
+
+
+def _weak_parameters(run: Run, cofactor: Cofactor) -> Iterator[str]:
+    problem, state, free = run.numbering.problem, run.end.state, run.numbering.free
+    without_priors = factorise(run.numbering, run.end, camera_priors=False)
+    for each in weak_directions(problem, state, free, without_priors, run.singular):
+        yield f"Practically singular without priors: {description(each.parameters)}. {each.cause} {each.remedy}"
+    if run.converged:
+        yield from filter(None, [undetermined(problem, state, cofactor.variances)])
+        yield from hardly_told(problem, state, free, run.factor, cofactor)
+
+
+def _points_without_image(problem: Problem) -> list[str]:
+    """What is given and that no image shows."""
+    points = [point.id for point in problem.network.points if point.id not in problem.unknowns.point]
+    if not points:
+        return []
+    shown = ", ".join(points[:5]) + (f" and {len(points) - 5} more" if len(points) > 5 else "")
+    return [f"No image shows the object points {shown}: they take no part."]
+
+
+def _films_by_targets(problem: Problem) -> list[str]:
+    """Images whose film transformation takes more than their fiducial marks."""
+    images = problem.network.images
+    shown = np.bincount(problem.image_numbers[problem.is_fiducial], minlength=len(images))
+    few = [i for i, image in enumerate(images) if shown[i] < marks_needed(image.transformation)]
+    if not few:
+        return []
+    first = images[few[0]]
+    others = f" {len(few) - 1} more images are alike." if len(few) > 1 else ""
+    return [
+        f"Image {first.name} shows {shown[few[0]]} fiducial marks, and its {first.transformation} transformation takes "
+        f"{marks_needed(first.transformation)} of its own: the targets determine the rest of it.{others}"
+    ]
+
+
+def _is_gross(observations: Observations, v_mm: Array) -> NDArray[np.bool_]:
+    """(n,) Whether residuals (n, 2) can be those of other marks."""
+    sigma = np.sqrt(np.trace(observations.covariance_mm2, axis1=1, axis2=2) / 2)
+    return np.asarray(np.linalg.norm(v_mm, axis=1) > GROSS * sigma)
+
+
+def _swapped_numbers(run: Run, residuals: Residuals) -> list[str]:
+    """Sentences on marks of which each lies where the other is expected, most others of the image not.
+
+    By the residuals where the adjustment starts, whose orientations come of what most marks say: at its end it has bent
+    to fit the wrong ones too.
+    """
+    problem, observations = run.problem, run.problem.network.observations
+    if run.converged and not _is_gross(observations, residuals.v_mm).any():
+        return []
+    started = computed_observations(problem, problem.start())
+    if started is None:
+        return []
+    found = []
+    v_mm = started - observations.xy_mm
+    gross = _is_gross(observations, v_mm)
+    for rows in _rows_by_image(observations).values():
+        fiducial = observations.is_fiducial[rows]
+        for kind in (False, True):
+            marks = rows[fiducial == kind]
+            pairs = combinations([int(row) for row in marks[gross[marks]]], 2)
+            crossed = [(i, j) for i, j in pairs if _cross(observations, v_mm, i, j)]
+            if 2 * len({row for pair in crossed for row in pair}) < len(marks):
+                found += [_swapped(observations, i, j) for i, j in crossed]
+    return found
+
+
+def _unchecked_orientations(observations: Observations, residuals: Residuals) -> list[str]:
+    """Sentences on images whose orientation no redundant target checks."""
+    found = []
+    for name, rows in _rows_by_image(observations).items():
+        targets = rows[~observations.is_fiducial[rows]]
+        if len(targets) and residuals.redundancy[targets].sum() < UNCHECKED:
+            found.append(
+                f"Nothing checks the orientation of image {name}: its {len(targets)} targets just determine it, "
+                f"and an error of one of them would not show. Measure more targets in it."
+            )
+    return found
+
+
+def _rows_by_image(observations: Observations) -> dict[str, Indices]:
+    """The rows of every image, in their order; images in the order in which they come."""
+    number = {name: i for i, name in enumerate(dict.fromkeys(observations.image))}
+    of = np.array([number[name] for name in observations.image], dtype=np.intp)
+    rows = np.split(np.argsort(of, kind="stable"), np.cumsum(np.bincount(of))[:-1])
+    return dict(zip(number, rows, strict=True))
+
+
+def _cross(observations: Observations, v: Array, i: int, j: int) -> bool:
+    """Whether two marks each lie where the other is expected."""
+    xy = observations.xy_mm
+    apart = np.linalg.norm(xy[i] - xy[j])
+    off = max(np.linalg.norm(xy[i] + v[i] - xy[j]), np.linalg.norm(xy[j] + v[j] - xy[i]))
+    return bool(off < NEARER * apart)
+
+
+def _swapped(observations: Observations, i: int, j: int) -> str:
+    what = "fiducial marks" if observations.kind[i] == "fiducial" else "points"
+    first, second = sorted((observations.point[i], observations.point[j]))
+    return (
+        f"The {what} {first} and {second} of image {observations.image[i]} each lie "
+        f"where the other is expected: their numbers may be swapped."
+    )
