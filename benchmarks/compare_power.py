@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.lens import Distortion
+from adjust.functional_model.lens import Distortion, Lens
 from adjust.quality.lens_comparison import CameraCalibration, compare
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def drawn(rng: np.random.Generator, change: Array) -> CameraCalibration:
     values = error[:10]
     values[AT] += TRUE + change
     marks = {str(i): xy for i, xy in enumerate(MARKS + error[10:].reshape(-1, 2))}
-    return CameraCalibration("K", Distortion("torlegard"), values[:3], values[3:], marks, covariance(), 5000)
+    return CameraCalibration("K", Lens(Distortion("torlegard"), values[:3], values[3:]), marks, covariance(), 5000)
 
 
 def share(rng: np.random.Generator, change: Array, pairs: int) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
-from adjust.functional_model.lens import Distortion, Prior
+from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
 from adjust.functional_model.transformation import Film
@@ -284,7 +284,7 @@ def simulated(
 def exposed(optics: Optics, image: str, exterior: Array, film: Film, xyz: Array) -> list[Row]:
     """The points (n, 3) in an image's frame, and its fiducials, without errors."""
     camera, rotation = optics.camera, rotation_from_angles(exterior[3:])
-    model = ImageModel(camera.distortion, optics.interior, optics.lens, rotation, exterior[:3], film)
+    model = ImageModel(Lens(camera.distortion, optics.interior, optics.lens), rotation, exterior[:3], film)
     xy, seen = model.camera_from_object(xyz)
     comparator = model.comparator_from_camera(xy)[0]
     inside = np.flatnonzero(seen & (np.abs(xy) < optics.half_mm).all(axis=1))

@@ -29,13 +29,6 @@ class Settings(Protocol):
     def half_mm(self) -> tuple[float, float]: ...
 
 
-class DistortionModel(Settings, Protocol):
-    """A distortion family by its name, with its settings."""
-
-    @property
-    def family(self) -> str: ...
-
-
 @dataclass(frozen=True)
 class Correction:
     """d (n, 2) in mm, which is subtracted from the observed point, and its derivatives.

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
-from adjust.functional_model.families import family, parameter_names
-from adjust.functional_model.projection import folded_over
+from adjust.functional_model.families import family
+from adjust.functional_model.lens import Lens
 from adjust.functional_model.rotation import angles_from_rotation, angles_near
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.dlt import KnownField, taper
@@ -119,7 +119,7 @@ def _interior(camera: Camera, frames: Frames) -> Array:
     if family(camera.distortion.family).is_pinhole_at_zero:
         found = find_principal_distance(fields)
     else:
-        found = find_wide_distance(fields, camera.distortion, camera.distortion.values)
+        found = find_wide_distance(fields, camera.distortion)
     if found is None:
         why = _why_no_distance(fields)
         raise AdjustmentError(f"the principal distance of camera {camera.name} cannot be found from its images: {why}")
@@ -171,16 +171,15 @@ def _known_place(network: Network, name: str) -> tuple[float, float, float]:
 def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]:
     """Freed of the distortion as it is known beforehand. Raises AdjustmentError where that folds an image over."""
     known = camera.distortion.parameters
-    names = parameter_names(camera.distortion.family)
-    parameters = camera.distortion.values
+    lens = Lens(camera.distortion, interior, camera.distortion.values)
     images = frames.of_camera(camera.name)
-    folds = folded_over(camera.distortion, interior, parameters, frames.xy_mm[frames.places(images)])
+    folds = lens.folded_over(frames.xy_mm[frames.places(images)])
     first = np.cumsum([0, *np.diff(frames.starts)[images]])
     for i, start, stop in zip(images, first[:-1], first[1:], strict=True):
         folded = folds[start:stop]
         if folded.mean() > MOST_FOLDED:
             radius_mm = float(np.linalg.norm(frames.xy_mm[frames.part(i)][folded] - interior[1:], axis=1).min())
-            given = [name for name in names if name in known and known[name].value]
+            given = [name for name in lens.quantities if name in known and known[name].value]
             values = ", ".join(f"{name} = {known[name].value:g}" for name in given)
             raise AdjustmentError(
                 f"camera {camera.name}: the distortion that is given ({values or 'all 0'}) folds the image over: from "
@@ -188,7 +187,7 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
                 f"{folded.sum()} of the {len(folded)} points of an image were measured there. Correct the signs, the "
                 "units or the family of these values, the principal point or c, or begin with 0."
             )
-    return frames.sights(camera, interior, parameters)
+    return frames.sights(camera.name, lens)
 
 
 def _exterior(image: Image, pose: Pose) -> Array:

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.projection import ideal_from_observed
+from adjust.functional_model.lens import Lens
 from adjust.functional_model.sight import Sight
 from adjust.functional_model.transformation import film_kind
-from adjust.problem.camera import Camera
 from adjust.problem.network import Network
 
 Array = NDArray[np.float64]
@@ -42,23 +41,23 @@ class Frames:
         """Where the points of some images stand, one image after the other."""
         return np.concatenate([np.arange(self.starts[i], self.starts[i + 1]) for i in images])
 
-    def sights(self, camera: Camera, interior: Array, parameters: Array) -> dict[str, Sight]:
-        """The images of a camera, by name, freed of the principal point and of a distortion with these parameters.
+    def sights(self, camera: str, lens: Lens) -> dict[str, Sight]:
+        """The images of a camera, by name, freed of the lens's principal point and distortion.
 
-        A coordinate that the distortion cannot have produced stays as it is. interior: c, x0', y0' (3,).
+        A coordinate that the distortion cannot have produced stays as it is.
         """
-        images, names = self.of_camera(camera.name), self.network.observations.point
+        images, names = self.of_camera(camera), self.network.observations.point
         if not images:
             return {}
         at = self.places(images)
-        ideal, found = ideal_from_observed(camera.distortion, interior, parameters, self.xy_mm[at])
+        ideal, found = lens.ideal_from_observed(self.xy_mm[at])
         freed_mm = np.empty_like(self.xy_mm)
-        freed_mm[at] = np.where(found[:, None], ideal, self.xy_mm[at]) - interior[1:]
+        freed_mm[at] = np.where(found[:, None], ideal, self.xy_mm[at]) - lens.interior[1:]
         return {
             self.network.images[i].name: Sight(
                 tuple(names[row] for row in self.rows[self.part(i)]),
                 freed_mm[self.part(i)],
-                float(interior[0]),
+                float(lens.interior[0]),
                 float(self.sigma_mm[i]),
             )
             for i in images

@@ -147,8 +147,8 @@ def _fitted_without(
     oriented = [image for image in reduced.images if image.name not in reduced.unoriented]
     return {
         image.name: replace(
-            approximate_image(reduced, fitted, image.name),
-            parameters=values["interior", image.camera, ""][3:],
+            (model := approximate_image(reduced, fitted, image.name)),
+            lens=model.lens.with_values(values["interior", image.camera, ""]),
             bend_parameters=values.get(("scanner", image.scanner, ""), np.empty(0)),
         )
         for image in oriented
@@ -229,8 +229,8 @@ def _known(network: Network, point: str) -> Array:
 
 def _directions(model: ImageModel, xy_mm: Array) -> Array:
     """The directions (n, 3) of rays in the object space, from observed comparator points (n, 2)."""
-    ideal, _ = model.ideal_from_observed(model.camera_from_comparator(xy_mm))
-    in_camera = np.column_stack([ideal - model.interior[1:], np.full(len(ideal), -model.interior[0])])
+    ideal, _ = model.lens.ideal_from_observed(model.camera_from_comparator(xy_mm))
+    in_camera = np.column_stack([ideal - model.lens.interior[1:], np.full(len(ideal), -model.lens.interior[0])])
     return np.asarray(in_camera @ model.rotation)
 
 

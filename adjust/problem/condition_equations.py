@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.correction import Imaged
-from adjust.functional_model.distortion import equations_of
-from adjust.functional_model.lens import Distortion
+from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import SightVectors, sight_vectors
-from adjust.functional_model.projection import camera_from_image, imaged_ray, rays
+from adjust.functional_model.projection import rays
 from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, of_each, product, zeros
 from adjust.problem.problem import Films, Part, Problem, State
 
@@ -81,14 +80,14 @@ def _computed_in_camera(problem: Problem, state: State, targets: Iterable[SeenTa
     camera_xy = state.values[problem.places.T[:2]].T  # fiducials stay, targets follow
     observed = observed_in_camera(problem, state) if problem.by_elements else camera_xy
     for seen in targets:
-        interior, parameters, distortion = _camera(problem, state, seen.camera)
-        if interior[0] <= 0.0:
+        lens = _lens(problem, state, seen.camera)
+        if lens.interior[0] <= 0.0:
             return None
         if problem.by_elements:
-            at = equations_of(distortion, interior, parameters, observed[seen.rows], seen.imaged)
+            at = lens.equations_with_image(observed[seen.rows], seen.imaged)
             xy_mm, found = observed[seen.rows] - at.value, np.isfinite(at.value).all(axis=1)
         else:
-            xy_mm, found = camera_from_image(distortion, interior, parameters, seen.imaged)
+            xy_mm, found = lens.camera_from_image(seen.imaged)
         if not (found & (seen.in_camera[:, 2] < 0.0)).all():
             return None
         camera_xy[seen.rows] = xy_mm
@@ -107,15 +106,13 @@ def _seen(problem: Problem, state: State, camera: str, targets: Indices) -> Seen
     sight = sight_vectors(problem.network.line_of_sight, stations, points)
     rotation = of_each(state.rotations, images)
     ray, in_camera = rays(rotation, sight.vector)
-    interior, parameters, distortion = _camera(problem, state, camera)
-    imaged = imaged_ray(distortion, interior, parameters, ray)
+    imaged = _lens(problem, state, camera).image(ray)
     return SeenTargets(camera, rows, sight, rotation, ray, in_camera, imaged)
 
 
-def _camera(problem: Problem, state: State, name: str) -> tuple[Array, Array, Distortion]:
-    """c, x0', y0' and the parameters of the distortion of a camera."""
-    interior, parameters = np.split(state.values[problem.unknowns.camera[name]], [3])
-    return interior, parameters, problem.network.camera_by_name[name].distortion
+def _lens(problem: Problem, state: State, camera: str) -> Lens:
+    interior, parameters = np.split(state.values[problem.unknowns.camera[camera]], [3])
+    return Lens(problem.network.camera_by_name[camera].distortion, interior, parameters)
 
 
 def observed_in_camera(problem: Problem, state: State) -> Array:
@@ -161,9 +158,9 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     by_unknowns[:, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4; those of targets follow
     straight = problem.network.line_of_sight.is_straight
     for seen in computed.targets:
-        interior, parameters, distortion = _camera(problem, state, seen.camera)
+        lens = _lens(problem, state, seen.camera)
         images, rows = problem.image_numbers[seen.rows], seen.rows
-        at = equations_of(distortion, interior, parameters, at_distorted.camera_xy[rows], seen.imaged)
+        at = lens.equations_with_image(at_distorted.camera_xy[rows], seen.imaged)
         by_in_camera = _by_in_camera(at.by_ray, seen)
         by_vector = product(by_in_camera, seen.rotation)
         by_attitude = cross(seen.in_camera[:, None, :], by_in_camera)
@@ -181,7 +178,7 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         _fill(
             by_unknowns, rows, parts.board, [applied(by_point, problem.lifted_by[rows, k]) for k in parts.board.members]
         )
-        own = [k for k in parts.camera.members if k < len(interior) + len(parameters)]  # others have other families
+        own = [k for k in parts.camera.members if k < len(lens.quantities)]  # others have other families
         _fill(by_unknowns, rows, parts.camera, [at.by_quantity(k) for k in own])
     for part, of_film, of_distorted in (
         (parts.film, film.by_parameters, at_distorted.by_parameters),
@@ -265,13 +262,13 @@ def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
     observations, numbers = problem.network.observations, problem.image_numbers
     blind: dict[int, tuple[str, str]] = {}
     for name, rows in problem.targets_by_camera.items():
-        interior, parameters, distortion = _camera(problem, state, name)
-        if interior[0] <= 0.0:
-            told = f"the principal distance of camera {name} is {interior[0]:.6g} mm and must be positive"
+        lens = _lens(problem, state, name)
+        if lens.interior[0] <= 0.0:
+            told = f"the principal distance of camera {name} is {lens.interior[0]:.6g} mm and must be positive"
             return {"": (told, "Give a positive one.")}
         seen = _seen(problem, state, name, rows)
         behind = seen.in_camera[:, 2] >= 0.0
-        _, found = camera_from_image(distortion, interior, parameters, seen.imaged)
+        _, found = lens.camera_from_image(seen.imaged)
         for which, is_behind in ((behind, True), (~found, False)):
             for row in _first_of_images(rows[which], numbers):
                 blind.setdefault(numbers[row], _blind_target(problem, row, is_behind))

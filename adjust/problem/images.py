@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import INTERIOR_NAMES, Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND, Bend
@@ -19,10 +20,9 @@ Array = NDArray[np.float64]
 
 
 def adjusted_image(estimates: Estimates, name: str) -> ImageModel:
-    """An image with the values of an estimates."""
+    """An image with the values of an adjustment."""
     network = estimates.network
     image = network.image_by_name[name]
-    camera = network.camera_by_name[image.camera]
 
     def values(kind: Kind, owner: str, quantities: tuple[str, ...]) -> Array:
         return estimates.values_of(Parameter(kind, owner, "", each) for each in quantities)
@@ -31,9 +31,7 @@ def adjusted_image(estimates: Estimates, name: str) -> ImageModel:
     parameters = values("film", name, film_parameter_names(image.transformation))
     bend = bend_of(network, image)
     return ImageModel(
-        distortion=camera.distortion,
-        interior=values("interior", camera.name, ("c", "x0", "y0")),
-        parameters=values("interior", camera.name, parameter_names(camera.distortion.family)),
+        lens=adjusted_lens(estimates, image.camera),
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
         film=_film(network, image, parameters, name in estimates.mirrored),
@@ -43,8 +41,16 @@ def adjusted_image(estimates: Estimates, name: str) -> ImageModel:
     )
 
 
+def adjusted_lens(estimates: Estimates, camera: str) -> Lens:
+    """A camera's lens with the values of an adjustment, without their covariance."""
+    distortion = estimates.network.camera_by_name[camera].distortion
+    names = (*INTERIOR_NAMES, *parameter_names(distortion.family))
+    interior, parameters = np.split(estimates.values_of(Parameter.interior(camera, each) for each in names), [3])
+    return Lens(distortion, interior, parameters)
+
+
 def adjusted_places(estimates: Estimates, points: Sequence[str]) -> Array:
-    """(n, 3) where object points are, with the values of an estimates: those of a bent board off its plane."""
+    """(n, 3) where object points are, with the values of an adjustment: those of a bent board off its plane."""
     places = estimates.values_of(Parameter.point(point, axis) for point in points for axis in "XYZ").reshape(-1, 3)
     return places + lifted(estimates, points)
 
@@ -69,14 +75,10 @@ def approximate_image(network: Network, approximations: Approximations, name: st
     """An image with its approximations and the given distortion."""
     image = network.image_by_name[name]
     camera = network.camera_by_name[image.camera]
-    given = camera.distortion.parameters
-    names = parameter_names(camera.distortion.family)
     exterior = approximations.exterior[name]
     film_parameters = approximations.transformation.get(name, np.empty(0))
     return ImageModel(
-        distortion=camera.distortion,
-        interior=approximations.interior[camera.name],
-        parameters=np.array([given[each].value if each in given else 0.0 for each in names]),
+        lens=Lens(camera.distortion, approximations.interior[camera.name], camera.distortion.values),
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
         film=_film(network, image, film_parameters, name in approximations.mirrored),

@@ -17,10 +17,7 @@ from scipy.linalg import qr
 from scipy.special import fdtrc
 
 from adjust.errors import AdjustmentError
-from adjust.functional_model.distortion import image_equations
-from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion
-from adjust.functional_model.projection import ideal_from_observed
+from adjust.functional_model.lens import Lens
 
 Array = NDArray[np.float64]
 Use = Literal["space", "flat"]
@@ -35,24 +32,16 @@ _SIMILARITY = 4  # shift, turn and scale of a plane
 class CameraCalibration:
     """What an adjustment found of a camera.
 
-    interior (3,): c, x0', y0' in mm; parameters (k,) of the distortion, in the order of `parameter_names`; fiducials:
-    camera coordinates (2,) in mm by id. covariance (3 + k + 2 f, 3 + k + 2 f): of all these in this order, fiducials x
-    before y, zero where something was held. redundancy: of the observations that its sigma0 comes
-    from, 0 of a priori standard deviations.
+    fiducials: camera coordinates (2,) in mm by id. covariance (3 + k + 2 f, 3 + k + 2 f): of the lens's quantities and
+    of these in this order, fiducials x before y, zero where something was held. redundancy: of the observations that
+    its sigma0 comes from, 0 of a priori standard deviations.
     """
 
     name: str
-    distortion: Distortion
-    interior: Array
-    parameters: Array
+    lens: Lens
     fiducials: dict[str, Array]
     covariance: Array
     redundancy: float
-
-    @property
-    def quantities(self) -> tuple[str, ...]:
-        """The names of c, x0', y0' and the parameters."""
-        return ("c", "x0", "y0", *parameter_names(self.distortion.family))
 
 
 @dataclass(frozen=True)
@@ -160,19 +149,18 @@ class _View:
     def __init__(
         self, own: CameraCalibration, first: CameraCalibration, places_mm: Array, shared: tuple[str, ...]
     ) -> None:
-        self.own, self.c_um = own, 1e3 * first.interior[0]
+        self.own, self.c_um = own, 1e3 * first.lens.interior[0]
         marks = np.array([own.fiducials[id] for id in shared]).reshape(-1, 2)
         there = np.array([first.fiducials[id] for id in shared]).reshape(-1, 2)
         turn, shift = _similarity(there, marks)
         self.points_mm = places_mm @ turn.T + shift
-        ideal, found = ideal_from_observed(own.distortion, own.interior, own.parameters, self.points_mm)
+        ray, found = own.lens.ray_from_observed(self.points_mm)
         if not found.all():
             raise AdjustmentError(
                 f"the distortion of {own.name} folds the image over within the frame: it is not known there. "
                 "Compare over a smaller frame."
             )
-        ray = (ideal - own.interior[1:]) / own.interior[0]
-        self.equations = image_equations(own.distortion, own.interior, own.parameters, self.points_mm, ray)
+        self.equations = own.lens.equations(self.points_mm, ray)
         # In the first one's axes: what is left of a turn is small, and taken out with the orientation.
         self.turn = turn / np.sqrt(np.linalg.det(turn))
         self.ray = ray @ self.turn

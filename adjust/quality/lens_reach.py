@@ -6,11 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.displacement import displacement
-from adjust.functional_model.families import parameter_names
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates
-from adjust.problem.images import adjusted_image
+from adjust.problem.images import adjusted_image, adjusted_lens
 from adjust.problem.parameter import Parameter
 
 Array = NDArray[np.float64]
@@ -68,13 +66,11 @@ def lens_reach(estimates: Estimates, camera: Camera, frame_mm: tuple[float, floa
 
 def _sigma_um(estimates: Estimates, camera: Camera, radius_mm: float) -> float:
     """The largest standard deviation of the distortion at a radius, over all directions and along any."""
-    names = parameter_names(camera.distortion.family)
-    unknowns = [Parameter.interior(camera.name, each) for each in ("c", *names)]
-    interior = np.array([estimates.value(Parameter.interior(camera.name, each)) for each in ("c", "x0", "y0")])
+    lens = adjusted_lens(estimates, camera.name)
+    unknowns = [Parameter.interior(camera.name, each) for each in lens.quantities if each not in ("x0", "y0")]
     angles = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     places = radius_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    values = np.array([estimates.value(each) for each in unknowns[1:]])
-    moved = displacement(camera.distortion, interior, values, places)
+    moved = lens.displacement(places)
     if not moved.imaged.all():
         return np.nan
     by = moved.by_unknowns_um

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.lens import Prior
+from adjust.functional_model.lens import Lens, Prior
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.frames import frames_of
 from adjust.initial_values.intersection import intersect
@@ -116,7 +116,7 @@ def _sights(problem: Problem) -> dict[str, Sight]:
     sights = {}
     for name, at in unknowns.camera.items():
         interior, known = np.split(unknowns.start[at], [3])
-        sights.update(frames.sights(network.camera_by_name[name], interior, known))
+        sights.update(frames.sights(name, Lens(network.camera_by_name[name].distortion, interior, known)))
     return sights
 
 

@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import Parameter
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
 from pipeline.adjusting.compare_picture import draw_comparison
@@ -85,14 +84,14 @@ def _calibration(path: Path, content: Json, name: str, label: str) -> CameraCali
     if not content["converged"]:
         raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
     camera = content["cameras"][name]
-    distortion, interior, parameters = calibrated_lens(camera)
-    if not np.isfinite([*interior, *parameters]).all():
+    lens = calibrated_lens(camera)
+    if not np.isfinite(lens.values).all():
         raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
     marks = {id: np.array([mark["x_mm"]["value"], mark["y_mm"]["value"]]) for id, mark in camera["fiducials"].items()}
-    unknowns = [Parameter.interior(name, each) for each in ("c", "x0", "y0", *parameter_names(distortion.family))]
+    unknowns = [Parameter.interior(name, each) for each in lens.quantities]
     unknowns += [Parameter.fiducial(name, id, axis) for id in marks for axis in "xy"]
     covariance, redundancy = read_own_covariance(path).of(unknowns), content["sigma0_from"]["redundancy"]
-    return CameraCalibration(label, distortion, interior, parameters, marks, covariance, redundancy)
+    return CameraCalibration(label, lens, marks, covariance, redundancy)
 
 
 def _half_mm(path: Path, content: Json, name: str) -> tuple[float, float]:
@@ -140,7 +139,7 @@ def comparison_json(comparison: Comparison, remarks: Sequence[str], level: float
         "same": _test(comparison.same),
         "trend": comparison.trend and _test(comparison.trend),
         "calibrations": [
-            {"name": each.name, "time": time, "family": each.distortion.family}
+            {"name": each.name, "time": time, "family": each.lens.distortion.family}
             for each, time in zip(comparison.calibrations, comparison.times.tolist(), strict=True)
         ],
         "places_mm": comparison.places_mm.tolist(),
@@ -173,11 +172,11 @@ def _test(test: Test) -> Json:
 
 def parameter_differences(first: CameraCalibration, other: CameraCalibration) -> list[Json]:
     """The parameters that both have, as they stand: difference and its standard deviation, mm and powers of it."""
-    if first.distortion.family != other.distortion.family:
-        shared: tuple[str, ...] = first.quantities[:3]
+    if first.lens.distortion.family != other.lens.distortion.family:
+        shared: tuple[str, ...] = first.lens.quantities[:3]
     else:
-        shared = first.quantities
-    values = [np.concatenate([each.interior, each.parameters]) for each in (first, other)]
+        shared = first.lens.quantities
+    values = [each.lens.values for each in (first, other)]
     sigmas = [np.sqrt(np.diag(each.covariance)) for each in (first, other)]
     rows = []
     for k, name in enumerate(shared):

@@ -7,16 +7,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.projection import ideal_from_observed
+from adjust.functional_model.lens import Lens
+from adjust.problem.images import adjusted_lens
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import Options
 from adjust.solution.planning import Plan, plan
 from pipeline.design.reliability import PlannedReliability, planned_reliability
 from pipeline.design.setup import Setup, planned_network
-from pipeline.report.lens import Lens, displacement
 
 Array = NDArray[np.float64]
 
@@ -136,16 +135,14 @@ class Expected:
         outward = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         across = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
         adjustment = self.plan.adjustment
-        interior = adjustment.values_of(Parameter.interior(self.camera, name) for name in INTERIOR)
-        values = adjustment.values_of(Parameter.interior(self.camera, name) for name in self._parameters)
-        lens = Lens(self.camera, self.network.cameras[0].distortion, interior, values)
-        by_c_and_parameters = displacement(lens, radius_mm * outward).by_unknowns_um
+        lens = adjusted_lens(adjustment, self.camera)
+        by_c_and_parameters = lens.displacement(radius_mm * outward).by_unknowns_um
         by_c_and_parameters[np.abs(by_c_and_parameters) < ROUNDING_UM] = 0.0  # most families do not depend on c
         radial = np.einsum("di,dik->dk", outward, by_c_and_parameters)
         tangential = np.einsum("di,dik->dk", across, by_c_and_parameters)
         ray = _ray_by_unknowns(lens, radius_mm * outward)
         functions = np.zeros((4 * DIRECTIONS, len(self._unknowns)))
-        count = len(INTERIOR) + len(values)
+        count = len(lens.quantities)
         columns = [0, *range(len(INTERIOR), count)]
         functions[:DIRECTIONS, columns] = radial
         functions[DIRECTIONS : 2 * DIRECTIONS, columns] = tangential
@@ -156,9 +153,8 @@ class Expected:
 def _ray_by_unknowns(lens: Lens, from_principal_point_mm: Array) -> Array:
     """How the image of a ray moves with c, x0', y0' and the parameters (n, 2, 3 + k): F = 0 with the ray held."""
     xy_mm = lens.interior[1:] + from_principal_point_mm
-    ideal, _ = ideal_from_observed(lens.distortion, lens.interior, lens.parameters, xy_mm)
-    ray = (ideal - lens.interior[1:]) / lens.interior[0]
-    at = image_equations(lens.distortion, lens.interior, lens.parameters, xy_mm, ray)
+    ray, _ = lens.ray_from_observed(xy_mm)
+    at = lens.equations(xy_mm, ray)
     by_unknowns = np.concatenate([at.by_interior, at.by_parameters], axis=2)
     return -np.asarray(np.linalg.solve(at.by_xy, by_unknowns))
 

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.lens import Lens
 from pipeline.exchange.block import Block, Frame, WholeFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
-from pipeline.resampling.frame_chain import Lens
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def _image(frame: WholeFrame, origin: Array) -> tuple[str, list[str]]:
     """The lines of an image, and the points whose lens could not be taken out."""
     assert frame.model is not None
     marks = frame.observed(fiducials=False)
-    refined, found = frame.model.ideal_from_observed(frame.camera_mm(marks))
+    refined, found = frame.model.lens.ideal_from_observed(frame.camera_mm(marks))
     lines = [f"{_word(frame.image)} {_word(frame.camera)}"]
     for mark, (x, y), usable in zip(marks, (refined - origin).tolist(), found, strict=True):
         lines += [f"{_word(mark.point)} {x:.6f} {y:.6f}"] if usable else []

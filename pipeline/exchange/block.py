@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import LineOfSight
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
@@ -16,7 +17,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import UNITS_MM, Project
 from pipeline.publishing.made_from import adjusted_from, differing
-from pipeline.resampling.frame_chain import FrameChain, Lens, image_chain
+from pipeline.resampling.frame_chain import FrameChain, image_chain
 from pipeline.results.adjustment_reader import Covariance, calibrated_lens, read_adjustment, read_own_covariance
 from pipeline.results.comparator_file import ComparatorPoint, pitches_of, pixel_from_comparator, read_comparator
 from pipeline.results.lens_known import estimated_lenses, reach_sentence
@@ -256,7 +257,7 @@ def _frame(
     camera = project.camera_of(image).name
     if adjustment is None or known is None:
         return OutFrame(image, camera, project.scans.get(image), pitch_um, marks, None, None, False)
-    lens = Lens(*calibrated_lens(adjustment["cameras"][known["camera"]]))
+    lens = calibrated_lens(adjustment["cameras"][known["camera"]])
     model = _model(project, adjustment, image, marks, lens)
     oriented = all(known["exterior"][element]["sigma"] is not None for element in ELEMENTS)
     return OutFrame(image, camera, project.scans.get(image), pitch_um, marks, model, lens, oriented)
@@ -272,9 +273,7 @@ def _model(
     own = adjustment["images"][image]
     exterior = np.array([own["exterior"][element]["value"] for element in ELEMENTS], dtype=float)
     return ImageModel(
-        lens.distortion,
-        lens.interior,
-        lens.parameters,
+        lens,
         rotation_from_angles(np.radians(exterior[3:])),
         exterior[:3],
         chain.film,

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
-from adjust.functional_model.lens import Distortion, Prior
+from adjust.functional_model.families import FAMILY_NAMES, family
+from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
 from adjust.problem.parameter import Parameter
 from pipeline.errors import InputError
@@ -36,8 +36,6 @@ from pipeline.text.wording import listed
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
-
-INTERIOR = ("c", "x0", "y0")
 
 
 @dataclass(frozen=True)
@@ -86,17 +84,18 @@ def run_convert(path: Path, folder: Path, options: ConvertOptions) -> Conversion
 
 
 def _converted(
-    lens: tuple[Distortion, Array, Array], sigmas: Array, corners_mm: Array, options: ConvertOptions
+    lens: Lens, sigmas: Array, corners_mm: Array, options: ConvertOptions
 ) -> tuple[ConvertedLens, tuple[str, ...]]:
     """The lens, and what is to be said of it; sigmas (k,): of its parameters."""
-    names = parameter_names(lens[0].family)
-    uncertain = [name for name, sigma in zip(names, sigmas, strict=True) if sigma > 0.0]
+    uncertain = [name for name, sigma in zip(lens.quantities[3:], sigmas, strict=True) if sigma > 0.0]
     half = np.abs(corners_mm).max(axis=0) if family(options.family).needs == "half_mm" else np.zeros(2)
     into = Distortion(options.family, r0_mm=options.r0_mm, half_mm=(float(half[0]), float(half[1])))
-    found = convert_lens(*lens, into, corners_mm, options.parameters or None, uncertain)
+    found = convert_lens(lens, into, corners_mm, options.parameters or None, uncertain)
     size = "{:.4g} x {:.4g} mm".format(*(corners_mm[1] - corners_mm[0]))
     if found.is_same:
-        told = f"{lens[0].family} and {options.family} mean the same here: what is left over {size} is rounding."
+        told = (
+            f"{lens.distortion.family} and {options.family} mean the same here: what is left over {size} is rounding."
+        )
     else:
         told = (
             f"{options.family} does not take this lens quite: over {size} it is off by up to "
@@ -117,14 +116,14 @@ def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion
         raise InputError(f"{path}: holds the cameras {listed(cameras)}. Say which one: --camera NAME.")
     camera = content["cameras"][name]
     given = calibrated_lens(camera)
-    if not np.isfinite([*given[1], *given[2]]).all():
+    if not np.isfinite(given.values).all():
         raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
-    known = np.sqrt(np.diag(covariance.of(_parameters(name, given[0])[3:])))
+    known = np.sqrt(np.diag(covariance.of(_parameters(name, given)[3:])))
     lens, told = _converted(given, known, _observed_corners_mm(path, content, name), options)
-    moved = _moved_covariance(covariance, name, given[0], lens)
-    sigmas = np.sqrt(np.diag(moved.of(_parameters(name, lens.distortion))))
-    entry = _camera_entry(camera, given[0], lens, sigmas)
-    gone = {Parameter.interior(name, each).text for each in parameter_names(given[0].family)}
+    moved = _moved_covariance(covariance, name, given, lens)
+    sigmas = np.sqrt(np.diag(moved.of(_parameters(name, lens.lens))))
+    entry = _camera_entry(camera, given.distortion, lens, sigmas)
+    gone = {Parameter.interior(name, each).text for each in given.quantities[3:]}
     correlations = [row for row in content["correlations"] if not gone & set(row["parameters"])]
     content |= {"cameras": content["cameras"] | {name: entry}, "correlations": correlations}
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
@@ -154,33 +153,32 @@ def _observed_corners_mm(path: Path, content: Json, name: str) -> Array:
     return np.array([np.min(seen, axis=0), np.max(seen, axis=0)])
 
 
-def _parameters(camera: str, distortion: Distortion) -> tuple[Parameter, ...]:
-    return tuple(Parameter.interior(camera, each) for each in (*INTERIOR, *parameter_names(distortion.family)))
+def _parameters(camera: str, lens: Lens) -> tuple[Parameter, ...]:
+    return tuple(Parameter.interior(camera, each) for each in lens.quantities)
 
 
-def _moved_covariance(covariance: Covariance, camera: str, source: Distortion, lens: ConvertedLens) -> Covariance:
+def _moved_covariance(covariance: Covariance, camera: str, source: Lens, lens: ConvertedLens) -> Covariance:
     """That of all quantities, the camera's own in the other family: with all others, too."""
-    old, new = _parameters(camera, source), _parameters(camera, lens.distortion)
+    old, new = _parameters(camera, source), _parameters(camera, lens.lens)
     others = tuple(each for each in covariance.parameters if each not in old)
     by_old = np.zeros((len(new) + len(others), len(old) + len(others)))
     by_old[: len(new), : len(old)] = lens.by_source
     by_old[len(new) :, len(old) :] = np.eye(len(others))
     matrix = by_old @ covariance.of((*old, *others)) @ by_old.T
     value = dict(zip(covariance.parameters, covariance.values, strict=True))
-    values = np.concatenate([lens.interior, lens.parameters, [value[each] for each in others]])
+    values = np.concatenate([lens.lens.values, [value[each] for each in others]])
     return Covariance((*new, *others), values, (matrix + matrix.T) / 2.0)
 
 
 def _camera_entry(camera: Json, source: Distortion, lens: ConvertedLens, sigmas: Array) -> Json:
     c, x0, y0, *parameters = (
-        {"value": float(value), "sigma": float(sigma)}
-        for value, sigma in zip([*lens.interior, *lens.parameters], sigmas, strict=True)
+        {"value": float(value), "sigma": float(sigma)} for value, sigma in zip(lens.lens.values, sigmas, strict=True)
     )
-    named = dict(zip(parameter_names(lens.distortion.family), parameters, strict=True))
+    named = dict(zip(lens.lens.quantities[3:], parameters, strict=True))
     return camera | {
         "principal_distance_mm": c,
         "principal_point_mm": {"x": x0, "y": y0},
-        "distortion": distortion_settings(lens.distortion) | named,
+        "distortion": distortion_settings(lens.lens.distortion) | named,
         "significance": [],
         "converted": {
             "from": distortion_settings(source),
@@ -198,24 +196,24 @@ def _camera_file(path: Path, folder: Path, options: ConvertOptions) -> Conversio
     if distance is None or point is None or camera.frame_mm is None:
         missing = "frame_mm" if camera.frame_mm is None else "principal distance or principal point"
         raise InputError(f"{path}: has no {missing}, and a lens is converted over its frame. Give it there.")
-    names = parameter_names(camera.distortion.family)
-    priors = [camera.distortion.parameters.get(name, Prior(0.0)) for name in names]
-    interior, parameters = np.array([distance, *point]), np.array([prior.value for prior in priors])
-    middle = np.zeros(2) if camera.fiducials else interior[1:]
+    source = Lens(camera.distortion, np.array([distance, *point]), camera.distortion.values)
+    priors = [camera.distortion.parameters.get(name, Prior(0.0)) for name in source.quantities[3:]]
+    middle = np.zeros(2) if camera.fiducials else source.interior[1:]
     half = np.array(camera.frame_mm) / 2.0
     corners_mm = np.array([middle - half, middle + half])
     given = np.array([camera.principal_distance_sigma_mm, *camera.principal_point_sigma_mm, *(p.sigma for p in priors)])
-    lens, told = _converted((camera.distortion, interior, parameters), given[3:], corners_mm, options)
-    sigmas = _sigmas(given, camera.distortion, lens)
+    source = replace(source, covariance=np.diag(np.where(np.isinf(given), 0.0, given) ** 2))
+    found, told = _converted(source, given[3:], corners_mm, options)
+    lens, sigmas = found.lens, _sigmas(given, source, found)
     if np.count_nonzero(np.isfinite(sigmas) & (sigmas > 0.0)) > 1:
         told += (
             "A camera file holds no correlations: to keep them convert adjustment.json, and name the result there.",
         )
     if camera.calibration is not None:
         told += (f"The earlier calibration {camera.calibration.path} is left out: convert it by itself.",)
-    sigma = dict(zip(parameter_names(lens.distortion.family), sigmas[3:].tolist(), strict=True))
+    sigma = dict(zip(lens.quantities[3:], sigmas[3:].tolist(), strict=True))
     value = dict(zip(sigma, lens.parameters.tolist(), strict=True))
-    estimated = {name: Prior(value[name], sigma[name]) for name in lens.estimated}
+    estimated = {name: Prior(value[name], sigma[name]) for name in found.estimated}
     converted = replace(
         camera,
         path=folder / "camera.toml",
@@ -233,19 +231,18 @@ def _camera_file(path: Path, folder: Path, options: ConvertOptions) -> Conversio
         return f"{name}.tif"
 
     files["camera.toml"] = camera_text(converted, save)
-    return _written(path, folder, files, Conversion(lens, sigmas, told, tuple(files)))
+    return _written(path, folder, files, Conversion(found, sigmas, told, tuple(files)))
 
 
-def _sigmas(given: Array, source: Distortion, lens: ConvertedLens) -> Array:
+def _sigmas(given: Array, source: Lens, found: ConvertedLens) -> Array:
     """Standard deviations (3 + k,) of those of the source, taken as uncorrelated; what hangs on a free one is free."""
-    free = np.isinf(given)
-    sigmas = np.sqrt(np.maximum(np.diag(lens.covariance(np.diag(np.where(free, 0.0, given) ** 2))), 0.0))
+    free, lens = np.isinf(given), found.lens
+    sigmas = np.sqrt(np.maximum(np.diag(lens.covariance), 0.0))
     is_free = np.zeros(len(sigmas), dtype=bool)
     is_free[:3] = free[:3]
     if free[3:].any():
-        names = parameter_names(lens.distortion.family)
-        is_free[[3 + names.index(name) for name in lens.estimated]] = True
-        is_free[0] |= source.r0_mm != lens.distortion.r0_mm
+        is_free[[lens.quantities.index(name) for name in found.estimated]] = True
+        is_free[0] |= source.distortion.r0_mm != lens.distortion.r0_mm
     sigmas[is_free] = math.inf
     return np.asarray(sigmas)
 
@@ -259,11 +256,10 @@ def _written(path: Path, folder: Path, files: dict[str, str | bytes], conversion
 def conversion_json(conversion: Conversion) -> Json:
     """As `--json` prints it."""
     lens = conversion.lens
-    values = [*lens.interior.tolist(), *lens.parameters.tolist()]
-    names = (*INTERIOR, *parameter_names(lens.distortion.family))
+    names, values = lens.lens.quantities, lens.lens.values.tolist()
     sigmas = [sigma if math.isfinite(sigma) else "free" for sigma in conversion.sigmas.tolist()]
     return {
-        **distortion_settings(lens.distortion),
+        **distortion_settings(lens.lens.distortion),
         "same": lens.is_same,
         "largest_um": conversion.misfit_um,
         "rms_um": 1e3 * lens.rms_mm,

@@ -8,13 +8,11 @@ from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion
+from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
-from adjust.functional_model.projection import camera_from_ray, ideal_from_observed
 from pipeline.exchange.block import Block, Frame
 from pipeline.exchange.convention import ExportOptions
 from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, fixed, opencv_values
-from pipeline.resampling.frame_chain import Lens
 
 Array = NDArray[np.float64]
 
@@ -131,8 +129,8 @@ def _over_frame(block: Block, frame: Frame) -> tuple[Array, Array]:
     lens = frame.lens
     assert lens is not None
     grid_mm = frame_grid_mm(frame_corners_mm(block, frame))
-    ideal_mm, found = ideal_from_observed(lens.distortion, lens.interior, lens.parameters, grid_mm)
-    return (ideal_mm[found] - lens.interior[1:]) / lens.interior[0], grid_mm[found]
+    rays, found = lens.ray_from_observed(grid_mm)
+    return rays[found], grid_mm[found]
 
 
 def _fitted(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
@@ -145,10 +143,10 @@ def _fitted(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
     into = fixed("opencv", {name: value for name, value in own if name in estimated} if family == "opencv" else {})
     corners_mm = frame_corners_mm(block, frame)
     try:
-        found = convert_lens(lens.distortion, lens.interior, lens.parameters, into, corners_mm, estimated)
+        found = convert_lens(lens, into, corners_mm, estimated)
     except AdjustmentError:  # as bad as a model that is nowhere near
         return FittedLens(_pinhole(lens), np.inf)
-    return FittedLens(opencv_values(found)[0], found.largest_mm, shear=float(found.parameters[-1]))
+    return FittedLens(opencv_values(found.lens)[0], found.largest_mm, shear=float(found.lens.parameters[-1]))
 
 
 def _sheared_step(rays: Array, observed_mm: Array) -> tuple[Array, float]:
@@ -170,7 +168,8 @@ def _sheared_step(rays: Array, observed_mm: Array) -> tuple[Array, float]:
 def _sheared(values: Array, shear: float, rays: Array) -> Array:
     """Camera coordinates (n, 2) in mm of rays."""
     fx, fy = values[:2]
-    bent, _ = camera_from_ray(Distortion("opencv"), np.array([1.0, 0.0, 0.0]), np.array([*values[4:], 0.0, 0.0]), rays)
+    unit = Lens(Distortion("opencv"), np.array([1.0, 0.0, 0.0]), np.array([*values[4:], 0.0, 0.0]))
+    bent, _ = unit.camera_from_ray(rays)
     across = fy * bent[:, 0] + (fx - fy) * rays[:, 0] - fy * shear * rays[:, 1]
     return np.asarray(np.column_stack([across, fy * bent[:, 1]]) + values[2:4])
 

@@ -53,8 +53,8 @@ def footprint(block: Block, frame: WholeFrame) -> Array | str:
     if not heights:
         return "none of its points is adjusted, so the height of its ground is not known."
     outline_mm = _outline(frame_corners_mm(block, frame))
-    ideal, found = model.ideal_from_observed(outline_mm)
-    c, point = model.interior[0], model.interior[1:]
+    ideal, found = model.lens.ideal_from_observed(outline_mm)
+    c, point = model.lens.interior[0], model.lens.interior[1:]
     # x' = x0' - c U/W: towards the ground W is negative, and the ray is (x' - x0', y' - y0', -c).
     rays = np.column_stack([ideal - point, np.full(len(ideal), -c)]) @ model.rotation
     reach = (float(np.mean(heights)) - model.station[2]) / np.where(rays[:, 2] == 0.0, np.nan, rays[:, 2])

@@ -4,7 +4,7 @@ it lying in the scan."""
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.transformation import Film
 from pipeline.files.camera_file import CameraFile
@@ -25,16 +25,8 @@ def camera_model(camera: CameraFile, measured: MeasuredScan) -> ImageModel | str
     middle = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]) / 2.0, measured.pitch_um)
     c = camera.principal_distance_mm or 2.0 * float(np.linalg.norm(middle))
     x0, y0 = middle if camera.principal_point_mm is None else camera.principal_point_mm
-    distortion = camera.distortion
-    given = [distortion.parameters.get(name) for name in parameter_names(distortion.family)]
-    return ImageModel(
-        distortion,
-        np.array([c, x0, y0], dtype=np.float64),
-        np.array([0.0 if prior is None else prior.value for prior in given]),
-        np.eye(3),
-        np.zeros(3),
-        film,
-    )
+    lens = Lens(camera.distortion, np.array([c, x0, y0], dtype=np.float64), camera.distortion.values)
+    return ImageModel(lens, np.eye(3), np.zeros(3), film)
 
 
 def misplaced_principal_point(camera: CameraFile, measured: MeasuredScan) -> str:

@@ -179,9 +179,9 @@ def _resected(
     row = {id: i for i, id in enumerate(field.ids)}
     xyz = field.xyz[[row[id] for id, _ in named]]
     comparator = comparator_from_pixel(np.array([place for _, place in named]), measured.pitch_um)
-    ideal, _ = model.ideal_from_observed(model.camera_from_comparator(comparator))
-    c = float(model.interior[0])
-    resection = resect(xyz, ideal - model.interior[1:], c, np.random.default_rng(_SEED))
+    ideal, _ = model.lens.ideal_from_observed(model.camera_from_comparator(comparator))
+    c = float(model.lens.interior[0])
+    resection = resect(xyz, ideal - model.lens.interior[1:], c, np.random.default_rng(_SEED))
     if resection is None or resection.inliers.sum() < LEAST_PAIRS:
         return None
     sigma_px = 1000.0 * resection.sigma_mm / min(measured.pitch_um)

@@ -81,7 +81,7 @@ def name_field(
     """
     places = np.array([one.center_px for one in candidates]).reshape(-1, 2)
     ideal = _ideal(model, measured, places)
-    frame = frame_mm(camera, model, measured) - model.interior[1:]
+    frame = frame_mm(camera, model, measured) - model.lens.interior[1:]
     inside = np.flatnonzero(((ideal >= frame[0]) & (ideal <= frame[1])).all(axis=1))
     strongest = inside if codes else inside[: int(_STRAYS * len(field.ids)) + 1]
     normals = np.array([field.normals.get(id, np.full(3, np.nan)) for id in field.ids]).reshape(-1, 3)
@@ -100,8 +100,8 @@ def name_field(
 def _named(
     names: Names, field: Field, model: ImageModel, candidates: Sequence[Candidate], pitch_mm: float
 ) -> NamedField:
-    interior = np.array([names.principal_distance_mm, *model.interior[1:]])
-    oriented = replace(model, interior=interior, rotation=names.pose.rotation, station=names.pose.center)
+    lens = replace(model.lens, interior=np.array([names.principal_distance_mm, *model.lens.interior[1:]]))
+    oriented = replace(model, lens=lens, rotation=names.pose.rotation, station=names.pose.center)
     by_id = {field.ids[point]: candidates[mark] for point, mark in names.mark.items()}
     return NamedField(oriented, by_id, max(names.gate_mm / pitch_mm, _FOUND_WITHIN_PX))
 
@@ -109,5 +109,5 @@ def _named(
 def _ideal(model: ImageModel, measured: MeasuredScan, places_px: Array) -> Array:
     """(n, 2) mm about the principal point, free of what is known of the distortion."""
     camera = model.camera_from_comparator(comparator_from_pixel(places_px, measured.pitch_um))
-    ideal, found = model.ideal_from_observed(camera)
-    return np.asarray(np.where(found[:, None], ideal, camera) - model.interior[1:])
+    ideal, found = model.lens.ideal_from_observed(camera)
+    return np.asarray(np.where(found[:, None], ideal, camera) - model.lens.interior[1:])

@@ -1,12 +1,12 @@
 """A solution of the bare problem in OpenCV's model, with standard deviations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens_conversion import convert_lens
+from adjust.problem.images import adjusted_lens
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem
@@ -29,19 +29,19 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     """Raises AdjustmentError where the lens cannot be brought to OpenCV's model."""
     camera = problem.network.cameras[0]
     family = camera.distortion.family
-    own = [Parameter.interior(camera.name, each) for each in ("c", "x0", "y0", *parameter_names(family))]
-    values = solved.values_of(own)
+    lens = adjusted_lens(solved, camera.name)
+    own = [Parameter.interior(camera.name, each) for each in lens.quantities]
     observed = problem.network.observations.xy_mm
-    of_lens = camera.distortion, values[:3], values[3:]
     corners_mm = np.array([observed.min(axis=0), observed.max(axis=0)])
-    whole = to_opencv_model(*of_lens, corners_mm, _whole(family))
+    whole = to_opencv_model(lens, corners_mm, _whole(family))
     # What OpenCV does not estimate it holds at these values, and so they are for its standard deviations.
-    held = dict(zip(parameter_names(whole.distortion.family), whole.parameters.tolist(), strict=True))
-    model = fixed(whole.distortion.family, held)
-    free = convert_lens(*of_lens, model, corners_mm, problem.freedom.distortion, held=problem.freedom.held)
-    parameters, _ = opencv_values(whole)
-    _, by_lens = opencv_values(free)
-    covariance = by_lens @ free.covariance(solved.cofactor_of(own)) @ by_lens.T
+    held = dict(zip(whole.lens.quantities[3:], whole.lens.parameters.tolist(), strict=True))
+    model = fixed(whole.lens.distortion.family, held)
+    known = replace(lens, covariance=solved.cofactor_of(own))
+    free = convert_lens(known, model, corners_mm, problem.freedom.distortion, held=problem.freedom.held)
+    parameters, _ = opencv_values(whole.lens)
+    _, by_lens = opencv_values(free.lens)
+    covariance = by_lens @ free.lens.covariance @ by_lens.T
     return Converted(parameters, np.sqrt(np.maximum(np.diag(covariance), 0.0)), whole.rms_mm)
 
 

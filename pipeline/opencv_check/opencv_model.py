@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion, Prior
+from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
 
 Array = NDArray[np.float64]
@@ -49,28 +49,27 @@ def model_names(family: str) -> tuple[str, ...]:
     return FISHEYE_NAMES if family == FISHEYE else NAMES
 
 
-def to_opencv_model(
-    distortion: Distortion, interior: Array, parameters: Array, corners_mm: Array, estimated: Sequence[str]
-) -> ConvertedLens:
+def to_opencv_model(lens: Lens, corners_mm: Array, estimated: Sequence[str]) -> ConvertedLens:
     """A lens in the adjustment's family of OpenCV's model, over the rectangle between two corners (2, 2).
 
-    interior (3,): c, x0', y0' in mm; estimated: the parameters that are fitted. Of a lens of such a family the others
+    estimated: the parameters that are fitted. Of a lens of such a family the others
     keep their values, but for the skew b2, which cv2.calibrateCamera does not know.
     Raises AdjustmentError where no fit stands still.
     """
-    own = dict(zip(parameter_names(distortion.family), parameters.tolist(), strict=True))
-    begun = own if distortion.family in ("opencv", FISHEYE) else {}
-    if distortion.family == "opencv":
+    family = lens.distortion.family
+    own = dict(zip(parameter_names(family), lens.parameters.tolist(), strict=True))
+    begun = own if family in ("opencv", FISHEYE) else {}
+    if family == "opencv":
         begun = own | {"b2": 0.0}
-    model = FISHEYE if distortion.family == FISHEYE else "opencv"
-    return convert_lens(distortion, interior, parameters, fixed(model, begun), corners_mm, estimated)
+    model = FISHEYE if family == FISHEYE else "opencv"
+    return convert_lens(lens, fixed(model, begun), corners_mm, estimated)
 
 
 def fixed(family: str, values: Mapping[str, float]) -> Distortion:
     return Distortion(family, {name: Prior(value, 0.0) for name, value in values.items()})
 
 
-def opencv_values(lens: ConvertedLens) -> tuple[Array, Array]:
+def opencv_values(lens: Lens) -> tuple[Array, Array]:
     """OpenCV's parameters (n,) of a lens in the family of its model, and their derivatives (n, 3 + k) by c, x0', y0'
     and the family's parameters."""
     (c, x0, y0), (*others, b1, b2) = lens.interior, lens.parameters

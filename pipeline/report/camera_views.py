@@ -114,10 +114,10 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
         correlations=high_correlations(name, camera, covariance) if covariance else [],
         trade_offs=_trade_offs(name, stored),
         curves=lens.curves_plot(curve, radius_mm) if curve else None,
-        effect_where="in the frame" if lens.lens(name, camera).is_of_frame else f"at {fixed(radius_mm, 0)} mm",
+        effect_where="in the frame" if lens.is_of_frame(lens.lens(name, camera)) else f"at {fixed(radius_mm, 0)} mm",
         lens_map=_lens_map(name, camera, covariance, rows, radius_mm, frame_mm) if covariance else None,
         curve_rows=_curve_rows(curve) if curve else [],
-        certificate=certificate_view(lens.lens(name, camera), covariance, _reach_mm(curve, radius_mm))
+        certificate=certificate_view(lens.lens(name, camera, covariance), _reach_mm(curve, radius_mm))
         if curve and covariance
         else None,
         fiducials=[_fiducial_row(id, fiducial, form) for id, fiducial in camera["fiducials"].items()],
@@ -179,8 +179,8 @@ def _curves(
     largest = max(radius_mm, camera.get("lens_known", {}).get("corner_mm") or half_diagonal_mm)
     if not parameter_names(camera["distortion"]["family"]) or largest == 0.0:
         return None
-    of = lens.lens(name, camera)
-    return lens.curves(of, covariance, min(largest, *of.distortion.half_mm) if of.is_of_frame else largest)
+    of = lens.lens(name, camera, covariance)
+    return lens.curves(of, min(largest, *of.distortion.half_mm) if lens.is_of_frame(of) else largest)
 
 
 def _reach_mm(curve: lens.Curves, observed_mm: float) -> float:
@@ -204,7 +204,7 @@ def _lens_map(
         on = vectors.plane_about(low, high, PLOT_PX)
     else:
         on = vectors.plane(rows, frame_mm, PLOT_PX)
-    return lens_map(lens.lens(name, camera), covariance, on, radius_mm)
+    return lens_map(lens.lens(name, camera, covariance), on, radius_mm)
 
 
 def _curve_rows(curve: lens.Curves) -> list[CurveRow]:

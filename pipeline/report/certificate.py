@@ -1,15 +1,14 @@
 """A camera in the form of a calibration certificate: principal distances, and a table of radial distortion by angle."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.projection import ideal_from_observed
-from pipeline.report.lens import Lens, curves
+from adjust.functional_model.lens import Lens
+from pipeline.report.lens import curves, displacement_covariance
 from pipeline.report.numbers import fixed, value_and_sigma
-from pipeline.results.adjustment_reader import Covariance
 
 Array = NDArray[np.float64]
 
@@ -42,12 +41,12 @@ class CertificateView:
     rows: list[CertificateRow]
 
 
-def certificate_view(of: Lens, covariance: Covariance, largest_radius_mm: float) -> CertificateView:
+def certificate_view(of: Lens, largest_radius_mm: float) -> CertificateView:
     """Of a lens, out to a radius, with standard deviations from the full covariance."""
     angles = _angles_deg(of, largest_radius_mm)
-    values, sigmas = _with_sigmas(of, covariance, lambda moved: _quantities(moved, angles, largest_radius_mm))
+    values, sigmas = _with_sigmas(of, lambda moved: _quantities(moved, angles, largest_radius_mm))
     radii = np.interp(np.tan(np.radians(angles)), *_tangents(of, largest_radius_mm)[::-1])
-    asymmetric = curves(of, covariance, largest_radius_mm)
+    asymmetric = curves(of, largest_radius_mm)
     rows = [
         CertificateRow(
             fixed(angle, 1),
@@ -105,14 +104,14 @@ def _tangents(of: Lens, largest_radius_mm: float) -> tuple[Array, Array]:
     outward = np.column_stack([np.cos(turns), np.sin(turns)])
     point = of.interior[1:]
     places = point + (radius[:, None, None] * outward).reshape(-1, 2)
-    ideal, _ = ideal_from_observed(of.distortion, of.interior, of.parameters, places)
+    ideal, _ = of.ideal_from_observed(places)
     along = ((ideal - point).reshape(_RADII, _DIRECTIONS, 2) * outward).sum(axis=2).mean(axis=1)
     return radius, np.asarray(along / of.interior[0])
 
 
-def _with_sigmas(of: Lens, covariance: Covariance, quantities: Callable[[Lens], Array]) -> tuple[Array, Array]:
+def _with_sigmas(of: Lens, quantities: Callable[[Lens], Array]) -> tuple[Array, Array]:
     """Quantities (n,) of a lens and their standard deviations, by central differences."""
-    cofactor = covariance.of(of.unknowns)
+    cofactor = displacement_covariance(of)
     columns = []
     for number, sigma in enumerate(np.sqrt(np.maximum(np.diag(cofactor), 0.0)).tolist()):
         step = _STEP_SIGMAS * sigma
@@ -124,9 +123,6 @@ def _with_sigmas(of: Lens, covariance: Covariance, quantities: Callable[[Lens], 
 
 def _moved(of: Lens, number: int, step: float) -> Lens:
     """c is the first of the unknowns."""
-    interior, parameters = of.interior.copy(), of.parameters.copy()
-    if number == 0:
-        interior[0] += step
-    else:
-        parameters[number - 1] += step
-    return replace(of, interior=interior, parameters=parameters)
+    values = of.values
+    values[number + 2 if number else 0] += step
+    return of.with_values(values)

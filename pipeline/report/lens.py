@@ -1,15 +1,13 @@
 """The distortion of a camera as curves over the radius, with their standard deviations from the full covariance."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from adjust.functional_model.displacement import Displacement
-from adjust.functional_model.displacement import displacement as lens_displacement
 from adjust.functional_model.families import family, parameter_names
-from adjust.functional_model.lens import Distortion
+from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
 from pipeline.report.data import Json
@@ -21,26 +19,6 @@ RADII = 80
 DIRECTIONS = 36
 FRAME_GRID = 17
 BAND = 1.959964  # sigmas to a probability of 95 %
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A camera's interior orientation as estimated: c, x0', y0' (3,) in mm, and the parameters (k,) of its family."""
-
-    name: str
-    distortion: Distortion
-    interior: Array
-    parameters: Array
-
-    @property
-    def is_of_frame(self) -> bool:
-        """Whether the family is defined over the frame, and not over the radius."""
-        return family(self.distortion.family).needs == "half_mm"
-
-    @property
-    def unknowns(self) -> tuple[Parameter, ...]:
-        """c and the parameters, on which a displacement about the principal point depends."""
-        return tuple(Parameter.interior(self.name, name) for name in ("c", *parameter_names(self.distortion.family)))
 
 
 @dataclass(frozen=True)
@@ -58,26 +36,34 @@ class Curves:
     asymmetric_sigma_um: Array
 
 
-def lens(name: str, camera: Json) -> Lens:
-    """From a camera's entry in adjustment.json."""
-    return Lens(name, *calibrated_lens(camera))
+def lens(name: str, camera: Json, covariance: Covariance | None = None) -> Lens:
+    """From a camera's entry in adjustment.json, with its covariance where that is known."""
+    of = calibrated_lens(camera)
+    if covariance is None:
+        return of
+    return replace(of, covariance=covariance.of(Parameter.interior(name, each) for each in of.quantities))
 
 
-def displacement(of: Lens, from_principal_point_mm: Array) -> Displacement:
-    """What the lens does at observed points (n, 2), counted from the principal point."""
-    return lens_displacement(of.distortion, of.interior, of.parameters, from_principal_point_mm)
+def is_of_frame(of: Lens) -> bool:
+    """Whether the family is defined over the frame, and not over the radius."""
+    return family(of.distortion.family).needs == "half_mm"
 
 
-def curves(of: Lens, covariance: Covariance, largest_radius_mm: float) -> Curves:
+def displacement_covariance(of: Lens) -> Array:
+    """(1 + k, 1 + k) of c and the parameters, on which a displacement about the principal point depends."""
+    return np.delete(np.delete(of.covariance, [1, 2], axis=0), [1, 2], axis=1)
+
+
+def curves(of: Lens, largest_radius_mm: float) -> Curves:
     """The curves from the principal point out to a radius, or as far as the lens makes an image."""
     radius = np.linspace(0.0, largest_radius_mm, RADII)[1:]
     outward = _directions()
-    imaged = displacement(of, (radius[:, None, None] * outward).reshape(-1, 2)).imaged.reshape(len(radius), -1)
+    imaged = of.displacement((radius[:, None, None] * outward).reshape(-1, 2)).imaged.reshape(len(radius), -1)
     radius = radius[np.logical_and.accumulate(imaged.all(axis=1))]
-    moved = displacement(of, (radius[:, None, None] * outward).reshape(-1, 2))
+    moved = of.displacement((radius[:, None, None] * outward).reshape(-1, 2))
     value = moved.value_um.reshape(len(radius), DIRECTIONS, 2)
     by = moved.by_unknowns_um.reshape(len(radius), DIRECTIONS, 2, -1)
-    cofactor = covariance.of(of.unknowns)
+    cofactor = displacement_covariance(of)
 
     radial = np.einsum("rdi,di->r", value, outward) / DIRECTIONS
     radial_by = np.einsum("rdik,di->rk", by, outward) / DIRECTIONS
@@ -102,7 +88,7 @@ def largest_effects_um(of: Lens, radius_mm: float) -> dict[str, float]:
 
     Of a family that is defined over the frame: anywhere in it, for beyond it a polynomial means nothing.
     """
-    moved = displacement(of, _over_the_frame(of.distortion.half_mm) if of.is_of_frame else radius_mm * _directions())
+    moved = of.displacement(_over_the_frame(of.distortion.half_mm) if is_of_frame(of) else radius_mm * _directions())
     sizes = np.hypot(moved.by_unknowns_um[:, 0, 1:], moved.by_unknowns_um[:, 1, 1:]).max(axis=0)
     return dict(zip(parameter_names(of.distortion.family), sizes.tolist(), strict=True))
 

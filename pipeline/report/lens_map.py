@@ -6,11 +6,11 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from adjust.functional_model.lens import Lens
 from pipeline.drawing import svg
-from pipeline.report.lens import Lens, displacement
+from pipeline.report.lens import displacement_covariance
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.vectors import FOOT_PX, Plane, scale_bar
-from pipeline.results.adjustment_reader import Covariance
 
 Array = NDArray[np.float64]
 
@@ -29,16 +29,16 @@ class LensMap:
     largest_um: tuple[str, str]
 
 
-def lens_map(of: Lens, covariance: Covariance, on: Plane, observed_radius_mm: float = np.inf) -> LensMap:
+def lens_map(of: Lens, on: Plane, observed_radius_mm: float = np.inf) -> LensMap:
     """The displacement at a grid of observed points over a plane, from the ideal to the observed place; grey beyond the
     outermost target, where it is extrapolated."""
     xy = _grid(on)
-    xy = xy[displacement(of, xy - of.interior[1:]).imaged]  # a fisheye's image does not fill the corners
-    moved = displacement(of, xy - of.interior[1:])
+    xy = xy[of.displacement(xy - of.interior[1:]).imaged]  # a fisheye's image does not fill the corners
+    moved = of.displacement(xy - of.interior[1:])
     size = np.hypot(*moved.value_um.T)
     at = int(size.argmax())
     by = (moved.value_um[at] / max(float(size[at]), 1e-12)) @ moved.by_unknowns_um[at]
-    sigma = float(np.sqrt(max(by @ covariance.of(of.unknowns) @ by, 0.0)))
+    sigma = float(np.sqrt(max(by @ displacement_covariance(of) @ by, 0.0)))
     beyond = np.hypot(*(xy - of.interior[1:]).T) > observed_radius_mm
     edge = _circle(of.interior[1:], observed_radius_mm, on) if beyond.any() else Markup("")
     drawn = _drawn(xy, moved.value_um, beyond, edge, on)

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.lens import Distortion
-from adjust.functional_model.projection import camera_from_ray, ideal_from_observed
+from adjust.functional_model.lens import Lens
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
 from pipeline.results.adjustment_reader import calibrated_lens
@@ -20,15 +19,6 @@ Mask = NDArray[np.bool_]
 Json = Mapping[str, Any]
 
 _RAD_PER_DEG = np.pi / 180.0
-
-
-@dataclass(frozen=True)
-class Lens:
-    """An interior orientation c, x0', y0' (3,) in mm and its distortion with parameters (k,)."""
-
-    distortion: Distortion
-    interior: Array
-    parameters: Array
 
 
 @dataclass(frozen=True)
@@ -47,7 +37,7 @@ class FrameChain:
         observed, seen = xy_mm, np.ones(len(xy_mm), dtype=bool)
         if self.lens is not None:
             ray = (xy_mm - self.lens.interior[1:]) / self.lens.interior[0]
-            observed, seen = camera_from_ray(self.lens.distortion, self.lens.interior, self.lens.parameters, ray)
+            observed, seen = self.lens.camera_from_ray(ray)
         comparator, on_film = self.film.comparator_from_camera(observed)
         place, on_glass = self.bend.inverse(self.bend_parameters, comparator)
         return pixel_from_comparator(place, self.pitch_um), seen & on_film & on_glass
@@ -58,7 +48,7 @@ class FrameChain:
         observed = self.film.camera_from_comparator(comparator)
         if self.lens is None:
             return observed, np.ones(len(observed), dtype=bool)
-        return ideal_from_observed(self.lens.distortion, self.lens.interior, self.lens.parameters, observed)
+        return self.lens.ideal_from_observed(observed)
 
 
 def adjusted_chain(measured: MeasuredScan, adjustment: Json, with_lens: bool) -> FrameChain:
@@ -83,7 +73,7 @@ def image_chain(
         terms = scanner["terms"]
         bend = Bend(tuple(terms), tuple(scanner["center_mm"]), tuple(scanner["half_mm"]))
         bend_parameters = np.array([term["value"] for term in terms.values()], float)
-    lens = Lens(*calibrated_lens(adjustment["cameras"][image["camera"]])) if with_lens else None
+    lens = calibrated_lens(adjustment["cameras"][image["camera"]]) if with_lens else None
     return FrameChain(pitch_um, film, bend, bend_parameters, lens)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion
+from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.parameter import (
     Parameter,
@@ -143,8 +143,8 @@ def _array(data: bytes, name: str, file: Path) -> NDArray[Any]:
         raise InputError(f"{file}: is not a covariance file ({name}: {error}). {_AGAIN}") from None
 
 
-def calibrated_lens(camera: Json) -> tuple[Distortion, Array, Array]:
-    """From a camera's entry in adjustment.json: distortion, c, x0', y0' (3,) in mm, the family's parameters (k,)."""
+def calibrated_lens(camera: Json) -> Lens:
+    """The lens of a camera's entry in adjustment.json, without its covariance."""
     stored = camera["distortion"]
     half = stored.get("half_mm", (0.0, 0.0))
     distortion = Distortion(
@@ -156,7 +156,7 @@ def calibrated_lens(camera: Json) -> tuple[Distortion, Array, Array]:
     point = camera["principal_point_mm"]
     interior = [camera["principal_distance_mm"]["value"], point["x"]["value"], point["y"]["value"]]
     values = [stored.get(parameter, {"value": 0.0})["value"] for parameter in parameter_names(distortion.family)]
-    return distortion, np.array(interior, dtype=float), np.array(values, dtype=float)
+    return Lens(distortion, np.array(interior, dtype=float), np.array(values, dtype=float))
 
 
 def stored_films(content: Json, images: Iterable[str]) -> dict[str, Film]:

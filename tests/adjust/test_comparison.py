@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
-from adjust.functional_model.lens import Distortion
+from adjust.functional_model.lens import Distortion, Lens
 from adjust.quality.lens_comparison import CameraCalibration, compare, sigmas
 
 Array = NDArray[np.float64]
@@ -40,7 +40,7 @@ def calibration(values: Array, marks: dict[str, Array] | None = None) -> CameraC
     whole = np.zeros(10)
     whole[AT] = values
     return CameraCalibration(
-        "K", Distortion("torlegard"), whole[:3], whole[3:], dict(marks or MARKS), covariance(), redundancy=5000
+        "K", Lens(Distortion("torlegard"), whole[:3], whole[3:]), dict(marks or MARKS), covariance(), redundancy=5000
     )
 
 
@@ -129,8 +129,7 @@ def test_over_flat_ground_another_principal_distance_is_another_height() -> None
 def test_families_that_mean_the_same_agree() -> None:
     brown = replace(
         calibration(TRUE),
-        distortion=Distortion("brown"),
-        parameters=np.array([TRUE[3], TRUE[4], 0.0, TRUE[5], TRUE[6], 0.0, 0.0]),
+        lens=Lens(Distortion("brown"), TRUE[:3], np.array([TRUE[3], TRUE[4], 0.0, TRUE[5], TRUE[6], 0.0, 0.0])),
         covariance=np.zeros((18, 18)),
     )
     compared = compare([calibration(TRUE), brown], HALF)

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from simulated import KINDS, Truth, simulated
 
-from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Decentering, Distortion, Prior
+from adjust.functional_model.lens import Decentering, Distortion, Lens, Prior
 from adjust.functional_model.projection import rays
 from adjust.functional_model.rotation import rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
@@ -50,12 +49,12 @@ def test_image_equations_by_complex_steps(family: str, decentering: Decentering)
         rng.uniform(-100, 100, (6, 2)),
         rng.uniform(-0.7, 0.7, (6, 2)),
     ]
-    at = image_equations(distortion, *parts)
+    at = Lens(distortion, *parts[:2]).equations(*parts[2:])
     for part_number, derivative in enumerate((at.by_interior, at.by_parameters, at.by_xy, at.by_ray)):
         for column in range(derivative.shape[2]):
             moved = [part.astype(complex) for part in parts]
             moved[part_number][..., column] += 1j * STEP
-            numeric = image_equations(distortion, *moved).value.imag / STEP
+            numeric = Lens(distortion, *moved[:2]).equations(*moved[2:]).value.imag / STEP
             scale = np.abs(numeric).max() or 1.0
             np.testing.assert_allclose(derivative[..., column], numeric, rtol=0, atol=2e-14 * scale)
 

@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion, Prior
-from adjust.functional_model.projection import ideal_from_observed
+from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
@@ -86,7 +85,7 @@ def distortion_errors(result: Adjustment, radius_mm: float) -> tuple[Array, Arra
 
     def ideal(values: Array) -> Array:
         interior = np.array([values[0], 0.0, 0.0])
-        return ideal_from_observed(of, interior, values[1:], places)[0]
+        return Lens(of, interior, values[1:]).ideal_from_observed(places)[0]
 
     values = np.array([result.value(name) for name in names])
     steps = 1e-3 * np.array([result.sigma(name) for name in names])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion, Prior
+from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.lens_conversion import convert_lens
 from adjust.initial_values.approximations import approximate
 from adjust.problem.network import Network
@@ -31,12 +31,12 @@ def test_another_r0_is_another_principal_distance() -> None:
     """c, k and p are divided by 1 + k3 r0² + k5 r0⁴: exact, and the derivative by k3 is that of the quotient."""
     r0, k3, k5, p1 = 9.0, 1.1e-4, -2e-7, 4e-6
     lens = values("torlegard", k3=k3, k5=k5, p1=p1)
-    found = convert_lens(Distortion("torlegard", r0_mm=r0), INTERIOR, lens, Distortion("brown"), CORNERS_MM)
+    found = convert_lens(Lens(Distortion("torlegard", r0_mm=r0), INTERIOR, lens), Distortion("brown"), CORNERS_MM)
     s = 1 + k3 * r0**2 + k5 * r0**4
     assert found.is_same
     assert found.estimated == ("k1", "k2", "p1")
-    np.testing.assert_allclose(found.interior, [INTERIOR[0] / s, *INTERIOR[1:]], rtol=1e-12)
-    np.testing.assert_allclose(found.parameters, values("brown", k1=k3 / s, k2=k5 / s, p1=p1 / s), rtol=1e-8)
+    np.testing.assert_allclose(found.lens.interior, [INTERIOR[0] / s, *INTERIOR[1:]], rtol=1e-12)
+    np.testing.assert_allclose(found.lens.parameters, values("brown", k1=k3 / s, k2=k5 / s, p1=p1 / s), rtol=1e-8)
     c_by_k3 = -INTERIOR[0] * r0**2 / s**2
     assert found.by_source[0, 3] == pytest.approx(c_by_k3, rel=1e-7)
     assert found.by_source[3, 3] == pytest.approx(1 / s - k3 * r0**2 / s**2, rel=1e-6)
@@ -46,9 +46,11 @@ def test_the_ideal_point_in_mm_and_without_units() -> None:
     """aicon with r0 = 0 is OpenCV's: k1 = a1 c², p1 = -b2 c, p2 = b1 c, as cv2 projects."""
     c = INTERIOR[0]
     given = {"a1": -1.1e-4, "a2": 1.5e-7, "b1": 6e-6, "b2": -9e-6}
-    found = convert_lens(Distortion("aicon"), INTERIOR, values("aicon", **given), Distortion("opencv"), CORNERS_MM)
+    found = convert_lens(
+        Lens(Distortion("aicon"), INTERIOR, values("aicon", **given)), Distortion("opencv"), CORNERS_MM
+    )
     assert found.is_same
-    k1, k2, p1, p2 = found.parameters[:4]
+    k1, k2, p1, p2 = found.lens.parameters[:4]
     expected = [given["a1"] * c**2, given["a2"] * c**4, -given["b2"] * c, given["b1"] * c]
     np.testing.assert_allclose([k1, k2, p1, p2], expected, rtol=1e-9)
     ray = np.array([0.3, 0.2])  # by hand, beside OpenCV with y down
@@ -68,21 +70,23 @@ def test_the_ideal_point_in_mm_and_without_units() -> None:
 
 def test_frasers_terms_are_browns_with_the_other_sign() -> None:
     given = {"k1": 1e-4, "k2": -1e-7, "p1": 5e-6, "p2": -8e-6, "b1": 1e-4, "b2": -2e-4}
-    found = convert_lens(Distortion("brown"), INTERIOR, values("brown", **given), Distortion("australis"), CORNERS_MM)
+    found = convert_lens(
+        Lens(Distortion("brown"), INTERIOR, values("brown", **given)), Distortion("australis"), CORNERS_MM
+    )
     assert found.is_same
-    np.testing.assert_allclose(found.parameters, -values("brown", **given), rtol=1e-8)
-    back = convert_lens(Distortion("australis"), found.interior, found.parameters, Distortion("brown"), CORNERS_MM)
+    np.testing.assert_allclose(found.lens.parameters, -values("brown", **given), rtol=1e-8)
+    back = convert_lens(found.lens, Distortion("brown"), CORNERS_MM)
     used = [0, 1, 2, 3, 4, 6, 7, 8, 9]  # k3 is 0 and certain: nothing takes its place
     np.testing.assert_allclose((back.by_source @ found.by_source)[np.ix_(used, used)], np.eye(9), atol=1e-6)
 
 
 def test_what_is_0_and_uncertain_has_its_counterpart() -> None:
     """A lens that is yet to be found: k3 and p1 free at 0 are k1 and p1, and nothing else."""
-    lens = Distortion("torlegard"), INTERIOR, np.zeros(7)
-    found = convert_lens(*lens, Distortion("brown"), CORNERS_MM, None, ("k3", "p1"))
+    lens = Lens(Distortion("torlegard"), INTERIOR, np.zeros(7))
+    found = convert_lens(lens, Distortion("brown"), CORNERS_MM, None, ("k3", "p1"))
     assert found.is_same
     assert found.estimated == ("k1", "p1")
-    assert convert_lens(*lens, Distortion("brown"), CORNERS_MM).estimated == ()
+    assert convert_lens(lens, Distortion("brown"), CORNERS_MM).estimated == ()
 
 
 def test_covariance_is_that_of_the_same_data_adjusted_in_the_other_family() -> None:
@@ -92,13 +96,14 @@ def test_covariance_is_that_of_the_same_data_adjusted_in_the_other_family() -> N
     network = first.network
     second = adjusted(in_family(network, "opencv"), ("k1", "k2", "p1", "p2"))
     source, names = quantities("aicon"), quantities("opencv")
-    lens = np.array([first.value(name) for name in source])
-    found = convert_lens(network.cameras[0].distortion, lens[:3], lens[3:], Distortion("opencv"), CORNERS_MM)
+    values = np.array([first.value(name) for name in source])
+    lens = Lens(network.cameras[0].distortion, values[:3], values[3:], first.cofactor_of(source))
+    found = convert_lens(lens, Distortion("opencv"), CORNERS_MM)
     assert found.is_same
-    covariance, expected = found.covariance(first.cofactor_of(source)), second.cofactor_of(names)
+    covariance, expected = found.lens.covariance, second.cofactor_of(names)
     sigmas = np.sqrt(np.diag(expected))
     free = sigmas > 0.0
-    assert (np.abs(np.concatenate([found.interior, found.parameters]) - [second.value(n) for n in names])[free]
+    assert (np.abs(found.lens.values - [second.value(n) for n in names])[free]
             < 1e-4 * sigmas[free]).all()  # fmt: skip
     scale = np.outer(sigmas, sigmas)[np.ix_(free, free)]
     np.testing.assert_allclose(covariance[np.ix_(free, free)] / scale, expected[np.ix_(free, free)] / scale, atol=1e-5)
@@ -123,7 +128,7 @@ def adjusted(network: Network, free: tuple[str, ...]) -> Adjustment:
 def test_what_no_family_takes_is_told_by_its_residual() -> None:
     """A correction of the observed point as one of the ideal point: 0.7 um are left."""
     lens = values("torlegard", k3=1e-4, k5=-1e-7, p1=5e-6, p2=-8e-6)
-    found = convert_lens(Distortion("torlegard"), INTERIOR, lens, Distortion("opencv"), CORNERS_MM)
+    found = convert_lens(Lens(Distortion("torlegard"), INTERIOR, lens), Distortion("opencv"), CORNERS_MM)
     assert not found.is_same
     assert 1e-4 < found.largest_mm < 1e-3
     assert found.rms_mm < found.largest_mm
@@ -135,14 +140,14 @@ def test_every_lens_comes_near_every_other(source: str, target: str) -> None:
     c, given = LENSES[source]
     lens = values(source, **given), np.array([c, 0.12, -0.07])
     into = Distortion(target, r0_mm=10.0 if target in ("torlegard", "aicon") else 0.0)
-    found = convert_lens(Distortion(source, r0_mm=13.0), lens[1], lens[0], into, CORNERS_MM / 2.0)
+    found = convert_lens(Lens(Distortion(source, r0_mm=13.0), lens[1], lens[0]), into, CORNERS_MM / 2.0)
     assert found.largest_mm < 0.03
 
 
 def test_a_frame_without_an_image_is_refused() -> None:
     with pytest.raises(AdjustmentError, match="makes no image at"):
         convert_lens(
-            Distortion("opencv_fisheye"), np.array([5.0, 0.0, 0.0]), np.zeros(6), Distortion("opencv"), CORNERS_MM
+            Lens(Distortion("opencv_fisheye"), np.array([5.0, 0.0, 0.0]), np.zeros(6)), Distortion("opencv"), CORNERS_MM
         )
     with pytest.raises(ValueError, match="brown has no parameter a1"):
-        convert_lens(Distortion("opencv"), INTERIOR, np.zeros(16), Distortion("brown"), CORNERS_MM, ("a1",))
+        convert_lens(Lens(Distortion("opencv"), INTERIOR, np.zeros(16)), Distortion("brown"), CORNERS_MM, ("a1",))

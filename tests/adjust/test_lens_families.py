@@ -7,8 +7,7 @@ import pytest
 from lens_networks import LENSES, R0_MM, network_of
 
 from adjust.functional_model.families import family, parameter_names
-from adjust.functional_model.lens import Distortion
-from adjust.functional_model.projection import camera_from_ray, folded_over, ideal_from_observed
+from adjust.functional_model.lens import Distortion, Lens
 from adjust.initial_values.approximations import approximate
 from adjust.solution.adjustment import adjust
 
@@ -63,10 +62,10 @@ def test_r0_balances_the_ideal_point_and_not_the_observed_one() -> None:
     rays = R0_MM / 30.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     interior, values = np.array([30.0, 0.5, -0.2]), np.array([-1e-4, 1e-7, 0.0, 0.0, 0.0, 0.0, 0.0])
     balanced = Distortion("aicon", r0_mm=R0_MM)
-    seen, found = camera_from_ray(balanced, interior, values, rays)
+    seen, found = Lens(balanced, interior, values).camera_from_ray(rays)
     assert found.all()
     np.testing.assert_allclose(seen, interior[1:] + 30.0 * rays, atol=1e-13)
-    inner, _ = camera_from_ray(balanced, interior, values, 0.5 * rays)
+    inner, _ = Lens(balanced, interior, values).camera_from_ray(0.5 * rays)
     half = R0_MM / 2.0
     expected = half * (1.0 - 1e-4 * (half**2 - R0_MM**2) + 1e-7 * (half**4 - R0_MM**4))
     np.testing.assert_allclose(np.linalg.norm(inner - interior[1:], axis=1), expected, rtol=1e-13)
@@ -77,11 +76,11 @@ def test_a_fisheye_without_parameters_is_equidistant() -> None:
     interior, zero = np.array([10.0, 0.0, 0.0]), np.zeros(len(parameter_names("opencv_fisheye")))
     angles = np.radians([0.0, 30.0, 60.0, 85.0])
     at = np.column_stack([10.0 * angles, np.zeros(4)])
-    ideal, found = ideal_from_observed(Distortion("opencv_fisheye"), interior, zero, at)
+    ideal, found = Lens(Distortion("opencv_fisheye"), interior, zero).ideal_from_observed(at)
     assert found.all()
     np.testing.assert_allclose(ideal[:, 0], 10.0 * np.tan(angles), rtol=1e-12)
     beyond = np.array([[16.0, 0.0], [3.0, 0.0]])
-    assert list(folded_over(Distortion("opencv_fisheye"), interior, zero, beyond)) == [True, False]
+    assert list(Lens(Distortion("opencv_fisheye"), interior, zero).folded_over(beyond)) == [True, False]
 
 
 def test_every_parameter_has_its_unit_and_a_ladder_names_only_parameters() -> None:

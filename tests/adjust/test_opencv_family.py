@@ -12,8 +12,8 @@ from simulated import Truth, camera_point, field_points, simulated
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion, Prior
-from adjust.functional_model.projection import ImageModel, camera_from_ray, ideal_from_observed
+from adjust.functional_model.lens import Distortion, Lens, Prior
+from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.functional_model.transformation import Film
 from adjust.initial_values.approximations import approximate
@@ -111,10 +111,10 @@ def test_skew_and_fisheye_are_opencvs(
     rays = np.vstack([np.random.default_rng(3).uniform(-largest, largest, (60, 2)) / np.sqrt(2.0), np.zeros(2)])
     interior = np.array([FY, CX, -CY]) * PIXEL_MM
     values = np.array([*lens, FX / FY - 1.0, SKEW / FY])
-    seen, found = camera_from_ray(Distortion(family), interior, values, rays)
+    seen, found = Lens(Distortion(family), interior, values).camera_from_ray(rays)
     assert found.all()
     np.testing.assert_allclose(seen, mm(pixels(rays)), atol=1e-11)
-    ideal, found = ideal_from_observed(Distortion(family), interior, values, seen)
+    ideal, found = Lens(Distortion(family), interior, values).ideal_from_observed(seen)
     assert found.all()
     np.testing.assert_allclose((ideal - interior[1:]) / interior[0], rays, atol=1e-12)
 
@@ -124,7 +124,7 @@ def test_corrected_points_are_opencvs_undistorted_points() -> None:
     pixels = rng.uniform([0, 0], SIZE_PX, (40, 2))
     values = np.array([*DISTORTION, FX / FY - 1.0, 0.0])
     interior = np.array([FY, CX, -CY]) * PIXEL_MM
-    ideal, found = ideal_from_observed(Distortion("opencv"), interior, values, mm(pixels))
+    ideal, found = Lens(Distortion("opencv"), interior, values).ideal_from_observed(mm(pixels))
     matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
     normal = cv2.undistortPoints(pixels[:, None], matrix, DISTORTION, R=np.eye(3), P=np.eye(3), criteria=criteria)
@@ -176,9 +176,11 @@ def test_torlegard_is_inverted() -> None:
     xyz = field_points(np.random.default_rng(1), 30)
     angles, station = np.array(truth.attitudes[1]), np.array(truth.stations[1])
     model = ImageModel(
-        Distortion("torlegard"),
-        np.array([truth.c, truth.x0, truth.y0]),
-        np.array([truth.distortion.get(name, 0.0) for name in parameter_names("torlegard")]),
+        Lens(
+            Distortion("torlegard"),
+            np.array([truth.c, truth.x0, truth.y0]),
+            np.array([truth.distortion.get(name, 0.0) for name in parameter_names("torlegard")]),
+        ),
         rotation_from_angles(angles),
         station,
         Film("none", np.empty(0), np.zeros(2)),
@@ -187,7 +189,7 @@ def test_torlegard_is_inverted() -> None:
     assert visible.all()
     expected = camera_point(truth, 1, xyz)
     np.testing.assert_allclose(observed, expected, atol=1e-10)
-    ideal, found = model.ideal_from_observed(observed)
+    ideal, found = model.lens.ideal_from_observed(observed)
     u, v, w = model.rotation @ (xyz - station).T
     assert found.all()
     np.testing.assert_allclose(
@@ -199,17 +201,15 @@ def test_what_has_no_image_is_told() -> None:
     """Behind the camera, and beyond the radius where a polynomial folds the image over."""
     fold = Distortion("torlegard")
     parameters = np.array([4e-5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # x - k3 x³ turns back at 91 mm
-    _, found = camera_from_ray(fold, np.array([100.0, 0.0, 0.0]), parameters, np.array([[0.3, 0.0], [2.0, 0.0]]))
+    _, found = Lens(fold, np.array([100.0, 0.0, 0.0]), parameters).camera_from_ray(np.array([[0.3, 0.0], [2.0, 0.0]]))
     assert list(found) == [True, False]
     barrel = np.array([-0.3] + [0.0] * 15)  # OpenCV's k1: the image of a ray turns back at a slope of 1.05
-    _, found = camera_from_ray(
-        Distortion("opencv"), np.array([100.0, 0.0, 0.0]), barrel, np.array([[0.9, 0], [1.2, 0]])
+    _, found = Lens(Distortion("opencv"), np.array([100.0, 0.0, 0.0]), barrel).camera_from_ray(
+        np.array([[0.9, 0], [1.2, 0]])
     )
     assert list(found) == [True, False]
     model = ImageModel(
-        Distortion(),
-        np.array([100.0, 0.0, 0.0]),
-        np.empty(0),
+        Lens(Distortion(), np.array([100.0, 0.0, 0.0]), np.empty(0)),
         np.eye(3),
         np.zeros(3),
         Film("none", np.empty(0), np.zeros(2)),

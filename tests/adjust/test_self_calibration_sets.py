@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion
+from adjust.functional_model.lens import Distortion, Lens
 
 Array = NDArray[np.float64]
 
@@ -19,7 +18,7 @@ def columns(family: str, xy_mm: Array, half_mm: tuple[float, float] = (B, B)) ->
     names = parameter_names(family)
     interior = np.array([C, 0.3, -0.2])
     observed = xy_mm + interior[1:]
-    at = image_equations(Distortion(family, half_mm=half_mm), interior, np.zeros(len(names)), observed, xy_mm / C)
+    at = Lens(Distortion(family, half_mm=half_mm), interior, np.zeros(len(names))).equations(observed, xy_mm / C)
     return -at.by_parameters
 
 

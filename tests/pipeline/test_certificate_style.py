@@ -8,24 +8,18 @@ import numpy as np
 import pytest
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion
-from adjust.problem.parameter import Parameter
+from adjust.functional_model.lens import Distortion, Lens
 from pipeline.exchange.certificate import fit, read_certificate
 from pipeline.report.certificate import ANGLES_DEG, certificate_view
-from pipeline.report.lens import Lens
-from pipeline.results.adjustment_reader import Covariance
 
 C, K3, K5 = 153.02, 2.0e-8, -1.5e-12
 NAMES = parameter_names("torlegard")
+SIGMAS = {"c": 0.01, "k3": 4e-9, "k5": 3e-13}
 LENS = Lens(
-    "K",
     Distortion("torlegard"),
     np.array([C, 0.1, -0.2]),
     np.array([{"k3": K3, "k5": K5, "p1": 3e-7}.get(name, 0.0) for name in NAMES]),
-)
-SIGMAS = {"c": 0.01, "k3": 4e-9, "k5": 3e-13}
-COVARIANCE = Covariance(
-    tuple(Parameter.interior("K", name) for name in SIGMAS), np.zeros(3), np.diag(np.square(list(SIGMAS.values())))
+    np.diag([SIGMAS.get(name, 0.0) ** 2 for name in ("c", "x0", "y0", *NAMES)]),
 )
 REACH_MM = 140.0
 
@@ -58,7 +52,7 @@ def balanced(lens: tuple[float, float, float]) -> float:
 
 
 def test_the_table_is_that_of_the_lens() -> None:
-    view = certificate_view(LENS, COVARIANCE, REACH_MM)
+    view = certificate_view(LENS, REACH_MM)
     calibrated = balanced((C, K3, K5))
     assert number(view.calibrated[0]) == pytest.approx(calibrated, abs=6e-4)
     assert number(view.equivalent[0]) == pytest.approx(C, abs=6e-4)
@@ -72,7 +66,7 @@ def test_the_table_is_that_of_the_lens() -> None:
 def test_its_standard_deviations_are_those_of_lenses_drawn_at_random() -> None:
     rng = np.random.default_rng(2)
     drawn = [rng.normal((C, K3, K5), list(SIGMAS.values())) for _ in range(300)]
-    view = certificate_view(LENS, COVARIANCE, REACH_MM)
+    view = certificate_view(LENS, REACH_MM)
     distances = [balanced((float(c), float(k3), float(k5))) for c, k3, k5 in drawn]
     assert number(view.calibrated[1]) == pytest.approx(np.std(distances), rel=0.15)
     for row in view.rows[1:]:
@@ -90,8 +84,8 @@ def test_its_standard_deviations_are_those_of_lenses_drawn_at_random() -> None:
 def test_the_printed_table_gives_the_lens_back(tmp_path: Path, c: float, k3: float, k5: float, reach_mm: float) -> None:
     """Typed as a certificate, the camera comes out again, to the tenths of a micrometre that are printed."""
     powers = np.array([{"k3": k3, "k5": k5}.get(name, 0.0) for name in NAMES])
-    lens = replace(LENS, interior=np.array([c, 0.0, 0.0]), parameters=powers)
-    view = certificate_view(lens, replace(COVARIANCE, matrix=COVARIANCE.matrix * 1e-4), reach_mm)
+    lens = replace(LENS, interior=np.array([c, 0.0, 0.0]), parameters=powers, covariance=1e-4 * LENS.covariance)
+    view = certificate_view(lens, reach_mm)
     (tmp_path / "c.toml").write_text(
         f"calibrated_principal_distance_mm = {number(view.calibrated[0])}\n"
         f"angle_deg = {[number(row.angle_deg) for row in view.rows]}\n"
@@ -107,7 +101,7 @@ def test_the_printed_table_gives_the_lens_back(tmp_path: Path, c: float, k3: flo
 
 
 def test_a_narrow_camera_has_angles_of_its_own() -> None:
-    view = certificate_view(replace(LENS, interior=np.array([600.0, 0.0, 0.0])), COVARIANCE, 140.0)
+    view = certificate_view(replace(LENS, interior=np.array([600.0, 0.0, 0.0])), 140.0)
     angles = [number(row.angle_deg) for row in view.rows]
     assert len(angles) == 6
     assert angles[-1] == pytest.approx(np.degrees(np.arctan(140.0 / 600.0)), abs=0.1)

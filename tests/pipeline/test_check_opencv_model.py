@@ -6,9 +6,8 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion
-from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
-from adjust.functional_model.projection import camera_from_ray
+from adjust.functional_model.lens import Distortion, Lens
+from adjust.functional_model.lens_conversion import convert_lens
 from pipeline.opencv_check.opencv_model import (
     FISHEYE,
     NAMES,
@@ -42,9 +41,9 @@ def of_torlegard(
     values: dict[str, float], interior: Array = INTERIOR, r0_mm: float = 0.0
 ) -> tuple[dict[str, float], float]:
     """OpenCV's values, and what is left, rms in mm."""
-    lens = Distortion("torlegard", r0_mm=r0_mm), interior, lens_of("torlegard", **values)
-    found = to_opencv_model(*lens, FRAME_MM, RADIAL_TANGENTIAL)
-    return dict(zip(NAMES, opencv_values(found)[0].tolist(), strict=True)), found.rms_mm
+    lens = Lens(Distortion("torlegard", r0_mm=r0_mm), interior, lens_of("torlegard", **values))
+    found = to_opencv_model(lens, FRAME_MM, RADIAL_TANGENTIAL)
+    return dict(zip(NAMES, opencv_values(found.lens)[0].tolist(), strict=True)), found.rms_mm
 
 
 @pytest.mark.parametrize(("strength", "at_most_um"), [(1.0, 0.06), (4.0, 0.4)])
@@ -77,9 +76,9 @@ def test_r0_is_no_parameter_of_its_own() -> None:
 
 @pytest.mark.parametrize("family", list(VALUES))
 def test_opencvs_own_families_keep_their_values_and_project_as_opencv_does(family: str) -> None:
-    lens = lens_of(family, **VALUES[family])
-    found = to_opencv_model(Distortion(family), INTERIOR, lens, FRAME_MM, ())
-    values, _ = opencv_values(found)
+    lens = Lens(Distortion(family), INTERIOR, lens_of(family, **VALUES[family]))
+    found = to_opencv_model(lens, FRAME_MM, ())
+    values, _ = opencv_values(found.lens)
     assert found.is_same
     named = dict(zip(model_names(family), values, strict=True))
     b1 = VALUES[family]["b1"]
@@ -94,7 +93,7 @@ def test_opencvs_own_families_keep_their_values_and_project_as_opencv_does(famil
         )
     else:
         seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, values[4:])
-    ours, _ = camera_from_ray(Distortion(family), INTERIOR, lens, RAYS)
+    ours, _ = lens.camera_from_ray(RAYS)
     np.testing.assert_allclose(ours, np.reshape(seen, (-1, 2)) * (1.0, -1.0), atol=1e-12)
 
 
@@ -103,10 +102,9 @@ def test_derivatives_of_opencvs_values(family: str) -> None:
     start = np.concatenate([INTERIOR, lens_of(family, **VALUES[family])])
 
     def values(at: Array) -> Array:
-        lens = ConvertedLens(Distortion(family), at[:3], at[3:], (), np.zeros((0, 0)), 0.0, 0.0)
-        return opencv_values(lens)[0]
+        return opencv_values(Lens(Distortion(family), at[:3], at[3:]))[0]
 
-    _, by_lens = opencv_values(ConvertedLens(Distortion(family), start[:3], start[3:], (), start[None], 0.0, 0.0))
+    _, by_lens = opencv_values(Lens(Distortion(family), start[:3], start[3:]))
     for k, step in enumerate(1e-6 * np.eye(len(start))):
         numeric = (values(start + step) - values(start - step)) / 2e-6
         np.testing.assert_allclose(by_lens[:, k], numeric, atol=1e-7)
@@ -115,12 +113,12 @@ def test_derivatives_of_opencvs_values(family: str) -> None:
 def test_what_is_held_stays_and_its_share_is_not_taken_by_others() -> None:
     """By k3 alone, c and the principal point held: OpenCV's k1 changes as the series says, and nothing else does."""
     freedom = Freedom(("k1",))
-    lens = Distortion("torlegard"), INTERIOR, lens_of("torlegard", k3=1e-6)
-    whole = to_opencv_model(*lens, FRAME_MM, RADIAL_TANGENTIAL)
-    held = fixed("opencv", dict(zip(parameter_names("opencv"), whole.parameters.tolist(), strict=True)))
-    found = convert_lens(*lens, held, FRAME_MM, freedom.distortion, held=freedom.held)
-    np.testing.assert_allclose(found.parameters[1:], whole.parameters[1:], atol=1e-15)
-    assert (found.interior == INTERIOR).all()
+    lens = Lens(Distortion("torlegard"), INTERIOR, lens_of("torlegard", k3=1e-6))
+    whole = to_opencv_model(lens, FRAME_MM, RADIAL_TANGENTIAL)
+    held = fixed("opencv", dict(zip(parameter_names("opencv"), whole.lens.parameters.tolist(), strict=True)))
+    found = convert_lens(lens, held, FRAME_MM, freedom.distortion, held=freedom.held)
+    np.testing.assert_allclose(found.lens.parameters[1:], whole.lens.parameters[1:], atol=1e-15)
+    assert (found.lens.interior == INTERIOR).all()
     changed = found.by_source[:, 3]
     assert changed[3] == pytest.approx(C_MM**2, rel=1e-2)
     assert np.flatnonzero(changed).tolist() == [3]

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from simulated_project import write_project
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Prior
-from adjust.functional_model.projection import camera_from_ray
+from adjust.functional_model.lens import Lens, Prior
 from pipeline.cli import DONE, WRONG_INPUT, run
 from pipeline.files.camera_file import CameraFile, read_camera
 
@@ -61,7 +60,7 @@ def seen_px(camera: CameraFile, rays_down: Array) -> Array:
     assert camera.principal_distance_mm is not None
     assert camera.principal_point_mm is not None
     interior = np.array([camera.principal_distance_mm, *camera.principal_point_mm])
-    places, found = camera_from_ray(camera.distortion, interior, values, rays_down * [1.0, -1.0])
+    places, found = Lens(camera.distortion, interior, values).camera_from_ray(rays_down * [1.0, -1.0])
     assert found.all()
     return np.asarray(places * [1.0, -1.0] / PITCH_MM)
 

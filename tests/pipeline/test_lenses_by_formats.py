@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from simulated import affine, comparator_point, simulated
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion, Prior
-from adjust.functional_model.projection import camera_from_ray
+from adjust.functional_model.lens import Distortion, Lens, Prior
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.exchange.convention import IMPORTED
 from pipeline.files.camera_file import CameraFile, read_camera
@@ -129,7 +128,7 @@ def seen_px(camera: CameraFile, format: str) -> Array:
     names = parameter_names(camera.distortion.family)
     values = np.array([given[name].value if name in given else 0.0 for name in names])
     interior = np.array([camera.principal_distance_mm, *(camera.principal_point_mm or ())])
-    places, found = camera_from_ray(camera.distortion, interior, values, np.column_stack([-u / w, -v / w]))
+    places, found = Lens(camera.distortion, interior, values).camera_from_ray(np.column_stack([-u / w, -v / w]))
     assert found.all()
     middle = 0.0 if format == "metashape" else frame_px(0, np.zeros((1, 2)))
     return np.asarray(places * [1.0, -1.0] / PITCH_MM - middle)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion
+from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
@@ -99,15 +99,17 @@ def true_model(camera: dict[str, Any], frame: dict[str, Any]) -> ImageModel:
     distortion, exterior, film = camera["distortion"], frame["exterior"], frame["transformation"]
     angles = np.deg2rad([exterior[name]["value"] for name in ("omega_deg", "phi_deg", "kappa_deg")])
     return ImageModel(
-        Distortion(distortion["family"], {}, distortion["decentering"], distortion["r0_mm"]),
-        np.array(
-            [
-                camera["principal_distance_mm"]["value"],
-                camera["principal_point_mm"]["x"]["value"],
-                camera["principal_point_mm"]["y"]["value"],
-            ]
+        Lens(
+            Distortion(distortion["family"], {}, distortion["decentering"], distortion["r0_mm"]),
+            np.array(
+                [
+                    camera["principal_distance_mm"]["value"],
+                    camera["principal_point_mm"]["x"]["value"],
+                    camera["principal_point_mm"]["y"]["value"],
+                ]
+            ),
+            np.array([distortion[name]["value"] for name in parameter_names(distortion["family"])]),
         ),
-        np.array([distortion[name]["value"] for name in parameter_names(distortion["family"])]),
         rotation_from_angles(angles),
         np.array([exterior[name]["value"] for name in ("X0", "Y0", "Z0")]),
         Film("affine", np.array([film[name]["value"] for name in ("a1", "a2", "a3", "b1", "b2", "b3")]), np.zeros(2)),
@@ -143,7 +145,7 @@ def test_the_ellipse_of_a_near_disk_is_that_of_its_outline() -> None:
     radius, c = 0.9, 100.0
     centers, normals = np.array([[0.8, -0.5, -3.0], [-1.0, 0.6, -2.7]]), np.array([[0.6, 0.0, 0.8], [0.36, -0.48, 0.8]])
     film = Film("none", np.empty(0), np.zeros(2), False)
-    model = ImageModel(Distortion("none", {}), np.array([c, 0.0, 0.0]), np.empty(0), np.eye(3), np.zeros(3), film)
+    model = ImageModel(Lens(Distortion("none", {}), np.array([c, 0.0, 0.0]), np.empty(0)), np.eye(3), np.zeros(3), film)
     found = eccentricity_mm(model, centers, normals, radius)
     angles = np.linspace(0.0, 2.0 * np.pi, 4000, endpoint=False)
     for center, normal, off in zip(centers, normals, found, strict=True):
@@ -166,7 +168,9 @@ def test_the_eccentricity_of_disks_at_seven_digits_is_that_at_the_origin() -> No
         np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]]),
     )
     film = Film("none", np.empty(0), np.zeros(2), False)
-    model = ImageModel(Distortion("none", {}), np.array([100.0, 0.0, 0.0]), np.empty(0), np.eye(3), np.zeros(3), film)
+    model = ImageModel(
+        Lens(Distortion("none", {}), np.array([100.0, 0.0, 0.0]), np.empty(0)), np.eye(3), np.zeros(3), film
+    )
     far = np.array([500_000.0, 5_400_000.0, 300.0])
     there = eccentricity_mm(replace(model, station=far), centers + far, normals, 0.013)
     np.testing.assert_allclose(there, eccentricity_mm(model, centers, normals, 0.013), rtol=0.0, atol=1e-12)

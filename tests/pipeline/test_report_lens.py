@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from adjust.problem.parameter import Parameter
 from pipeline.report.fiducials import Figure, figure, figure_plot
-from pipeline.report.lens import curves, curves_plot, displacement, largest_effects_um, lens
+from pipeline.report.lens import curves, curves_plot, largest_effects_um, lens
 from pipeline.report.lens_map import lens_map
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import high_correlations, parameter_rows
@@ -41,7 +41,7 @@ def test_the_radial_curve_of_torlegard_is_its_polynomial_and_its_sigma_follows()
     k3, k5, s3, s5, rho = 1.7e-7, -5.4e-12, 3e-9, 2e-13, -0.97
     matrix = np.array([[s3**2, rho * s3 * s5], [rho * s3 * s5, s5**2]])
     drawn = curves(
-        lens("A", camera("torlegard", k3=k3, k5=k5)), covariance("A", ("k3", "k5"), matrix), RADIUS_MM
+        lens("A", camera("torlegard", k3=k3, k5=k5), covariance("A", ("k3", "k5"), matrix)), RADIUS_MM
     )  # fmt: skip
     r = drawn.radius_mm
     np.testing.assert_allclose(drawn.radial_um, 1e3 * (k3 * r**3 + k5 * r**5), rtol=1e-10)
@@ -54,7 +54,7 @@ def test_decentering_moves_a_point_by_three_times_its_profile_at_most() -> None:
     """Along the direction of (p1, p2) the decentering displacement is 3 sqrt(p1² + p2²) r², all of it radial."""
     p1, sigma = 8e-7, 9e-8
     drawn = curves(
-        lens("A", camera("torlegard", p1=p1)), covariance("A", ("p1",), np.array([[sigma**2]])), RADIUS_MM
+        lens("A", camera("torlegard", p1=p1), covariance("A", ("p1",), np.array([[sigma**2]]))), RADIUS_MM
     )  # fmt: skip
     np.testing.assert_allclose(drawn.asymmetric_um, 3e3 * p1 * drawn.radius_mm**2, rtol=1e-10)
     np.testing.assert_allclose(drawn.asymmetric_sigma_um, 3e3 * sigma * drawn.radius_mm**2, rtol=1e-8)
@@ -74,7 +74,7 @@ def test_the_opencv_family_is_drawn_as_opencv_undistorts() -> None:
     pixels = (observed * (1.0, -1.0) / pitch)[:, None, :]
     rays = cv2.undistortPoints(pixels, matrix, np.array(k), criteria=criteria)
     ideal = c * rays.reshape(-1, 2) * (1.0, -1.0)
-    np.testing.assert_allclose(displacement(of, observed).value_um, 1e3 * (observed - ideal), atol=1e-6)
+    np.testing.assert_allclose(of.displacement(observed).value_um, 1e3 * (observed - ideal), atol=1e-6)
 
 
 def test_the_band_of_the_opencv_family_knows_that_c_and_k1_move_together() -> None:
@@ -82,13 +82,13 @@ def test_the_band_of_the_opencv_family_knows_that_c_and_k1_move_together() -> No
     c, k1, sigma_c, sigma_k = 20.0, -0.12, 0.02, 2e-3
     off = -0.9 * sigma_c * sigma_k
     matrix = np.array([[sigma_c**2, off], [off, sigma_k**2]])
-    drawn = curves(lens("A", camera("opencv", c, k1=k1)), covariance("A", ("c", "k1"), matrix), 9.0)
+    drawn = curves(lens("A", camera("opencv", c, k1=k1), covariance("A", ("c", "k1"), matrix)), 9.0)
     r = drawn.radius_mm[-1]
     nodes, weights = np.polynomial.hermite_e.hermegauss(5)
     pairs = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2) @ np.linalg.cholesky(matrix).T + (c, k1)
     share = np.outer(weights, weights).ravel() / weights.sum() ** 2
     moved = np.array(
-        [displacement(lens("A", camera("opencv", a, k1=b)), np.array([[r, 0.0]])).value_um[0, 0] for a, b in pairs]
+        [lens("A", camera("opencv", a, k1=b)).displacement(np.array([[r, 0.0]])).value_um[0, 0] for a, b in pairs]
     )
     assert drawn.radial_sigma_um[-1] == pytest.approx(np.sqrt(share @ (moved - share @ moved) ** 2), rel=0.01)
 
@@ -101,8 +101,8 @@ def test_the_effect_of_a_parameter_is_the_displacement_it_makes() -> None:
 
 def test_the_map_shows_the_longest_vector_with_its_sigma() -> None:
     """k3 r³ with r to the outermost of 15 x 15 squares over a frame of 150 mm: 70 mm in x and y, less x0', y0'."""
-    of, matrix = lens("A", camera("torlegard", k3=1e-7)), np.array([[1e-18]])
-    drawn = lens_map(of, covariance("A", ("k3",), matrix), Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0))
+    of = lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]])))
+    drawn = lens_map(of, Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0))
     r = np.hypot(70.3, 70.2)
     assert drawn.largest_um == value_and_sigma(1e3 * 1e-7 * r**3, 1e3 * 1e-9 * r**3)
     assert drawn.plot.count("M") == 2 * 15**2 + drawn.plot.count('class="bar"')
@@ -110,13 +110,14 @@ def test_the_map_shows_the_longest_vector_with_its_sigma() -> None:
 
 def test_the_map_shows_what_lies_beyond_the_outermost_target() -> None:
     """Of 15 x 15 squares of 10 mm about (0.3, -0.2) the middles of 37 lie within 35 mm."""
-    of, plane = lens("A", camera("torlegard", k3=1e-7)), Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
-    drawn = lens_map(of, covariance("A", ("k3",), np.array([[1e-18]])), plane, 35.0)
+    of = lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]])))
+    plane = Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
+    drawn = lens_map(of, plane, 35.0)
     dots = {kind: re.search(f'd="([^"]*)" class="dot {kind}"', drawn.plot) for kind in ("target", "extrapolated")}
     counts = {kind: found[1].count("M") for kind, found in dots.items() if found}
     assert counts == {"target": 37, "extrapolated": 15**2 - 37}
     assert drawn.extrapolated
-    assert not lens_map(of, covariance("A", ("k3",), np.array([[1e-18]])), plane, 110.0).extrapolated
+    assert not lens_map(of, plane, 110.0).extrapolated
 
 
 def test_of_a_set_over_the_frame_the_effect_is_the_largest_within_it() -> None:
@@ -127,7 +128,7 @@ def test_of_a_set_over_the_frame_the_effect_is_the_largest_within_it() -> None:
 
 
 def test_the_curve_shows_where_no_target_was() -> None:
-    drawn = curves(lens("A", camera("torlegard", k3=1e-7)), covariance("A", ("k3",), np.array([[1e-18]])), RADIUS_MM)
+    drawn = curves(lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]]))), RADIUS_MM)
     assert "no targets here" in curves_plot(drawn, 100.0)
     assert "no targets here" not in curves_plot(drawn, RADIUS_MM)
 

@@ -13,13 +13,13 @@ import tifffile
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion
+from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import Film
 from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from pipeline.cli import run
 from pipeline.resampling.canvas import canvas_of, scan_places
-from pipeline.resampling.frame_chain import FrameChain, Lens
+from pipeline.resampling.frame_chain import FrameChain
 from pipeline.resampling.resample_stage import BEST, FAST, OtherScan, ResampleTask, resampled
 from pipeline.resampling.source import source_of
 
