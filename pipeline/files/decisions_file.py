@@ -7,12 +7,15 @@ only grows, so that who decided what, and when, can be seen for ever.
 import gc
 import json
 import os
+from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
 from functools import lru_cache
+from itertools import repeat
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -60,12 +63,12 @@ About = tuple[str, str, str]  # image, point, kind; of a pose: image, "", ""; of
 
 OF_SCANS = (Choice.POSE, Choice.LEARN, Choice.UNDO)  # and of no single mark
 _LONGEST_LINE = 4_000_000  # bytes
-_AT_A_TIME = 10_000  # lines
+_BYTES_AT_A_TIME = 300_000
 _MOST_MB = 2000
 _NO_PLACES: Mapping[str, tuple[float, float]] = {}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Decision:
     """One line. point, kind: of the mark; "" for a pose. col_px, row_px: of `place`. fingerprint: of the result that
     was looked at, and of `learn` the SHA-256 of the scan's file; window: what of it was seen, first column, first row,
@@ -113,19 +116,19 @@ def decisions_bytes(path: Path, start: int = 0) -> bytes:
 
 def parse_decisions(path: Path, data: bytes, first_line: int = 1) -> tuple[Decision, ...]:
     """The same of lines of the file, from one on. path: for messages."""
-    lines, decisions = data.split(b"\n"), list[Decision]()
-    if _is_cut_short(lines[-1]):
-        lines.pop()
+    decisions, start, number = list[Decision](), 0, first_line
     with _without_search_for_cycles():
-        for start in range(0, len(lines), _AT_A_TIME):
-            numbered = list(enumerate(lines[start : start + _AT_A_TIME], first_line + start))
-            numbered = [(number, line) for number, line in numbered if line and not line.isspace()]
-            number = 0
+        while start < len(data):
+            end = data.find(b"\n", start + _BYTES_AT_A_TIME) + 1 or len(data)
+            lines = data[start:end].split(b"\n")
+            if end == len(data) and _is_cut_short(lines[-1]):
+                lines.pop()
+            numbered = [(at, line) for at, line in enumerate(lines, number) if line and not line.isspace()]
             try:
-                for number, told in _objects(numbered):
-                    decisions.append(_decision(told, number))
+                decisions += _decisions_of(numbered)
             except _LineError as error:
-                raise InputError(f"{path}, line {error.number or number}{error}") from None
+                raise InputError(f"{path}, line {error.number}{error}") from None
+            number, start = number + data.count(b"\n", start, end), end
     return tuple(decisions)
 
 
@@ -191,7 +194,7 @@ def _checked_line(decision: Decision) -> str:
     told = {key: value for key, value in values.items() if value not in (None, "", {})}
     try:
         line = json.dumps(told, ensure_ascii=False, allow_nan=False)
-        _decision(_json_object(line.encode()), 0)
+        _decisions_of([(0, line.encode())])
     except (_LineError, ValueError) as error:
         about = f"{decision.image}{f', {decision.point}' if decision.point else ''}"
         raise InputError(f"the decision about {about}{error}. Nothing was written.") from None
@@ -237,7 +240,7 @@ def _end_last_line(file: BinaryIO, path: Path) -> None:
         file.truncate(size - len(last))
     elif last.strip():
         try:
-            _decision(_json_object(last), 0)
+            _decisions_of([(0, last)])
         except _LineError as error:
             raise InputError(f"{path}, its last line{error} Nothing was written.") from None
         file.write(b"\n")
@@ -247,11 +250,12 @@ def _end_last_line(file: BinaryIO, path: Path) -> None:
 
 
 class _LineError(Exception):
-    """What is wrong in a line, as it goes on behind the line's number. number: where only this tells it."""
+    """What is wrong in a line, as it goes on behind the line's number."""
 
-    def __init__(self, message: str, key: str = "", number: int = 0) -> None:
+    number: int
+
+    def __init__(self, message: str, key: str = "") -> None:
         super().__init__(f"{f', {key}' if key else ''}: {message}")
-        self.number = number
 
 
 def _no_number(text: str) -> float:
@@ -285,61 +289,79 @@ def _without_search_for_cycles() -> Iterator[None]:
             gc.enable()
 
 
-def _objects(numbered: Sequence[tuple[int, bytes]]) -> Iterable[tuple[int, Any]]:
-    """The lines' objects, read at once, and one by one only where that fails."""
+def _decisions_of(numbered: Sequence[tuple[int, bytes]]) -> list[Decision]:
+    """The decisions of lines, all lines at once, and one by one only where that fails: to name the line."""
     numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
     if {line[:1] + line[-1:] for line in lines} == {b"{}"}:
-        with suppress(ValueError, RecursionError):
-            told = _read_json(f"[{b','.join(lines).decode()}]")
-            if len(told) == len(lines):
-                return zip(numbers, told, strict=True)
-    return ((number, _json_object(line, number)) for number, line in numbered)
+        with suppress(ValueError, RecursionError, _LineError):
+            objects = _read_json(f"[{b','.join(lines).decode()}]")
+            if len(objects) == len(lines):
+                return _decisions(objects, numbers)
+    decisions = list[Decision]()
+    for number, line in numbered:
+        try:
+            decisions += _decisions([_json_object(line)], [number])
+        except _LineError as error:
+            error.number = number
+            raise
+    return decisions
 
 
-def _json_object(line: bytes, number: int = 0) -> Any:
+def _json_object(line: bytes) -> Any:
     try:
         return _read_json(line.decode())
     except (ValueError, RecursionError) as error:
-        raise _LineError(f"is no JSON ({error}). Mend the line, or take it out.", number=number) from None
+        raise _LineError(f"is no JSON ({error}). Mend the line, or take it out.") from None
 
 
-def _decision(told: Any, number: int) -> Decision:
-    """A line's object, checked key by key."""
-    if not isinstance(told, dict):
-        raise _LineError(f"must be a JSON object, not {shown(told)}.")
-    for key in _checked_keys((*told, *map(type, told.values()))):
-        told[key] = _CHECKS[key](key, told[key])
-    if "decision" not in told:
+def _decisions(objects: Sequence[Any], numbers: Sequence[int]) -> list[Decision]:
+    """Objects of lines, checked key by key, each key for all lines that have the same keys and decide the same."""
+    groups = defaultdict[tuple[str, ...], list[tuple[int, dict[str, Any]]]](list)
+    for number, told in zip(numbers, objects, strict=True):
+        if not isinstance(told, dict):
+            raise _LineError(f"must be a JSON object, not {shown(told)}.")
+        groups[str(told.get("decision")), *told].append((number, told))
+    decisions = [
+        one for (_, *keys), group in groups.items() for one in _decisions_alike(keys, *zip(*group, strict=True))
+    ]
+    return decisions if len(groups) == 1 else sorted(decisions, key=attrgetter("line"))
+
+
+def _decisions_alike(keys: Sequence[str], numbers: Sequence[int], objects: Sequence[dict[str, Any]]) -> list[Decision]:
+    """Decisions of one choice whose objects have these keys."""
+    for key in keys:
+        if key not in _CHECKS:
+            raise _LineError(f"there is no such key.{did_you_mean(key, _CHECKS)} Known: {', '.join(_CHECKS)}.", key)
+    columns = zip(*map(dict.values, objects), strict=True)
+    values = {key: _checked(key, column) for key, column in zip(keys, columns, strict=True)}
+    if "decision" not in values:
         raise _LineError("is missing.", "decision")
-    choice, needed = _RULES[told["decision"]]
+    choice, needed = _RULES[values["decision"][0]]
     for key in needed:
-        if not told.get(key) and told.get(key) != 0.0:
+        if key not in values or not all(value or value == 0.0 for value in values[key]):
             raise _LineError(f"must be {_MUST_BE[key]}, not None." if key in _MUST_BE else "is missing.", key)
-    if choice is _POSE or choice is _LEARN:
-        if told.get("point"):
-            what = "a pose" if choice is _POSE else "what is learned"
-            raise _LineError(f"is of no use: {what} is of the whole scan. Take it out.", "point")
-        told["kind"] = "" if choice is _POSE else LEARNED
-    if choice is not _POSE:
-        told["pose"] = ""
-    if choice is not _LEARN:
-        told["px"] = _NO_PLACES
-    told["decision"], told["line"] = choice, number
-    decision = object.__new__(Decision)  # of a million, the constructor of a frozen dataclass takes most of the time
-    object.__setattr__(decision, "__dict__", told)
-    return decision
+    if choice in (_POSE, _LEARN) and any(values.get("point", ())):
+        what = "a pose" if choice is _POSE else "what is learned"
+        raise _LineError(f"is of no use: {what} is of the whole scan. Take it out.", "point")
+    values["line"] = numbers
+    fixed = {"decision": choice, **_FIXED.get(choice, {"pose": "", "px": _NO_PLACES})}
+    decisions = [object.__new__(Decision) for _ in objects]  # the constructor takes most of the time of a million
+    for key, default in {**_DEFAULTS, **fixed, "line": 0}.items():
+        column = values[key] if key in values and key not in fixed else repeat(default)
+        deque(map(getattr(Decision, key).__set__, decisions, column), maxlen=0)
+    return decisions
 
 
-@lru_cache(maxsize=4096)
-def _checked_keys(form: tuple[Any, ...]) -> tuple[str, ...]:
-    """Which values of a line are to be checked one by one. form: its keys, and then the types of its values."""
-    keys, types = form[: len(form) // 2], form[len(form) // 2 :]
-    unknown = next((key for key in keys if key not in _CHECKS), None)
-    if unknown is not None:
-        hint = did_you_mean(unknown, _CHECKS)
-        raise _LineError(f"there is no such key.{hint} Known: {', '.join(_CHECKS)}.", unknown)
-    is_text = {key: _CHECKS[key] is _check_text and type is str for key, type in zip(keys, types, strict=True)}
-    return tuple(key for key in keys if not is_text[key])
+def _checked(key: str, values: Sequence[Any]) -> Sequence[Any]:
+    """The values of a key in many lines. Each text is checked once, and held once."""
+    check = _CHECKS[key]
+    if set(map(type, values)) != {str}:
+        return [check(key, value) for value in values]
+    texts = dict(zip(values, values, strict=True))
+    if check is not _check_text:
+        for text in texts:
+            check(key, text)
+    return values if len(texts) == len(values) else list(map(texts.__getitem__, values))
 
 
 def _check_text(key: str, value: Any) -> str:
@@ -428,7 +450,16 @@ _CHECKS: Mapping[str, Callable[[str, Any], Any]] = {
     "window": _check_window,
     "px": _check_places,
 }
+_DEFAULTS: Mapping[str, Any] = {
+    **dict.fromkeys(_CHECKS, ""),
+    **dict.fromkeys(("col_px", "row_px", "window")),
+    "px": _NO_PLACES,
+}
 _POSE, _LEARN = Choice.POSE, Choice.LEARN
+_FIXED: Mapping[Choice, Mapping[str, Any]] = {  # whatever a line says
+    _POSE: {"kind": "", "px": _NO_PLACES},
+    _LEARN: {"kind": LEARNED, "pose": ""},
+}
 _RULES: Mapping[str, tuple[Choice, tuple[str, ...]]] = {  # the choice, and the keys that it needs
     "accept": (Choice.ACCEPT, ("image", "point")),
     "reject": (Choice.REJECT, ("image", "point")),

@@ -27,6 +27,7 @@ from pipeline.files.scan_files import FoundScans, as_named, find_scans, with_cut
 from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
 from pipeline.results.adjustment_reader import covariance_path
+from pipeline.results.fingerprints import of_content
 from pipeline.text.output_paths import path_below
 from pipeline.text.tables import Table, read_toml
 
@@ -47,8 +48,9 @@ class Project:
     left_out: the images that `exclude` leaves out.
     tone: the curve of the scans: auto, one of TONES, or the power of the grey value that light grows as.
     unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
-    decisions: that a person made about marks and poses, the oldest first. decisions_cut_short: the number of their last
-    line where that was cut short and does not count, else 0.
+    decisions: that a person made about marks and poses, the oldest first. decisions_hash: SHA-256 of their file, ""
+    where there are none. decisions_cut_short: the number of their last line where that was cut short and does not
+    count, else 0.
     board_bend_sigma: of how far the middle of the board, which is all object points, stands off its plane, in the
     user's unit; 0 flat, inf unknown.
     transparent: whether a flat field of object points can be seen from both sides.
@@ -79,6 +81,7 @@ class Project:
     board_bend_sigma: float = 0.0
     transparent: bool = False
     decisions: tuple[Decision, ...] = ()
+    decisions_hash: str = ""
     decisions_cut_short: int = 0
 
     def open_scan(self, name: str) -> "Scan":
@@ -271,7 +274,13 @@ def with_decisions(project: Project) -> Project:
         if camera.is_asked:
             images = {image for image in project.scans if project.camera_of(image) is camera}
             cameras[name] = replace(camera, clicks=_shown(project, camera, learned_from(decisions, images)))
-    return replace(project, cameras=cameras, decisions=decisions, decisions_cut_short=cut_short)
+    return replace(
+        project,
+        cameras=cameras,
+        decisions=decisions,
+        decisions_hash=of_content(data) if decisions else "",
+        decisions_cut_short=cut_short,
+    )
 
 
 def _shown(project: Project, camera: CameraFile, shown: Decision | None) -> Clicks | None:

@@ -65,7 +65,7 @@ def measured_from(project: Project) -> MadeFrom:
     return {
         SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
         PLACES: fingerprint(places),
-        **({DECISIONS: fingerprint(project.decisions)} if project.decisions else {}),
+        **({DECISIONS: project.decisions_hash} if project.decisions else {}),
         **{f"{CAMERA}{camera.name}": fingerprint(_sought(camera)) for camera in project.cameras.values()},
         **{f"{SCAN}{image}": scan_hash(image, path) for image, path in project.scans.items()},
     }

@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.archive.decided import after_checks, before_checks, decided
 from pipeline.cli import run
 from pipeline.errors import InputError, WriteError
+from pipeline.files import decisions_file
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
@@ -187,6 +189,39 @@ def test_a_million_lines_are_read_in_five_seconds(tmp_path: Path) -> None:
     began = time.process_time()
     assert len(read_decisions(path)) == 1_000_000
     assert time.process_time() - began < 5.0
+
+
+def test_lines_of_all_forms_are_read_in_their_order_and_a_wrong_one_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lines are checked many at a time, those of one form together."""
+    monkeypatch.setattr(decisions_file, "_BYTES_AT_A_TIME", 500)
+    forms: Sequence[dict[str, Any]] = [
+        {"image": "a", "point": "{}", "decision": "accept"},
+        {"decision": "place", "image": "b", "point": "{}", "kind": "target", "col_px": 3, "row_px": 4.5},
+        {"image": "c", "decision": "pose", "pose": "90m", "note": "{}"},
+        {"image": "d", "decision": "learn", "px": {"1": [2, 3.5]}, "who": "{}", "pose": "0", "window": [0, 1, 2, 3]},
+        {"image": "e", "decision": "undo", "fingerprint": "{}", "row_px": 0.0},
+    ]
+    chosen = np.random.default_rng(3).integers(len(forms), size=200).tolist()
+    lines = [json.dumps(forms[form]).replace("{}", str(k)) for k, form in enumerate(chosen)]
+    path = tmp_path / "decisions.jsonl"
+    path.write_text("\n \n".join(lines) + "\n")
+    read = read_decisions(path)
+    expected = [
+        Decision("a", Choice.ACCEPT, "{}"),
+        Decision("b", Choice.PLACE, "{}", "target", 3.0, 4.5),
+        Decision("c", Choice.POSE, pose="90m", note="{}"),
+        Decision("d", Choice.LEARN, kind="learned", who="{}", window=(0.0, 1.0, 2.0, 3.0), px={"1": (2.0, 3.5)}),
+        Decision("e", Choice.UNDO, fingerprint="{}", row_px=0.0),
+    ]
+    field = ("point", "point", "note", "who", "fingerprint")
+    assert [one.line for one in read] == list(range(1, 400, 2))
+    assert read == tuple(replace(expected[form], **{field[form]: str(k)}) for k, form in enumerate(chosen))
+    wrong = lines[150].replace("image", "imagine")
+    path.write_text("\n \n".join([*lines[:150], wrong, *lines[151:]]) + "\n")
+    with pytest.raises(InputError, match="line 301, imagine: there is no such key"):
+        read_decisions(path)
 
 
 @pytest.mark.parametrize(
