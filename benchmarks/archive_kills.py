@@ -18,8 +18,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from benchmarks.archive_stand_ins import use, write_project
-from pipeline.archive.judging import judged_records, latest
-from pipeline.archive.store import Store
+from pipeline.archive.checked_statuses import judged_records, latest
+from pipeline.archive.results_database import Store
 
 _SCANS, _SCAN_S, _WORKERS = 200, 0.2, 2
 

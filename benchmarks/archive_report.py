@@ -17,13 +17,12 @@ from benchmarks.archive_scale import told_of
 from benchmarks.archive_stand_ins import stand_in, write_project
 from measure.flags import Code, Reason, Status
 from measure.results import MarkMeasurement
-from pipeline.archive.file_state import Identity, file_state
-from pipeline.archive.identity import parts_hash
-from pipeline.archive.judging import JudgedScan, judge, judged_marks, judging_of, tell_written
+from pipeline.archive.checked_statuses import JudgedScan, judge, judged_marks, judging_of, tell_written
 from pipeline.archive.measurement import pitches, tell_place
-from pipeline.archive.store import Kept, Store
+from pipeline.archive.results_database import Kept, Store
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.scan_task import scan_tasks
+from pipeline.provenance import Identity, file_state, parts_hash
 from pipeline.publishing.made_from import measured_from
 from pipeline.results.comparator_file import write_comparator
 from pipeline.results.measured_record import record_of

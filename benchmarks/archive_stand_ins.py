@@ -14,7 +14,7 @@ import numpy as np
 
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
-from pipeline.archive.witness import Witnessed
+from pipeline.archive.work import Witnessed
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan
 

@@ -93,7 +93,7 @@ LINES = (
     ),
     Broken("measure/targets/consistency.py", "own + best.predicted_px2", "own", "measure/test_shared_offsets.py"),
     Broken(
-        "pipeline/measuring/perspective_disks.py",
+        "pipeline/measuring/target_field.py",
         "c[:, 2] ** 2 - radius**2 * tilt",
         "c[:, 2] ** 2 + radius**2 * tilt",
         "pipeline/test_perspective_disks.py",

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from measure.geometry import pose_in_camera
 from pipeline.files.project_file import read_project
-from pipeline.review.trial import measured_as_shown
+from pipeline.review.frame_view import measured_as_shown
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene
 

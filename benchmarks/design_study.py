@@ -20,11 +20,9 @@ from matplotlib.figure import Figure
 
 import synthetic_images
 from adjust.problem.parameter import Parameter
-from pipeline.design.alone import alone
 from pipeline.design.alternatives import gains
-from pipeline.design.expected import INTERIOR, UM_PER_MM, expect, rms
-from pipeline.design.sweeps import Swept, over_layouts, sweep
-from pipeline.design.variations import Variations
+from pipeline.design.expected import INTERIOR, UM_PER_MM, alone, expect, rms
+from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.rendered.design_table import Sweep
 
 Row = Sequence[str | float]

@@ -24,7 +24,7 @@ from range_server import range_server
 
 from measure.marks.rendering import extent_px, picture
 from measure.marks.shapes import FiducialLayout
-from pipeline.archive.witness import Witnessed, witnessed_scan
+from pipeline.archive.work import Witnessed, witnessed_scan
 from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import read_project
 from pipeline.measuring.scan_task import scan_tasks

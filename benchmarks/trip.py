@@ -65,7 +65,7 @@ def followed() -> Followed:
 
     from pipeline.archive import measure_archive
     from pipeline.archive.measurement import read_measurement
-    from pipeline.archive.store import Store
+    from pipeline.archive.results_database import Store
     from pipeline.files.project_file import read_project
     from pipeline.progress import Reporter
     from pipeline.results.comparator_file import mark_rows, write_comparator

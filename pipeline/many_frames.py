@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from measure.flags import Status
-from pipeline.archive.stored_marks import MarkColumns, StoredFrame, StoredMarks
+from pipeline.archive.measurement import MarkColumns, StoredFrame, StoredMarks
 from pipeline.archive.verdicts import Verdict, verdict_of
 from pipeline.report.data import FrameTotals, Problem, ReportData
 from pipeline.report.fractions import centers_px, places_apart

@@ -6,13 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.decision_check import inapplicable
-from pipeline.archive.measurement import made_from_of, measured_scans
-from pipeline.archive.store import Store
-from pipeline.archive.stored_marks import StoredMarks
+from pipeline.archive.measurement import StoredMarks, made_from_of, measured_scans
+from pipeline.archive.results_database import Store
+from pipeline.archive.review_decisions import inapplicable
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.many_frames import MOST_FRAMES, reduced
+from pipeline.provenance import of_file
 from pipeline.publishing.made_from import (
     CAMERA,
     DECISIONS,
@@ -34,10 +34,8 @@ from pipeline.results.comparator_file import (
     measurement_of,
     read_comparator,
 )
-from pipeline.results.fingerprints import of_file
 from pipeline.results.measured_scan import FailureCode, MeasuredScan
-from pipeline.text.spelling import did_you_mean
-from pipeline.text.wording import listed
+from pipeline.text.wording import did_you_mean, listed
 
 Json = dict[str, Any]
 At = Callable[[Path], Path]

@@ -13,9 +13,14 @@ from typing import TYPE_CHECKING
 from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
-from pipeline.archive.archive_summary import archive_summary, shard_summary
-from pipeline.archive.digests import DamagedError
-from pipeline.archive.judging import drop_all_but, judged_marks, judging_of, marks_as_written, rejudge, tell_written
+from pipeline.archive.checked_statuses import (
+    drop_all_but,
+    judged_marks,
+    judging_of,
+    marks_as_written,
+    rejudge,
+    tell_written,
+)
 from pipeline.archive.measurement import (
     decisions_by,
     fingerprints_of,
@@ -27,13 +32,16 @@ from pipeline.archive.measurement import (
     written_scans,
 )
 from pipeline.archive.merge import Merged, merge
-from pipeline.archive.store import Store
+from pipeline.archive.results_database import Store
+from pipeline.archive.results_integrity import DamagedError
+from pipeline.archive.status import archive_summary, shard_summary
 from pipeline.archive.thumbnails import ThumbnailStore
-from pipeline.archive.work_options import NotMeasured, WorkOptions
+from pipeline.archive.work import NotMeasured, WorkOptions
 from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
+from pipeline.provenance import of_file
 from pipeline.publishing.made_from import adjusted_from, differing, measured_from
 from pipeline.publishing.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
@@ -48,7 +56,6 @@ from pipeline.results.comparator_file import (
     read_comparator,
     write_comparator,
 )
-from pipeline.results.fingerprints import of_file
 from pipeline.results.frames_file import for_images, write_frames
 from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import MeasuredScan

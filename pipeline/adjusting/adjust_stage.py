@@ -15,7 +15,7 @@ from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
 from pipeline.adjusting.scanners import with_scanners
 from pipeline.files.project_file import Project
-from pipeline.measuring.perspective_disks import across, disk_normals, eccentricity_mm, plane_normal
+from pipeline.measuring.target_field import across, disk_normals, eccentricity_mm, plane_normal
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.wording import listed
 

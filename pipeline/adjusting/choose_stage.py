@@ -22,7 +22,7 @@ from pipeline.publishing.made_from import adjusted_from
 from pipeline.publishing.publishing import unpublished
 from pipeline.results.comparator_file import read_comparator
 from pipeline.text.atomic import write_atomically
-from pipeline.text.finite import without_nan
+from pipeline.text.text_file import without_nan
 
 Json = dict[str, Any]
 

@@ -19,9 +19,8 @@ from pipeline.adjusting.compare_picture import draw_comparison
 from pipeline.errors import InputError
 from pipeline.results.adjustment_reader import calibrated_lens, read_adjustment, read_own_covariance
 from pipeline.text.atomic import check_writable, write_atomically
-from pipeline.text.finite import without_nan
-from pipeline.text.spelling import did_you_mean
-from pipeline.text.wording import listed
+from pipeline.text.text_file import without_nan
+from pipeline.text.wording import did_you_mean, listed
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

@@ -20,8 +20,7 @@ from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import UNITS_MM, Project
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.text.spelling import did_you_mean
-from pipeline.text.wording import listed
+from pipeline.text.wording import did_you_mean, listed
 
 Array = NDArray[np.float64]
 

@@ -17,12 +17,11 @@ from measure.scans.remote import fetch_location, scan_path
 from measure.targets.measure_targets import TargetPrediction
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.measuring.handed_out import results_of
-from pipeline.measuring.target_field import Field, measure_single_targets, target_field
-from pipeline.measuring.target_places import checked_places
+from pipeline.measuring.target_field import Field, checked_places, measure_single_targets, target_field
 from pipeline.measuring.target_stage import with_targets
 from pipeline.progress import Reporter
 from pipeline.results.measured_scan import MeasuredScan
+from pipeline.workers import results_of
 
 _SEARCH_PX = 2.0  # an adjusted orientation predicts to far less than that
 

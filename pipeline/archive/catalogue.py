@@ -10,11 +10,11 @@ from pathlib import Path
 from measure.errors import MeasurementError
 from measure.scans.opening import ScanHead, read_head
 from measure.scans.remote import Address, list_addresses
-from pipeline.archive.identity import content_hash, parts_hash
 from pipeline.errors import InputError
-from pipeline.files.scan_patterns import folders_below
+from pipeline.files.scan_files import folders_below
 from pipeline.progress import Count
-from pipeline.text.image_names import SCAN_ENDINGS
+from pipeline.provenance import content_hash, parts_hash
+from pipeline.text.names import SCAN_ENDINGS
 
 _ALIKE = 0.03  # of their sides: scans of one roll are cut by hand
 _SAME_PITCH = 0.01

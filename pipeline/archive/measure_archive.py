@@ -1,33 +1,110 @@
-"""A project's scans measured into its store: only what is missing or changed, whatever happens to the rest."""
+"""A project's scans measured into its results database: only what is missing or changed."""
 
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.remote import fetch_location
+from measure.scans.remote import fetch_location, scan_path
+from pipeline.archive.checked_statuses import judge_lots, latest
 from pipeline.archive.cluster import cluster_executor
-from pipeline.archive.decision_check import tell_inapplicable
-from pipeline.archive.judging import judge_lots, latest
-from pipeline.archive.key import shard_of
-from pipeline.archive.moved import find_moved, hash_contents
-from pipeline.archive.store import Store
+from pipeline.archive.cross_scan_checks import find_copies, input_of, judged_lots
+from pipeline.archive.results_database import Store
+from pipeline.archive.review_decisions import tell_inapplicable
 from pipeline.archive.thumbnails import ThumbnailStore
-from pipeline.archive.together import find_copies, input_of, judged_lots
-from pipeline.archive.work import Work
-from pipeline.archive.work_options import WorkOptions
+from pipeline.archive.work import Work, WorkOptions
+from pipeline.errors import InputError
 from pipeline.files.project_file import Project
+from pipeline.files.scan_files import as_named
 from pipeline.measuring.learn_stage import learn_marks
-from pipeline.measuring.measurable import check_measurable
 from pipeline.measuring.roll import with_known_lines
-from pipeline.measuring.scan_task import scan_tasks
-from pipeline.measuring.tied import tied
+from pipeline.measuring.scan_task import ScanTask, scan_tasks
+from pipeline.measuring.tie_stage import check_tie_names, tied
 from pipeline.measuring.tone_stage import said_of_tones
 from pipeline.progress import Reporter
+from pipeline.provenance import FileStates, Identity, content_hash, parts_hash, shard_of
 from pipeline.text.wording import counted, gathered
 from pipeline.workers import worker_pool
+
+
+def check_measurable(project: Project) -> tuple[str, ...]:
+    """The names of the images that are to be measured. Raises InputError for what is wrong in the user's own files."""
+    if not project.scans:
+        raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
+    _check_anything_to_measure(project)
+    check_tie_names(project)
+    _check_marks(project)
+    listed = project.given_images.exterior if project.given_images else {}
+    names = (*project.scans, *(name for name in listed if name not in project.scans and name not in project.left_out))
+    scan_tasks(project, names)  # raises for targets that nothing names and for marks that nobody has drawn
+    return names
+
+
+def _check_anything_to_measure(project: Project) -> None:
+    """Without fiducials, targets and natural points comparator.csv would hold nothing."""
+    sought = [one for camera in project.cameras.values() for one in camera.fiducials if not one.passed_over]
+    if not sought and project.targets is None and project.ties is None:
+        raise InputError(
+            f"{project.path}: there is nothing to measure: {project.default_camera.path} has no fiducial that is not "
+            "passed over, and the project neither [targets] nor [ties]. Add what the scans show."
+        )
+
+
+def _check_marks(project: Project) -> None:
+    """One mark by itself tells neither the turn nor the scale of a frame."""
+    for camera in project.cameras.values():
+        if len(camera.drawn) + len(camera.learned) == 1:
+            raise InputError(
+                f"{camera.path} has one fiducial mark, and a frame is found by two or more. Add the others, or pass it "
+                'over with mark = "none".'
+            )
+
+
+def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, str]:
+    """Give files that the store does not know as they are the results of those whose whole content they have, and say
+    what fingerprints these have now, by the earlier ones. Only results count whose content was hashed: an earlier call
+    with `--moved` did that."""
+    known, files = store.identities(), FileStates(project.path.resolve().parent)
+    by_size = defaultdict[int, dict[str, str]](dict)
+    for uri, content in store.content_hashes().items():
+        by_size[known[uri].state.bytes][content] = uri
+    states = {name: files.of(file) for name, file in as_named(project.scans).items()}
+    unknown = {name: state for name, state in states.items() if state != getattr(known.get(state.uri), "state", None)}
+    taken = {state.uri for name, state in states.items() if name not in unknown}
+    found, keys = 0, dict[str, str]()
+    with reporter.stage("looked for in the store") as count:
+        for done, (name, state) in enumerate(unknown.items(), 1):
+            count(name, done, len(unknown))
+            if not by_size.get(state.bytes):
+                continue
+            path = project.scans[name]
+            content = content_hash(path)
+            uri = by_size[state.bytes].get(content, "")
+            if content and uri and uri not in taken:
+                keys |= store.move(uri, Identity(state, parts_hash(path, project.max_pixels)))
+                taken.add(state.uri)
+                del by_size[state.bytes][content]
+                found += 1
+    if unknown:
+        reporter.say(
+            f"{found} of {len(unknown)} files that are new or changed have the content of ones that are measured"
+        )
+    return keys
+
+
+def hash_contents(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> None:
+    """Hash the whole files of all scans whose content is not known, so that they are known when they are moved."""
+    hashed = store.content_hashes()
+    left = {
+        work.state(task).uri: scan_path(task.scan) for task in tasks if task.scan and work.state(task).uri not in hashed
+    }
+    with reporter.stage("content hashed of") as count:
+        for done, (uri, path) in enumerate(left.items(), 1):
+            count(path.name, done, len(left))
+            store.set_content_hashes({uri: content_hash(path)})
 
 
 def measure_archive(

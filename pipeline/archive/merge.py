@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.archive.digests import damaged_results, is_sound, seal
-from pipeline.archive.store import Store, seal_result
+from pipeline.archive.results_database import Store, seal_result
+from pipeline.archive.results_integrity import damaged_results, is_sound, seal
 from pipeline.errors import InputError
 
 _SCAN = (

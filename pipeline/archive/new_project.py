@@ -22,9 +22,8 @@ from pipeline.measuring.scan_kinds import ScanKind
 from pipeline.progress import Reporter
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
-from pipeline.text.image_names import image_name, names_below
-from pipeline.text.toml_text import quoted
-from pipeline.text.wording import counted
+from pipeline.text.names import image_name, names_below
+from pipeline.text.wording import counted, quoted
 
 Json = dict[str, Any]
 

@@ -11,7 +11,7 @@ from measure.errors import MeasurementError
 from pipeline.archive.catalogue import Group
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.library import read_library
-from pipeline.measuring.camera_answer import Identification
+from pipeline.measuring.camera_identification import Identification
 from pipeline.measuring.camera_trials import identify
 from pipeline.measuring.scan_kinds import ScanKind, spread
 from pipeline.progress import Reporter

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.scans.remote import public_address
-from pipeline.archive.digests import add_digests, row_digest
+from pipeline.archive.results_integrity import add_digests, row_digest
 from pipeline.errors import InputError, what_to_do_about_store
 
 STORE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # of a damaged file; SQLite's own sentence may be damaged, too

@@ -1,4 +1,4 @@
-"""Where the scans of a project stand: counted by verdict, and those that need a look."""
+"""Where the scans of a project stand: counted by verdict, those that need a look, and what measure says of them."""
 
 import csv
 import io
@@ -13,17 +13,26 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.archive.asked import asked_of
-from pipeline.archive.decided import by_image, decisions_hash
-from pipeline.archive.decision_check import inapplicable, shortened, unknown_images
-from pipeline.archive.digests import DamagedError, check_judging, is_sound
-from pipeline.archive.file_state import FileStates
-from pipeline.archive.judging import judged_records, latest
-from pipeline.archive.store import Store
+from pipeline.archive.checked_statuses import judged_records, latest
+from pipeline.archive.results_database import Store
+from pipeline.archive.results_integrity import DamagedError, check_judging, is_sound
+from pipeline.archive.review_decisions import (
+    asked_of,
+    by_image,
+    decisions_hash,
+    inapplicable,
+    shortened,
+    unknown_images,
+)
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
+from pipeline.provenance import FileStates
+from pipeline.report.data import Problem
+from pipeline.report.verdict import Level
+from pipeline.report.verdict import Verdict as ProjectVerdict
 from pipeline.results.measured_scan import FailureCode
+from pipeline.summary import Summary
 
 NAMED = 20  # scans that a summary names
 _LOOK = (Verdict.FAILED, Verdict.POOR, Verdict.LOOK)  # the worst first
@@ -203,3 +212,27 @@ def worst_named(scans: Sequence[ScanStatus], most: int, every: bool) -> tuple[li
     """The first of those that need a look, the worst first; and how many there are beside them."""
     look = [scan for verdict in _LOOK for scan in scans if scan.verdict is verdict] if not every else list(scans)
     return look[:most], max(len(look) - most, 0)
+
+
+def archive_summary(project: Project, files: Mapping[str, Path]) -> Summary:
+    """What `measure` says of many scans."""
+    return _summary(archive_status(project), files)
+
+
+def shard_summary(project: Project, path: Path, shard: tuple[int, int]) -> Summary:
+    """What `measure --shard` says: of the scans of that part."""
+    status = archive_status(project, path)
+    own = tuple(scan for scan in status.scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
+    return _summary(ArchiveStatus(own), {f"part {shard[0]} of {shard[1]}": path})
+
+
+def _summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
+    told = ", ".join(f"{count} {verdict}" for verdict, count in status.counts.items() if count) or "none"
+    sentence = f"Measured: {len(status.scans)} scans: {told}."
+    named, more = worst_named(status.scans, NAMED, False)
+    problems = [Problem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
+    problems += [Problem(f"decisions.jsonl, {line}", "It does not count.") for line in status.idle_decisions]
+    if more:
+        problems.append(Problem(f"{more} more need a look.", "Run `reseau status` with --verdict or --csv."))
+    level: Level = "good" if status.all_good else "look"
+    return Summary(ProjectVerdict(level, sentence, tuple(problems), ()), {}, {}, None, None, files)

@@ -1,35 +1,138 @@
 """What is missing of a project's scans measured, and kept as each is done."""
 
 import os
+import sys
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
-from measure.scans.remote import scan_path
-from pipeline.archive.asked import asked_of
-from pipeline.archive.decided import after_checks, before_checks, by_image, decided, decisions_hash
-from pipeline.archive.expected_time import ExpectedTime
-from pipeline.archive.file_state import FileState, FileStates, Identity
-from pipeline.archive.identity import parts_hash
-from pipeline.archive.key import fingerprint, options_hash
-from pipeline.archive.store import Kept, Store
+from measure.scans.remote import TRAFFIC, scan_path
+from pipeline.archive.results_database import Kept, Store
+from pipeline.archive.review_decisions import after_checks, asked_of, before_checks, by_image, decided, decisions_hash
 from pipeline.archive.thumbnails import ThumbnailStore
-from pipeline.archive.witness import Witnessed, state_of, witnessed_scan
-from pipeline.archive.work_options import NotMeasured, WorkOptions
 from pipeline.files.decisions_file import About, Decision
 from pipeline.files.project_file import Project
-from pipeline.measuring.handed_out import TASKS_A_CORE, results_of
-from pipeline.measuring.measured import ended_scan, reads_writing
+from pipeline.measuring.scan_measurement import ended_scan, measured_scan, reads_writing
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
+from pipeline.provenance import FileState, FileStates, Identity, options_hash, parts_hash, result_key
 from pipeline.results.measured_record import record_of, scan_of
 from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails
 from pipeline.text.wording import counted, listed, without_file
+from pipeline.workers import TASKS_A_CORE, results_of
 
+_HOUR_S, _MINUTE_S = 3600.0, 60.0
+_NAMED = 3
+_COUNTED = Path("/proc/self/io")
 _SAID_EVERY_S = 30.0
 _hash_of = lru_cache(maxsize=4096)(options_hash)
+
+
+@dataclass(frozen=True)
+class WorkOptions:
+    """How the work is shared. shard: (K, N), only the scans of the K-th of N parts. cluster: a scheduler's address, or
+    `local`. retry: measure again what failed. moved: keep results of files whose content is the same elsewhere.
+    workers: processes, if not one a core. only_kept: nothing is measured; what is missing stays so."""
+
+    shard: tuple[int, int] | None = None
+    cluster: str | None = None
+    retry: bool = False
+    moved: bool = False
+    workers: int | None = None
+    only_kept: bool = False
+
+
+class NotMeasured(Exception):
+    """Something is missing, and nothing is to be measured now."""
+
+
+class ExpectedTime:
+    """Counts what is done of each kind: scans of one camera, of one sort of file."""
+
+    def __init__(self, tasks: Sequence[ScanTask], cameras: Sequence[str], at_a_time: int) -> None:
+        """tasks: all that are to be measured; cameras: of each; at_a_time: how many processes measure them."""
+        kinds = zip(tasks, cameras, strict=True)
+        self._kind = {task.name: f"{camera} {task.shown_scan.rpartition('.')[2].lower()}" for task, camera in kinds}
+        self._left = Counter(self._kind.values())
+        self._done, self._bytes = defaultdict[str, list[float]](list), defaultdict[str, float](float)
+        self._at_a_time = at_a_time
+
+    def is_done(self, name: str, seconds: float, bytes_read: int) -> None:
+        kind = self._kind[name]
+        self._left[kind] -= 1
+        self._done[kind].append(seconds)
+        self._bytes[kind] += max(bytes_read, 0)
+
+    @property
+    def left_s(self) -> float:
+        """A kind of which nothing is done takes as long as all others on the average."""
+        all_s = [seconds for each in self._done.values() for seconds in each]
+        usual = sum(all_s) / len(all_s) if all_s else 0.0
+        means = {kind: sum(each) / len(each) for kind, each in self._done.items()}
+        return sum(left * means.get(kind, usual) for kind, left in self._left.items()) / self._at_a_time
+
+    @property
+    def sentence(self) -> str:
+        """About how long, and by which kinds."""
+        kinds = [
+            f"{kind}: {self._left[kind]} left, {duration(sum(done) / len(done), 1)} and "
+            f"{self._bytes[kind] / len(done) / 1e6:.0f} MB read each"
+            for kind, done in sorted(self._done.items())
+        ]
+        more = f"; and {len(kinds) - _NAMED} kinds more" if len(kinds) > _NAMED else ""
+        return f"about {duration(self.left_s)} left ({'; '.join(kinds[:_NAMED])}{more})"
+
+
+def duration(seconds: float, decimals: int = 0) -> str:
+    """In words, to two digits or so. decimals: of less than ten seconds."""
+    if seconds >= 2 * _HOUR_S:
+        return f"{seconds / _HOUR_S:.1f} hours"
+    return (
+        f"{seconds / _MINUTE_S:.0f} minutes"
+        if seconds >= 2 * _MINUTE_S
+        else f"{seconds:.{decimals if seconds < 10 else 0}f} s"
+    )
+
+
+@dataclass(frozen=True)
+class Witnessed:
+    """scan: as measured, or why not. parts_hash: of its file. bytes_read: from the file; -1 where nobody counts.
+    thumbnails: cut from what was decoded for it."""
+
+    scan: MeasuredScan
+    parts_hash: str
+    bytes_read: int
+    thumbnails: tuple[StoredThumbnail, ...] = ()
+
+
+def witnessed_scan(task: ScanTask) -> Witnessed:
+    """Measure a scan. Raises nothing but interrupts, as `measured_scan` does."""
+    before = _bytes_read()
+    thumbnails = TakenThumbnails()
+    scan = measured_scan(task, thumbnails.take)
+    bytes_read = _bytes_read() - before if before >= 0 else -1
+    parts = parts_hash(scan_path(task.scan), task.max_pixels) if task.scan else ""
+    return Witnessed(scan, parts, bytes_read, tuple(thumbnails))
+
+
+def state_of(task: ScanTask, files: FileStates) -> FileState:
+    """The state of a task's file."""
+    return files.of(scan_path(task.scan)) if task.scan else FileState(f"(none) {task.name}", -1)
+
+
+def _bytes_read() -> int:
+    """By this process, of whatever file or address; mapped pages are not counted."""
+    if not sys.platform.startswith("linux"):
+        return -1
+    try:
+        return int(_COUNTED.read_text(encoding="ascii").split("rchar:")[1].split()[0]) + TRAFFIC.bytes
+    except (OSError, IndexError, ValueError):
+        return -1
 
 
 class Work:
@@ -170,7 +273,7 @@ class Work:
         now = decided(
             task,
             decisions,
-            lambda one: fingerprint(identity, _hash_of(_options_json(one))),
+            lambda one: result_key(identity, _hash_of(_options_json(one))),
             lambda key: None if (row := self._rows.get(key)) is None else self._store.pose_of(row),
         )
         self._counting[task.name] = now.counting
@@ -182,7 +285,7 @@ class Work:
         known = self._identities.get(state.uri)
         if known is None or known.state != state:
             return None
-        return self._rows.get(fingerprint(known, _hash_of(_options_json(task))))
+        return self._rows.get(result_key(known, _hash_of(_options_json(task))))
 
     def _found(self, task: ScanTask, row: int) -> MeasuredScan:
         self.results[task.name] = row

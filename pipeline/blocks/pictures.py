@@ -15,7 +15,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.frame_chain import FrameChain
 from pipeline.resampling.resample_stage import ResampleTask
-from pipeline.text.output_paths import file_word, path_below
+from pipeline.text.names import file_word, path_below
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

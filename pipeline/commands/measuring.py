@@ -89,7 +89,7 @@ def measuring(stage: str, told: str) -> Callable[..., int]:
         max_pixels: MaxPixels = None,
     ) -> int:
         from pipeline import stages
-        from pipeline.archive.work_options import WorkOptions
+        from pipeline.archive.work import WorkOptions
 
         work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
         return with_project(project, partial(getattr(stages, stage), work=work), as_json, max_pixels)
@@ -226,7 +226,7 @@ def _name_cameras(
 ) -> int:
     """One scan with all that was tried on it; of many some of each kind."""
     from pipeline.files.library import PREFIX, read_library
-    from pipeline.measuring.camera_answer import print_identification
+    from pipeline.measuring.camera_identification import print_identification
     from pipeline.measuring.camera_trials import identify
     from pipeline.measuring.scan_kinds import identify_kinds, print_kinds, scan_files
     from pipeline.progress import Reporter

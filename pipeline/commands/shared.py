@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.files.pitch import FINEST_PITCH_UM
+from pipeline.files.project_file import FINEST_PITCH_UM
 from pipeline.terminal import PlainConsole, plain
-from pipeline.text.finite import without_nan
+from pipeline.text.text_file import without_nan
 
 if TYPE_CHECKING:
     from pipeline.files.project_file import Project

@@ -12,12 +12,10 @@ from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Image
 from adjust.problem.parameter import Parameter
 from pipeline.design.alternatives import Alternative
-from pipeline.design.expected import Expected, rms
-from pipeline.design.reliability import error_unit
-from pipeline.design.sweeps import Layouts, Swept
-from pipeline.design.variations import Variations
+from pipeline.design.expected import Expected, error_unit, rms
+from pipeline.design.sweeps import Layouts, Swept, Variations
 from pipeline.results.adjustment_file import ANGLES, DEG_PER_RAD
-from pipeline.text.finite import without_nan
+from pipeline.text.text_file import without_nan
 
 Json = dict[str, Any]
 

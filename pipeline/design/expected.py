@@ -1,29 +1,100 @@
-"""The expected precision of a setup: of the camera, along the radius, of the points."""
+"""The expected precision and reliability of a setup: of the camera, along the radius, of the points."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Lens
+from adjust.functional_model.lens import Lens, Prior
+from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.images import adjusted_lens
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import Options
 from adjust.solution.planning import Plan, plan
-from pipeline.design.reliability import PlannedReliability, planned_reliability
 from pipeline.design.setup import Setup, planned_network
 
+UM_PER_MM = 1000.0
+IN_MM = ("target", "tie", "fiducial", "datum", "scanner")
 Array = NDArray[np.float64]
 
-UM_PER_MM = 1000.0
 DIRECTIONS = 36
 QUARTERS = 4
 ROUNDING_UM = 1e-9
 INTERIOR = ("c", "x0", "y0")
+ROUNDING = 1e-9  # part of the largest motion that is none
+
+
+@dataclass(frozen=True)
+class GroupReliability:
+    """One kind of observation or given quantity.
+
+    redundancy: the mean redundancy number of a coordinate. median, largest: of the smallest gross errors that are
+    found, um for what is measured in mm, else object units or rad, without those that nothing checks, `unchecked`.
+    """
+
+    group: str
+    coordinates: int
+    redundancy: float
+    median: float
+    largest: float
+    unchecked: int
+
+
+@dataclass(frozen=True)
+class CameraEffect:
+    """What the worst error that is not found does to a camera parameter: in sigmas of it; cause: where the error is."""
+
+    parameter: Parameter
+    in_sigmas: float
+    cause: str
+
+
+@dataclass(frozen=True)
+class PlannedReliability:
+    """Inner reliability by groups, outer reliability by camera parameters (Baarda)."""
+
+    groups: tuple[GroupReliability, ...]
+    camera: tuple[CameraEffect, ...]
+
+
+def planned_reliability(plan: Plan) -> PlannedReliability:
+    """The reliability of a plan at its sigma0; empty where there is no redundancy."""
+    found = plan.adjustment.reliability
+    if found is None:
+        return PlannedReliability((), ())
+    groups: dict[str, list[tuple[float, float]]] = {}
+    for unit, redundancy, smallest in zip(found.tested, found.redundancy, found.smallest, strict=True):
+        scale = plan.sigma0 * (UM_PER_MM if unit.group in IN_MM else 1.0)
+        rows = groups.setdefault(unit.group, [])
+        rows += [(float(redundancy[i]), scale * float(smallest[i])) for i in range(len(unit.coordinates))]
+    for each in plan.adjustment.further:
+        groups.setdefault(each.group, []).append((each.redundancy, plan.sigma0 * each.detectable))
+    camera = tuple(CameraEffect(one.parameter, one.in_sigmas, one.cause) for one in found.outer)
+    return PlannedReliability(tuple(_group(name, rows) for name, rows in groups.items()), camera)
+
+
+def error_unit(group: str) -> str:
+    """The unit of a group's gross errors."""
+    if group in IN_MM:
+        return "um"
+    return "object unit" if group in ("control", "distance") else "mixed"
+
+
+def _group(name: str, rows: list[tuple[float, float]]) -> GroupReliability:
+    redundancy, smallest = np.array(rows).T
+    checked = smallest[np.isfinite(smallest)]
+    return GroupReliability(
+        name,
+        len(rows),
+        float(redundancy.mean()),
+        float(np.median(checked)) if len(checked) else np.inf,
+        float(checked.max(initial=0.0)) if len(checked) else np.inf,
+        len(rows) - len(checked),
+    )
 
 
 @dataclass(frozen=True)
@@ -168,3 +239,43 @@ def expect(setup: Setup) -> Expected:
 def rms(values: list[float] | Array) -> float:
     """Root of the mean square; 0 of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
+
+
+# What the photographs alone would tell of a camera, where nothing is given of its fiducials and interior orientation.
+#
+# Then the camera frame itself can shift, turn and grow (Torlegård's singular cases), and what remains is how the
+# fiducials lie among themselves, and the rest of the camera in their frame.
+
+
+def alone(expected: Expected) -> Mapping[Parameter, float]:
+    """Standard deviations of the camera's quantities, with F5 to F9 dropped.
+
+    mm, and the parameters' own units; inf: not determined. With N how everything moves in the null directions, and N_f
+    its rows of the fiducials: those of d - N N_f^+ d_f (Baarda's S-transformation to inner constraints over the marks).
+    """
+    network = expected.network
+    camera = network.cameras[0]
+    without = replace(network, cameras=(_without_priors(camera),))
+    options = Options(expected.setup.settings.datum)
+    free = plan(without, planned_network(expected.setup)[1], options, expected.plan.sigma0)
+    interior = [Parameter.interior(camera.name, name) for name in (*INTERIOR, *expected.family_parameters)]
+    marks = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
+    moved = free.null[[free.adjustment.index(each) for each in (*interior, *marks)]]
+    functions = np.eye(len(interior) + len(marks))
+    functions[:, len(interior) :] -= moved @ np.linalg.pinv(moved[len(interior) :], rcond=ROUNDING)
+    return dict(zip((*interior, *marks), free.sigmas((*interior, *marks), functions).tolist(), strict=True))
+
+
+def _without_priors(camera: Camera) -> Camera:
+    """What is not fixed is free."""
+    fiducials = {id: Fiducial(_freed(mark.x_mm), _freed(mark.y_mm)) for id, mark in camera.fiducials.items()}
+    c, x0, y0 = (_freed_if_given(prior) for prior in (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm))
+    return replace(camera, principal_distance_mm=c, x0_mm=x0, y0_mm=y0, fiducials=fiducials)
+
+
+def _freed_if_given(prior: Prior | None) -> Prior | None:
+    return None if prior is None else _freed(prior)
+
+
+def _freed(prior: Prior) -> Prior:
+    return prior if prior.sigma == 0.0 else Prior(prior.value, np.inf)

@@ -8,14 +8,11 @@ from pathlib import Path
 from rich.console import Console
 
 from adjust.problem.parameter import Parameter
-from pipeline.design.alone import alone
 from pipeline.design.alternatives import Alternative, alternatives
 from pipeline.design.design_file import Json, design_json
-from pipeline.design.expected import Expected, expect
-from pipeline.design.plots import plot_sweep
-from pipeline.design.summary import print_design
-from pipeline.design.sweeps import Layouts, Swept, over_layouts, sweep
-from pipeline.design.variations import Variations
+from pipeline.design.expected import Expected, alone, expect
+from pipeline.design.summary import plot_sweep, print_design
+from pipeline.design.sweeps import Layouts, Swept, Variations, over_layouts, sweep
 from pipeline.progress import Reporter
 from pipeline.text.atomic import check_writable, write_atomically
 

@@ -21,7 +21,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import DEFAULT_SCANNER
 from pipeline.rendered.design_table import DesignSettings
 from pipeline.rendered.scene_project import SceneFile, film_transformation
-from pipeline.text.spelling import did_you_mean
+from pipeline.text.wording import did_you_mean
 from synthetic_images.film import turn
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import SceneCamera, SceneImage

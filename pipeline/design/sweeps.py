@@ -1,16 +1,162 @@
-"""One quantity of the scene through its values: how the camera's precision follows."""
+"""A scene with one of its quantities changed, and how the camera's precision follows."""
 
+import copy
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipeline.design.expected import Expected, expect
-from pipeline.design.variations import Variations
+from pipeline.design.setup import Setup, setup_of
+from pipeline.errors import InputError
 from pipeline.rendered.design_table import Sweep
+from pipeline.rendered.scene_file import parse_scene
+from pipeline.text.tables import Table, read_toml
+from pipeline.text.wording import did_you_mean
 
+Values = dict[str, Any]
+
+EXTERIOR = {
+    "X0": ("position", 0),
+    "Y0": ("position", 1),
+    "Z0": ("position", 2),
+    "omega_deg": ("angles_deg", 0),
+    "phi_deg": ("angles_deg", 1),
+    "kappa_deg": ("angles_deg", 2),
+}
+PLANNING_PITCH_UM = 20.0  # a scene that is only planned need not say how it is scanned
 Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Variations:
+    """A scene file's values, and the setups that it gives with some of them changed.
+
+    A quantity is a key of the scene file by its dotted name: `design.sigma_height`, `camera.principal_distance_mm`,
+    `field.grid.1.relief` (the first of several), `image.NAME.position.3` (the third number). Beyond these:
+    `exterior.IMAGE.X0` .. `kappa_deg`; `field.points`, the number of targets over the same area; `images` and
+    `camera.fiducials`, how many are kept of them.
+    """
+
+    path: Path
+    values: Values
+
+    @staticmethod
+    def read(path: Path) -> "Variations":
+        """The scene at a path. Raises InputError."""
+        values = copy.deepcopy(dict(read_toml(path).values))
+        values.setdefault("scan", {}).setdefault("pitch_um", PLANNING_PITCH_UM)
+        return Variations(path, values)
+
+    def setup(self, layout: int = 0) -> Setup:
+        """The setup, with the random layout of its field of that number."""
+        values = self.values | {"seed": self.values.get("seed", 1) + layout} if layout else self.values
+        return setup_of(parse_scene(Table(values, self.path, "")))
+
+    def varied(self, number: int, sweep: Sweep, value: float | str) -> "Variations":
+        """The scene with the quantity of a sweep at a value. Raises InputError for a quantity that there is not."""
+        try:
+            values = self._with(sweep.quantity, value)
+            varied = Variations(self.path, values)
+            varied.setup()
+        except InputError as error:
+            raise InputError(
+                f"{self.path}: [design.sweep[{number}]] {sweep.quantity} = {value!r} does not make a scene: {error}"
+            ) from None
+        return varied
+
+    def _with(self, quantity: str, value: float | str) -> Values:
+        values = copy.deepcopy(self.values)
+        parts = quantity.split(".")
+        if parts[0] == "camera" and isinstance(values.get("camera"), str):
+            values["camera"] = _camera_values(self.path.parent / values["camera"])
+        if parts[0] == "exterior":
+            element = _one_of(parts[-1], EXTERIOR, "an exterior orientation has no element")
+            image = _member(values.get("image", []), ".".join(parts[1:-1]), "image")
+            key, index = EXTERIOR[element]
+            image[key] = [*image[key][:index], value, *image[key][index + 1 :]]
+        elif quantity == "field.points":
+            _spread(values.get("field", {}), _count(quantity, value))
+        elif quantity == "images":
+            values["image"] = values.get("image", [])[: _count(quantity, value)]
+        elif quantity == "camera.fiducials":
+            values["camera"]["fiducial"] = values["camera"].get("fiducial", [])[: _count(quantity, value)]
+        else:
+            _set(values, parts, value)
+        return values
+
+
+def _camera_values(path: Path) -> Values:
+    """A camera file's values without the drawings of its marks, which nothing here needs."""
+    values = copy.deepcopy(dict(read_toml(path).values))
+    values.pop("mark", None)
+    for fiducial in values.get("fiducial", []):
+        fiducial.pop("mark", None)
+    return values
+
+
+def _count(quantity: str, value: float | str) -> int:
+    if not isinstance(value, int) or value < 1:
+        raise InputError(f"{quantity} counts things; its values must be whole numbers of at least 1, not {value!r}.")
+    return value
+
+
+def _spread(field: Values, points: int) -> None:
+    """As many targets, or as near as whole rows and columns allow, over the same area."""
+    if field.get("kind", "disks") != "disks":
+        raise InputError("field.points varies fields of disks; a board has columns and rows.")
+    scatters, grids = field.get("scatter", []), field.get("grid", [])
+    now = sum(one["points"] for one in scatters) + sum(one["columns"] * one["rows"] for one in grids)
+    if now == 0:
+        raise InputError("field.points varies [[field.grid]] and [[field.scatter]], and there is neither.")
+    share = points / now
+    for scatter in scatters:
+        scatter["points"] = max(round(scatter["points"] * share), 1)
+    for grid in grids:
+        for count, step in (("columns", "right"), ("rows", "up")):
+            new = max(round(grid[count] * np.sqrt(share)), 1)
+            grid[step] = [length * grid[count] / new for length in grid[step]]
+            grid[count] = new
+    first = 1
+    for part in (*grids, *scatters):  # numbers that the larger parts would share otherwise
+        part["first"] = first
+        first += part["points"] if "points" in part else part["columns"] * part["rows"]
+
+
+def _set(values: Values, parts: list[str], value: float | str) -> None:
+    node: Any = values
+    for i, part in enumerate(parts[:-1]):
+        if isinstance(node, list):
+            node = _member(node, part, ".".join(parts[:i]))
+        elif isinstance(node, dict):
+            node = node.setdefault(part, {})
+    last = parts[-1]
+    if isinstance(node, dict):
+        node[last] = value
+    elif isinstance(node, list) and last.isdigit() and 1 <= int(last) <= len(node):
+        node[int(last) - 1] = value
+    else:
+        raise InputError(f"{'.'.join(parts[:-1])} is {node!r} and has no {last!r}.")
+
+
+def _member(entries: list[Any], name: str, what: str) -> Any:
+    """One of an array of tables, by its name, its id or its number from 1."""
+    names = {str(entry.get("name", entry.get("id", ""))): entry for entry in entries if isinstance(entry, dict)}
+    if name in names:
+        return names[name]
+    if name.isdigit() and 1 <= int(name) <= len(entries):
+        return entries[int(name) - 1]
+    known = [one for one in names if one] or [str(i + 1) for i in range(len(entries))]
+    raise InputError(f"there is no {what} {name!r}.{did_you_mean(name, known)} There are {', '.join(known) or 'none'}.")
+
+
+def _one_of(word: str, known: Mapping[str, object], sentence: str) -> str:
+    if word not in known:
+        raise InputError(f"{sentence} {word!r}.{did_you_mean(word, known)} It has {', '.join(known)}.")
+    return word
 
 
 @dataclass(frozen=True)

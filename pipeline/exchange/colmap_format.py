@@ -16,7 +16,7 @@ from pipeline.exchange.foreign_camera import foreign_pose, opencv_camera
 from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
 from pipeline.opencv_check.opencv_model import INTERIOR
-from pipeline.text.image_names import image_name
+from pipeline.text.names import image_name
 
 CONVENTION = Convention(
     (0.5, 0.5),

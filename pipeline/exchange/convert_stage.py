@@ -20,7 +20,8 @@ from pipeline.errors import InputError
 from pipeline.exchange.export_stage import README, check_folder, publish
 from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
-from pipeline.files.template_table import Picture, picture_file
+from pipeline.files.mark_table import Picture, picture_file
+from pipeline.provenance import of_content
 from pipeline.results.adjustment_file import distortion_settings
 from pipeline.results.adjustment_reader import (
     Covariance,
@@ -29,10 +30,8 @@ from pipeline.results.adjustment_reader import (
     read_adjustment,
     read_own_covariance,
 )
-from pipeline.results.fingerprints import of_content
-from pipeline.text.spelling import did_you_mean
 from pipeline.text.text_file import read_bytes
-from pipeline.text.wording import listed
+from pipeline.text.wording import did_you_mean, listed
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

@@ -15,7 +15,7 @@ from pipeline.exchange.convention import FORMATS, Convention, ExportOptions, Wri
 from pipeline.files.project_file import Project
 from pipeline.results.comparator_file import decisions_of, decisions_told
 from pipeline.text.atomic import write_atomically, writing
-from pipeline.text.output_paths import path_below
+from pipeline.text.names import path_below
 
 README = "README.txt"
 _HEAD = "Written by reseau"

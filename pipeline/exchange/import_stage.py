@@ -19,7 +19,7 @@ from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import ELEMENTS
 from pipeline.results.comparator_file import COLUMNS, comparator_from_pixel
 from pipeline.text.csv_table import csv_line
-from pipeline.text.output_paths import file_word
+from pipeline.text.names import file_word
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from pipeline.exchange.pinhole import check_misfit, sight_misfit_mm
 from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, xml_lines, xml_text
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.canvas import Canvas
-from pipeline.text.output_paths import file_word
+from pipeline.text.names import file_word
 
 CONVENTION = Convention(
     (0.5, 0.5),

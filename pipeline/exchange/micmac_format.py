@@ -19,8 +19,7 @@ from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD, check_misfit, sight_misf
 from pipeline.exchange.xml_tree import Element, numbers_of, plain_number, read_xml, text_of, xml_lines, xml_text
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.text.image_names import image_name
-from pipeline.text.output_paths import file_word
+from pipeline.text.names import file_word, image_name
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming
 from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, text_of, xml_lines, xml_text
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.text.image_names import image_name
+from pipeline.text.names import image_name
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from pipeline.exchange.incoming import ForeignPose, ImportOptions, Incoming
 from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
 from pipeline.files.camera_file import CameraFile
 from pipeline.opencv_check.opencv_model import NAMES
-from pipeline.text.image_names import image_name
+from pipeline.text.names import image_name
 from pipeline.text.text_file import read_bytes
 
 CONVENTION = Convention(

@@ -7,9 +7,8 @@ from adjust.functional_model.families import family
 from adjust.functional_model.lens import Prior
 from measure.marks import shapes
 from pipeline.files.camera_file import NO_MARK, CameraFile, GivenFiducial, written_place_text
-from pipeline.files.learned_table import LearnedFrom
-from pipeline.files.template_table import SavePicture, template_lines
-from pipeline.text.toml_text import numbers, quoted, sigma, sigmas
+from pipeline.files.mark_table import LearnedFrom, SavePicture, template_lines
+from pipeline.text.wording import numbers, quoted, sigma, sigmas
 
 
 def camera_text(camera: CameraFile, save: SavePicture) -> str:

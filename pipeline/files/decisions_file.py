@@ -21,10 +21,10 @@ from typing import Any, BinaryIO
 
 from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.results.fingerprints import NO_FINGERPRINT
+from pipeline.provenance import NO_FINGERPRINT
 from pipeline.text.atomic import write_atomically, writing
-from pipeline.text.spelling import did_you_mean
 from pipeline.text.text_file import read_bytes, shown
+from pipeline.text.wording import did_you_mean
 
 try:
     import fcntl

@@ -14,7 +14,7 @@ from measure.scans.remote import Window
 from pipeline.errors import InputError
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import Row, read_csv
-from pipeline.text.image_names import image_name
+from pipeline.text.names import image_name
 from pipeline.text.text_file import read_bytes
 
 ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")

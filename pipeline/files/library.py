@@ -8,7 +8,7 @@ from rich.table import Table
 
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, read_camera, written_place_text
-from pipeline.text.spelling import did_you_mean
+from pipeline.text.wording import did_you_mean
 
 PREFIX = "library:"
 FOLDER = Path(__file__).parents[1] / "cameras"

@@ -17,20 +17,18 @@ from pipeline.files.adjust_table import AdjustSettings, read_adjust
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.decisions_file import FILE as DECISIONS
 from pipeline.files.decisions_file import Decision, cut_short_line, decisions_bytes, learned_from, parse_decisions
-from pipeline.files.distances_file import GivenDistance, read_distances
 from pipeline.files.images_file import GivenImages, read_images
-from pipeline.files.learned_table import Clicks
 from pipeline.files.library import camera_path
-from pipeline.files.pitch import FINEST_PITCH_UM
-from pipeline.files.points_file import GivenPoints, read_points
+from pipeline.files.mark_table import Clicks
+from pipeline.files.points_file import GivenDistance, GivenPoints, read_distances, read_points
 from pipeline.files.scan_files import FoundScans, as_named, find_scans, with_cuts
-from pipeline.files.target_table import TargetSettings, read_targets
-from pipeline.files.tie_table import TieSettings, read_ties
+from pipeline.files.target_table import TargetSettings, TieSettings, read_targets, read_ties
+from pipeline.provenance import of_content
 from pipeline.results.adjustment_reader import covariance_path
-from pipeline.results.fingerprints import of_content
-from pipeline.text.output_paths import path_below
+from pipeline.text.names import path_below
 from pipeline.text.tables import Table, read_toml
 
+FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
 if TYPE_CHECKING:
     from measure.scans.scan import Scan
 

@@ -1,22 +1,94 @@
-"""The scans that a project names: files and addresses, and patterns of them at any depth; what their images are
-called."""
+"""The scans that a project names: files, addresses and patterns, each real file once, and their images' names."""
 
 import glob
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from measure.errors import MeasurementError
 from measure.scans.remote import find_addresses, is_address, part_text, public_text, scan_path
 from pipeline.errors import InputError
 from pipeline.files.images_file import GivenImages
-from pipeline.files.scan_patterns import each_once, found_names
-from pipeline.text.image_names import names_below
+from pipeline.text.names import names_below
 from pipeline.text.tables import Table
 
+_ANY_DEPTH = "**"
 Named = str | Path  # a file by its text; an address by itself, for it knows what its store said of it
+
+
+def found_names(pattern: str, folder: Path) -> set[str]:
+    """Files, and folders, by their paths from the folder; what is hidden is not looked at."""
+    parts = pattern.split(os.sep)
+    if _ANY_DEPTH not in parts:
+        return set(glob.glob(pattern, root_dir=folder))
+    depth = parts.index(_ANY_DEPTH)
+    before, after = os.sep.join([*parts[:depth], ""]), os.sep.join(parts[depth + 1 :] if parts[depth + 1 :] else ["*"])
+    names = set[str]()
+    for start in glob.glob(before, root_dir=folder) if before else [""]:
+        for place in folders_below(folder / start):
+            here = os.path.join(start, place)
+            names |= {os.path.join(here, name) for name in found_names(after, folder / here)}
+    return names
+
+
+def folders_below(root: Path) -> Iterator[str]:
+    """The folder itself, "", and all below it but hidden ones, by their paths from it.
+
+    Each real folder comes once, by a path without links where there is one. A link to a folder that contains it is not
+    followed.
+    """
+    entered = set[str]()
+    waiting, links = deque([("", os.path.realpath(root))]), deque[tuple[str, str]]()
+    while waiting or links:
+        place, real = (waiting or links).popleft()
+        if real in entered:
+            continue
+        entered.add(real)
+        yield place
+        for name, is_link in _folders_in(real):
+            below, target = os.path.join(place, name), os.path.join(real, name)
+            if not is_link:
+                waiting.append((below, target))
+            elif not _contains(target := os.path.realpath(target), real):
+                links.append((below, target))
+
+
+def each_once(files: Mapping[str, bool], without: Iterable[str]) -> set[str]:
+    """The paths that are kept: of several to one real file the first that was named as it stands (True), else its own,
+    else the first; none to a file to which a path of `without` leads, too."""
+    folder_of = cache(os.path.realpath)
+
+    def real_path(file: str) -> str:
+        if os.path.islink(file):
+            return os.path.realpath(file)
+        parent, name = os.path.split(file)
+        return os.path.join(folder_of(parent or os.curdir), name)
+
+    left_out, kept = {real_path(file) for file in without}, dict[str, str]()
+    for file in files:
+        real = real_path(file)
+        if real in left_out:
+            continue
+        kept[real] = max(kept.get(real, file), file, key=lambda one: (files[one], os.path.abspath(one) == real))
+    return set(kept.values())
+
+
+def _folders_in(folder: str) -> list[tuple[str, bool]]:
+    """The names of its folders, and whether each is a link; none of a folder that may not be listed."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        return sorted((one.name, one.is_symlink()) for one in entries if one.is_dir() and not one.name.startswith("."))
+    return []
+
+
+def _contains(folder: str, path: str) -> bool:
+    return os.path.commonpath([folder, path]) == folder
+
+
+# The scans that a project names: files and addresses, and patterns of them at any depth; what their images are called.
 
 
 class ScanFiles(Mapping[str, Path]):

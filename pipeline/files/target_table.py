@@ -1,9 +1,11 @@
-"""The table [targets] of project.toml: what is to be measured beside the fiducials."""
+"""The tables [targets] and [ties] of project.toml: what is to be measured apart from the fiducials."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
+from adjust.functional_model.lens import Prior
+from adjust.problem.network import ObjectPoint
 from measure.marks.shapes import Polarity
 from pipeline.text.tables import Table
 
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
 KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco", "squares")
 
 _MOST_OF_A_BOARD = 500  # columns, and rows
+if TYPE_CHECKING:
+    from measure.tie_points.find_points import TieOptions
 
 
 @dataclass(frozen=True)
@@ -122,3 +126,33 @@ def _board(kind: str, table: Table) -> "BoardSpec":
         return CharucoSpec(dictionary, columns, rows, square, marker, legacy, table.whole("first_id", 0))
     first = table.whole("first_marker", 0)
     return ArucoSpec(dictionary, columns, rows, marker, table.number("gap_mm", above=0.0), first)
+
+
+@dataclass(frozen=True)
+class TieSettings:
+    """height: of the ground on which the natural points lie, object units, with its standard deviation; None where it
+    is not known."""
+
+    options: "TieOptions"
+    height: Prior | None = None
+
+    def point(self, id: str) -> ObjectPoint:
+        """A natural point as an object point: unknown but for its height, where that is given."""
+        return ObjectPoint(id, None, None, self.height)
+
+
+def read_ties(table: Table) -> TieSettings:
+    """Read the table. Raises InputError naming the key that is wrong."""
+    from measure.tie_points.find_points import TieOptions
+
+    usual = TieOptions()
+    wanted, images = table.whole("wanted", usual.wanted), table.whole("images", usual.images)
+    try:
+        options = TieOptions(wanted, images)
+    except ValueError as error:
+        raise table.error("wanted", f"these natural points are impossible: {error}.") from None
+    height = None
+    if "height" in table or "height_sigma" in table:
+        height = Prior(table.number("height"), table.number("height_sigma", least=0.0))
+    table.done()
+    return TieSettings(options, height)

@@ -24,7 +24,7 @@ from measure.scans.parallel import map_items
 from measure.scans.scan import Scan
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.learned_table import Clicks, LearnedFrom
+from pipeline.files.mark_table import Clicks, LearnedFrom
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 
 Array = NDArray[np.float64]

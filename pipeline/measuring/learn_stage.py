@@ -19,13 +19,12 @@ from measure.results import MEASURE_REVISION, FrameMeasurement
 from measure.scans.parallel import map_items
 from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
 from pipeline.files.camera_text import camera_text
+from pipeline.files.mark_table import saved_in
 from pipeline.files.project_file import Project
-from pipeline.files.template_table import saved_in
 from pipeline.measuring.first_pictures import digest, first_pictures
-from pipeline.measuring.memory import Json, Memory
-from pipeline.measuring.scan_task import Measure, ScanTask, scan_tasks
+from pipeline.measuring.scan_task import Json, Measure, Memory, ScanTask, scan_tasks
 from pipeline.progress import Reporter
-from pipeline.results.fingerprints import fingerprint, of_file
+from pipeline.provenance import fingerprint, of_file
 from pipeline.text.atomic import write_atomically
 
 _BY = f"# Marks learned by reseau {version('reseau')}"

@@ -1,25 +1,27 @@
-"""The frames of a camera brought to one direction by what is written on them, so that their marks have the same names.
-
-A camera's titles lie the same way in all its frames. So frames that lie otherwise in their scans are known to, and what
-is written on each adds to what tells how the camera has it. What is not told even so is one question for all.
-"""
+"""The second step of measuring: the scans of one camera together, brought to one direction by their writing."""
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NewType
 
 import numpy as np
 
 from measure.annotations.fields import KnownLine, Line, masked_text
 from measure.annotations.orientation_from_text import bounded, line_score
+from measure.boards.corners import one_definition
+from measure.fiducials.across_frames import judged
+from measure.fiducials.options import BelievedFilm
 from measure.fiducials.scan_orientation import DECIDED, TOLD
-from measure.flags import Status
+from measure.flags import Code, Reason, Status
 from measure.geometry import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import WrittenPlace
 from measure.results import FrameMeasurement, Pose
+from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, few_of
 from pipeline.progress import Reporter
+from pipeline.results.frames_file import said
 from pipeline.results.measured_scan import MeasuredScan
 
 _ONE_QUESTION = (
@@ -30,6 +32,8 @@ _READ_FIRST = 4  # frames of a camera on which all writing is read
 _WAYS = 2  # in which frames of a roll lie, as far as they are looked for: more take as long as reading all
 _LEAST = 6  # letters and digits of a line by which frames are known
 _TURNS = ("0", "90", "180", "270")  # in which writing may lie in the camera's frame
+CheckedScan = NewType("CheckedScan", MeasuredScan)  # beside the others of its camera
+_SAME = ("run", "frames", "date")  # that name a frame together with its number
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +133,7 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
     poses = {frame.image: frame.pose for frame in frames if frame.pose is not None and frame.pose.writing}
     if len(poses) < 2:
         return {}
-    told = _told([frame for frame in frames if frame.image in poses], places)
+    told = _writing_likelihoods([frame for frame in frames if frame.image in poses], places)
     alike = [turn for turn in _TURNS if told[turn] > -DECIDED]
     usual = Counter(_turn(pose) for pose in poses.values())
     chosen = max(alike, key=lambda turn: (told[turn] > -TOLD, usual[turn]))
@@ -137,7 +141,7 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
     return {frame.image: _together(frame, chosen, len(alike) == 1, len(poses)) for frame in undecided}
 
 
-def _told(frames: Sequence[FrameMeasurement], places: Sequence[WrittenPlace]) -> Mapping[str, float]:
+def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[WrittenPlace]) -> Mapping[str, float]:
     """Log-likelihoods of the turns of the writing in the camera's frame, 0 for the best. What stands on several frames,
     numbers apart, is one title, or one stamp, and counts once."""
     texts: dict[str, tuple[Pose, Line]] = {}
@@ -188,3 +192,76 @@ def _turn(pose: Pose) -> str:
 def _in_scan(pose: Pose, turn: str) -> str:
     """The pose of a frame whose writing lies so in the camera's frame."""
     return next(name for name in POSES if pose_in_camera(pose.writing, name) == turn)
+
+
+# The second step of measuring: the scans of one camera beside one another. What was measured stays as it is; what is
+# checked is made anew whenever a scan comes to them.
+
+
+def checked(
+    camera: CameraFile,
+    measured: Sequence[MeasuredScan],
+    roll: Roll,
+    again: Iterable[MeasuredScan],
+    film: BelievedFilm,
+) -> tuple[CheckedScan, ...]:
+    """The scans of one camera as all of them together show them, in their order: their poses, one definition of the
+    places of crossings, the fiducials judged together.
+
+    camera: with templates in the place of marks that were learned. again: the scans of `roll.tasks`, measured.
+    """
+    scans = roll.named([scan for scan in measured if not scan.failure], {scan.frame.image: scan for scan in again})
+    marks = one_definition([scan.frame.marks for scan in scans])
+    frames = [replace(scan.frame, marks=own) for scan, own in zip(scans, marks, strict=True)]
+    told = {
+        scan.frame.image: replace(scan, frame=frame)
+        for scan, frame in zip(scans, _judged(camera, frames, scans, film), strict=True)
+    }
+    return tuple(CheckedScan(told.get(scan.frame.image, scan)) for scan in measured)
+
+
+def _judged(
+    camera: CameraFile, frames: Sequence[FrameMeasurement], scans: Sequence[MeasuredScan], film: BelievedFilm
+) -> Sequence[FrameMeasurement]:
+    """The fiducials judged together, if the camera has any."""
+    if not camera.drawn:
+        return frames
+    return judged(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames
+
+
+def with_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:
+    """The scans, with a problem where another one says that it is the same frame. part_of: the frame of which an image
+    is one of several scans, which are meant to be of one frame."""
+    named: dict[tuple[tuple[str, str], ...], list[str]] = {}
+    names = {scan.frame.image: _name(scan.frame) for scan in scans}
+    for image, name in names.items():
+        if name:
+            named.setdefault(name, []).append(image)
+    return [_with_problem(scan, names[scan.frame.image], named, part_of) for scan in scans]
+
+
+def _name(frame: FrameMeasurement) -> tuple[tuple[str, str], ...]:
+    """What names the frame: its number, and the run, its frames or the date, as far as they are known."""
+    values = said(frame.writing or (), ("frame", *_SAME))
+    return tuple(values.items()) if "frame" in values and len(values) > 1 else ()
+
+
+def _with_problem(
+    scan: MeasuredScan,
+    name: tuple[tuple[str, str], ...],
+    named: Mapping[tuple[tuple[str, str], ...], list[str]],
+    part_of: Callable[[str], str],
+) -> MeasuredScan:
+    own = scan.frame.image
+    others = [
+        image for image in named.get(name, ()) if image != own and not (part_of(own) and part_of(image) == part_of(own))
+    ]
+    if not name or not others:
+        return scan
+    told = ", ".join(f"{field} {value}" for field, value in name)
+    problem = Reason(
+        f"its writing says {told}, and so does that of {' and '.join(others)}: these are scans of one frame, or a line "
+        "is misread. Leave one of them out, or look at frames.csv.",
+        Code.AMBIGUOUS,
+    )
+    return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))

@@ -12,7 +12,7 @@ from rich.console import Console
 from measure.errors import MeasurementError
 from measure.scans.opening import read_head
 from pipeline.errors import InputError
-from pipeline.measuring.camera_answer import Identification
+from pipeline.measuring.camera_identification import Identification
 
 Json = dict[str, Any]
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Exterior
@@ -17,14 +17,25 @@ from measure.scans.remote import fetch_location, public_address, scan_path
 from measure.tone.curve import ToneInformation
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.results.fingerprints import canonical_json
+from pipeline.provenance import canonical_json
 from pipeline.results.measured_scan import MeasuredScan
 
+Json = dict[str, Any]
 if TYPE_CHECKING:
     from measure.scans.scan import Scan
-    from pipeline.measuring.sought_targets import SoughtTargets
+    from pipeline.measuring.target_stage import SoughtTargets
 
 _NO_SCAN = "images.csv names it, and the project has no scan of that name. Look for the file, or take the line out."
+
+
+class Memory(Protocol):
+    """Values by keys, which name all that a value depends on."""
+
+    def told(self, key: str) -> Json | None:
+        """What was told by that key; None: nothing yet."""
+
+    def tell(self, key: str, value: Json) -> None:
+        """Keep a value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +152,7 @@ def options_of(project: Project, said: Mapping[str, tuple[ToneInformation, ...]]
 def _targets(project: Project) -> "SoughtTargets | None":
     if project.targets is None:
         return None
-    from pipeline.measuring.sought_targets import SoughtTargets  # and all that looks for them
+    from pipeline.measuring.target_stage import SoughtTargets  # and all that looks for them
 
     return SoughtTargets.of(project)
 

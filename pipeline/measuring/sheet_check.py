@@ -11,7 +11,7 @@ from measure.flags import SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE, Code, Re
 from measure.results import MarkMeasurement
 from measure.targets.consistency import FLAT, ImagePoints, SheetImage, along_plane, compared_together, sheet_points
 from pipeline.files.project_file import Project
-from pipeline.measuring.coded_points import CodedPoints
+from pipeline.measuring.coded_targets import CodedPoints
 from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""The single targets of a project: where they are in space, how they should look, and how they are found and fitted."""
+"""The single targets of a project: where they are in space, how they look, and which were seen elsewhere."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -7,20 +7,127 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.projection import ImageModel
+from adjust.functional_model.rotation import rotation_from_vector
+from measure.flags import TARGET_ELSEWHERE, TARGET_OFF_PLACE, Code, Reason, Status
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate
+from measure.targets.consistency import TargetPlaces, compared
 from measure.targets.crosses import CrossSearch, cross_candidates
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.measuring.perspective_disks import disk_images, disk_normals, plane_normal
+from pipeline.results.comparator_file import pixel_from_comparator
 from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 
+_ANGLES = np.arange(8) * np.pi / 4.0
+_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # enough for what a lens does within a target
+_FLAT = 1e-6  # of the field's size: points this near a plane lie on a board
 LEAST_DIAMETER_PX = 2.5  # of a target in the scan: of a smaller one, size and blur cannot be told apart
+_TURN_RAD, _SHIFT = 0.1, 0.1  # how wrong an orientation may be, the latter of the distance
+_STEP = 1e-3  # of these, for derivatives
+
+
+def eccentricity_mm(model: ImageModel, centers: Array, normals: Array, radius: float) -> Array:
+    """The centre of each disk's image less the image of its centre, in the comparator, (n, 2) mm.
+
+    centers (n, 3) and radius in object units, normals (n, 3) of unit length. With c the centre and n the normal in the
+    camera frame, z forward, the centre of the perspective ellipse is off by
+    `f r² [n_xy n_z + (c_xy / c_z) (1 - n_z²)] / (c_z² - r² (1 - n_z²))`: the pole of the disk's plane section, as from
+    the dual conic of its circle. The lens bends this ellipse; its centre of gravity, which a fitted ellipse finds, is
+    that of its outline as distortion and film image it.
+    """
+    model, centers = model.reduced_to(centers)
+    forward = np.array([1.0, 1.0, -1.0])
+    c = ((centers - model.station) @ model.rotation.T) * forward
+    n = (normals @ model.rotation.T) * forward
+    tilt = 1.0 - n[:, 2] ** 2
+    reach = c[:, 2] ** 2 - radius**2 * tilt
+    off_axis = n[:, :2] * n[:, 2:] + c[:, :2] / c[:, 2:] * tilt[:, None]
+    middle = c[:, :2] / c[:, 2:] + radius**2 * off_axis / reach[:, None]
+    axes = np.stack(
+        [radius * (v[:, :2] - c[:, :2] / c[:, 2:] * v[:, 2:]) / c[:, 2:] for v in across(n)], axis=-1
+    )  # fmt: skip
+
+    def imaged(places: Array) -> Array:
+        rays = np.column_stack([places, np.ones(len(places))]) * c[:, 2:]
+        image, _ = model.comparator_from_object((rays * forward) @ model.rotation + model.station)
+        return image
+
+    outline = np.stack([imaged(middle + axes @ u) for u in _CIRCLE], axis=1)
+    return _centre_of_gravity(outline) - imaged(c[:, :2] / c[:, 2:])
+
+
+def _centre_of_gravity(outline: Array) -> Array:
+    """(n, 2) of the areas within outlines (n, k, 2) that are, but for a little, affine images of _CIRCLE.
+
+    In the affine frame, a displacement of the unit circle moves its centre of gravity by twice the mean of its part
+    along the radius, times the radius vector.
+    """
+    mean = outline.mean(axis=1)
+    linear = 2.0 * np.einsum("nki,kj->nij", outline - mean[:, None], _CIRCLE) / len(_CIRCLE)
+    flat = np.einsum("nij,nkj->nki", np.linalg.inv(linear), outline - mean[:, None])
+    outward = np.einsum("nki,ki->nk", flat, _CIRCLE) - 1.0
+    shift = 2.0 * np.einsum("nk,ki->ni", outward, _CIRCLE) / len(_CIRCLE)
+    return np.asarray(mean + np.einsum("nij,nj->ni", linear, shift))
+
+
+def disk_images(
+    model: ImageModel, pitch_um: tuple[float, float], centers: Array, normals: Array, radius: float
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Predicted centres (n, 2) px, maps (n, 2, 2) from each disk's two radius vectors to pixels, perspective (n, 2) per
+    px, by which what is nearer to the camera is larger, and what is visible."""
+    first, second = across(normals)
+    place, visible = model.comparator_from_object(centers)
+    columns = []
+    for direction in (first, second):
+        ahead, seen_ahead = model.comparator_from_object(centers + radius * direction)
+        behind, seen_behind = model.comparator_from_object(centers - radius * direction)
+        columns.append(pixel_from_comparator((ahead - behind) / 2.0, pitch_um))
+        visible = visible & seen_ahead & seen_behind
+    maps = np.stack(columns, axis=-1)
+    depth = (model.station - centers) @ model.rotation[2]
+    deeper = -np.stack([first, second], axis=1) @ model.rotation[2] * radius / depth[:, None]
+    perspective = np.einsum("ni,nij->nj", deeper, np.linalg.inv(maps))
+    return pixel_from_comparator(place, pitch_um), maps, perspective, visible
+
+
+def disk_normals(
+    ids: Sequence[str], coordinates: Array, given: Mapping[str, Array], plane: Array | None, station: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Unit normals (n, 3) of disks at coordinates (n, 3), and which of them are known.
+
+    Known are those that are given, and all of a flat field: its plane's normal. Others are taken to face the station.
+    """
+    towards = station - coordinates
+    normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    if plane is not None:
+        normals = np.where((towards @ plane)[:, None] < 0.0, -plane, plane)
+    known = np.array([plane is not None or id in given for id in ids], dtype=bool)
+    for i, id in enumerate(ids):
+        if id in given:
+            normals[i] = given[id]
+    return normals, known
+
+
+def plane_normal(coordinates: Array) -> Array | None:
+    """The normal of the plane that holds all points (n, 3); None where they are not flat, or too few to say."""
+    if len(coordinates) < 4:
+        return None
+    spread = np.linalg.svd(coordinates - coordinates.mean(axis=0), full_matrices=False)
+    flat = spread.S[2] <= _FLAT * spread.S[0] < spread.S[1]
+    return np.asarray(spread.Vh[2], dtype=np.float64) if flat else None
+
+
+def across(normals: Array) -> tuple[Array, Array]:
+    """Two unit vectors at right angles to each of the unit vectors (n, 3) and to one another."""
+    helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(normals, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(normals, first)
 
 
 @dataclass(frozen=True)
@@ -81,3 +188,54 @@ def measure_single_targets(
     if settings.cross_line is None:
         return measure_disks(scan, predictions, options)
     return measure_crosses(scan, predictions, settings.cross_line, options)
+
+
+def checked_places(
+    marks: Sequence[MarkMeasurement], field: Field, model: ImageModel, scan: MeasuredScan
+) -> tuple[MarkMeasurement, ...]:
+    """The marks, those doubted or refused that lie where a right one seldom or never does; model: the image, oriented
+    to some degrees."""
+    observed = {mark.point: mark for mark in marks if mark.status.is_observation}
+    seen = np.array([mark.center_px for mark in observed.values()]).reshape(-1, 2)
+    covariances = np.array([mark.covariance_px2 for mark in observed.values()]).reshape(-1, 2, 2)
+    if len(observed) < 2:
+        return tuple(marks)
+    row = {id: i for i, id in enumerate(field.ids)}
+    targets = target_places(field.of([row[id] for id in observed]), model, scan)
+    comparison = compared(targets, seen, covariances, (scan.width_px, scan.height_px))
+    far = np.linalg.norm(comparison.off_px, axis=1)
+    verdicts = dict(zip(observed, zip(far.tolist(), comparison.chance.tolist(), strict=True), strict=True))
+    return tuple(_judged(mark, verdicts) for mark in marks)
+
+
+def _judged(mark: MarkMeasurement, verdicts: Mapping[str, tuple[float, float]]) -> MarkMeasurement:
+    off_px, chance = verdicts.get(mark.point, (0.0, 1.0))
+    if chance > TARGET_OFF_PLACE:
+        return mark
+    how = f"it lies {off_px:.2f} px from where the other targets put it"
+    if chance < TARGET_ELSEWHERE:
+        wrong = Reason(f"another mark, or the point's coordinates are wrong: {how}", Code.OFF_PLACE)
+        return replace(mark, status=Status.REJECTED, reason=wrong)
+    reason = Reason(f"{how}, as one of {1.0 / chance:.0f} right ones does", Code.OFF_PLACE)
+    return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, reason)))
+
+
+def target_places(field: Field, model: ImageModel, scan: MeasuredScan) -> TargetPlaces:
+    """Where an image shows the points of a field, by its orientation and their coordinates."""
+
+    def places(image: ImageModel, xyz: Array) -> Array:
+        comparator, _ = image.comparator_from_object(xyz)
+        return pixel_from_comparator(comparator, scan.pitch_um)
+
+    distance = float(np.median(np.linalg.norm(field.xyz - model.station, axis=1)))
+    ahead = places(model, field.xyz)
+    by_orientation = []
+    for axis in np.eye(3):
+        turned = replace(model, rotation=rotation_from_vector(_STEP * _TURN_RAD * axis) @ model.rotation)
+        shifted = replace(model, station=model.station + _STEP * _SHIFT * distance * axis)
+        by_orientation += [(places(moved, field.xyz) - ahead) / _STEP for moved in (turned, shifted)]
+    step = _STEP * distance
+    by_point = np.stack([(places(model, field.xyz + step * axis) - ahead) / step for axis in np.eye(3)], axis=-1)
+    is_free = np.asarray(~np.isfinite(field.sigmas).all(axis=1))
+    moved = by_point * np.where(is_free[:, None], 0.0, field.sigmas)[:, None]
+    return TargetPlaces(ahead, np.stack(by_orientation, axis=-1), moved @ moved.swapaxes(1, 2), is_free)

@@ -1,10 +1,11 @@
 """The targets of one scan: boards name their own points; single disks and crosses get their names by prediction."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
@@ -14,24 +15,33 @@ from measure.flags import Code, Reason, Status
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.measure_targets import TargetPrediction
+from pipeline.errors import InputError
+from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.measuring.camera_model import camera_model
-from pipeline.measuring.coded_field import measure_coded_field
-from pipeline.measuring.coded_sheet import measure_sheet
-from pipeline.measuring.identification import PatternOptions, assign, log10_of_chance, recognise
+from pipeline.measuring.coded_targets import CodedPoints, measure_coded_field, measure_sheet
 from pipeline.measuring.scan_task import ScanOptions
-from pipeline.measuring.sought_targets import LEAST_PAIRS, SoughtTargets
 from pipeline.measuring.target_field import (
     LEAST_DIAMETER_PX,
     Field,
+    checked_places,
     measure_single_targets,
     target_candidates,
+    target_field,
 )
-from pipeline.measuring.target_places import checked_places
-from pipeline.measuring.unoriented import NamedField, likely_diameters_px, name_field
+from pipeline.measuring.target_identification import (
+    NamedField,
+    PatternOptions,
+    assign,
+    camera_model,
+    likely_diameters_px,
+    log10_of_chance,
+    name_field,
+    recognise,
+)
 from pipeline.results.comparator_file import comparator_from_pixel
 from pipeline.results.measured_scan import MeasuredScan
 
+LEAST_PAIRS = 4  # of points and marks that name an image's targets
 Array = NDArray[np.float64]
 
 _SEED = 1  # of the resection's random triples: a result must not depend on the run
@@ -42,6 +52,63 @@ _MOST_LOG10_CHANCE = -1.0  # of agreements as good by chance: the project says t
 _STRONGEST = 3  # patches a target, by contrast: dust and texture are weaker than what was painted to be seen
 _NEAR = 0.65  # of the scan's size from its middle: targets there may be in it
 _SIZE_SLACK = 1.5  # how wrong the approximate distance may make a target's size
+
+
+@dataclass(frozen=True, eq=False)
+class SoughtTargets:
+    """settings: what the targets are. field: those whose coordinates are known, if only roughly; coded: the same where
+    some bear codes. surveyed: whether a file of points gives them one by one. unit: of their coordinates, which is that
+    many mm."""
+
+    settings: TargetSettings
+    field: Field
+    coded: CodedPoints | None
+    surveyed: bool
+    unit: str
+    unit_mm: float
+
+    @classmethod
+    def of(cls, project: Project) -> "SoughtTargets":
+        """Raises InputError for single targets and rings that nothing in the project could name."""
+        settings = project.targets
+        assert settings is not None
+        coded = CodedPoints.of(project, settings) if settings.code is not None else None
+        field = target_field(project)
+        if settings.board is None and coded is None:
+            _check(project, settings, field)
+        return cls(settings, field, coded, project.given_points is not None, project.unit, project.unit_mm)
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """The names of the marks that are sought."""
+        if self.coded is not None:
+            return self.coded.ids
+        return tuple(self.settings.board.object_points()) if self.settings.board else self.field.ids
+
+
+def _check(project: Project, settings: TargetSettings, field: Field) -> None:
+    if project.given_points is None:
+        raise InputError(
+            f"{project.path}: [targets] kind {settings.kind!r} is named by the targets' coordinates, and there is no "
+            '[object] points = "...". Give the file of the points, or leave [targets] out to measure fiducials only.'
+        )
+    if len(field.ids) < LEAST_PAIRS:
+        raise InputError(
+            f"{project.path}: [object] points: {len(field.ids)} points with X, Y and Z name no targets; give "
+            f"{LEAST_PAIRS}, if only roughly."
+        )
+    nearest = cKDTree(field.xyz).query(field.xyz, k=[2])[0]
+    spacing, diameter = float(np.quantile(nearest, 0.9)), 2.0 * field.radius
+    if diameter > spacing:  # coordinates in another unit than the project says
+        raise InputError(
+            f"{project.path}: [targets] of {diameter * project.unit_mm:g} mm would cover one another: nine of ten "
+            f"points of [object] lie within {spacing * project.unit_mm:.3g} mm of the next one if their coordinates "
+            f'are in {project.unit}. Give the unit that they are in, as [object] unit = "m".'
+        )
+
+
+# What is known of an image before its targets are: the camera as its file gives it, on the film as its fiducials show
+# it lying in the scan.
 
 
 def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) -> MeasuredScan:

@@ -14,10 +14,9 @@ from measure.scans.opening import declared_tone
 from measure.tone.curve import Tone, ToneInformation, power, srgb
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.memory import Memory
-from pipeline.measuring.scan_task import Measure, few_of, scan_tasks
+from pipeline.measuring.scan_task import Measure, Memory, few_of, scan_tasks
 from pipeline.progress import Reporter
-from pipeline.results.fingerprints import fingerprint
+from pipeline.provenance import fingerprint
 from pipeline.results.measured_record import said_of, said_record
 
 _SAMPLES = 8  # scans of a scanner that tell its curve to the others

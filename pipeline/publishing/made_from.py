@@ -5,13 +5,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.file_state import FileStates, Identity
-from pipeline.archive.identity import parts_hash
-from pipeline.archive.store import known_identities
+from pipeline.archive.results_database import known_identities
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
+from pipeline.provenance import FileStates, Identity, fingerprint, of_content, parts_hash
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.fingerprints import fingerprint, of_content
 
 MadeFrom = dict[str, str]
 

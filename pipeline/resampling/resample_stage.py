@@ -14,11 +14,11 @@ import numpy as np
 from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
-from pipeline.archive.file_state import file_state
 from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
+from pipeline.provenance import file_state
 from pipeline.resampling.canvas import canvas_of
 from pipeline.resampling.frame_chain import FrameChain, adjusted_chain, measured_chain
 from pipeline.resampling.frame_file import TILE_PX, Description, read_description, write_frame
@@ -28,7 +28,7 @@ from pipeline.resampling.source import source_of
 from pipeline.results.adjustment_reader import read_adjustment
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.atomic import check_writable
-from pipeline.text.output_paths import path_below
+from pipeline.text.names import path_below
 from pipeline.workers import worker_pool
 
 BEST: Degree = 5

@@ -24,13 +24,13 @@ from adjust.quality.contradiction import CalibrationTest
 from adjust.quality.residuals import FurtherResidual
 from adjust.quality.significance import SignificanceTest
 from adjust.solution.result import Adjustment
+from pipeline.provenance import of_file
 from pipeline.results.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.results.covariance_arrays import covariance_arrays, covariance_note
-from pipeline.results.fingerprints import of_file
 from pipeline.results.joined_frames import frames_json
 from pipeline.results.reliability_json import point_tests, reliability_json, suspect_json
 from pipeline.text.atomic import atomic_path
-from pipeline.text.finite import without_nan
+from pipeline.text.text_file import without_nan
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

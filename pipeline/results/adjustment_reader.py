@@ -23,7 +23,7 @@ from adjust.problem.parameter import (
     parameters_from_texts,
 )
 from pipeline.errors import InputError
-from pipeline.results.fingerprints import of_file
+from pipeline.provenance import of_file
 from pipeline.results.json_form import NUMBER, Each, check_form
 from pipeline.text.text_file import MOST_MB, read_bytes, read_json
 

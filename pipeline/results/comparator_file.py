@@ -22,7 +22,7 @@ from measure.results import FrameMeasurement
 from pipeline.errors import InputError
 from pipeline.text.atomic import atomic_path
 from pipeline.text.csv_table import Row, csv_line, csv_rows
-from pipeline.text.image_names import image_name
+from pipeline.text.names import image_name
 from pipeline.text.text_file import read_bytes
 
 COLUMNS = (

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from measure.flags import Code, Status
-from pipeline.archive.digests import check_judging, damaged_frames, damaged_sentence
+from pipeline.archive.results_integrity import check_judging, damaged_frames, damaged_sentence
 from pipeline.archive.verdicts import Verdict
 from pipeline.files.project_file import Project
 

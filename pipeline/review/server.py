@@ -26,11 +26,10 @@ from pipeline.files.decisions_file import KINDS, LEARNED, MEANING, OF_SCANS, Cho
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import few_of
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.review.looked_at import mark_json
+from pipeline.review.frame_view import mark_json, measured_as_shown, measured_from_clicks
 from pipeline.review.pictures import Pictures
 from pipeline.review.safety import Guard
 from pipeline.review.session import Filters, Session
-from pipeline.review.trial import measured_as_shown, measured_from_clicks
 
 _FILES = {"review.js": "text/javascript", "review.css": "text/css", "index.html": "text/html"}
 _LARGEST_BODY = 200_000  # bytes

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.text.finite import LARGEST, SMALLEST_SIGMA
-from pipeline.text.spelling import did_you_mean
-from pipeline.text.text_file import read_bytes, shown
+from pipeline.text.text_file import LARGEST, SMALLEST_SIGMA, read_bytes, shown
+from pipeline.text.wording import did_you_mean
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 

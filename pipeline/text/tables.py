@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.text.finite import LARGEST
-from pipeline.text.spelling import did_you_mean, nearest
-from pipeline.text.text_file import read_bytes, shown
-from pipeline.text.wording import LISTED
+from pipeline.text.text_file import LARGEST, read_bytes, shown
+from pipeline.text.wording import LISTED, did_you_mean, nearest
 
 FREE = "free"
 MOST_MB = 4  # marks that were learned from 12,000 scans make a camera file of this size

@@ -1,9 +1,24 @@
-"""Lists and counts as the program words them."""
+"""Lists, counts and suggestions as the program words them, and values as the text of a TOML file."""
 
+import difflib
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import PurePosixPath
 
 LISTED = 8  # so many names are listed; the rest are counted
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """The known word that is the most like it; None where none is near."""
+    words = list(known)
+    alike = [each for each in words if each.casefold() == word.casefold()]
+    return next(iter(alike or difflib.get_close_matches(word, words, n=1)), None)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The question " Did you mean '...'?", with the blank in front; "" where nothing is near."""
+    near = nearest(word, known)
+    return "" if near is None else f" Did you mean {near!r}?"
 
 
 def listed(names: Sequence[str]) -> str:
@@ -33,3 +48,20 @@ def gathered(told: Iterable[tuple[str, str, str]]) -> list[str]:
         f"{len(own)} scans ({listed([image for image, _ in own])}): {same}" if len(own) > 1 else own[0][1]
         for same, own in alike.items()
     ]
+
+
+def quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
+def numbers(values: Iterable[float]) -> str:
+    return f"[{', '.join(repr(float(value)) for value in values)}]"
+
+
+def sigma(value: float) -> str:
+    return '"free"' if math.isinf(value) else repr(float(value))
+
+
+def sigmas(values: tuple[float, float]) -> str:
+    return f"[{sigma(values[0])}, {sigma(values[1])}]"

@@ -137,9 +137,9 @@ def test_no_other_module_takes_names_apart_or_builds_them() -> None:
             if file != ROOT / "adjust" / "problem" / "parameter.py":
                 found += [f"{file.relative_to(ROOT)}: {what}" for what in dotted_names(file)]
     assert set(found) == {
-        "pipeline/archive/expected_time.py: rpartition",  # a scan's suffix
+        "pipeline/archive/work.py: rpartition",  # a scan's suffix
         "pipeline/many_frames.py: rpartition",  # a scan's suffix
-        "pipeline/design/variations.py: split",  # a key of a scene's table
+        "pipeline/design/sweeps.py: split",  # a key of a scene's table
         "pipeline/rendered/design_table.py: split",  # a key of a scene's table
     }
 

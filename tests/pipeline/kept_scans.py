@@ -3,11 +3,10 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pipeline.archive.file_state import Identity, file_state
-from pipeline.archive.identity import parts_hash
-from pipeline.archive.judging import JudgedScan, judge, judged_records, judging_of
+from pipeline.archive.checked_statuses import JudgedScan, judge, judged_records, judging_of
 from pipeline.archive.measurement import tell_place
-from pipeline.archive.store import Kept, Store
+from pipeline.archive.results_database import Kept, Store
+from pipeline.provenance import Identity, file_state, parts_hash
 from pipeline.results.comparator_file import measurement_of
 from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import MeasuredScan

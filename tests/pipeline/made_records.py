@@ -5,8 +5,8 @@ import random
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.file_state import FileState, Identity
-from pipeline.archive.store import Kept, Store
+from pipeline.archive.results_database import Kept, Store
+from pipeline.provenance import FileState, Identity
 
 Json = dict[str, Any]
 

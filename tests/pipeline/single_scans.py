@@ -1,7 +1,7 @@
 """One scan of a project, measured by itself."""
 
 from pipeline.files.project_file import Project
-from pipeline.measuring.measured import measured_scan
+from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.results.measured_scan import MeasuredScan
 

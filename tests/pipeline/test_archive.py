@@ -20,16 +20,16 @@ from drawn_frames import PITCH_UM, layout_of
 from drawn_project import CAMERA, write_project
 
 from measure.marks.shapes import MarkShape, polygon
-from pipeline.archive.digests import add_digests
 from pipeline.archive.measurement import picture_sizes_mm
+from pipeline.archive.results_integrity import add_digests
 from pipeline.archive.schema import opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
-from pipeline.archive.witness import Witnessed, witnessed_scan
+from pipeline.archive.work import Witnessed, witnessed_scan
 from pipeline.cli import run
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import read_project
-from pipeline.measuring.checked import CheckedScan, checked
+from pipeline.measuring.roll import CheckedScan, checked
 from pipeline.measuring.scan_task import Measure, ScanTask
 from pipeline.results.comparator_file import measurement_of
 from pipeline.results.measured_scan import MeasuredScan
@@ -157,7 +157,7 @@ def test_what_was_measured_with_other_options_comes_back_without_measuring(folde
 
 
 def test_a_new_revision_of_measuring_measures_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.archive.key.fingerprint.__defaults__", (-1,))
+    monkeypatch.setattr("pipeline.provenance.fingerprint.__defaults__", (-1,))
     measure(folder)
     assert sorted(measured) == ["a", "b", "c"]
 
@@ -288,7 +288,7 @@ def test_a_full_disk_is_told_and_costs_nothing_that_was_measured(
         return store
 
     with monkeypatch.context() as patched:
-        patched.setattr("pipeline.archive.store.opened", full)
+        patched.setattr("pipeline.archive.results_database.opened", full)
         assert measure(folder) == 2
     said = capsys.readouterr().err
     assert "is full). Make room there" in said
@@ -380,14 +380,14 @@ def test_of_many_scans_only_the_lot_of_a_new_one_is_judged_again(
     monkeypatch.setattr("pipeline.archive.work.witnessed_scan", without_targets)
     rewritten(folder, "project.toml", "[measure]", f"{BOARD}[measure]")
     measure(folder)
-    monkeypatch.setattr("pipeline.archive.together._TOGETHER", 1)
+    monkeypatch.setattr("pipeline.archive.cross_scan_checks._TOGETHER", 1)
     beside = list[list[str]]()
 
     def counted(camera: CameraFile, scans: Sequence[MeasuredScan], *more: Any) -> tuple[CheckedScan, ...]:
         beside.append([scan.frame.image for scan in scans])
         return checked(camera, scans, *more)
 
-    monkeypatch.setattr("pipeline.archive.together.checked", counted)
+    monkeypatch.setattr("pipeline.archive.cross_scan_checks.checked", counted)
     shutil.copy(three / "a.tif", folder / "other.tif")  # a copy is no frame of its own, and needs no checks
     pixels = tifffile.imread(three / "a.tif")
     for number, (name, lots) in enumerate({"d": [["d"]], "h": [["h"]], "e": [["a", "b", "c", "e"]]}.items()):

@@ -6,7 +6,7 @@ import pytest
 
 from measure.results import FrameMeasurement
 from pipeline.files.camera_file import read_camera
-from pipeline.measuring.camera_model import misplaced_principal_point
+from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.results.measured_scan import MeasuredScan
 
 MEASURED = MeasuredScan("v.tif", 2001, 1801, (20.0, 20.0), FrameMeasurement("v", ()))

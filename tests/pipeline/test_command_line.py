@@ -343,7 +343,7 @@ def test_the_help_does_not_wait_for_what_commands_need() -> None:
     program = f"import sys, pipeline.cli; print(*set(sys.modules) & set({heavy}))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "\n"
-    program = "import sys, pipeline.stages; sys.exit('pipeline.measuring.measured' in sys.modules)"
+    program = "import sys, pipeline.stages; sys.exit('pipeline.measuring.scan_measurement' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 

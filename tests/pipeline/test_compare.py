@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.adjusting.compare_stage import _labels
 from pipeline.cli import run
-from pipeline.results.fingerprints import of_file
+from pipeline.provenance import of_file
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -15,7 +15,7 @@ from drawn_project import write_project
 from measure.fiducials.options import Click, FiducialOptions
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
-from pipeline.archive.decided import after_checks, before_checks, decided
+from pipeline.archive.review_decisions import after_checks, before_checks, decided
 from pipeline.cli import run
 from pipeline.errors import InputError, WriteError
 from pipeline.files import decisions_file

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
-from pipeline.design.alone import alone
 from pipeline.design.alternatives import alternatives, gains
-from pipeline.design.expected import expect, rms
+from pipeline.design.expected import alone, expect, rms
 from pipeline.design.setup import planned_network, setup_of
-from pipeline.design.sweeps import Swept, over_layouts, sweep
-from pipeline.design.variations import Variations
+from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.errors import InputError
 from pipeline.rendered.design_table import Sweep
 from pipeline.rendered.scene_file import read_scene

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.archive.expected_time import duration
+from pipeline.archive.work import duration
 
 
 @pytest.mark.parametrize(

@@ -15,15 +15,15 @@ from measure.fiducials.options import SCATTER_MM, BelievedFilm
 from measure.flags import Cause, Code, Reason, Status
 from measure.marks.shapes import MarkShape, MarkTemplate, Polygon, turned
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
+from pipeline.archive.measure_archive import check_measurable
 from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import read_images
+from pipeline.files.mark_table import saved_in
 from pipeline.files.points_file import read_points
 from pipeline.files.project_file import Project, read_project
-from pipeline.files.template_table import saved_in
-from pipeline.measuring.measurable import check_measurable
 from pipeline.results.comparator_file import (
     comparator_from_pixel,
     mark_rows,
@@ -33,7 +33,7 @@ from pipeline.results.comparator_file import (
 )
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.atomic import atomic_path, check_writable, write_atomically
-from pipeline.text.image_names import image_name
+from pipeline.text.names import image_name
 from pipeline.text.tables import read_toml
 
 CAMERA = """

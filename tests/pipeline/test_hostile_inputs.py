@@ -20,10 +20,10 @@ from exported_project import adjusted_project
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
 from measure.scans.remote import Address
-from pipeline.archive.judging import latest
+from pipeline.archive.checked_statuses import latest
 from pipeline.archive.measurement import measured_scans
+from pipeline.archive.results_database import Store
 from pipeline.archive.status import archive_status
-from pipeline.archive.store import Store
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.exchange.convention import ExportOptions
@@ -35,7 +35,7 @@ from pipeline.files.project_file import read_project
 from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import FailureCode
 from pipeline.review.queue import queue_of
-from pipeline.text.image_names import names_below
+from pipeline.text.names import names_below
 
 REFUSED = (InputError, MeasurementError, AdjustmentError)
 SECRETS = ("hunter2", "s3cr3t-signature", "AKIAEXAMPLE")

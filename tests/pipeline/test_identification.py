@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.measuring.identification import assign, log10_of_chance, recognise
+from pipeline.measuring.target_identification import assign, log10_of_chance, recognise
 
 
 def test_pattern_is_named_right_with_targets_missing_and_marks_that_are_none() -> None:

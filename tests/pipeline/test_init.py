@@ -19,7 +19,7 @@ from pipeline.archive.sampling import name_cameras
 from pipeline.cli import run
 from pipeline.files.library import read_library
 from pipeline.files.project_file import read_project
-from pipeline.measuring.camera_answer import Identification, Trial
+from pipeline.measuring.camera_identification import Identification, Trial
 from pipeline.measuring.scan_kinds import ScanKind
 from pipeline.progress import Reporter
 

@@ -21,9 +21,8 @@ from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring import learn_stage
 from pipeline.measuring.learn_stage import learn_marks
-from pipeline.measuring.measured import measure_scans
-from pipeline.measuring.memory import Json
-from pipeline.measuring.scan_task import scan_tasks
+from pipeline.measuring.scan_measurement import measure_scans
+from pipeline.measuring.scan_task import Json, scan_tasks
 from pipeline.progress import Reporter
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene

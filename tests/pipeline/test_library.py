@@ -23,10 +23,8 @@ from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import library_names, library_path, read_library
 from pipeline.files.project_file import read_project
 from pipeline.measuring import camera_trials
-from pipeline.measuring.camera_answer import Identification, Trial
-from pipeline.measuring.camera_trials import _alike, identify
-from pipeline.measuring.drawn_alike import drawn_alike
-from pipeline.measuring.layout_search import LayoutSearch, Tried
+from pipeline.measuring.camera_identification import Identification, Trial, drawn_alike
+from pipeline.measuring.camera_trials import LayoutSearch, Tried, _alike, identify
 from pipeline.progress import Reporter
 from pipeline.rendered.against_truth import compare_with_truth
 from pipeline.rendered.scene_file import render_project
@@ -271,7 +269,7 @@ def test_a_part_of_a_lattice_is_no_other_camera(
     (scan,) = (frame.parent / "scans").glob("*.tif")
     two = {name: LIBRARY[name] for name in ("hasselblad-reseau-60", "register-glass-262")}
     monkeypatch.setattr(
-        "pipeline.measuring.layout_search.answer", lambda _, layout, *__: Answer(10.0 ** -len(layout.marks), ())
+        "pipeline.measuring.camera_trials.answer", lambda _, layout, *__: Answer(10.0 ** -len(layout.marks), ())
     )
     monkeypatch.setattr(
         camera_trials, "_trial", lambda *_: replace(trial(("lattice",), 0.5), found=found, expected=1e-25)
@@ -292,7 +290,7 @@ def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     def small_only(scan: Scan, layout: FiducialLayout, *given: Any) -> Answer:
         return answered(scan, layout, *given) if len(layout.marks) == 4 else Answer(math.inf, ())
 
-    monkeypatch.setattr("pipeline.measuring.layout_search.answer", small_only)
+    monkeypatch.setattr("pipeline.measuring.camera_trials.answer", small_only)
     assert run(["cameras", "--scan", str(scan), "--json"]) == 0
     trials = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["trials"]
     assert trials[0]["expected"] < 1e-4

@@ -13,8 +13,8 @@ from kept_scans import keep_scans
 
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
-from pipeline.archive.judging import tell_written
-from pipeline.archive.store import Store
+from pipeline.archive.checked_statuses import tell_written
+from pipeline.archive.results_database import Store
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.many_frames import MOST_FRAMES, reduced

@@ -17,7 +17,7 @@ from measure.tie_points.tracks import TieCandidate
 from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
-from pipeline.measuring.natural_points import check_tie_names
+from pipeline.measuring.tie_stage import check_tie_names
 from pipeline.results.comparator_file import read_comparator
 from synthetic_images.film import FrameGeometry
 from synthetic_images.render import render_scene

@@ -13,12 +13,11 @@ from range_server import range_server
 
 from measure.scans import remote
 from pipeline.archive.catalogue import Group
-from pipeline.archive.file_state import file_state
-from pipeline.archive.identity import parts_hash
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
 from pipeline.measuring.scan_kinds import ScanKind
+from pipeline.provenance import file_state, parts_hash
 
 
 @pytest.fixture(scope="module")

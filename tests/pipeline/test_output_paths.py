@@ -8,7 +8,7 @@ from exported_project import adjusted_project
 from pipeline.cli import WRONG_INPUT, run
 from pipeline.errors import InputError
 from pipeline.exchange.convention import FORMATS
-from pipeline.text.output_paths import file_word, path_below
+from pipeline.text.names import file_word, path_below
 
 ELSEWHERE = (
     "../../x",

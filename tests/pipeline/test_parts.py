@@ -22,7 +22,7 @@ from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.images_file import read_images
 from pipeline.files.project_file import Project, read_project
-from pipeline.measuring.joins import with_joins
+from pipeline.measuring.tie_stage import with_joins
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_scan import MeasuredScan
 

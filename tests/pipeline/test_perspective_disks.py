@@ -12,7 +12,7 @@ from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
-from pipeline.measuring.perspective_disks import across, disk_images, disk_normals, eccentricity_mm, plane_normal
+from pipeline.measuring.target_field import across, disk_images, disk_normals, eccentricity_mm, plane_normal
 from pipeline.rendered.scene_file import read_scene
 from pipeline.results.comparator_file import pixel_from_comparator
 from synthetic_images.frame import frame_truth

@@ -25,10 +25,10 @@ from pipeline.adjusting import second_visit
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
+from pipeline.provenance import fingerprint, of_scan
 from pipeline.publishing.made_from import measured_from
 from pipeline.report_data import adjusted
 from pipeline.results.comparator_file import mark_rows, read_comparator, write_comparator
-from pipeline.results.fingerprints import fingerprint, of_scan
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.summary import summarise
 

@@ -4,7 +4,7 @@ import random
 from pathlib import Path
 
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
-from pipeline.review.ledger import Ledger
+from pipeline.review.session import Ledger
 
 
 def some(rng: random.Random, count: int) -> list[Decision]:

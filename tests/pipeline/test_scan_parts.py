@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from measure.flags import Status
 from pipeline.cli import LOOK, WRONG_INPUT, run
 from pipeline.files.project_file import read_project
-from pipeline.measuring.measured import measured_scan
+from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_scan import MeasuredScan

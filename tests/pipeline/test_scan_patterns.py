@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.archive.catalogue import catalogue
-from pipeline.files.scan_files import find_scans
-from pipeline.files.scan_patterns import found_names
+from pipeline.files.scan_files import find_scans, found_names
 from pipeline.text.tables import Table
 
 FILES = ("1.tif", "a/2.tif", "a/b/3.tif", ".hidden/4.tif", ".5.tif")

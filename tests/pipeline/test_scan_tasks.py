@@ -20,8 +20,8 @@ from measure.flags import Status
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
-from pipeline.measuring import measured
-from pipeline.measuring.measured import measure_scans, measured_scan
+from pipeline.measuring import scan_measurement
+from pipeline.measuring.scan_measurement import measure_scans, measured_scan
 from pipeline.measuring.scan_task import ScanTask, few_of, scan_tasks
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_scan import FailureCode, MeasuredScan
@@ -203,7 +203,7 @@ def a_fault(*_: object) -> None:
 def test_whatever_happens_in_a_scan_is_a_result(
     two: Path, monkeypatch: pytest.MonkeyPatch, raises: Callable[..., None], code: str, words: str
 ) -> None:
-    monkeypatch.setattr(measured, "measure_fiducials", raises)
+    monkeypatch.setattr(scan_measurement, "measure_fiducials", raises)
     scan = measured_scan(scan_tasks(read_project(two), ["a"])[0])
     assert scan.failure is not None
     assert scan.failure.code == code
@@ -294,7 +294,7 @@ def test_no_module_is_entered_again_from_one_that_it_has_called() -> None:
     trip = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(trip)
     calls = trip.followed()
-    assert {"measure.fiducials.measurement", "pipeline.measuring.checked", "pipeline.results.comparator_file"} <= set(
+    assert {"measure.fiducials.measurement", "pipeline.measuring.roll", "pipeline.results.comparator_file"} <= set(
         calls.order
     )
     assert not calls.again

@@ -15,9 +15,7 @@ import pytest
 import tifffile
 from made_records import dump, failed, kept, record
 
-from pipeline.archive.file_state import file_state
-from pipeline.archive.identity import content_hash, parts_hash
-from pipeline.archive.judging import (
+from pipeline.archive.checked_statuses import (
     JudgedScan,
     Lot,
     drop_all_but,
@@ -28,12 +26,12 @@ from pipeline.archive.judging import (
     judging_of,
     latest,
 )
-from pipeline.archive.key import fingerprint, options_hash, shard_of
 from pipeline.archive.merge import merge
+from pipeline.archive.results_database import Store
 from pipeline.archive.schema import MIGRATIONS, VERSION, opened
-from pipeline.archive.store import Store
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, verdict_of
 from pipeline.errors import InputError
+from pipeline.provenance import content_hash, file_state, options_hash, parts_hash, result_key, shard_of
 from pipeline.results.comparator_file import mark_rows
 from pipeline.results.measured_record import scan_of
 
@@ -248,7 +246,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from made_records import kept
-from pipeline.archive.store import Store
+from pipeline.archive.results_database import Store
 with Store(Path(sys.argv[1])) as store:
     for seed in range(100_000):
         store.keep(kept(seed), str(seed))
@@ -342,7 +340,7 @@ def test_the_key_depends_on_all_that_it_names() -> None:
     base = kept(1)
     others = [kept(1, options="[1]"), kept(1, mtime_ns=2), kept(2)]
     keys = {base.fingerprint, *(other.fingerprint for other in others)}
-    keys.add(fingerprint(base.identity, options_hash("{}"), revision=-1))
+    keys.add(result_key(base.identity, options_hash("{}"), revision=-1))
     assert len(keys) == 5
     assert base.fingerprint == kept(1, problems=["another result"]).fingerprint
 

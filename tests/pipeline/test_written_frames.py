@@ -23,10 +23,8 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import parse_camera, read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import WRITTEN, fill_images, read_images
-from pipeline.measuring.camera_answer import Identification, Trial
-from pipeline.measuring.camera_plate import contradictions, plate_of, with_plates
-from pipeline.measuring.roll import known_lines, poses_of_roll, with_known_lines
-from pipeline.measuring.same_frames import with_same_frames
+from pipeline.measuring.camera_identification import Identification, Trial, contradictions, plate_of, with_plates
+from pipeline.measuring.roll import known_lines, poses_of_roll, with_known_lines, with_same_frames
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
@@ -377,7 +375,7 @@ def test_a_rendered_frame_is_read_and_its_pose_decided(tmp_path: Path, monkeypat
     assert (scan.frame.pose.name, scan.frame.pose.decided) == ("90m", True)
     assert "a,run," in (tmp_path / "p" / "out" / "frames.csv").read_text(encoding="utf-8")
     assert (tmp_path / "p" / "images.csv").read_text(encoding="utf-8") == "image,run,date\na,7,1968-05-16\n"
-    monkeypatch.setattr("pipeline.measuring.measured.networks", lambda: None)
+    monkeypatch.setattr("pipeline.measuring.scan_measurement.networks", lambda: None)
     monkeypatch.setattr("measure.fiducials.measurement.networks", lambda: None)
     run(["measure", str(project)])
     (scan,) = read_measurement(tmp_path / "p" / "out" / "measurement.db")

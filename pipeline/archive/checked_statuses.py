@@ -13,7 +13,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.digests import (
+from pipeline.archive.results_database import MARK_COLUMNS, Json, Store, mark_of, places, row_of
+from pipeline.archive.results_integrity import (
     IS_JUDGING_SOUND,
     DamagedError,
     check_judging,
@@ -24,10 +25,9 @@ from pipeline.archive.digests import (
     seal,
     seal_judging,
 )
-from pipeline.archive.store import MARK_COLUMNS, Json, Store, mark_of, places, row_of
 from pipeline.archive.verdicts import Verdict, verdict_of
+from pipeline.provenance import of_file
 from pipeline.results.comparator_file import MarkRow
-from pipeline.results.fingerprints import of_file
 
 _AT_A_TIME = 500  # frames in a transaction
 _WRITTEN = "comparator.csv"

@@ -1,13 +1,7 @@
-"""Which of the marks found in a scan is which target: a pattern is recognised, then each mark takes its nearest name.
+"""Which of the marks found in a scan is which target."""
 
-An approximate orientation predicts the targets with errors far larger than their distances: a degree of tilt shifts
-them all by hundreds of pixels, together. So first the pattern as a whole is laid on the marks found (pairs of targets
-suggest a similarity, all others test it), then the fit is tightened, and only then are names given, one to one. What an
-orientation by these names explains is believed if marks that lie where they like would hardly agree as well (a
-contrario: Desolneux, Moisan and Morel 2008).
-"""
-
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
@@ -16,8 +10,20 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from adjust.functional_model.lens import Lens
+from adjust.functional_model.projection import ImageModel
+from adjust.functional_model.transformation import Film
 from adjust.initial_values.resection import MAX_TRIPLES
+from adjust.target_identification.naming import Names, name_coded, name_marks
 from adjust.target_identification.unnamed_marks import chance_of_a_mark, density_about, log10_of_agreement
+from measure.targets.block_search import Candidate
+from measure.targets.measure_targets import TargetPrediction
+from pipeline.files.camera_file import CameraFile
+from pipeline.measuring.target_field import (
+    Field,
+)
+from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -26,6 +32,14 @@ _PAIRS = 60  # long pairs of targets that suggest where the pattern lies
 _TESTED = 400  # suggestions that are tested on all targets
 _OF_POSE = 3  # targets that can always be brought onto marks...
 _POSES = 4  # ...by so many poses
+_SIGMA_PX = 0.5  # of a mark as the search has it, eccentricity and lens included as far as they change quickly
+_FOUND_WITHIN_PX = 2.0  # how far the fit may move from where the search has a target
+_STRAYS = 1.5  # strongest marks a target: dust and texture are weaker than what was painted to be seen
+_NEIGHBOURS = 4  # named targets next to one that was missed, that tell how far off its place is
+_SIZES = 4.0  # how far a target's size may be from that in a picture that the whole field fills
+
+
+_IN_THE_PICTURE = 0.4  # of its size: a principal point is no farther from its middle, unless much was cut off
 
 
 @dataclass(frozen=True)
@@ -211,3 +225,141 @@ def _similarity(source: Array, target: Array) -> Array:
 def _mapped(matrix: Array, points: Array) -> Array:
     mapped: Array = points @ matrix[:, :2].T + matrix[:, 2]
     return mapped
+
+
+def likely_diameters_px(field: Field, measured: MeasuredScan) -> tuple[float, float]:
+    """The smallest and the largest that a target may have, if the field fills the picture more or less."""
+    size = float(np.linalg.norm(np.ptp(field.xyz, axis=0)))
+    filling = 2.0 * field.radius / size * float(np.hypot(measured.width_px, measured.height_px))
+    return filling / _SIZES, filling * _SIZES
+
+
+@dataclass(frozen=True, eq=False)
+class NamedField:
+    """The image as oriented by the names; candidates: of the points that have one, by id; gate_px: how far a target
+    may lie from the place that the image gives it."""
+
+    model: ImageModel
+    candidates: Mapping[str, Candidate]
+    gate_px: float
+
+    def predictions(self, field: Field, measured: MeasuredScan) -> tuple[TargetPrediction, ...]:
+        """Named targets where they were found, the others where the image and the named ones about them put them."""
+        predicted = field.predictions(self.model, measured, self.gate_px)
+        named = [one for one in predicted if one.point in self.candidates]
+        off = np.array([self.candidates[one.point].center_px - one.center_px for one in named])
+        tree = cKDTree([one.center_px for one in named])
+        near = np.arange(1, min(_NEIGHBOURS, len(named)) + 1)
+        return tuple(
+            self._as_found(one)
+            if one.point in self.candidates
+            else replace(one, center_px=one.center_px + np.median(off[tree.query(one.center_px, k=near)[1]], axis=0))
+            for one in predicted
+        )
+
+    def _as_found(self, predicted: TargetPrediction) -> TargetPrediction:
+        found = self.candidates[predicted.point]
+        return replace(
+            predicted,
+            center_px=found.center_px,
+            pixel_from_disk=found.pixel_from_disk,
+            search_px=_FOUND_WITHIN_PX,
+        )
+
+
+def name_field(
+    field: Field,
+    model: ImageModel,
+    camera: CameraFile,
+    measured: MeasuredScan,
+    candidates: Sequence[Candidate],
+    codes: Mapping[int, int] | None = None,
+) -> NamedField | str:
+    """Name the candidates, which come in the order of their strength; or why they have no names.
+
+    model: the image's camera and film, its orientation not used, nor its principal distance where the camera's file
+    gives none; codes: the point (by index) that a code says some candidates (by index) are.
+    """
+    places = np.array([one.center_px for one in candidates]).reshape(-1, 2)
+    ideal = _ideal(model, measured, places)
+    frame = frame_mm(camera, model, measured) - model.lens.interior[1:]
+    inside = np.flatnonzero(((ideal >= frame[0]) & (ideal <= frame[1])).all(axis=1))
+    strongest = inside if codes else inside[: int(_STRAYS * len(field.ids)) + 1]
+    normals = np.array([field.normals.get(id, np.full(3, np.nan)) for id in field.ids]).reshape(-1, 3)
+    c, pitch_mm = camera.principal_distance_mm, min(measured.pitch_um) / 1000.0
+    known = field.xyz, normals, ideal[strongest], (frame[0], frame[1]), c, _SIGMA_PX * pitch_mm
+    if codes:
+        row = {int(candidate): mark for mark, candidate in enumerate(strongest)}
+        names = name_coded(*known, {row[one]: point for one, point in codes.items() if one in row})
+    else:
+        names = name_marks(*known)
+    if isinstance(names, str):
+        return names
+    return _named(names, field, model, [candidates[i] for i in strongest], pitch_mm)
+
+
+def _named(
+    names: Names, field: Field, model: ImageModel, candidates: Sequence[Candidate], pitch_mm: float
+) -> NamedField:
+    lens = replace(model.lens, interior=np.array([names.principal_distance_mm, *model.lens.interior[1:]]))
+    oriented = replace(model, lens=lens, rotation=names.pose.rotation, station=names.pose.center)
+    by_id = {field.ids[point]: candidates[mark] for point, mark in names.mark.items()}
+    return NamedField(oriented, by_id, max(names.gate_mm / pitch_mm, _FOUND_WITHIN_PX))
+
+
+def _ideal(model: ImageModel, measured: MeasuredScan, places_px: Array) -> Array:
+    """(n, 2) mm about the principal point, free of what is known of the distortion."""
+    camera = model.camera_from_comparator(comparator_from_pixel(places_px, measured.pitch_um))
+    ideal, found = model.lens.ideal_from_observed(camera)
+    return np.asarray(np.where(found[:, None], ideal, camera) - model.lens.interior[1:])
+
+
+def camera_model(camera: CameraFile, measured: MeasuredScan) -> ImageModel | str:
+    """The image with its orientation left open; or what is missing. Where the camera's file gives no principal
+    distance, it is the scan's diagonal, as good as nothing."""
+    film = _camera_from_comparator(camera, measured)
+    if film is None:
+        return "too few fiducials were measured to know where the camera's frame lies in the scan"
+    middle = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]) / 2.0, measured.pitch_um)
+    c = camera.principal_distance_mm or 2.0 * float(np.linalg.norm(middle))
+    x0, y0 = middle if camera.principal_point_mm is None else camera.principal_point_mm
+    lens = Lens(camera.distortion, np.array([c, x0, y0], dtype=np.float64), camera.distortion.values)
+    return ImageModel(lens, np.eye(3), np.zeros(3), film)
+
+
+def misplaced_principal_point(camera: CameraFile, measured: MeasuredScan) -> str:
+    """A sentence where a camera without fiducials has a principal point that is hardly in the picture: as if it counted
+    from the middle of the scan."""
+    if camera.fiducials or camera.principal_point_mm is None:
+        return ""
+    size = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]), measured.pitch_um)
+    if (np.abs(np.array(camera.principal_point_mm) - size / 2.0) < _IN_THE_PICTURE * np.abs(size)).all():
+        return ""
+    given, middle = (f"[{x:.4g}, {y:.4g}]" for x, y in (camera.principal_point_mm, (size / 2.0).tolist()))
+    return (
+        f"principal_point_mm = {given} is at the edge of the scan or beyond it. A camera without fiducials has it in "
+        f"comparator coordinates, from the scan's top-left pixel, x to the right and y up: the middle of this scan is "
+        f"{middle}. Give it so, or leave it out."
+    )
+
+
+def frame_mm(camera: CameraFile, model: ImageModel, measured: MeasuredScan) -> Array:
+    """(2, 2) least and greatest camera coordinates of what the scan shows of the exposed frame."""
+    last = np.array([measured.width_px - 1, measured.height_px - 1])
+    corners = comparator_from_pixel(np.array([(0, 0), (1, 0), (0, 1), (1, 1)]) * last, measured.pitch_um)
+    seen = model.camera_from_comparator(corners)
+    if camera.fiducials and camera.frame_mm is not None:
+        half = np.array(camera.frame_mm) / 2.0
+        seen = np.clip(seen, -half, half)
+    return np.stack([seen.min(axis=0), seen.max(axis=0)])
+
+
+def _camera_from_comparator(camera: CameraFile, measured: MeasuredScan) -> Film | None:
+    """The film as the measurement of the fiducials took it to be; none for a camera that has none."""
+    if not camera.fiducials:
+        return Film("none", np.zeros(0), np.zeros(2))
+    if measured.frame.pixel_from_camera is None:
+        return None
+    places = np.linalg.inv(np.vstack([measured.frame.pixel_from_camera, [0.0, 0.0, 1.0]]))[:2]
+    linear = places[:, :2] @ np.diag(pixel_from_comparator(np.ones(2), measured.pitch_um))
+    return Film("affine", np.array([places[0, 2], *linear[0], places[1, 2], *linear[1]]), np.zeros(2))

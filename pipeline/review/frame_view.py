@@ -1,7 +1,7 @@
-"""What of the store a person looks at: one frame of the latest judging with its result, as JSON for the page."""
+"""What a person sees of a frame: its result as JSON for the page, outlines of marks, trial measurements."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -9,24 +9,61 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.fiducials.options import Click
 from measure.flags import CAUSE_MEANING
-from measure.marks.shapes import FrameCorner, LayoutMark
+from measure.marks.shapes import Bar, Disk, FrameCorner, LayoutMark, Mark, MarkShape, Part, Polygon, Ring
 from measure.results import MarkMeasurement
-from pipeline.archive.digests import DamagedError
-from pipeline.archive.judging import Judging, judged_records, latest
-from pipeline.archive.store import Store
+from pipeline.archive.checked_statuses import Judging, judged_records, latest
+from pipeline.archive.results_database import Store
+from pipeline.archive.results_integrity import DamagedError
+from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
+from pipeline.files.mark_table import Clicks
+from pipeline.files.project_file import Project
+from pipeline.measuring.first_pictures import first_pictures
+from pipeline.measuring.scan_measurement import measured_scan
+from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.results.measured_record import scan_of
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.review.outlines import outlines_px
 
-Json = dict[str, Any]
 Array = NDArray[np.float64]
+
+_STEPS = 48  # of a circle
+Json = dict[str, Any]
 
 _NEAR = 100  # scans before and after it among which these are sought
 _OTHERS = 6  # frames beside which a mark is shown
 _LEAST_PX = 40  # of a window, so that the surroundings can be seen
 _REACH_SIZES = 2.5  # of a window, in the mark's own size
+
+
+def outlines_px(mark: Mark, pixel_from_mark: Array) -> list[list[list[float]]]:
+    """Closed lines in pixels of the scan; none of a mark that is a picture."""
+    if not isinstance(mark, MarkShape):
+        return []
+    lines = (line for part in mark.parts for line in _lines_mm(part))
+    return [(line @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]).round(3).tolist() for line in lines]
+
+
+def _lines_mm(part: Part) -> list[Array]:
+    match part:
+        case Disk():
+            return [_circle(part.center_mm, part.radius_mm)]
+        case Ring():
+            half = part.line_mm / 2
+            return [_circle(part.center_mm, part.radius_mm + sign * half) for sign in (1, -1)]
+        case Bar():
+            start, end = np.array(part.from_mm), np.array(part.to_mm)
+            along = (end - start) / np.hypot(*(end - start))
+            side = part.line_mm / 2 * np.array([-along[1], along[0]])
+            return [np.stack([start + side, end + side, end - side, start - side])]
+        case Polygon():
+            return [np.array(part.vertices_mm)]
+
+
+def _circle(center_mm: tuple[float, float], radius_mm: float) -> Array:
+    angles = np.linspace(0.0, 2 * np.pi, _STEPS, endpoint=False)
+    return np.array(center_mm) + radius_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -205,3 +242,33 @@ def _causes(mark: MarkMeasurement) -> list[Json]:
     parts = mark.covariance.parts.items() if mark.covariance else ()
     told = [(str(c), CAUSE_MEANING[c], float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
     return [{"cause": c, "meaning": m, "sigma_px": s} for c, m, s in sorted(told, key=lambda one: -one[2])]
+
+
+def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) -> MeasuredScan:
+    """The scan's fiducials, as `reseau measure` would find them with these decisions. project: with what was learned of
+    its marks. Raises InputError for a mark that the camera does not have."""
+    known = {mark.id for mark in project.camera_of(image).drawn}
+    unknown = [click.point for click in clicks if click.point not in known]
+    if unknown:
+        raise InputError(f"{image}: its camera has no mark {', '.join(unknown)}.")
+    (task,) = scan_tasks(project, [image])
+    fiducials = replace(task.options.fiducials, clicks=tuple(clicks))
+    return _tried(replace(task, options=replace(task.options, fiducials=fiducials)))
+
+
+def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float, float]], image: str) -> MeasuredScan:
+    """A scan's fiducials, found by the pictures of marks that are to be learned at places of one scan, which may be
+    itself. shown: that scan; px: column and row of its camera's marks. Raises InputError for a mark that is missing."""
+    camera = project.camera_of(shown)
+    missing = [one.id for one in camera.learned if one.id not in px]
+    if missing:
+        raise InputError(f"{shown}: click {', '.join(missing)}, too.")
+    (task,) = scan_tasks(project, [shown])
+    start = first_pictures(replace(camera, clicks=Clicks(shown, px)), [task.fiducials_alone("linear")], None)
+    own = {name: start if one.path == camera.path else one for name, one in project.cameras.items()}
+    return _tried(scan_tasks(replace(project, cameras=own), [image])[0])
+
+
+def _tried(task: ScanTask) -> MeasuredScan:
+    fiducials = replace(task.options.fiducials, writing="none")
+    return measured_scan(replace(task, options=replace(task.options, fiducials=fiducials, targets=None, exterior=None)))

@@ -16,11 +16,17 @@ from pathlib import Path
 from typing import Any, Self
 
 from measure.results import MEASURE_REVISION
-from pipeline.archive.digests import IS_JUDGING_SOUND, DamagedError, damaged_results, is_sound, marks_digest, seal
-from pipeline.archive.file_state import FileState, Identity
-from pipeline.archive.key import fingerprint, options_hash
+from pipeline.archive.results_integrity import (
+    IS_JUDGING_SOUND,
+    DamagedError,
+    damaged_results,
+    is_sound,
+    marks_digest,
+    seal,
+)
 from pipeline.archive.schema import STORE_ERRORS, opened, store_error
 from pipeline.archive.verdicts import Verdict, verdict_of
+from pipeline.provenance import FileState, Identity, options_hash, result_key
 
 Json = dict[str, Any]
 
@@ -48,7 +54,7 @@ class Kept:
 
     @property
     def fingerprint(self) -> str:
-        return fingerprint(self.identity, options_hash(self.options_json))
+        return result_key(self.identity, options_hash(self.options_json))
 
 
 class Store:
@@ -245,7 +251,7 @@ class Store:
                 "where uri = ?",
                 (state.uri,),
             ).fetchall()
-            keys = {before: fingerprint(identity, told, revision) for before, told, revision in results}
+            keys = {before: result_key(identity, told, revision) for before, told, revision in results}
             self._db.executemany(
                 "update result set fingerprint = ? where fingerprint = ?",
                 ((now, before) for before, now in keys.items()),

@@ -1,19 +1,142 @@
-"""What trying the library's cameras on a scan says: which of them stand out, in words, in figures and as JSON."""
+"""The cameras of scans: what trials, plates and drawings say of them, in words, in figures and as JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 from rich.console import Console
 from rich.padding import Padding
 
+from measure.annotations.fields import CAMERA, Line, find_fields
+from measure.flags import Code, Reason
+from measure.marks.rendering import known_picture
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon
+from pipeline.files.camera_file import CameraFile
+from pipeline.results.measured_scan import MeasuredScan
+
+_OTHER_CONE = 0.02  # of the principal distance: cameras of one cone differ by less
+_MAKERS = ("Wild", "Zeiss", "Jena", "Fairchild")
+_PX_PER_MM = 4.0
+_HALF_MM, _OFF_MM = 7.0, 2.0  # of what is compared about a mark's point, and by how much two drawings may lie apart
+_BLUR_PX = 1.5
+_NEAR_MM = 6.0  # marks of two cameras that are taken for each other
+_ALIKE = (
+    0.75  # correlation from which on it takes a look to tell them apart: forms of the K-17's wings have 0.8 to 0.93
+)
 Json = dict[str, Any]
 
 _OUTSTANDING = 2.0  # times what chance finds
 CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
 _SHRUNK = 0.03  # of its size: more than film and cameras of a model differ by
+
+
+def plate_of(lines: Sequence[Line]) -> dict[str, str]:
+    """Maker, number and principal distance in mm, as far as one plate says them."""
+    found = {name: {field.value for field in find_fields(lines) if field.name == name} - {""} for name in CAMERA}
+    return {name: next(iter(values)) for name, values in found.items() if len(values) == 1}
+
+
+def is_whole_plate(lines: Sequence[Line]) -> bool:
+    """Whether they say all that a plate says."""
+    return len(plate_of(lines)) == len(CAMERA)
+
+
+def contradictions(camera: CameraFile, plate: dict[str, str]) -> list[str]:
+    """How a plate says that it is of another camera, a clause each."""
+    told = []
+    makers = [maker for maker in _MAKERS if maker.lower() in camera.name.lower()]
+    if "camera_type" in plate and makers and plate["camera_type"] not in makers:
+        told.append(f"it is of a camera by {plate['camera_type']}")
+    given = camera.principal_distance_mm
+    if given and "principal_distance_mm" in plate:
+        read = float(plate["principal_distance_mm"])
+        if abs(read / given - 1.0) > _OTHER_CONE:
+            told.append(f"it gives a principal distance of {read:g} mm")
+    if camera.number and plate.get("camera_number", camera.number) != camera.number:
+        told.append(f"it gives the number {plate['camera_number']}, the file {camera.number}")
+    return told
+
+
+def with_plates(
+    camera: CameraFile, scans: Sequence[MeasuredScan], cameras: Mapping[str, CameraFile]
+) -> list[MeasuredScan]:
+    """The scans of one camera with what their plates say. A principal distance that was read changes nothing. cameras:
+    all of the project, by the names that images.csv has for them."""
+    plates = {scan.frame.image: plate_of(scan.frame.writing or ()) for scan in scans}
+    numbers = sorted({plate["camera_number"] for plate in plates.values() if "camera_number" in plate})
+    known = {other.number: name for name, other in cameras.items() if other.number}
+    return [_told(camera, scan, plates[scan.frame.image], numbers, known) for scan in scans]
+
+
+def _told(
+    camera: CameraFile, scan: MeasuredScan, plate: dict[str, str], numbers: Sequence[str], known: Mapping[str, str]
+) -> MeasuredScan:
+    problems, notes = [], []
+    against = contradictions(camera, plate)
+    if against:
+        named = known.get(plate.get("camera_number", ""), "")
+        its_own = f"the camera {named}, whose number that is," if named else "its own camera"
+        problems.append(
+            f"the plate in the picture is not of {camera.name}: {' and '.join(against)}. Give this scan {its_own} by "
+            "the column camera of images.csv, or see in frames.csv whether the plate is misread."
+        )
+    if len(numbers) > 1 and "camera_number" in plate and not camera.number:
+        problems.append(
+            f"the scans of {camera.name} show plates of several cameras, Nr {', '.join(numbers)}: each has a "
+            "calibration of its own. Give each a camera file with its number, by the column camera of images.csv, or "
+            "see in frames.csv whether a number is misread."
+        )
+    if "principal_distance_mm" in plate and not against and camera.principal_distance_mm:
+        number = f" (Nr {plate['camera_number']})" if "camera_number" in plate else ""
+        notes.append(
+            f"The camera's plate{number} says a principal distance of {plate['principal_distance_mm']} mm, its file "
+            f"{camera.principal_distance_mm:g} mm: worth taking as an approximation, and nothing is changed by it."
+        )
+    frame = replace(scan.frame, problems=(*scan.frame.problems, *(Reason(each, Code.PLATE) for each in problems)))
+    return replace(scan, frame=frame, notes=(*scan.notes, *notes))
+
+
+# Cameras whose solid marks are drawn much like those of others: wings, notches and arrows of which a scan hardly tells
+# which form they have.
+
+
+def drawn_alike(layouts: Mapping[tuple[str, ...], FiducialLayout]) -> dict[str, tuple[str, ...]]:
+    """By name, of cameras of solid marks alone, the others whose marks look much like theirs at about their places."""
+    solid = {names: layout for names, layout in layouts.items() if all(_is_solid(mark) for mark in layout.marks)}
+    pictures = {names: [_picture(mark) for mark in layout.marks] for names, layout in solid.items()}
+
+    def alike(names: tuple[str, ...], other: tuple[str, ...]) -> bool:
+        places = np.array([mark.xy_mm for mark in solid[other].marks])
+        found = []
+        for mark, picture in zip(solid[names].marks, pictures[names], strict=True):
+            off_mm = np.hypot(*(places - mark.xy_mm).T)
+            found.append(_likeness(picture, pictures[other][int(off_mm.argmin())]) if off_mm.min() < _NEAR_MM else 0.0)
+        return float(np.mean(found)) >= _ALIKE
+
+    others = {names: [other[0] for other in solid if other != names and alike(names, other)] for names in solid}
+    return {name: tuple(own) for names, own in others.items() if own for name in names}
+
+
+def _is_solid(mark: LayoutMark) -> bool:
+    return isinstance(mark.mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.mark.parts)
+
+
+def _picture(mark: LayoutMark) -> cv2.typing.MatLike:
+    """What is not known of a drawing is ground."""
+    half_px = round(_HALF_MM * _PX_PER_MM)
+    matrix = np.array([[_PX_PER_MM, 0.0, half_px], [0.0, -_PX_PER_MM, half_px]])
+    size = 2 * half_px + 1
+    return np.nan_to_num(known_picture(mark.mark, matrix, size, size, _BLUR_PX)).astype(np.float32)
+
+
+def _likeness(first: cv2.typing.MatLike, second: cv2.typing.MatLike) -> float:
+    """The largest correlation of two drawings that may lie a little apart."""
+    rim = round(_OFF_MM * _PX_PER_MM)
+    return float(cv2.matchTemplate(second, first[rim:-rim, rim:-rim], cv2.TM_CCOEFF_NORMED).max())
 
 
 @dataclass(frozen=True)

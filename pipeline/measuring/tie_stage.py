@@ -1,8 +1,10 @@
-"""Frames that were scanned in overlapping parts: what joins their scans, and whether the fiducials agree with it."""
+"""The third step of measuring: all scans of a project together, with joins of parts and natural points."""
 
+import re
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from typing import NewType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +13,13 @@ from measure.flags import Code, Reason, Status
 from measure.results import MarkMeasurement
 from measure.scans.remote import scan_path
 from measure.tie_points.features import TieFrame
+from measure.tie_points.find_points import measure_ties
 from measure.tie_points.joins import measure_joins
+from pipeline.errors import InputError
 from pipeline.files.project_file import Project
-from pipeline.progress import Count
+from pipeline.files.target_table import TieSettings
+from pipeline.measuring.sheet_check import with_checked_sheet
+from pipeline.progress import Count, Reporter
 from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
@@ -22,6 +28,12 @@ _LEAST_MARK_PX = 20.0  # about a mark whose size nobody has noted
 _CHECKED = 3  # fiducials that agree by themselves: fewer fit any frame
 _GATE_MM, _GATE_SHARE = 0.3, 0.003  # of fiducials beside where the other scan puts them: film, and a share of the way
 _FEWEST = 3  # joins that tell how two scans lie to one another
+_TIE_NAME = re.compile(r"tie\d+")
+
+_NO_FRAME = Reason(
+    "No natural points are sought here: without fiducials nobody knows where the frame lies.", Code.NO_FRAME
+)
+TiedScan = NewType("TiedScan", MeasuredScan)  # beside all others of its project
 
 
 def with_joins(
@@ -49,12 +61,12 @@ def _joined(
         )
         return [_with(scan, (), (lacking,)) for scan in parts]
     parts = sorted(parts, key=lambda scan: scan.frame.image)
-    joins = measure_joins([_tie_frame(project, scan) for scan in parts], workers=workers)
+    joins = measure_joins([_part_frame(project, scan) for scan in parts], workers=workers)
     problems = {image: (problem,) for image, problem in joins.problems.items()}
     return _agreed([_with(scan, joins.marks[scan.frame.image], problems.get(scan.frame.image, ())) for scan in parts])
 
 
-def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame:
+def _part_frame(project: Project, scan: MeasuredScan) -> TieFrame:
     taken = [
         (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
         for mark in scan.frame.marks
@@ -177,3 +189,70 @@ def _changed(scan: MeasuredScan, status: Status, reason: Reason) -> list[MarkMea
         replace(mark, status=status, reason=reason) if mark.kind == "fiducial" and mark.status.is_observation else mark
         for mark in scan.frame.marks
     ]
+
+
+def check_tie_names(project: Project) -> None:
+    """Raises InputError where a given point has a name that a natural point would take."""
+    reserved = sorted(id for id in project.object_points if _TIE_NAME.fullmatch(id)) if project.ties else []
+    if reserved:
+        raise InputError(
+            f"{project.path}: the given points hold {reserved[0]!r}, a name that [ties] gives to natural points. "
+            "Rename it in points.csv."
+        )
+
+
+def with_ties(
+    project: Project, settings: TieSettings, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
+) -> tuple[MeasuredScan, ...]:
+    """The scans with the natural points that they share."""
+    frames = {scan.frame.image: _tie_frame(project, scan) for scan in scans}
+    placed = [frame for frame in frames.values() if frame is not None]
+    ties = measure_ties(placed, settings.options, count, workers)
+    problems = {**ties.problems, **{image: (_NO_FRAME,) for image, frame in frames.items() if frame is None}}
+    return tuple(
+        replace(
+            scan,
+            frame=replace(
+                scan.frame,
+                marks=(*scan.frame.marks, *ties.marks.get(scan.frame.image, ())),
+                problems=(*scan.frame.problems, *problems.get(scan.frame.image, ())),
+            ),
+        )
+        for scan in scans
+    )
+
+
+def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
+    """None where the camera has fiducials and too few of them were measured."""
+    camera = project.camera_of(scan.frame.image)
+    taken = [
+        (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
+        for mark in scan.frame.marks
+        if mark.center_px is not None
+    ]
+    pixel_from_camera, frame_mm = scan.frame.pixel_from_camera, camera.frame_mm
+    if pixel_from_camera is None:
+        if camera.fiducials:
+            return None
+        middle = np.array([scan.width_px - 1, scan.height_px - 1]) / 2
+        pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
+        frame_mm = None
+    path, marks = scan_path(scan.scan), np.array(taken).reshape(-1, 3)
+    frame = project.part_of(scan.frame.image)
+    return TieFrame(scan.frame.image, path, pixel_from_camera, frame_mm, marks, project.max_pixels, frame)
+
+
+def tied(
+    project: Project, scans: Sequence[MeasuredScan], reporter: Reporter, executor: Executor | None = None
+) -> tuple[TiedScan, ...]:
+    """Checked scans as all of the project together show them, in their order: points of a sheet or board that
+    contradict its other pictures, what joins the parts of frames, and natural points."""
+    seen = with_checked_sheet(project, [scan for scan in scans if not scan.failure])
+    if project.has_parts:
+        with reporter.stage("parts joined of") as count:
+            seen = with_joins(project, seen, count, executor)
+    if project.ties is not None:
+        with reporter.stage("natural points sought in") as count:
+            seen = with_ties(project, project.ties, seen, count, executor)
+    told = {scan.frame.image: scan for scan in seen}
+    return tuple(TiedScan(told.get(scan.frame.image, scan)) for scan in scans)

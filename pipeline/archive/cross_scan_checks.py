@@ -1,4 +1,4 @@
-"""All scans of a project beside one another, from the store and into it: what was measured stays as it is."""
+"""The cross-scan checks: all scans of a project checked together, from the results database and into it."""
 
 import hashlib
 import json
@@ -11,19 +11,15 @@ from importlib.metadata import version
 from measure.flags import Code, Reason, Status
 from measure.results import MEASURE_REVISION
 from measure.scans.remote import scan_path
-from pipeline.archive.identity import content_hash
-from pipeline.archive.judging import JudgedScan, Lot
-from pipeline.archive.key import shard_of
-from pipeline.archive.store import Store
+from pipeline.archive.checked_statuses import JudgedScan, Lot
+from pipeline.archive.results_database import Store
 from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.camera_plate import with_plates
-from pipeline.measuring.checked import CheckedScan, checked
-from pipeline.measuring.roll import roll_of
-from pipeline.measuring.same_frames import with_same_frames
+from pipeline.measuring.camera_identification import with_plates
+from pipeline.measuring.roll import CheckedScan, checked, roll_of, with_same_frames
 from pipeline.measuring.scan_task import ScanTask
-from pipeline.results.fingerprints import fingerprint
+from pipeline.provenance import content_hash, fingerprint, shard_of
 from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import MeasuredScan
 

@@ -22,12 +22,12 @@ from measure.scans.opening import crop_scan
 from measure.scans.remote import ScanPart, Window, public_text
 from measure.scans.scan import Scan
 from pipeline.errors import InputError, what_to_do
-from pipeline.measuring.camera_model import misplaced_principal_point
-from pipeline.measuring.handed_out import Submits, results_of
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
+from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.measuring.target_stage import measure_targets
 from pipeline.measuring.tone_stage import tone_before
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+from pipeline.workers import Submits, results_of
 
 Look = Callable[[Scan, MeasuredScan], None]
 

@@ -1,8 +1,11 @@
-"""Names of images, as tables and files of all kinds have them."""
+"""Names of images in tables and files, and names as paths: below the folder they are meant for, or refused."""
 
 import os
 from collections.abc import Collection
 from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.text.text_file import shown
 
 SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".png")
 
@@ -25,3 +28,27 @@ def names_below(files: Collection[str | Path], others: Collection[str | Path] | 
     below = {folder: Path(os.path.relpath(path, shared)).as_posix() for folder, path in folders.items()}
     before = {folder: "" if path == os.curdir else f"{path}/" for folder, path in below.items()}
     return [image_name(before[folder + sign] + name) for folder, sign, name in places]
+
+
+def path_below(folder: Path, name: str, suffix: str = "") -> Path:
+    """The path of a name in a folder, with sub-folders where the name has `/`. suffix: after the name.
+
+    Raises InputError for a name that would lead out of the folder, or that no file can have on some system.
+    """
+    parts = name.split("/")
+    if not name.isprintable() or any(map(_leads_elsewhere, parts)):
+        raise InputError(
+            f"the name {shown(name)} cannot be that of a file below {folder}: nothing was written. A name is a file's, "
+            "with folders before it and `/` between, without .. and backslash. Rename the image, frame or camera."
+        )
+    return folder.joinpath(*parts[:-1], f"{parts[-1]}{suffix}")
+
+
+def _leads_elsewhere(part: str) -> bool:
+    return part.strip() in ("", ".", "..") or "\\" in part or part[1:2] == ":"  # a drive, on some systems
+
+
+def file_word(name: str) -> str:
+    """A name as a part of a file's name: letters, digits, `-`, `_` and `.`, with `-` in the place of all others."""
+    word = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)
+    return word if word.strip(".") else "-"

@@ -1,0 +1,238 @@
+"""Review decisions as input of measuring: which count for a scan, what they change, which lines change nothing."""
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from measure.fiducials.options import CLICK_SIGMA_PX, Click
+from measure.flags import Cause, Code, Reason, Status
+from measure.results import MEASURE_REVISION, Covariance, MarkMeasurement
+from pipeline.archive.checked_statuses import judging_of
+from pipeline.archive.results_database import Store
+from pipeline.archive.results_integrity import row_digest
+from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, put_on, standing
+from pipeline.files.project_file import Project
+from pipeline.measuring.scan_task import ScanTask, options_of
+from pipeline.provenance import fingerprint, options_hash
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.text.wording import did_you_mean
+
+_MEASURED = (Choice.PLACE, Choice.POSE, Choice.UNDO)  # decisions that change what is measured
+KeyOf = Callable[[ScanTask], str]
+PoseOf = Callable[[str], str | None]
+if TYPE_CHECKING:
+    from pipeline.archive.work import Work
+
+_TOLD = "decisions that do not apply"
+_NAMED = 10
+
+Marks = Mapping[tuple[str, str], bool]  # by point and kind whether something was measured
+
+
+def asked_of(project: Project) -> Callable[[str], str]:
+    """A hash of it, by the image's name. Raises InputError for marks that cannot be sought."""
+    options, hashes = options_of(project, {}), dict[int, str]()
+    decided = {
+        image: [one for one in decisions if one.decision in _MEASURED]
+        for image, decisions in by_image(project.decisions).items()
+    }
+
+    def asked(image: str) -> str:
+        own = options(image)
+        if id(own) not in hashes:
+            hashes[id(own)] = options_hash(f"{own.json} {MEASURE_REVISION}")
+        told = decided.get(image)
+        return fingerprint([hashes[id(own)], told]) if told else hashes[id(own)]
+
+    return asked
+
+
+# What a person decided, as input of measuring: which decisions count for a scan, and what they change.
+#
+# A decision counts for the result that was looked at, which its fingerprint names: after the scan's file, the options
+# or the way of measuring changed, somebody has to look again. Places and poses change what is measured; results that
+# follow from decisions by those before them are the same scan still.
+
+
+@dataclass(frozen=True)
+class Decided:
+    """A scan's task as decisions leave it, and those that count, by what they are about."""
+
+    task: ScanTask
+    counting: Mapping[About, Decision]
+
+
+def by_image(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Decision]]:
+    """The decisions about each scan, the oldest first; those about a camera's marks left out."""
+    told = defaultdict[str, list[Decision]](list)
+    for one in decisions:
+        if one.about[2] != LEARNED:
+            told[one.image].append(one)
+    return told
+
+
+def decisions_hash(decisions: Sequence[Decision]) -> str:
+    """Of all decisions about an image; "" where there are none."""
+    if not decisions:
+        return ""
+    told = [
+        (str(one.decision), *one.about, one.col_px, one.row_px, one.pose, one.note, one.who, one.fingerprint)
+        for one in decisions
+    ]
+    return row_digest(*told)
+
+
+def decided(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf) -> Decided:
+    """decisions: about this scan, the oldest first. key_of: the fingerprint of a task's result; pose_of: the pose in
+    which the result of a fingerprint names its marks, None where it is not known."""
+    if not decisions:
+        return Decided(task, {})
+    counted, now, key = list[Decision](), task, key_of(task)
+    seen = {key}  # of the results that a decision may have been made about
+    ever = set(seen)
+    for one in decisions:
+        known = ever if one.decision is Choice.POSE else seen
+        if one.decision is not Choice.UNDO and one.fingerprint and one.fingerprint not in known:
+            continue
+        before, old_key, counted = now, key, [*counted, one]
+        now = _with(task, standing(counted).values())
+        key = key_of(now)
+        seen = seen | {key} if _names_alike(before, now, pose_of(old_key)) else {key}
+        ever |= seen
+    return Decided(now, standing(counted))
+
+
+def _names_alike(before: ScanTask, now: ScanTask, pose: str | None) -> bool:
+    """Whether marks keep their names: they have others in another pose than that in which they were found."""
+    was, will = before.options.fiducials.pose, now.options.fiducials.pose
+    return was == will or (will == pose and was == "auto")
+
+
+def before_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
+    """The scan without the marks that are none, by which no other is judged then."""
+    return _changed(scan, {about: one for about, one in counting.items() if one.decision is not Choice.ACCEPT})
+
+
+def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
+    """The scan as decisions have it, whatever the checks say, and who made how many of them."""
+    marks = {(scan.frame.image, mark.point, mark.kind) for mark in scan.frame.marks}
+    applied = [one for about, one in counting.items() if not about[1] or about in marks]
+    people = Counter(one.who or "somebody" for one in applied)
+    return replace(_changed(scan, counting), decided_by=dict(sorted(people.items())))
+
+
+def _with(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:
+    clicks, fiducials = list[Click](), task.options.fiducials
+    for one in sorted(decisions, key=lambda one: one.about):
+        if one.decision is Choice.POSE:
+            fiducials = replace(fiducials, pose=one.pose)
+        elif one.decision is Choice.PLACE and one.about[2] == "fiducial":
+            assert one.col_px is not None
+            assert one.row_px is not None
+            clicks.append(Click(one.point, one.col_px, one.row_px))
+    return replace(task, options=replace(task.options, fiducials=replace(fiducials, clicks=tuple(clicks))))
+
+
+def _changed(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
+    marks = [_decided(mark, counting.get((scan.frame.image, mark.point, mark.kind))) for mark in scan.frame.marks]
+    return replace(scan, frame=replace(scan.frame, marks=tuple(marks)))
+
+
+def _decided(mark: MarkMeasurement, decision: Decision | None) -> MarkMeasurement:
+    if decision is None:
+        return mark
+    by = f"by {decision.who or 'somebody'}{f' ({decision.note})' if decision.note else ''}"
+    match decision.decision:
+        case Choice.ACCEPT if mark.covariance is not None and mark.center_px is not None:
+            told = Reason(f"accepted {by}{f': {mark.reason}' if mark.reason else ''}", Code.DECIDED, *mark.reason.codes)
+            return replace(mark, status=Status.MEASURED, reason=told)
+        case Choice.REJECT:
+            return replace(mark, status=Status.REJECTED, reason=Reason(f"rejected {by}", Code.DECIDED))
+        case Choice.ABSENT:
+            told = Reason(f"absent, {by}", Code.DECIDED)
+            return replace(mark, status=Status.ABSENT, center_px=None, covariance=None, reason=told)
+        case Choice.PLACE if mark.kind != "fiducial":  # fiducials are matched from there
+            place = np.array([decision.col_px, decision.row_px], dtype=np.float64)
+            covariance = Covariance({Cause.CLICK: CLICK_SIGMA_PX**2 * np.eye(2)})
+            told = Reason(f"placed {by}", Code.DECIDED)
+            return replace(mark, status=Status.WEAK, center_px=place, covariance=covariance, reason=told)
+    return mark
+
+
+def tell_inapplicable(project: Project, store: Store, digest: str, work: "Work") -> None:
+    """Keep, beside a judging, what is to be said of decisions that it could not take in."""
+    told = [*unknown_images(project), *_of_known(project, store, digest, work)]
+    store.tell(_TOLD, {"digest": digest, "lines": [f"line {number}: {why}" for number, why in sorted(told)]})
+
+
+def inapplicable(store: Store, digest: str) -> tuple[str, ...]:
+    """What is to be said of the decisions that a judging could not take in; the first of them, if they are many."""
+    told = store.told(_TOLD) or {}
+    return shortened(told["lines"]) if told.get("digest") == digest else ()
+
+
+def shortened(lines: Sequence[str]) -> tuple[str, ...]:
+    """The first of many."""
+    left = len(lines) - _NAMED
+    return (*lines[:_NAMED], *([f"and {left} lines more"] if left > 0 else []))
+
+
+def unknown_images(project: Project) -> Iterator[tuple[int, str]]:
+    """Lines about images that the project has not, and a last line that was cut short."""
+    if project.decisions_cut_short:
+        yield project.decisions_cut_short, "is cut short, or has a typing error. Mend the line, or take it out."
+    unknown = {one.image for one in project.decisions} - project.scans.keys() if project.scans else set()
+    hints = {image: did_you_mean(image, project.scans) for image in sorted(unknown)[:_NAMED]}
+    for one in project.decisions if unknown else ():
+        if one.image in unknown:
+            yield one.line, f"the project has no image {one.image!r}.{hints.get(one.image, '')}"
+
+
+def _of_known(project: Project, store: Store, digest: str, work: "Work") -> Iterator[tuple[int, str]]:
+    for image, decisions in work.decisions.items():
+        if image in project.scans:
+            yield from _of_image(decisions, work.counting_of(image), _marks(store, digest, image))
+
+
+def _of_image(
+    decisions: Sequence[Decision], counting: Mapping[About, Decision], marks: Marks
+) -> Iterator[tuple[int, str]]:
+    stacks = dict[About, list[Decision]]()
+    for one in decisions:
+        if one.decision is Choice.UNDO and not stacks.get(one.about):
+            yield one.line, f"there is nothing to undo about {_named(one)}."
+        put_on(stacks, one)
+    for about, stack in stacks.items():
+        if stack and (why := _why(stack[-1], counting.get(about), marks)):
+            yield stack[-1].line, why
+
+
+def _why(one: Decision, counted: Decision | None, marks: Marks) -> str:
+    """Why a decision that stands does not apply; "" of one that does."""
+    _, point, kind = one.about
+    if point and (point, kind) not in marks:
+        hint = did_you_mean(point, [name for name, of_kind in marks if of_kind == kind])
+        return f"image {one.image!r} has no {kind} {point!r}.{hint}"
+    if counted != one:
+        return f"what was decided about {_named(one)} is of an earlier result. Look again in `reseau review`."
+    if one.decision is Choice.ACCEPT and not marks[point, kind]:
+        return f"nothing was measured of {_named(one)} that could be accepted. Place it in `reseau review`."
+    return ""
+
+
+def _named(one: Decision) -> str:
+    return f"{one.about[2]} {one.point!r} of image {one.image!r}" if one.point else f"image {one.image!r}"
+
+
+def _marks(store: Store, digest: str, image: str) -> Marks:
+    judging = judging_of(store, digest)
+    assert judging is not None  # it was made just now
+    db = store.connection
+    query = "select result, own_marks from judged_frame where judging = ? and name = ?"
+    result, own_marks = db.execute(query, (judging.row, image)).fetchone()
+    table, where = ("judged", f"judging = {judging.row:d} and") if own_marks else ("mark", "")
+    rows = db.execute(f"select point, kind, causes is not null from {table} where {where} result = ?", (result,))
+    return {(point, kind): bool(is_measured) for point, kind, is_measured in rows}

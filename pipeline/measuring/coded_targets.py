@@ -1,0 +1,233 @@
+"""Ring-coded targets, on a flat sheet or in space: found in the whole picture, named by their codes."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.flags import NO_REASON, Code, Reason, Status
+from measure.results import MarkMeasurement
+from measure.scans.scan import Scan
+from measure.targets.block_search import Candidate
+from measure.targets.consistency import along_plane, is_flat
+from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_disks
+from measure.targets.ring_codes import read_code
+from measure.targets.sheets import Dots, Naming, name_dots
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.project_file import Project
+from pipeline.files.target_table import TargetSettings
+from pipeline.measuring.target_field import Field, checked_places
+from pipeline.measuring.target_identification import NamedField, camera_model, name_field
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.text.wording import did_you_mean, listed
+
+Array = NDArray[np.float64]
+
+_LEAST_DIAMETER_PX, _GREATEST_SHARE = 8.0, 0.04  # of a dot; the greatest of the picture's diagonal
+_LEAST_CONTRAST = 0.06  # of the full scale: coded targets are printed to be seen
+_FOUND_WITHIN_PX = 2.0  # how far the fit may move from where the search has a dot
+
+
+@dataclass(frozen=True, eq=False)
+class CodedPoints:
+    """Points of a sheet or of a field in space: ids and coordinates xyz (n, 3); places (n, 2): on the plane that holds
+    them best; is_flat: whether it does; settings: the kind of the targets."""
+
+    ids: tuple[str, ...]
+    xyz: Array
+    places: Array
+    is_flat: bool
+    settings: TargetSettings
+
+    @classmethod
+    def of(cls, project: Project, settings: TargetSettings) -> "CodedPoints":
+        """The points of points.csv. Raises InputError where it holds too few, or lacks a coded one."""
+        if project.given_points is None:
+            raise InputError(
+                f'{project.path}: [targets] kind "coded-ring" names the dots by the sheet, and there is no [object] '
+                'points = "...". Give the file of the sheet\'s points.'
+            )
+        known = {id: [p.value for p in (q.X, q.Y, q.Z) if p] for id, q in project.object_points.items()}
+        xyz = {id: values for id, values in known.items() if len(values) == 3}
+        for point in settings.numbers.values():
+            if point not in xyz:
+                raise InputError(
+                    f"{project.path}: [targets.codes] {point}: points.csv has no coordinates of such a point."
+                    f"{did_you_mean(point, list(xyz))} Name points of the sheet."
+                )
+        coordinates = np.array(list(xyz.values())).reshape(-1, 3)
+        if len(coordinates) < 4:
+            raise InputError(
+                f"{project.path}: [object] points: {len(coordinates)} points with X, Y and Z name no coded targets; "
+                "give 4."
+            )
+        along = along_plane(coordinates)
+        return cls(tuple(xyz), coordinates, along[:, :2], is_flat(along), settings)
+
+
+def coded_candidates(scan: Scan, coded: CodedPoints) -> list[Candidate]:
+    """The dots of the whole scan that may be such points, the strongest first."""
+    greatest = max(_GREATEST_SHARE * float(np.hypot(scan.width_px, scan.height_px)), _LEAST_DIAMETER_PX)
+    search = DiskSearch((_LEAST_DIAMETER_PX, greatest), coded.settings.polarity, _LEAST_CONTRAST)
+    return disk_candidates(scan, search)
+
+
+def read_numbers(scan: Scan, found: Sequence[Candidate], coded: CodedPoints, mirrored: bool = False) -> dict[int, int]:
+    """The number about each dot that has one; mirrored: as the other side of the film shows it."""
+    code = coded.settings.code
+    read = {index: read_code(scan, dot, code) for index, dot in enumerate(found)} if code else {}
+    return {
+        index: code.mirrored(number) if mirrored else number
+        for index, number in read.items()
+        if number is not None and code is not None
+    }
+
+
+def points_read(numbers: Mapping[int, int], coded: CodedPoints) -> dict[int, int]:
+    """The point (by index) that the ring about each dot says, right or not."""
+    row = {id: i for i, id in enumerate(coded.ids)}
+    points = {dot: coded.settings.numbers.get(number, str(number)) for dot, number in numbers.items()}
+    return {dot: row[point] for dot, point in points.items() if point in row}
+
+
+def named_by_code(points: Mapping[int, int], coded: CodedPoints) -> tuple[dict[int, int], tuple[str, ...]]:
+    """The same but for those that are read at several places: these say nothing, until the others tell which is right;
+    and what is to be said of them."""
+    count = Counter(points.values())
+    twice = sorted(coded.ids[point] for point in count if count[point] > 1)
+    notes = (f"The codes of {listed(twice)} were read at more than one place and name nothing.",) if twice else ()
+    return {dot: point for dot, point in points.items() if count[point] == 1}, notes
+
+
+def none_coded(found: Sequence[Candidate], numbers: dict[int, int], coded: CodedPoints) -> str:
+    """Why no dot has a name by its code."""
+    bits = coded.settings.code.bits if coded.settings.code else 0
+    if not found:
+        return "no dot was found"
+    if not numbers:
+        return f"none of the {len(found)} dots found has a ring of {bits} segments about it that can be read"
+    read = ", ".join(str(number) for number in sorted(set(numbers.values()))[:8])
+    return f"the codes read ({read}) are those of no point of the sheet, or were read at more than one place"
+
+
+def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
+    """A mark for every point of the sheet, and what is to be said of the whole."""
+    scan = scan.green_channel()
+    found = coded_candidates(scan, sheet)
+    numbers = read_numbers(scan, found, sheet)
+    coded, notes = named_by_code(points_read(numbers, sheet), sheet)
+    naming: Naming | str = none_coded(found, numbers, sheet)
+    if coded:
+        alike = [i for i, dot in enumerate(found) if dot.contrast_dn * _sign(found, coded) > 0.0]
+        found, coded = [found[i] for i in alike], {new: coded[i] for new, i in enumerate(alike) if i in coded}
+        naming = name_dots(sheet.places, _dots(found, coded), (scan.width_px, scan.height_px))
+    if isinstance(naming, str):
+        unnamed = Reason(naming, Code.UNNAMED)
+        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in sheet.ids)
+        return marks, (*notes, f"No target has a name: {naming}.")
+    misread = [sheet.ids[coded[dot]] for dot in naming.misread]
+    if misread:
+        notes = (*notes, f"Rings that read as {listed(misread)} lie where the sheet has another point, or none.")
+    options = TargetOptions("light" if _sign(found, coded) > 0.0 else "dark")
+    predictions = _predictions(sheet, found, naming)
+    measured = {mark.point: mark for mark in measure_disks(scan, predictions, options)}
+    unseen = Reason("the sheet's place in the picture does not show it", Code.OUTSIDE)
+    absent = {id: MarkMeasurement(id, "target", None, None, Status.ABSENT, unseen) for id in sheet.ids}
+    return tuple((absent | measured).values()), notes
+
+
+def _sign(found: Sequence[Candidate], coded: dict[int, int]) -> float:
+    """Whether coded dots are light (1) or dark (-1)."""
+    return float(np.sign(np.sum([np.sign(found[dot].contrast_dn) for dot in coded]))) or 1.0
+
+
+def _dots(found: Sequence[Candidate], coded: dict[int, int]) -> Dots:
+    return Dots(
+        np.array([dot.center_px for dot in found]).reshape(-1, 2),
+        np.array([dot.pixel_from_disk for dot in found]).reshape(-1, 2, 2),
+        coded,
+    )
+
+
+def _predictions(sheet: CodedPoints, found: Sequence[Candidate], naming: Naming) -> list[TargetPrediction]:
+    """Each named point where its dot was found; each other point where the sheet's place in the picture puts it."""
+    predictions = []
+    for index, id in enumerate(sheet.ids):
+        place, shape = naming.places_px[index], naming.pixel_from_disk[index]
+        if index in naming.named:
+            dot = found[naming.named[index]]
+            predictions.append(TargetPrediction(id, dot.center_px, dot.pixel_from_disk, _FOUND_WITHIN_PX))
+        elif np.all(np.isfinite(place)) and np.all(np.isfinite(shape)):
+            predictions.append(TargetPrediction(id, place, shape, naming.gate_px))
+    return predictions
+
+
+def measure_coded_field(
+    scan: Scan, points: CodedPoints, field: Field, camera: CameraFile, measured: MeasuredScan
+) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
+    """A mark for every point of the field, and what is to be said of the whole."""
+    scan = scan.green_channel()
+    found = coded_candidates(scan, points)
+    numbers = read_numbers(scan, found, points, _is_mirrored(measured))
+    read = points_read(numbers, points)
+    coded, notes = named_by_code(read, points)
+    model = camera_model(camera, measured)
+    if isinstance(model, str):
+        named: NamedField | str = model
+    elif not coded:
+        named = none_coded(found, numbers, points)
+    else:
+        named = name_field(field, model, camera, measured, found, coded)
+    if isinstance(named, str):
+        unnamed = Reason(named, Code.UNNAMED)
+        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in points.ids)
+        return marks, (*notes, f"No target has a name: {named}.")
+    ids = {dot: points.ids[point] for dot, point in read.items()}
+    misread = [(id, found[dot]) for dot, id in ids.items() if named.candidates.get(id) is not found[dot]]
+    if misread:
+        others = listed(sorted({id for id, _ in misread}))
+        notes = (*notes, f"Rings that read as {others} lie where the field has another point, or none.")
+    predictions = named.predictions(_of_size(field, named, measured), measured)
+    contradicted = {
+        one.point: MarkMeasurement(one.point, "target", one.center_px, None, Status.REJECTED, reason)
+        for one in predictions
+        if (reason := _contradiction(one, misread))
+    }
+    sought = [one for one in predictions if one.point not in contradicted]
+    seen = {mark.point: mark for mark in measure_disks(scan, sought, TargetOptions(points.settings.polarity))}
+    unseen = Reason("it lies behind the camera", Code.OUTSIDE)
+    absent = {id: MarkMeasurement(id, "target", None, None, Status.ABSENT, unseen) for id in points.ids}
+    marks = tuple((absent | seen | contradicted).values())
+    return checked_places(marks, field, named.model, measured), notes
+
+
+def _contradiction(prediction: TargetPrediction, misread: Sequence[tuple[str, Candidate]]) -> Reason:
+    """Why a point is not what lies at its place, if a ring there says so."""
+    reach = float(prediction.half_axes_px[0]) + prediction.search_px
+    for id, dot in misread:
+        if id != prediction.point and np.hypot(*(dot.center_px - prediction.center_px)) < reach:
+            return Reason(f"the ring at its place reads as {id}", Code.UNNAMED)
+    return NO_REASON
+
+
+def _is_mirrored(measured: MeasuredScan) -> bool:
+    """Whether the scan shows the film from its other side. The camera frame's y goes up, the scan's rows go down."""
+    place = measured.frame.pixel_from_camera
+    return place is not None and bool(np.linalg.det(place[:, :2]) > 0.0)
+
+
+def _of_size(field: Field, named: NamedField, measured: MeasuredScan) -> Field:
+    """The field with the size that its dots have in the picture, where the project does not say it."""
+    if field.radius > 0.0:
+        return field
+    unit = replace(field, radius=1e-4 * float(np.ptp(field.xyz, axis=0).max()))
+    expected = {one.point: one for one in unit.predictions(named.model, measured, named.gate_px)}
+    ratios = [
+        candidate.radius_px / float(np.sqrt(abs(np.linalg.det(expected[id].pixel_from_disk))))
+        for id, candidate in named.candidates.items()
+    ]
+    return replace(unit, radius=unit.radius * float(np.median(ratios)))

@@ -1,0 +1,235 @@
+"""Provenance: fingerprints of values, files and scans, the states of files, and the keys of results."""
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from measure.errors import MeasurementError, MissingError, UnreachableError
+from measure.results import MEASURE_REVISION
+from measure.scans.metadata import DECODING_ERRORS
+from measure.scans.opening import open_scan
+from measure.scans.remote import Address, tiff_file, whole_file
+from measure.scans.scan import Scan
+from pipeline.text.text_file import read_bytes
+
+_PLAIN = {str, int, bool, type(None)}  # most values by far
+NO_FINGERPRINT = {"fingerprint": False}  # metadata of a field that tells nothing of a value
+_PIECES, _PIECE = 8, 32768  # of a scan, spread evenly from its first byte to its last
+_HEAD_BYTES = 1 << 16
+_MIDDLE_PX = 256
+_PIECE_BYTES = 1 << 20
+
+
+def fingerprint(value: object) -> str:
+    """SHA-256 of a value made of dataclasses, mappings, sequences, arrays, numbers and text."""
+    return of_content(canonical_json(value).encode("utf-8", "surrogateescape"))
+
+
+def canonical_json(value: object) -> str:
+    """Such a value as JSON: equal values give equal text, and any other value gives another.
+
+    The order of a mapping does not count, nor where a file stands: a project may be moved, and its files rewritten. Nor
+    do fields of dataclasses that are NO_FINGERPRINT by their metadata.
+    Arrays are told by their form and the SHA-256 of their numbers, numbers that are not finite by their names.
+    """
+    return json.dumps(_json(value), ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
+
+
+def of_content(data: bytes) -> str:
+    """SHA-256 of the content of a file."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def of_file(path: Path) -> str:
+    """The same, the file read here."""
+    return of_content(read_bytes(path))
+
+
+def of_scan(path: Path) -> str:
+    """Its size, and SHA-256 of pieces of its file. "" where it cannot be read."""
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            pieces = []
+            for number in range(_PIECES):
+                file.seek(max(size - _PIECE, 0) * number // (_PIECES - 1))
+                pieces.append(file.read(_PIECE))
+    except OSError:
+        return ""
+    return fingerprint([size, *map(of_content, pieces)])
+
+
+def _json(value: Any) -> Any:
+    if value.__class__ in _PLAIN or (value.__class__ is float and math.isfinite(value)):
+        return value
+    if is_dataclass(value) and not isinstance(value, type):
+        told = {one.name: _json(getattr(value, one.name)) for one in fields(value) if one.metadata != NO_FINGERPRINT}
+        return {"is": type(value).__name__, **told}
+    if isinstance(value, Mapping):
+        if all(isinstance(key, str) for key in value):
+            return {str(key): _json(item) for key, item in value.items()}
+        return {"pairs": sorted(([_json(key), _json(item)] for key, item in value.items()), key=json.dumps)}
+    if isinstance(value, np.ndarray):
+        return {"array": f"{value.dtype.str}{value.shape}", "sha256": of_content(np.ascontiguousarray(value).tobytes())}
+    if isinstance(value, Set):
+        return _json(sorted(value, key=str))
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [_json(item) for item in value]
+    if isinstance(value, np.generic):
+        return _json(value.item())
+    if isinstance(value, Path):
+        return value.name
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"number": repr(value)}
+    if isinstance(value, str):
+        return str(value)
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    raise TypeError(f"no fingerprint is known of {type(value).__name__}")
+
+
+class FileState(NamedTuple):  # archives have many
+    """What is known of a scan's file without reading it.
+
+    uri: its path relative to the project's folder with `/`, or its address. bytes: its size, -1 where it is not there.
+    mtime_ns: when it was last changed, local files; etag: the same of objects.
+    """
+
+    uri: str
+    bytes: int
+    mtime_ns: int = 0
+    etag: str = ""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """state: of the file. parts_hash: SHA-256 of its telling parts."""
+
+    state: FileState
+    parts_hash: str
+
+
+class FileStates:
+    """The states of the files of a project; where a folder stands is asked once for all files in it."""
+
+    def __init__(self, folder: Path) -> None:
+        """folder: that of the project, which may be moved as a whole."""
+        self._folder = os.path.abspath(folder)
+        self._below: dict[str, str] = {}  # by folder, what stands before the names of its files
+
+    def of(self, path: str | Path) -> FileState:
+        """Of a file or an object; one that does not answer is as one that is not there."""
+        try:
+            if isinstance(path, Address):
+                stat = path.stat()
+                return FileState(str(path), stat.st_size, etag=path.etag)
+            stat = os.stat(whole_file(str(path)))
+        except (OSError, MissingError, UnreachableError):
+            return FileState(self.uri(path), -1)
+        return FileState(self.uri(path), stat.st_size, stat.st_mtime_ns)
+
+    def uri(self, path: str | Path) -> str:
+        """Relative to the folder, where that is possible, with `/`; an address as it is."""
+        if isinstance(path, Address):
+            return str(path)
+        parent, sign, name = str(path).rpartition(os.sep)
+        below = self._below.get(parent)
+        if below is None:
+            below = self._below[parent] = self._before_names(os.path.abspath(parent + sign))
+        return below + name
+
+    def _before_names(self, parent: str) -> str:
+        try:
+            relative = os.path.relpath(parent, self._folder)
+        except ValueError:  # on another drive
+            relative = parent
+        return "" if relative == os.curdir else f"{Path(relative).as_posix().removesuffix('/')}/"
+
+
+def file_state(path: Path, folder: Path) -> FileState:
+    """The state of one file or object. folder: that of the project."""
+    return FileStates(folder).of(path)
+
+
+def parts_hash(path: Path, max_pixels: int | None = None) -> str:
+    """SHA-256 (hexadecimal) of the first 64 KiB, of the tables of tile offsets and byte counts, of the 256 x 256 px in
+    the middle, and of pieces spread over the file. Head and tables alone would not do: uncompressed scans of one
+    scanner share them.
+
+    A file that cannot be opened as a scan has a hash of its first bytes; "" where not even these can be read. Of an
+    object, what its store calls its content stands for all this: nothing of it is read.
+    """
+    try:
+        if isinstance(path, Address) and path.etag:
+            return hashlib.sha256(f"{path.etag} {path.stat().st_size}".encode()).hexdigest()
+        part = str(path).removeprefix(whole_file(str(path)))  # two parts of one file are two scans
+        digest = hashlib.sha256(f"{of_scan(path)}{part}".encode())
+        with path.open("rb") as file:
+            digest.update(file.read(_HEAD_BYTES))
+    except (OSError, MissingError, UnreachableError):
+        return ""
+    try:
+        with open_scan(path, max_pixels) as scan:
+            digest.update(_tables(path))
+            digest.update(_middle(scan))
+    except (MeasurementError, *DECODING_ERRORS):
+        digest.update(b"cannot be opened")
+    return digest.hexdigest()
+
+
+def content_hash(path: Path) -> str:
+    """SHA-256 (hexadecimal) of the whole file; "" where it cannot be read. It takes 0.6 s of CPU a GB, so it is made
+    where it decides, and not of every scan."""
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while piece := file.read(_PIECE_BYTES):
+                digest.update(piece)
+    except (OSError, MissingError, UnreachableError):
+        return ""
+    return digest.hexdigest()
+
+
+def _tables(path: Path) -> bytes:
+    """Where the tiles or strips of all its pictures stand in a TIFF file; empty for other files, which have none."""
+    if not _is_tiff(path):
+        return b""
+    with tiff_file(path) as file:
+        pages = [page.aspage() for page in file.pages]
+        tables = [np.array([*page.dataoffsets, *page.databytecounts], dtype="<u8") for page in pages]
+    return b"".join(table.tobytes() for table in tables)
+
+
+def _is_tiff(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(2) in (b"II", b"MM")
+
+
+def _middle(scan: Scan) -> bytes:
+    width, height = min(_MIDDLE_PX, scan.width_px), min(_MIDDLE_PX, scan.height_px)
+    return scan.samples((scan.width_px - width) // 2, (scan.height_px - height) // 2, width, height).tobytes()
+
+
+def result_key(identity: Identity, options_hash: str, revision: int = MEASURE_REVISION) -> str:
+    """SHA-256 (hexadecimal) of a scan's identity, the hash of its options, and the revision of `measure`. It is the
+    same on every machine, so results of several may be joined."""
+    state = identity.state
+    told = [state.uri, state.bytes, state.mtime_ns, state.etag, identity.parts_hash, options_hash, revision]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+
+
+def options_hash(options_json: str) -> str:
+    """SHA-256 (hexadecimal) of a task's options."""
+    return hashlib.sha256(options_json.encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def shard_of(name: str, shards: int) -> int:
+    """Which of so many shards, 1 to N, an image is of: by its name, the same on every machine and in every run."""
+    return int.from_bytes(hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()[:8]) % shards + 1
