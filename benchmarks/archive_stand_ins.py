@@ -14,7 +14,7 @@ import numpy as np
 
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
-from pipeline.archive.work import Witnessed
+from pipeline.measuring.scan_measurement import MeasuredFile
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan
 
@@ -40,7 +40,7 @@ def write_project(folder: Path, scans: int, a_folder: int = 1000) -> Path:
     return folder / "project.toml"
 
 
-def stand_in(task: ScanTask) -> Witnessed:
+def stand_in(task: ScanTask) -> MeasuredFile:
     """Measured in the time that RESEAU_STAND_IN_S says, 0 by default; RESEAU_STAND_IN_LOG: where its begin is told;
     RESEAU_STAND_IN_WEAK: how many of its marks are weak."""
     if told := os.environ.get("RESEAU_STAND_IN_LOG"):
@@ -56,7 +56,7 @@ def stand_in(task: ScanTask) -> Witnessed:
     pose = Pose("0", True, ("set in the project.",))
     frame = FrameMeasurement(task.name, marks, pose, matrix)
     scan = MeasuredScan(task.scan, 11500, 11500, (_PITCH_UM, _PITCH_UM), frame, ("It is a stand-in.",))
-    return Witnessed(replace(scan, seconds=0.5), digest.hex(), len(digest))
+    return MeasuredFile(replace(scan, seconds=0.5), digest.hex(), len(digest))
 
 
 def _mark(point: str, xy: tuple[int, int], matrix: np.ndarray, rng: np.random.Generator) -> MarkMeasurement:
@@ -72,4 +72,4 @@ def use() -> None:
     """From now on this process hands out stand-ins."""
     from pipeline.archive import work
 
-    vars(work)["witnessed_scan"] = stand_in
+    vars(work)["measure_file"] = stand_in

@@ -24,9 +24,9 @@ from range_server import range_server
 
 from measure.marks.rendering import extent_px, picture
 from measure.marks.shapes import FiducialLayout
-from pipeline.archive.work import Witnessed, witnessed_scan
 from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import read_project
+from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import scan_tasks
 
 PITCH_UM, _EDGE_MM = 20.0, 106.0
@@ -80,13 +80,13 @@ def main() -> None:
                 print(f"| {kind} | {told} | {took} |", flush=True)
 
 
-def _measured(folder: Path, address: str) -> Witnessed:
+def _measured(folder: Path, address: str) -> MeasuredFile:
     """As `reseau measure` does it."""
     text = f'camera = "camera.toml"\nscans = ["{address}"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n'
     (folder / "project.toml").write_text(text, encoding="utf-8")
     project = read_project(folder / "project.toml")
     (task,) = scan_tasks(project, tuple(project.scans))
-    return witnessed_scan(task)
+    return measure_file(task)
 
 
 def drawn_frame(layout: FiducialLayout, side: int, rng: np.random.Generator, off_px: int = 0) -> NDArray[np.uint8]:

@@ -1,34 +1,30 @@
 """What is missing of a project's scans measured, and kept as each is done."""
 
 import os
-import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
-from measure.scans.remote import TRAFFIC, scan_path
+from measure.scans.remote import scan_path
 from pipeline.archive.results_database import Kept, Store
 from pipeline.archive.review_decisions import after_checks, asked_of, before_checks, by_image, decided, decisions_hash
 from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.files.decisions_file import About, Decision
 from pipeline.files.project_file import Project
-from pipeline.measuring.scan_measurement import ended_scan, measured_scan, reads_writing
+from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measure_file, reads_writing
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 from pipeline.provenance import FileState, FileStates, Identity, options_hash, parts_hash, result_key
 from pipeline.results.measured_record import record_of, scan_of
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails
 from pipeline.text.wording import counted, listed, without_file
 from pipeline.workers import TASKS_A_CORE, results_of
 
 _HOUR_S, _MINUTE_S = 3600.0, 60.0
 _NAMED = 3
-_COUNTED = Path("/proc/self/io")
 _SAID_EVERY_S = 30.0
 _hash_of = lru_cache(maxsize=4096)(options_hash)
 
@@ -99,40 +95,9 @@ def duration(seconds: float, decimals: int = 0) -> str:
     )
 
 
-@dataclass(frozen=True)
-class Witnessed:
-    """scan: as measured, or why not. parts_hash: of its file. bytes_read: from the file; -1 where nobody counts.
-    thumbnails: cut from what was decoded for it."""
-
-    scan: MeasuredScan
-    parts_hash: str
-    bytes_read: int
-    thumbnails: tuple[StoredThumbnail, ...] = ()
-
-
-def witnessed_scan(task: ScanTask) -> Witnessed:
-    """Measure a scan. Raises nothing but interrupts, as `measured_scan` does."""
-    before = _bytes_read()
-    thumbnails = TakenThumbnails()
-    scan = measured_scan(task, thumbnails.take)
-    bytes_read = _bytes_read() - before if before >= 0 else -1
-    parts = parts_hash(scan_path(task.scan), task.max_pixels) if task.scan else ""
-    return Witnessed(scan, parts, bytes_read, tuple(thumbnails))
-
-
 def state_of(task: ScanTask, files: FileStates) -> FileState:
     """The state of a task's file."""
     return files.of(scan_path(task.scan)) if task.scan else FileState(f"(none) {task.name}", -1)
-
-
-def _bytes_read() -> int:
-    """By this process, of whatever file or address; mapped pages are not counted."""
-    if not sys.platform.startswith("linux"):
-        return -1
-    try:
-        return int(_COUNTED.read_text(encoding="ascii").split("rchar:")[1].split()[0]) + TRAFFIC.bytes
-    except (OSError, IndexError, ValueError):
-        return -1
 
 
 class Work:
@@ -296,8 +261,8 @@ class Work:
         if tasks and self._only_kept:
             raise NotMeasured
         states = {task.name: self.state(task) for task in tasks}
-        for task, result in results_of(witnessed_scan, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
-            seen = result if isinstance(result, Witnessed) else Witnessed(ended_scan(task, result), "", -1)
+        for task, result in results_of(measure_file, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
+            seen = result if isinstance(result, MeasuredFile) else MeasuredFile(ended_scan(task, result), "", -1)
             kept = self._kept(task, states[task.name], seen)
             if self._thumbnails is not None and seen.thumbnails:
                 self._thumbnails.keep(kept.fingerprint, seen.thumbnails)
@@ -307,7 +272,7 @@ class Work:
             self._now.add(row)
             yield task, row, kept
 
-    def _kept(self, task: ScanTask, state: FileState, seen: Witnessed) -> Kept:
+    def _kept(self, task: ScanTask, state: FileState, seen: MeasuredFile) -> Kept:
         known = self._identities.get(state.uri)
         lost = not seen.parts_hash and known is not None and known.state == state
         parts = known.parts_hash if lost and known is not None else seen.parts_hash

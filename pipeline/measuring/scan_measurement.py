@@ -1,10 +1,11 @@
 """The first step of measuring: each scan by itself, its fiducials and then the targets that they make predictable."""
 
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +20,22 @@ from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement, MarkMeasurement, moved_frame
 from measure.scans.opening import crop_scan
-from measure.scans.remote import ScanPart, Window, public_text
+from measure.scans.remote import TRAFFIC, ScanPart, Window, public_text, scan_path
 from measure.scans.scan import Scan
 from pipeline.errors import InputError, what_to_do
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.measuring.target_stage import measure_targets
 from pipeline.measuring.tone_stage import tone_before
+from pipeline.provenance import parts_hash
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails
 from pipeline.workers import Submits, results_of
 
 Look = Callable[[Scan, MeasuredScan], None]
+
+
+_COUNTED = Path("/proc/self/io")
 
 
 def measure_scans(
@@ -223,3 +229,34 @@ def _pitch(
         f"{scan.path}: pitch_um is missing in the project, and {scan.pitch_note}. Give the size of a "
         "pixel in µm; for a digital camera that of the sensor's, or any, with the principal distance to match."
     )
+
+
+@dataclass(frozen=True)
+class MeasuredFile:
+    """scan: as measured, or why not. parts_hash: of its file. bytes_read: from the file; -1 where nobody counts.
+    thumbnails: cut from what was decoded for it."""
+
+    scan: MeasuredScan
+    parts_hash: str
+    bytes_read: int
+    thumbnails: tuple[StoredThumbnail, ...] = ()
+
+
+def measure_file(task: ScanTask) -> MeasuredFile:
+    """Measure a scan. Raises nothing but interrupts, as `measured_scan` does."""
+    before = _bytes_read()
+    thumbnails = TakenThumbnails()
+    scan = measured_scan(task, thumbnails.take)
+    bytes_read = _bytes_read() - before if before >= 0 else -1
+    parts = parts_hash(scan_path(task.scan), task.max_pixels) if task.scan else ""
+    return MeasuredFile(scan, parts, bytes_read, tuple(thumbnails))
+
+
+def _bytes_read() -> int:
+    """By this process, of whatever file or address; mapped pages are not counted."""
+    if not sys.platform.startswith("linux"):
+        return -1
+    try:
+        return int(_COUNTED.read_text(encoding="ascii").split("rchar:")[1].split()[0]) + TRAFFIC.bytes
+    except (OSError, IndexError, ValueError):
+        return -1

@@ -25,11 +25,11 @@ from pipeline.archive.results_integrity import add_digests
 from pipeline.archive.schema import opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
-from pipeline.archive.work import Witnessed, witnessed_scan
 from pipeline.cli import run
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import read_project
 from pipeline.measuring.roll import CheckedScan, checked
+from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
 from pipeline.results.comparator_file import measurement_of
 from pipeline.results.measured_scan import MeasuredScan
@@ -39,15 +39,15 @@ SAID = pytest.CaptureFixture[str]
 measured: list[str] = []  # the images that were measured, in their order
 
 
-def counted_scan(task: ScanTask) -> Witnessed:
+def counted_scan(task: ScanTask) -> MeasuredFile:
     measured.append(task.name)
-    return witnessed_scan(task)
+    return measure_file(task)
 
 
 @pytest.fixture(autouse=True)
 def counts(monkeypatch: pytest.MonkeyPatch) -> None:
     measured.clear()
-    monkeypatch.setattr("pipeline.archive.work.witnessed_scan", counted_scan)
+    monkeypatch.setattr("pipeline.archive.work.measure_file", counted_scan)
 
 
 @pytest.fixture(scope="module")
@@ -369,15 +369,15 @@ def test_the_page_of_archives_has_the_table_of_verdicts() -> None:
 BOARD = '[targets]\nkind = "chessboard"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\n'
 
 
-def without_targets(task: ScanTask) -> Witnessed:
+def without_targets(task: ScanTask) -> MeasuredFile:
     """The board is sought in no scan: that takes longer than all the rest."""
-    return witnessed_scan(replace(task, options=replace(task.options, targets=None)))
+    return measure_file(replace(task, options=replace(task.options, targets=None)))
 
 
 def test_of_many_scans_only_the_lot_of_a_new_one_is_judged_again(
     folder: Path, three: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.archive.work.witnessed_scan", without_targets)
+    monkeypatch.setattr("pipeline.archive.work.measure_file", without_targets)
     rewritten(folder, "project.toml", "[measure]", f"{BOARD}[measure]")
     measure(folder)
     monkeypatch.setattr("pipeline.archive.cross_scan_checks._TOGETHER", 1)
