@@ -22,7 +22,7 @@ from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Network
 from adjust.problem.parameter import description
 from adjust.quality.reweighting import NO_WEIGHT
-from adjust.rank_defect.datum_choice import with_held
+from adjust.rank_defect.datum_choice import held_as_known
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 
@@ -176,7 +176,7 @@ class _Fits:
             if result is not None and (result.converged or result.singular):
                 return result
         network = self._network(model, None)
-        return adjust(network, approximate(with_held(network, self.options.datum_coordinates)), self.options)
+        return adjust(network, approximate(held_as_known(network, self.options.datum_coordinates)), self.options)
 
     def _network(self, model: Model, near: Adjustment | None) -> Network:
         """The network with a model, parameters that the near one has too starting at its values."""

@@ -20,7 +20,7 @@ from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network, Scanner
 from adjust.problem.parameter import Parameter
 from adjust.quality.significance import LEVEL
-from adjust.rank_defect.scanner_directions import HARDLY, poses_of, untold_sentences
+from adjust.rank_defect.scanner_directions import HARDLY, scan_poses, undetermined_term_sentences
 from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -82,9 +82,9 @@ def choose_bends(
         untold = [term for term in equations.untold(chosen[scanner.name]) if term in smooth]
         images = [image.name for image in network.images if image.scanner == scanner.name]
         center = np.array([scanner.center_mm])
-        poses = poses_of(adjusted_image(trial, name).camera_by_comparator(center)[0] for name in images)
+        poses = scan_poses(adjusted_image(trial, name).camera_by_comparator(center)[0] for name in images)
         with_lens = _equations(trial, scanner, _free_distortion(trial)).untold(chosen[scanner.name])
-        remarks += untold_sentences(scanner.name, untold, set(untold) - set(with_lens), poses)
+        remarks += undetermined_term_sentences(scanner.name, untold, set(untold) - set(with_lens), poses)
     return ScannerChoice(with_terms(network, chosen, sigma_mm), tuple(remarks))
 
 

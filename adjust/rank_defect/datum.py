@@ -54,8 +54,8 @@ def _further_motions(problem: Problem, state: State, generators: Array) -> Array
         by_unknowns = further.by_unknowns(state.values)
         motions = by_unknowns @ generators[further.positions]
         lengths = np.linalg.norm(motions, axis=1, keepdims=True)
-        seen = lengths[:, 0] > EXACT * np.linalg.norm(by_unknowns, axis=1)
-        rows.append(motions[seen] / lengths[seen])
+        strength = lengths[:, 0] > EXACT * np.linalg.norm(by_unknowns, axis=1)
+        rows.append(motions[strength] / lengths[strength])
     return np.vstack(rows)
 
 
@@ -137,8 +137,8 @@ def centered(problem: Problem, state: State, members: Indices) -> State:
 def _nearest(motion: Array, off: Array, first: NDArray[np.bool_]) -> Array:
     """Amounts (d,) of motions (n, d) nearest to off (n,): by the rows `first`, then as far as these leave it open."""
     count = motion.shape[1]
-    _, seen, right = np.linalg.svd(np.vstack([motion[first], np.zeros((count, count))]), full_matrices=False)
-    left_open = right[seen <= FLAT * seen.max(initial=0.0)].T
+    _, strength, right = np.linalg.svd(np.vstack([motion[first], np.zeros((count, count))]), full_matrices=False)
+    left_open = right[strength <= FLAT * strength.max(initial=0.0)].T
     amount = np.linalg.lstsq(motion[first], off[first], rcond=FLAT)[0]
     rest = off[~first] - motion[~first] @ amount
     return np.asarray(amount + left_open @ np.linalg.lstsq(motion[~first] @ left_open, rest)[0])
@@ -165,10 +165,10 @@ def _transformed(problem: Problem, state: State, datum: ObjectDatum, amounts: Ar
     for i, positions in enumerate(problem.exterior[:, 3:]):
         if problem.unknowns.sigma[positions].any():
             values[positions] = angles_near(rotations[i], values[positions])
-    return State(values, np.where(_held(problem)[:, None, None], state.rotations, rotations))
+    return State(values, np.where(_fixed_attitudes(problem)[:, None, None], state.rotations, rotations))
 
 
-def _held(problem: Problem) -> NDArray[np.bool_]:
+def _fixed_attitudes(problem: Problem) -> NDArray[np.bool_]:
     """Images whose attitude is fixed."""
     return np.asarray((problem.unknowns.sigma[problem.exterior[:, 3:]] == 0.0).all(axis=1))
 

@@ -12,7 +12,7 @@ from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter, object_coordinate
 from adjust.problem.problem import Problem
 from adjust.rank_defect.datum import FLAT, ObjectDatum, free_coordinates, object_datum
-from adjust.rank_defect.directions import DATUM_LEADS
+from adjust.rank_defect.named_directions import DATUM_DIRECTIONS
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -20,13 +20,13 @@ Indices = NDArray[np.intp]
 DEPENDENT = 1e-6  # part of a coordinate's motion that those before it must leave open, or it is theirs already
 
 
-def with_held(network: Network, coordinates: Sequence[str]) -> Network:
+def held_as_known(network: Network, coordinates: Sequence[str]) -> Network:
     """The network for approximations: coordinates that are to be held, and have a value, count as known."""
     held = {object_coordinate(text) for text in coordinates}
-    return replace(network, points=tuple(_with_held(point, held) for point in network.points))
+    return replace(network, points=tuple(_known_point(point, held) for point in network.points))
 
 
-def _with_held(point: ObjectPoint, held: set[Parameter]) -> ObjectPoint:
+def _known_point(point: ObjectPoint, held: set[Parameter]) -> ObjectPoint:
     priors = [
         Prior(prior.value) if prior is not None and Parameter.point(point.id, axis) in held else prior
         for axis, prior in zip("XYZ", (point.X, point.Y, point.Z), strict=True)
@@ -86,8 +86,8 @@ def chosen_points(problem: Problem, points: Sequence[str]) -> Indices:
     if points:
         datum = object_datum(problem, problem.start(), FLAT)
         motions = datum.generators[members] @ datum.free
-        _, seen, right = np.linalg.svd(np.vstack([motions, np.zeros((7, motions.shape[1]))]), full_matrices=False)
-        _check_complete(datum, right[seen > FLAT], f"The datum points {', '.join(points)}")
+        _, strength, right = np.linalg.svd(np.vstack([motions, np.zeros((7, motions.shape[1]))]), full_matrices=False)
+        _check_complete(datum, right[strength > FLAT], f"The datum points {', '.join(points)}")
     return members
 
 
@@ -107,8 +107,8 @@ def _check_complete(datum: ObjectDatum, motions: Array, what: str) -> None:
         return
     numbers = _telling_rows(open_directions)
     raise DatumError(
-        f"{what} do not hold the object space: it {'; it '.join(DATUM_LEADS[number][0] for number in numbers)}. "
-        f"Name {'; '.join(dict.fromkeys(DATUM_LEADS[number][1] for number in numbers))}, or leave the choice to "
+        f"{what} do not hold the object space: it {'; it '.join(DATUM_DIRECTIONS[number][0] for number in numbers)}. "
+        f"Name {'; '.join(dict.fromkeys(DATUM_DIRECTIONS[number][1] for number in numbers))}, or leave the choice to "
         f"the program."
     )
 

@@ -1,7 +1,6 @@
 """What the observations do not determine: null directions of the equations, named with cause and remedy."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +10,11 @@ from adjust.problem.estimates import NullDirection
 from adjust.problem.parameter import Parameter, description
 from adjust.problem.problem import Problem, State
 from adjust.rank_defect.datum import free_coordinates, object_datum
-from adjust.rank_defect.directions import camera_leads, datum_sentence, field_of, following
 from adjust.rank_defect.flat_valleys import trading_off
+from adjust.rank_defect.named_directions import camera_directions, datum_sentence, field_geometry, followers
 from adjust.rank_defect.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
-from adjust.rank_defect.own_directions import many_sentence, own_sentence, unnamed_sentence
-from adjust.rank_defect.scanner_directions import scanner_leads
+from adjust.rank_defect.scanner_directions import scanner_directions
+from adjust.rank_defect.unnamed_directions import many_sentence, own_sentence, unnamed_sentence
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -37,8 +36,8 @@ def singular_directions(problem: Problem, state: State, free: Indices, factor: F
         return ()
     blind = blind_blocks(factor)
     null, _ = null_space(factor, blind, SINGULAR)
-    found = _named(problem, state, free, factor, blind, null, PURE)
-    return (*_within_blocks(problem, state, free, blind), *found.named, *found.left)
+    named, left = _named_directions(problem, state, free, factor, blind, null, PURE)
+    return (*_block_directions(problem, state, free, blind), *named, *left)
 
 
 def weak_directions(
@@ -46,16 +45,15 @@ def weak_directions(
 ) -> tuple[NullDirection, ...]:
     """What the observations hardly see, and priors do not settle: there the solution is made by noise.
 
-    The factor is to be that without the priors of cameras and scanners. Of all directions below WEAK those are told in
-    which these priors weigh less than SETTLED times what the observations do. Directions that move fiducials with
+    The factor is to be that without the priors of cameras and scanners. Of all directions below WEAK those are given
+    in which these priors weigh less than SETTLED times what the observations do. Directions that move fiducials with
     priors are no cause for alarm: their priors are meant to place them; nor are those of lenses whose parameters trade
-    off, of which notes tell. singular: the null directions, which are not
-    told again. Many directions without a name are told as one: the longer a strip is, the more ways there are in which
-    it can bend.
+    off, which notes are about. singular: the null directions, which are left out. Many directions without a name are
+    given as one: the longer a strip is, the more ways there are in which it can bend.
     """
     blind = blind_blocks(factor)
-    hardly, told = null_space(factor, blind, WEAK)
-    if singular and (told <= SINGULAR).all():
+    hardly, visibility = null_space(factor, blind, WEAK)
+    if singular and (visibility <= SINGULAR).all():
         return ()
     marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
     cameras_and_scanners = np.isin(
@@ -65,20 +63,21 @@ def weak_directions(
     calibrated = [each.positions for each in problem.further if each.group == "calibration"]
     placed = marks & (np.isfinite(problem.unknowns.sigma[free]) | np.isin(free, np.concatenate([[], *calibrated])))
     placed |= np.isin(free, np.concatenate([[], *trading_off(problem).values()]))
-    kept = _unseen_by(hardly[placed], MIXED)
-    of_unit_weight = hardly @ kept @ np.linalg.inv(np.linalg.qr(np.maximum(told, SINGULAR)[:, None] * kept, mode="r"))
+    kept = _complement(hardly[placed], MIXED)
+    weights = np.maximum(visibility, SINGULAR)[:, None] * kept
+    of_unit_weight = hardly @ kept @ np.linalg.inv(np.linalg.qr(weights, mode="r"))
     _, weight, right = np.linalg.svd(of_unit_weight / (factor.scale * sigma)[:, None], full_matrices=False)
     unsettled = of_unit_weight @ right[weight < SETTLED].T
-    found = _named(problem, state, free, factor, blind, np.linalg.qr(unsettled)[0], MIXED)
+    found = _named_directions(problem, state, free, factor, blind, np.linalg.qr(unsettled)[0], MIXED)
     again = {_motion(each) for each in singular}
-    named, left = (tuple(each for each in some if _motion(each) not in again) for some in (found.named, found.left))
-    return (*named, *(left if len(left) <= NAMES_SHOWN else (_together(left),)))
+    named, left = (tuple(each for each in some if _motion(each) not in again) for some in found)
+    return (*named, *(left if len(left) <= NAMES_SHOWN else (_merged_direction(left),)))
 
 
-def _together(directions: Sequence[NullDirection]) -> NullDirection:
+def _merged_direction(directions: Sequence[NullDirection]) -> NullDirection:
     """Many directions that have no name, as one."""
     moved = tuple(dict.fromkeys(moved for each in directions for moved in each.parameters))
-    return NullDirection(_collapsed(moved), *many_sentence(len(directions), following(set(moved))))
+    return NullDirection(_collapsed(moved), *many_sentence(len(directions), followers(moved)))
 
 
 def _motion(direction: NullDirection) -> str:
@@ -93,20 +92,20 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
     shows is not among them: nobody expects otherwise.
     """
     unknowns = problem.unknowns
-    told = np.zeros(len(unknowns), dtype=bool)
-    told[np.unique(problem.columns[problem.columns >= 0])] = True
-    told[[i for point in unknowns.point.values() for i in point]] = False
-    prior = np.where(unknowns.has_prior & told, unknowns.sigma, np.inf)
-    untold = np.flatnonzero(np.sqrt(variances) > UNDETERMINED * prior)
-    if not len(untold):
+    observed = np.zeros(len(unknowns), dtype=bool)
+    observed[np.unique(problem.columns[problem.columns >= 0])] = True
+    observed[[i for point in unknowns.point.values() for i in point]] = False
+    prior = np.where(unknowns.has_prior & observed, unknowns.sigma, np.inf)
+    unobserved = np.flatnonzero(np.sqrt(variances) > UNDETERMINED * prior)
+    if not len(unobserved):
         return ""
-    shown = description(_collapsed([unknowns.parameters[i] for i in untold]))
-    said = f"The observations say nothing about {shown}: their standard deviations stay as given"
-    cameras = [name for name, positions in unknowns.camera.items() if np.isin(positions[:3], untold).any()]
+    shown = description(_collapsed([unknowns.parameters[i] for i in unobserved]))
+    statement = f"The observations say nothing about {shown}: their standard deviations stay as given"
+    cameras = [name for name, positions in unknowns.camera.items() if np.isin(positions[:3], unobserved).any()]
     if not cameras:
-        return f"{said}. What is given is all that places them: give it well, or fix what you do not need."
-    field = field_of(problem, state, cameras[0])
-    return f"{said}, for {field.because}. To determine them, {field.remedy}."
+        return f"{statement}. What is given is all that places them: give it well, or fix what you do not need."
+    field = field_geometry(problem, state, cameras[0])
+    return f"{statement}, for {field.because}. To determine them, {field.remedy}."
 
 
 def _collapsed(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
@@ -120,15 +119,7 @@ def _collapsed(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     return tuple(shown)
 
 
-@dataclass(frozen=True)
-class _Directions:
-    """Directions that have a name, and those that are told after what moves most in them."""
-
-    named: tuple[NullDirection, ...]
-    left: tuple[NullDirection, ...]
-
-
-def _within_blocks(
+def _block_directions(
     problem: Problem, state: State, free: Indices, blind: Sequence[BlindBlock]
 ) -> Iterable[NullDirection]:
     """Null directions of an image's or a point's own unknowns, which the shared ones have no part in."""
@@ -138,7 +129,7 @@ def _within_blocks(
             yield NullDirection(moved, *own_sentence(problem, state, moved[0]))
 
 
-def _named(
+def _named_directions(
     problem: Problem,
     state: State,
     free: Indices,
@@ -146,39 +137,44 @@ def _named(
     blind: Sequence[BlindBlock],
     null: Array,
     part: float,
-) -> "_Directions":
-    """Sentences for the vectors (n, d) of a null space: the object datum first, then the camera, then what is left."""
+) -> tuple[Sequence[NullDirection], Sequence[NullDirection]]:
+    """The vectors (n, d) of a null space as directions: those with a name, the object datum first, then the camera's;
+    and those that are described by what moves most in them."""
     if null.shape[1] == 0:
-        return _Directions((), ())
+        return (), ()
     parameters = [problem.unknowns.parameters[i] for i in free]
     datum, sentences, rest = _datum_part(problem, state, free, factor, blind, null)
-    still = _with_points_still(problem, free, datum, rest)
-    leads = [*scanner_leads(problem, state), *camera_leads(problem, state)]
+    still = _points_fixed(problem, free, datum, rest)
+    leads = [*scanner_directions(problem, state), *camera_directions(problem, state)]
     functionals = np.array([lead.functional[free] for lead in leads]).reshape(len(leads), len(free)) / factor.scale
     lengths = np.linalg.norm(functionals, axis=1, keepdims=True)
-    seen = (functionals / np.where(lengths > 0.0, lengths, 1.0)) @ rest
+    visibility = (functionals / np.where(lengths > 0.0, lengths, 1.0)) @ rest
     ranks = np.array([lead.rank for lead in leads], dtype=np.intp)
     axes = (functionals[ranks == 0] * factor.scale**2).T  # as motions of the scaled unknowns
-    chosen = _independent_rows(seen, part, ranks, _made_of(axes, rest, part))
-    vectors = _with_object_still(parameters, still @ np.linalg.pinv(seen[chosen]), ranks[chosen])
-    left = still @ _unseen_by(seen[chosen], PURE)
+    chosen = _independent_rows(visibility, part, ranks, _axes_projector(axes, rest, part))
+    vectors = _object_fixed(parameters, still @ np.linalg.pinv(visibility[chosen]), ranks[chosen])
+    left = still @ _complement(visibility[chosen], PURE)
     moved = [[parameters[i] for i in _largest(vector)] for vector in np.hstack([datum, vectors, left]).T]
     of_leads = moved[datum.shape[1] : len(moved) - left.shape[1]]
     for own, i in zip(of_leads, chosen, strict=True):  # small as they may be, what it is named after moves
         own += [parameters[k] for k in np.flatnonzero(functionals[i]) if parameters[k] not in own]
     sentences += [leads[i].sentence(own) for i, own in zip(chosen, of_leads, strict=True)]
     for vector, own in zip(left.T, moved[len(moved) - left.shape[1] :], strict=True):
-        sentences.append(_left_sentence(problem, state, parameters[int(np.argmax(np.abs(vector)))], own))
-    told = tuple(NullDirection(_collapsed(own), *sentence) for own, sentence in zip(moved, sentences, strict=True))
-    return _Directions(told[: len(told) - left.shape[1]], told[len(told) - left.shape[1] :])
+        sentences.append(_sentence_without_name(problem, state, parameters[int(np.argmax(np.abs(vector)))], own))
+    named = zip(moved, sentences, strict=True)
+    directions = [NullDirection(_collapsed(own), *sentence) for own, sentence in named]
+    count = len(directions) - left.shape[1]
+    return directions[:count], directions[count:]
 
 
-def _left_sentence(problem: Problem, state: State, most: Parameter, moved: Sequence[Parameter]) -> tuple[str, str]:
+def _sentence_without_name(
+    problem: Problem, state: State, most: Parameter, moved: Sequence[Parameter]
+) -> tuple[str, str]:
     """Cause and remedy of a direction without a lead, of what moves most in it: of one point or image, or of many."""
     owners = {(each.owner, each.id) for each in moved}
     if len(owners) == 1 and most.kind in ("point", "exterior", "film"):
         return own_sentence(problem, state, most)
-    return unnamed_sentence(most, following(set(moved) - {most}))
+    return unnamed_sentence(most, followers(set(moved) - {most}))
 
 
 def _datum_part(
@@ -202,14 +198,14 @@ def _datum_part(
     return vectors, [datum_sentence(i) for i in chosen], null @ left[:, count:]
 
 
-def _with_points_still(problem: Problem, free: Indices, datum: Array, vectors: Array) -> Array:
+def _points_fixed(problem: Problem, free: Indices, datum: Array, vectors: Array) -> Array:
     """Null vectors (n, d) with as much of the free datum (n, k) added as leaves the object points where they are."""
     points = np.isin(free, free_coordinates(problem))
     amounts = np.linalg.lstsq(datum[points], vectors[points])[0]
     return np.asarray(vectors - datum @ amounts)
 
 
-def _with_object_still(parameters: Sequence[Parameter], vectors: Array, ranks: Indices) -> Array:
+def _object_fixed(parameters: Sequence[Parameter], vectors: Array, ranks: Indices) -> Array:
     """Vectors (n, d) with as much of the others added to those of rank 0 as leaves stations and points where they are.
 
     A common shift of fiducials and principal point, which no object takes part in, is then told as just that.
@@ -221,14 +217,14 @@ def _with_object_still(parameters: Sequence[Parameter], vectors: Array, ranks: I
     return result
 
 
-def _made_of(motions: Array, vectors: Array, part: float) -> Array:
+def _axes_projector(motions: Array, vectors: Array, part: float) -> Array:
     """A projector (d, d) on what of orthonormal vectors (n, d) moves the unknowns of motions (n, m) by these alone.
 
     An affinity that leaves two fiducial marks in their places shifts their mean, and yet it is no shift.
     """
     moved = np.any(motions != 0.0, axis=1)
     basis = np.linalg.qr(motions[moved])[0]
-    kept = _unseen_by(vectors[moved] - basis @ (basis.T @ vectors[moved]), part)
+    kept = _complement(vectors[moved] - basis @ (basis.T @ vectors[moved]), part)
     return kept @ kept.T
 
 
@@ -254,11 +250,11 @@ def _independent_rows(rows: Array, part: float, ranks: Indices, axes: Array | No
     return sorted(chosen)
 
 
-def _unseen_by(rows: Array, part: float) -> Array:
+def _complement(rows: Array, part: float) -> Array:
     """Orthonormal vectors (d, k) of which rows (m, d) see no more than a part."""
     square = np.zeros((rows.shape[1], rows.shape[1]))
-    _, seen, right = np.linalg.svd(np.vstack([rows, square]), full_matrices=False)
-    return np.asarray(right[seen <= part].T)
+    _, visibility, right = np.linalg.svd(np.vstack([rows, square]), full_matrices=False)
+    return np.asarray(right[visibility <= part].T)
 
 
 def _largest(vector: Array) -> list[int]:

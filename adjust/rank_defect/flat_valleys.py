@@ -19,6 +19,7 @@ from adjust.functional_model.families import family
 from adjust.least_squares.iteration import Linearised
 from adjust.problem.condition_equations import observed_in_camera
 from adjust.problem.problem import Problem, State
+from adjust.rank_defect.named_directions import enumeration
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -87,23 +88,19 @@ def held_directions(problem: Problem, variances: Array) -> int:
 
 def inseparable(problem: Problem, state: State, variances: Array) -> list[str]:
     """A sentence on every camera of which parameters are not separable."""
-    told = set(unresolved(problem.pseudo_observed, variances))
+    inseparable_positions = set(unresolved(problem.pseudo_observed, variances))
     sentences = []
     for name, positions in problem.unknowns.camera.items():
         of = family(problem.network.camera_by_name[name].distortion.family)
-        names = [each for each, i in zip(of.parameters, positions[3:], strict=True) if int(i) in told]
+        names = [each for each, i in zip(of.parameters, positions[3:], strict=True) if int(i) in inseparable_positions]
         if names:
             radius_mm = observed_radius_mm(problem, state, name)
             sentences.append(
-                f"{_listed(names)} of camera {name} cannot be separated: up to {radius_mm:.3g} mm from the "
+                f"{enumeration(names)} of camera {name} cannot be separated: up to {radius_mm:.3g} mm from the "
                 "principal point, as far as targets were observed, they do the same. The distortion itself is known "
                 "there. Use its parameters together, not one by one, or estimate fewer of them."
             )
     return sentences
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _largest_motion_mm(problem: Problem, at: Linearised, rows: Indices, position: int) -> float:

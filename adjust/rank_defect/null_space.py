@@ -69,7 +69,7 @@ def null_space(factor: Factor, blind: Sequence[BlindBlock], below: float) -> tup
     count = factor.shared_count
     if count == 0:
         return np.zeros((len(factor.scale), 0)), np.zeros(0)
-    singular, shared = _smallest(_with_blind_rows(factor, blind), below)
+    singular, shared = _smallest(_shared_triangle(factor, blind), below)
     vectors = np.zeros((len(factor.scale), len(singular)))
     vectors[:count] = shared
     first_of_blind = [block.own[0] for block in blind]
@@ -82,7 +82,7 @@ def null_space(factor: Factor, blind: Sequence[BlindBlock], below: float) -> tup
     return np.linalg.qr(vectors)[0], singular / np.linalg.norm(vectors, axis=0)
 
 
-def _with_blind_rows(factor: Factor, blind: Sequence[BlindBlock]) -> Triangle:
+def _shared_triangle(factor: Factor, blind: Sequence[BlindBlock]) -> Triangle:
     """The shared triangle, where blocks have null vectors together with the rows that these leave over."""
     if not blind:
         return factor.triangle

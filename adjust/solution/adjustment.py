@@ -19,7 +19,7 @@ from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.rank_defect.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
-from adjust.rank_defect.datum_choice import chosen_coordinates, chosen_points, with_held
+from adjust.rank_defect.datum_choice import chosen_coordinates, chosen_points, held_as_known
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
 from adjust.solution.coordinate_blunders import Slip, far_points, few_points, freed, slips
 from adjust.solution.left_out_images import fitting, with_lens, without_images
@@ -71,7 +71,7 @@ def _orientable(network: Network, options: Options) -> tuple[Network, Approximat
     out. The whole network without approximations where too little would be left, or something else is wrong.
     """
     try:
-        return network, initial_values(with_held(network, options.datum_coordinates)), {}
+        return network, initial_values(held_as_known(network, options.datum_coordinates)), {}
     except UnorientedError as error:
         part, reasons = without_images(network, error.reasons), error.reasons
     except AdjustmentError:
@@ -128,7 +128,7 @@ def _as_a_whole(
         own = own or _own_start(network, options)
         _check_whole(network, _plainly(network, own, options), options)
     try:
-        start = approximations or own or initial_values(with_held(network, options.datum_coordinates))
+        start = approximations or own or initial_values(held_as_known(network, options.datum_coordinates))
         result = _adjusted(network, start, options)
     except DatumError:  # whatever the observations say
         raise
@@ -160,7 +160,7 @@ def _tried(network: Network, options: Options) -> Adjustment | None:
 def _own_start(network: Network, options: Options) -> Approximations | None:
     """A network's own approximations; None where it has none."""
     try:
-        return initial_values(with_held(network, options.datum_coordinates))
+        return initial_values(held_as_known(network, options.datum_coordinates))
     except AdjustmentError:
         return None
 
@@ -257,7 +257,7 @@ def _begun_anew(network: Network, approximations: Approximations, options: Optio
     """The adjustment from the network's own approximations; what is there already where these are no better."""
     for known in (*_without_guesses(network), network):
         try:
-            own = initial_values(with_held(known, options.datum_coordinates))
+            own = initial_values(held_as_known(known, options.datum_coordinates))
         except AdjustmentError:
             continue
         if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):

@@ -15,7 +15,7 @@ from adjust.problem.parameter import description
 from adjust.problem.problem import Problem
 from adjust.quality.residuals import Residuals
 from adjust.rank_defect.diagnosis import undetermined, weak_directions
-from adjust.rank_defect.scanner_directions import hardly_told
+from adjust.rank_defect.scanner_directions import weak_term_sentences
 from adjust.solution.reweighting import ROUNDS, Run
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ def _weak_parameters(run: Run, cofactor: Cofactor) -> Iterator[str]:
         yield f"Practically singular without priors: {description(each.parameters)}. {each.cause} {each.remedy}"
     if run.converged:
         yield from filter(None, [undetermined(problem, state, cofactor.variances)])
-        yield from hardly_told(problem, state, free, run.factor, cofactor)
+        yield from weak_term_sentences(problem, state, free, run.factor, cofactor)
 
 
 def _points_without_image(problem: Problem) -> list[str]:

@@ -1,0 +1,289 @@
+"""The directions in which a network's unknowns are known to move together: a table with the words for each."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.families import family
+from adjust.functional_model.transformation import follows_tilts
+from adjust.problem.parameter import Kind, Parameter
+from adjust.problem.problem import Problem, State
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+FLAT = 0.01  # least over largest extent of the field, below which there is no relief to speak of
+PARALLEL_RAD = np.radians(1.0)  # axes within this of each other are parallel
+FIELD = 4  # points from which something is known of the field, and not just of its datum
+LEAST_BEND = 1e-6  # of squares of the fiducials' places beyond affinities: three marks have none
+
+
+class Reason(NamedTuple):
+    """Why nothing hinders a motion, where that is more than what follows it; what given prior would end it; what else
+    to do."""
+
+    because: str
+    given: str
+    otherwise: str
+
+
+@dataclass(frozen=True)
+class NamedDirection:
+    """What a null direction is called after: a functional (n,) of the unknowns that it changes, and the words for it.
+
+    rank: of several that would do, that of the lowest rank gives the name. motion: what moves. reason: of what moves
+    along. partner: another unknown (its key, and in words) whose prior would end it, where it moves too.
+    """
+
+    rank: int
+    functional: Array
+    motion: str
+    reason: Callable[[set[Parameter]], Reason]
+    partner: tuple[Parameter, str] | None = None
+
+    def sentence(self, moved: Iterable[Parameter]) -> tuple[str, str]:
+        """Cause and remedy of a direction that moves some unknowns."""
+        moved = set(moved)
+        because, given, otherwise = self.reason(moved)
+        if self.partner and self.partner[0] in moved:
+            given = f"{given}, or to {self.partner[1]}"
+        cause = f"{self.motion}{followers(moved, self.motion)}{because and f': {because}'}."
+        return cause, f"Give a standard deviation to {given}{otherwise and f', or {otherwise}'}."
+
+
+# What follows a motion: the unknowns' kind, quantities (all where empty), words, a word of motions that name it.
+FOLLOWERS: tuple[tuple[Kind, tuple[str, ...], str, str], ...] = (
+    ("fiducial", (), "the fiducial marks", "fiducial mark"),
+    ("film", (), "the film transformations", ""),
+    ("join", (), "what joins scans of a frame", ""),
+    ("interior", ("x0", "y0"), "the principal point", "principal point's"),
+    ("interior", ("c",), "the principal distance", "principal distance"),
+    ("exterior", ("X0", "Y0", "Z0"), "the stations", ""),
+    ("exterior", ("omega", "phi"), "the tilts", ""),
+    ("exterior", ("kappa",), "kappa", ""),
+    ("point", ("X", "Y"), "the object points in plan", ""),
+    ("point", ("Z",), "the heights", ""),
+)
+
+
+def followers(moved: Iterable[Parameter], motion: str = "") -> str:
+    """What moves along, in words."""
+    kinds = {(each.kind, each.quantity) for each in moved}
+    words = [
+        word
+        for kind, quantities, word, own in FOLLOWERS
+        if not (own and own in motion) and any(k == kind and (not quantities or q in quantities) for k, q in kinds)
+    ]
+    return f", followed by {enumeration(words)}" if words else ""
+
+
+def enumeration(words: Sequence[str]) -> str:
+    """Words as a sentence lists them: with commas, and `and` before the last one."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+# The free directions of the object space: motion, and what known coordinates end it.
+DATUM_DIRECTIONS = (
+    ("can shift in X", "X of one point"),
+    ("can shift in Y", "Y of one point"),
+    ("can shift in Z", "Z of one point"),
+    ("can turn about X", "Z of three points that are not in line"),
+    ("can turn about Y", "Z of three points that are not in line"),
+    ("can turn about Z", "X and Y of two points"),
+    ("can grow or shrink", "X and Y of two points, or a distance"),
+)
+
+
+def datum_sentence(number: int) -> tuple[str, str]:
+    """Cause and remedy of one of the seven free directions of the object space."""
+    motion, known = DATUM_DIRECTIONS[number]
+    return (
+        f"The object space {motion} with all stations and points: nothing that is given fixes it.",
+        f'Give {known} with a standard deviation in points.csv, or choose the datum "minimal" or "free".',
+    )
+
+
+_X0, _Y0, _C = ("x0", "x0' (F7)"), ("y0", "y0' (F8)"), ("c", "the principal distance (F9)")
+_LEVER = "one coordinate of a fiducial mark that has a lever arm (F5, F6)"
+_TWO, _THREE = (f"x' and y' of {number} fiducial marks (F5, F6)" for number in ("two", "three"))
+_TURNED = "add images turned by 90 degrees about their axes or tilted in other directions"
+# Common motions of all fiducial marks of a camera: rank, dx' and dy' by 1, x and y about the marks' mean, motion, what
+# given prior ends it, the interior quantity that would, too, where it moves along, what else to do.
+FIDUCIAL_MOTIONS = (
+    (0, (1, 0, 0), (0, 0, 0), "Shift x: {} shift together in x'", "x' of one fiducial mark (F5)", _X0, ""),
+    (0, (0, 0, 0), (1, 0, 0), "Shift y: {} shift together in y'", "y' of one fiducial mark (F6)", _Y0, ""),
+    (0, (0, 0, -1), (0, 1, 0), "Rotation: {} turn together about the principal point", _LEVER, None, ""),
+    (0, (0, 1, 0), (0, 0, 1), "Scale: {} grow together", _TWO, _C, ""),
+    (1, (0, 1, 0), (0, 0, -1), "Affinity: {} stretch in x' against y'", _THREE, None, _TURNED),
+    (1, (0, 0, 1), (0, 1, 0), "Shear: {} shear", _THREE, None, _TURNED),
+)
+
+
+def camera_directions(problem: Problem, state: State) -> list[NamedDirection]:
+    """The named directions of all cameras.
+
+    Ranks: -1 a tilt, which moves much else along, 0 what is a change of the camera's own axes, 1 other changes of its
+    fiducials, 2 interior orientation, 3 distortion; -2 of a scanner's bend, which moves still more (see
+    `scanner_directions`).
+    """
+    directions = []
+    for name, positions in problem.unknowns.camera.items():
+        marks = _film_places(problem, name)
+        if marks is not None:
+            directions += _fiducial_directions(problem, state, name, marks)
+            directions += _tilt_directions(problem, state, name, marks)
+        directions += _interior_directions(problem, name, positions, field_geometry(problem, state, name))
+        directions += _distortion_directions(problem, name, positions[3:])
+    return directions
+
+
+def _film_places(problem: Problem, camera: str) -> Indices | None:
+    """Positions (m, 2) of all fiducials of a camera, and of what joins the scans of its frames, which moves with
+    them; None of a camera without fiducials."""
+    frames = {image.frame for image in problem.network.images if image.camera == camera}
+    unknowns = problem.unknowns
+    marks = [positions for (owner, _), positions in unknowns.fiducial.items() if owner == camera]
+    joins = [positions for (frame, _), positions in unknowns.join.items() if frame in frames]
+    return np.array(marks + joins) if marks else None
+
+
+def _fiducial_directions(problem: Problem, state: State, camera: str, marks: Indices) -> list[NamedDirection]:
+    """Shift, rotation, scale, affinity and shear of all fiducials of a camera."""
+    centred = state.values[marks] - state.values[marks].mean(axis=0)
+    basis = np.column_stack([np.ones(len(centred)), centred])
+    directions = []
+    for rank, dx, dy, motion, given, partner, otherwise in FIDUCIAL_MOTIONS:
+        functional = _functional(problem, marks, basis @ np.array([dx, dy]).T)
+        words = motion.format(f"all fiducial marks of camera {camera} can")
+        with_partner = partner and (Parameter.interior(camera, partner[0]), partner[1])
+        directions.append(NamedDirection(rank, functional, words, _fixed_reason("", given, otherwise), with_partner))
+    return directions
+
+
+def _tilt_directions(problem: Problem, state: State, camera: str, marks: Indices) -> list[NamedDirection]:
+    """A tilt of all cameras about x' or y', where every film transformation of a camera can undo it.
+
+    It moves the fiducials by t (x'², x'y'), of which the functional takes what no affinity of theirs can be.
+    """
+    kinds = [image.transformation for image in problem.network.images if image.camera == camera]
+    if not all(follows_tilts(kind) for kind in kinds):
+        return []
+    centred = state.values[marks] - state.values[marks].mean(axis=0)
+    affine = np.column_stack([np.ones(len(centred)), centred])
+    directions = []
+    for axis, other in ((0, 1), (1, 0)):
+        bend = centred[:, [axis]] * centred
+        bend -= affine @ np.linalg.lstsq(affine, bend)[0]
+        if np.abs(bend).max() < LEAST_BEND * np.abs(centred).max() ** 2:
+            continue
+        motion = (
+            f"Tilt {'xy'[axis]}: all fiducial marks of camera {camera} can move by {'xy'[axis]}' times x' and y', as "
+            f"with one tilt of all cameras about {'xy'[other]}'"
+        )
+        given = "x' and y' of four fiducial marks (F5, F6), or to the attitude of an image"
+        reason = _fixed_reason("", given, "choose an affine transformation")
+        directions.append(NamedDirection(-1, _functional(problem, marks, bend), motion, reason))
+    return directions
+
+
+def _interior_directions(
+    problem: Problem, camera: str, positions: Indices, field: "FieldGeometry"
+) -> list[NamedDirection]:
+    """x0', y0' and c of a camera."""
+    for_point = field.remedy
+    if field.known != "points" and not field.flat:
+        for_point = "add images turned by 180 degrees about their axes"
+    table = (
+        (1, f"The principal point's x0' of camera {camera} can shift", "x0' (F7)", for_point),
+        (2, f"The principal point's y0' of camera {camera} can shift", "y0' (F8)", for_point),
+        (0, f"The principal distance of camera {camera} can change", "it (F9)", field.remedy),
+    )
+    return [
+        unit_direction(problem, 2, positions[number], motion, _fixed_reason(field.because, given, otherwise))
+        for number, motion, given, otherwise in table
+    ]
+
+
+def _distortion_directions(problem: Problem, camera: str, positions: Indices) -> list[NamedDirection]:
+    """The distortion parameters of a camera."""
+    own_family = family(problem.network.camera_by_name[camera].distortion.family)
+    named = dict(zip(own_family.parameters, positions, strict=True))
+    free = [each for each in own_family.alike_at_zero if np.isinf(problem.unknowns.sigma[named[each]])]
+    because, remedy = "the targets do not tell it from the other unknowns", "spread the targets better over the frame"
+    if free:
+        because = f"with {', '.join(free)} free the radial numerator and denominator do the same over this image"
+        remedy = f"fix some of {', '.join(free)} at 0"
+    return [
+        unit_direction(
+            problem,
+            3,
+            position,
+            f"The distortion parameter {name} of camera {camera} can change",
+            _fixed_reason(because, name, f"fix it, or {remedy}"),
+        )
+        for name, position in named.items()
+    ]
+
+
+def unit_direction(
+    problem: Problem, rank: int, position: int, motion: str, reason: Callable[[set[Parameter]], Reason]
+) -> NamedDirection:
+    """The direction that is called after one unknown."""
+    return NamedDirection(rank, _functional(problem, position, 1.0), motion, reason)
+
+
+def _fixed_reason(because: str, given: str, otherwise: str) -> Callable[[set[Parameter]], Reason]:
+    """A reason that does not depend on what moves along."""
+    return lambda _: Reason(because, given, otherwise)
+
+
+def _functional(problem: Problem, positions: Indices | int, values: Array | float) -> Array:
+    functional = np.zeros(len(problem.unknowns))
+    functional[positions] = values
+    return functional
+
+
+@dataclass(frozen=True)
+class FieldGeometry:
+    """What decides whether images tell the interior orientation from the exterior.
+
+    known: coordinates of object points that are known beforehand, and not just as a datum.
+    """
+
+    flat: bool
+    parallel: bool
+    known: str  # "points", "heights", "nothing"
+
+    @property
+    def because(self) -> str:
+        if self.flat:
+            axes = "the camera axes are parallel" if self.parallel else "too few images are tilted in other directions"
+            return f"the field is flat and {axes}"
+        known = {"points": "", "heights": ", and only heights are known", "nothing": ", and no object point is known"}
+        if self.parallel:
+            return f"the camera axes are parallel{known[self.known]}"
+        return "these stations and points do not tell them apart"
+
+    @property
+    def remedy(self) -> str:
+        """What tells a principal distance from the stations' distance in any field."""
+        relief = "points at other heights" if self.known == "points" else "known points (X, Y, Z) at different heights"
+        return f"add images tilted in different directions, or {relief}"
+
+
+def field_geometry(problem: Problem, state: State, camera: str) -> FieldGeometry:
+    """The field that the observed points make, and the axes of a camera's images."""
+    positions = np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
+    xyz = state.values[positions]
+    extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False) if len(xyz) > 2 else np.zeros(3)
+    axes = state.rotations[[image.camera == camera for image in problem.network.images], 2]
+    mean = axes.mean(axis=0)
+    off = np.linalg.norm(np.cross(axes, mean / (np.linalg.norm(mean) or 1.0)), axis=1)
+    given = problem.network.points
+    heights = sum(point.Z is not None and np.isfinite(point.Z.sigma) for point in given)
+    whole = sum(all(q is not None and np.isfinite(q.sigma) for q in (point.X, point.Y, point.Z)) for point in given)
+    known = "points" if whole >= FIELD else "heights" if heights >= FIELD else "nothing"
+    return FieldGeometry(bool(extents[-1] <= FLAT * extents[0]), bool(off.max() < PARALLEL_RAD), known)
