@@ -13,6 +13,7 @@ from scipy.special import chdtrc
 
 from measure.annotations.fields import Line
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
+from measure.geometry import linear_scale
 from measure.tone.estimate import FrameTone, MarkTone
 
 Mask = NDArray[np.bool_]
@@ -158,7 +159,7 @@ class FrameMeasurement:
     def px_per_mm(self) -> float | None:
         """The scale of pixel_from_camera, the mean of both directions; None without one."""
         matrix = self.pixel_from_camera
-        return None if matrix is None else float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+        return None if matrix is None else linear_scale(matrix)
 
     def marks_because(self, code: Code) -> tuple[MarkMeasurement, ...]:
         """Those of whose reason this is a code."""

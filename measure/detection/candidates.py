@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from measure.detection.correlation import WIDE, Map, Surroundings
 from measure.detection.scan_maps import Held, ScanMaps, Sought
-from measure.geometry import quarter_turned
+from measure.geometry import linear_scale, quarter_turned
 from measure.marks.rendering import extent_px, known_picture
 from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
 from measure.matching.window import FAINT
@@ -145,7 +145,7 @@ def respond_about(
 
 def detail_px(mark: Mark, linear: Array) -> float:
     """The width of the mark's finest detail in px, and no less than one."""
-    return max(float(np.sqrt(abs(np.linalg.det(linear)))) * thinnest_mm(mark), 1.0)
+    return max(linear_scale(linear) * thinnest_mm(mark), 1.0)
 
 
 def _reduction(scan: Scan, looks: Sequence[Look]) -> int:
@@ -153,7 +153,7 @@ def _reduction(scan: Scan, looks: Sequence[Look]) -> int:
     limits = []
     for look in looks:
         least, greatest = extent_px(look.mark, _centred(look.linear))
-        scale = float(np.sqrt(abs(np.linalg.det(look.linear))))
+        scale = linear_scale(look.linear)
         limits.append(min((greatest - least).max() / _EXTENT_PX, scale * thinnest_mm(look.mark) / _THINNEST_PX))
     needed = max(scan.width_px, scan.height_px) / _LARGEST_PX
     return min(max(1, int(min(limits)), int(np.ceil(needed))), scan.width_px, scan.height_px)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from measure.detection.correlation import WIDE
+from measure.geometry import linear_scale
 from measure.matching.window import FAINT
 from measure.scans.scan import Scan
 
@@ -47,7 +48,7 @@ def about(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm: float, re
     center = linear @ xy_mm + pixel_from_camera[:, 2]
     col0, row0 = (int(value) - reach for value in np.rint(center))
     grey = scan.window(col0, row0, 2 * reach + 1, 2 * reach + 1)
-    fine = cv2.GaussianBlur(grey, (0, 0), max(0.5 * pitch_mm * float(np.sqrt(abs(np.linalg.det(linear)))), 0.3))
+    fine = cv2.GaussianBlur(grey, (0, 0), max(0.5 * pitch_mm * linear_scale(linear), 0.3))
     col, row = np.tensordot(linear, np.stack(np.meshgrid(step, -step)), axes=1) + (center - (col0, row0)).reshape(
         2, 1, 1
     )

@@ -11,7 +11,7 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
-from measure.geometry import POSES, up_from_camera
+from measure.geometry import POSES, linear_scale, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
@@ -38,8 +38,8 @@ def clicked_frame(
     up_mm = clicked * pixel_mm * (1.0, -1.0)
     pose, up = _clicked_pose(camera, up_mm, POSES if options.pose == "auto" else (options.pose,))
     if pitch_um is None:  # then it is what the marks' separations say
-        pixel_mm = pixel_mm / float(np.sqrt(abs(np.linalg.det(up[:, :2]))))
-        up = up / np.sqrt(abs(np.linalg.det(up[:, :2])))
+        pixel_mm = pixel_mm / linear_scale(up)
+        up = up / linear_scale(up)
     matrix = np.diag([1.0, -1.0]) @ up / pixel_mm[:, None]
     pitch_mm = (float(pixel_mm[0]), float(pixel_mm[1]))
     polarities = (1, -1) if any(mark.mark.polarity == "auto" for mark in layout.marks) else (1,)

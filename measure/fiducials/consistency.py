@@ -12,7 +12,7 @@ from scipy.special import chdtrc, chdtri, fdtrc, logsumexp
 from measure.fiducials.doubts import TOLD, observed
 from measure.fiducials.options import MOST_BENT_MM, SCATTER_DEGREES
 from measure.flags import FALSE_DOUBT
-from measure.geometry import up_from_camera
+from measure.geometry import linear_scale, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
 from measure.results import FrameMeasurement
@@ -53,7 +53,7 @@ class Misfit:
         given = np.array([layout.marks[place].xy_mm for place in index])
         if np.linalg.matrix_rank(_affine(given)) < 3:
             return None
-        mm = float(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+        mm = float(1 / linear_scale(matrix))
         centers = np.array([mark.center_px for mark in marks])
         camera = (centers - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
         variances = [np.trace(mark.covariance_px2) / 2 for mark in marks if mark.covariance_px2 is not None]

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from measure.detection.candidates import Responses
 from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.response_layers import LEAST_TOLERANCE_PX, Layer, narrowed
-from measure.geometry import up_from_camera
+from measure.geometry import linear_scale, up_from_camera
 from measure.marks.shapes import LayoutMark, Mark
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ class Placement:
     def same_place(self, other: "Placement") -> bool:
         """Whether both put the frame at the same place and size, however its marks are named."""
         shift = np.hypot(*(self.pixel_from_camera[:, 2] - other.pixel_from_camera[:, 2]))
-        sizes = [np.sqrt(abs(np.linalg.det(each.pixel_from_camera[:, :2]))) for each in (self, other)]
+        sizes = [linear_scale(each.pixel_from_camera) for each in (self, other)]
         return bool(shift < _SAME_PX * self.reduction and abs(sizes[0] / sizes[1] - 1) < _SAME_SIZE)
 
     def places_px(self, camera_mm: Array) -> Array:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.geometry import linear_scale
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout, FrameCorner, LayoutMark
 from measure.matching.frame_edge import Course, edge_along, pool_edge_tones
@@ -29,7 +30,7 @@ def edge_tone_information(
 ) -> list[ToneInformation]:
     """None or one, of all pieces of edge that are seen as straight lines; pixel_from_camera (2, 3): of the frame."""
     linear = pixel_from_camera[:, :2]
-    px_per_mm = float(np.sqrt(abs(np.linalg.det(linear))))
+    px_per_mm = linear_scale(linear)
     told = []
     pieces = list(_pieces(layout))
     for start_mm, along_mm, inwards_mm, length_mm in pieces[:: max(len(pieces) // _PIECES, 1)]:

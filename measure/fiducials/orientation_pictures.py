@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from measure.detection.candidates import detail_px
-from measure.geometry import quarter_turned
+from measure.geometry import linear_scale, quarter_turned
 from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
 from measure.marks.shapes import Mark, MarkTemplate
 from measure.noise.robust_estimation import TukeyFit, robust_scale, tukey_fit
@@ -129,7 +129,7 @@ class Drawings:
         """scan_from_up (2, 2): px of the scan from mm right and up in the frame; blur_px: of the scan."""
         finest_px = min(detail_px(mark, scan_from_up) for mark in marks)
         self.reduction = max(1, int(finest_px / _FINEST_PX))
-        per_mm = float(np.sqrt(abs(np.linalg.det(scan_from_up)))) / self.reduction
+        per_mm = linear_scale(scan_from_up) / self.reduction
         grid_from_up = per_mm * _FLIP
         self.scan_from_grid = scan_from_up @ np.linalg.inv(grid_from_up)
         self._drawn = {mark: _drawn(mark, grid_from_up, blur_px / self.reduction) for mark in set(marks)}

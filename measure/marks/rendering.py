@@ -9,6 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
+from measure.geometry import linear_scale
 from measure.marks.coverage import CELLS, cell_coverage
 from measure.marks.frame_border import drawn_outline_mm, known_outline_mm
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Point
@@ -149,7 +150,7 @@ def _places_mm(pixel_from_mark: Array, width: int, height: int) -> Array:
 
 
 def _px_per_mm(pixel_from_mark: Array) -> float:
-    return float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
+    return linear_scale(pixel_from_mark)
 
 
 def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> NDArray[np.bool_]:
@@ -312,7 +313,7 @@ def _kernels(sigma: float, shift: float) -> Array:
 
 def _pixels_per_sample(mark: MarkTemplate, pixel_from_mark: Array) -> float:
     """How many pixels of the scan one pixel of the chip spans."""
-    scale = float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
+    scale = linear_scale(pixel_from_mark)
     return max(scale * mark.pitch_um / 1000, 1e-3)
 
 

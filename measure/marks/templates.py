@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.geometry import POSES, quarter_turned, up_from_camera
+from measure.geometry import POSES, linear_scale, quarter_turned, up_from_camera
 from measure.marks.shapes import MarkTemplate
 from measure.marks.shared_picture import NOISE_FLOOR, SharedPicture, adjusted, first_picture
 from measure.noise.robust_estimation import robust_scale
@@ -48,7 +48,7 @@ class Chip:
 
     @property
     def pitch_um(self) -> float:
-        return 1000.0 / float(np.sqrt(abs(np.linalg.det(self.pixel_from_mark[:, :2]))))
+        return 1000.0 / linear_scale(self.pixel_from_mark)
 
 
 def cut(scan: Scan, pixel_from_mark: Array, size_mm: float, weights: Sequence[float] | None = None) -> Chip:

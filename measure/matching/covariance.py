@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
 
+from measure.geometry import linear_scale
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
 from measure.marks.shared_picture import SMOOTHED_PX2
@@ -277,7 +278,7 @@ def _without_slope_noise(template: MarkTemplate, fit: MarkFit) -> Array:
     """(2, 2) what an error of the place is to be multiplied by: the squares of all slopes that the fit saw over those
     of the mark's."""
     linear, blur_px2 = fit.pixel_from_mark[:, :2], SMOOTHED_PX2 + fit.blur_px**2
-    px_per_sample = float(np.sqrt(abs(np.linalg.det(linear)))) * template.pitch_um / 1000
+    px_per_sample = linear_scale(linear) * template.pitch_um / 1000
     side = int(np.ceil(len(template.image) * px_per_sample))
     place = np.column_stack([linear, np.full(2, (side - 1) / 2)])
     shown = render(template, place, side, side, float(np.sqrt(blur_px2)))

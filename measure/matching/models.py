@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.flags import NO_REASON, Code, Reason
+from measure.geometry import linear_scale
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
 from measure.marks.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
 from measure.matching.options import Freedom, MatchOptions
@@ -364,5 +365,5 @@ def _planes(height: int, width: int) -> Array:
 
 def background_px(mark: Mark, pixel_from_mark: Array) -> float:
     """The standard deviation of a blur that leaves nothing of the mark's lines."""
-    scale = float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
+    scale = linear_scale(pixel_from_mark)
     return max(1.5 * scale * thinnest_mm(mark), 1.0) + 1.0

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.geometry import linear_scale
 from measure.scans.opening import open_scan
 from measure.scans.scan import Scan
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX
@@ -54,7 +55,7 @@ class TieFrame:
 
     @property
     def px_per_mm(self) -> float:
-        return float(np.sqrt(abs(np.linalg.det(self.pixel_from_camera[:, :2]))))
+        return linear_scale(self.pixel_from_camera)
 
     @property
     def mirrored(self) -> bool:
