@@ -52,9 +52,9 @@ from pipeline.files.camera_file import read_camera
 
 STAGES: dict[str, list[tuple[Any, str]]] = {
     "decoding tiles": [(TiffSegments, "read")],
-    "search: correlations": [(FrameSearch, "_about_middle")],
+    "search: correlations": [(FrameSearch, "_middle_responses")],
     "search: constellation": [(FrameSearch, "_placements")],
-    "first looks": [(measure.fiducials.mark_fit, "seen")],
+    "localisation": [(measure.fiducials.mark_fit, "localise")],
     "picture fits": [(measure.matching.match, "_fit_part")],
     "weights of grain": [(PictureFit, "weigh")],
     "other causes, second places, checks of a mark": [(measure.matching.match, "_result")],

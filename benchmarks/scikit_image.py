@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from drawn import scan_of
 from numpy.typing import NDArray
-from skimage.feature import blob_log, corner_subpix, peak_local_max
+from skimage.feature import blob_log, corner_subpix
 from skimage.filters import threshold_local
 from skimage.measure import EllipseModel, find_contours, label, ransac, regionprops
 from skimage.morphology import opening
@@ -29,7 +29,6 @@ from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from benchmarks.measured_marks import CONTRAST, GROUND, drawn, measured, start_off
 from measure.boards.corners import junction
-from measure.detection.response_layers import peaks
 from measure.fiducials.interior_orientation import outliers
 from measure.noise.damage import _opened
 from measure.targets.disk_detection import DiskSearch, disk_candidates
@@ -181,25 +180,6 @@ def morphology(count: int) -> str:
     return f"{end - middle:.2f} s, {same} of {len(masks)} masks the same | OpenCV {middle - start:.2f} s"
 
 
-def local_peaks(count: int) -> str:
-    """The hundred highest responses of maps of a reduced scan: how many are the same, and seconds for each."""
-    rng = np.random.default_rng(SEED)
-    maps = [
-        np.asarray(cv2.GaussianBlur(rng.standard_normal((1500, 1500)), (0, 0), 3), np.float32)
-        for _ in range(count // 6)
-    ]
-    start = time.process_time()
-    ours = [peaks(each, 100, 0.05)[0] for each in maps]
-    middle = time.process_time()
-    theirs = [peak_local_max(each, min_distance=3, threshold_abs=0.05, num_peaks=100)[:, ::-1] for each in maps]
-    end = time.process_time()
-    same = sum(
-        len({*map(tuple, a.astype(int).tolist())} & {*map(tuple, b.tolist())})
-        for a, b in zip(ours, theirs, strict=True)
-    )
-    return f"{end - middle:.2f} s, {same} of {100 * len(maps)} the same | OpenCV's dilation {middle - start:.2f} s"
-
-
 def film(count: int) -> str:
     """A film that is bent by a polynomial of the second order, known by eight marks to 3 um: the error all over it."""
     rng = np.random.default_rng(SEED)
@@ -237,7 +217,6 @@ METHODS: dict[str, Callable[[int], str]] = {
     "ransac": agreeing_marks,
     "corner_subpix": corners,
     "morphology": morphology,
-    "peak_local_max": local_peaks,
     "PolynomialTransform, PiecewiseAffineTransform": film,
 }
 

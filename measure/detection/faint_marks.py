@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.detection.candidates import detail_px
 from measure.detection.localisation import MarkPrediction
+from measure.detection.mark_views import detail_px
 from measure.flags import NO_REASON, Cause
 from measure.marks.rendering import extent_px, picture
 from measure.matching.window import FAINT, Coding

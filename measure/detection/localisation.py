@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import ndtr
 
-from measure.detection.candidates import detail_px
 from measure.detection.correlation import WIDE, Surroundings, correlation, variation
-from measure.detection.response_layers import highest
+from measure.detection.mark_views import detail_px
+from measure.detection.peaks import highest_about
 from measure.flags import NOISE_LIKE_A_MARK
 from measure.marks.rendering import extent_px, known_picture
 from measure.marks.shapes import Mark
@@ -114,7 +114,7 @@ class _PeakSearch:
         self._best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
         self._places = int(near.sum())
         # A fit that begins within a part of a pixel takes a step less.
-        top = highest(response, np.array([self._best[::-1]]), 0.0)[0][0]
+        top = highest_about(response, np.array([self._best[::-1]]), 0.0)[0][0]
         self.center_px: Array = (top + np.array([col0, row0]) - low) * reduction + shift_px
         self.height = float(response[self._best])
 

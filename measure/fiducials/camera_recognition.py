@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import comb
 
-from measure.detection.candidates import Effort
 from measure.detection.localisation import localise
+from measure.detection.responses import Effort
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import PitchHypothesis
@@ -22,7 +22,7 @@ from measure.results import MarkFit
 from measure.scans.scan import Scan
 
 _COMPARED = 3  # best placements: the one that chance makes least is among them
-_QUICK = Effort(held_bytes=48 << 20, half_px=16, twins=False)
+_QUICK = Effort(cache_bytes=48 << 20, half_px=16, all_orientations=False)
 _AT_LEAST = 3  # marks that are seen of a frame
 _LOOKS = 3  # at the best of these
 _PLACES = 2  # that are looked at, each in the poses that answer there
@@ -41,8 +41,8 @@ class Answer:
 def answer(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int = 0) -> Answer:
     """How the scan answers to the constellation under hypotheses about its pitch. tried: how many were before."""
     search, tried = FrameSearch(scan, layout, FiducialOptions(), effort=_QUICK), tried + len(hypotheses)
-    found = search.within(hypotheses)[:_COMPARED]
-    expected = [tried * search.expected_alike(placement) for placement in found]
+    found = search.search_room(hypotheses)[:_COMPARED]
+    expected = [tried * search.false_placements(placement) for placement in found]
     return Answer(min(expected, default=np.inf), tuple(found))
 
 

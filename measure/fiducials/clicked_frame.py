@@ -45,7 +45,7 @@ def clicked_frame(
     polarities = (1, -1) if any(mark.mark.polarity == "auto" for mark in layout.marks) else (1,)
     placements = [Placement(pose, matrix, 0.0, len(camera), polarity, 1, pitch_mm) for polarity in polarities]
     frames = [measure_frame(scan, layout, placement, options) for placement in placements]
-    frame = max(frames, key=lambda one: (one.measured, int(one.inliers.sum())))
+    frame = max(frames, key=lambda one: (one.measured_count, int(one.inliers.sum())))
     tells = options.pose != "auto" or not on_a_line(camera)
     evidence = _TOLD if tells else ("the marks that were pointed at lie on a line, which has two sides.",)
     return frame, Pose(pose, tells, evidence)

@@ -3,7 +3,7 @@
 Places are complex numbers here, x + iy in mm of the scan's own axes (right, up), so that a similarity is `a w + b`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from measure.detection.candidates import Responses
 from measure.detection.correlation import WIDE, Surroundings
-from measure.detection.response_layers import LEAST_TOLERANCE_PX, Layer, narrowed
+from measure.detection.responses import LEAST_TOLERANCE_PX, ResponseMap, Responses, narrow_tolerance_px
 from measure.geometry import linear_scale, up_from_camera
 from measure.marks.shapes import LayoutMark, Mark
 
@@ -25,11 +24,12 @@ _LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
 _PAIRS = 60  # of marks that hypotheses are made from
 _FAR = 0.4  # of the largest distance of two marks: nearer ones tell turn and scale badly
 _KEPT = 12  # placements of a pose that are refined
-_SLID = 3  # of them, in a lattice, that are moved by its steps
+_STEPPED = 3  # of them, in a lattice, that are moved by its steps
 _NEIGHBOURS = 4  # of a mark of a lattice
 _ALIKE = 0.5  # of the marks that a step takes to others: they are a lattice
 _SAME_PX = 10  # of the reduced scan: placements no farther apart put a mark on itself, which is some 14 px large there
 _SAME_SIZE = 0.01  # the same at the frame's edge, a thousand of these pixels off the middle
+_SAME = 0.1  # of the tolerance: orientations whose marks lie so near to one another's have the same placements
 _OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
 
 
@@ -120,29 +120,32 @@ def same_picture(
     return close and alike and polarities == [polarities[index] for index in nearest]
 
 
-def sign_of(mark: Mark, assumed: int) -> int:
+def mark_sign(mark: Mark, assumed: int) -> int:
     """+1 for a mark lighter than its surroundings, -1 for a darker one: as drawn, or else as assumed."""
     return {"light": 1, "dark": -1, "auto": assumed}[mark.polarity]
 
 
-def signs_of(marks: Sequence[LayoutMark]) -> set[int]:
+def possible_signs(marks: Sequence[LayoutMark]) -> set[int]:
     """Which signs the marks can have."""
-    return {sign_of(mark.mark, assumed) for mark in marks for assumed in (1, -1)}
+    return {mark_sign(mark.mark, assumed) for mark in marks for assumed in (1, -1)}
 
 
-def _different(found: Sequence[Placement], marks: Sequence[LayoutMark], tolerance_px: float) -> list[Placement]:
+def _different(found: Sequence[Placement], camera_mm: Array, tolerance_px: float) -> list[Placement]:
     kept: list[tuple[Placement, Array]] = []
-    xy = np.array([mark.xy_mm for mark in marks])
     for placement in found:
-        places = xy @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
+        places = placement.places_px(camera_mm)
         if all(np.hypot(*(places - other).T).max() > 2 * tolerance_px for _, other in kept):
             kept.append((placement, places))
     return [placement for placement, _ in kept]
 
 
 class PlacementSearch:
-    """The search for placements, in one pose after another, of a frame that bounds are known of. layers: of the
-    responses, by kind and sign."""
+    """The search for placements of a frame under one pitch, in one scan orientation after another.
+
+    kinds: by orientation, the kind of template of every mark; placements: by orientation, those of one that shows the
+    same marks in the same places as another only if all_orientations says so; distinct: orientations whose marks do not
+    lie within the tolerance of those of one before.
+    """
 
     def __init__(
         self,
@@ -150,17 +153,44 @@ class PlacementSearch:
         responses: Responses,
         pitch_mm: tuple[float, float],
         bounds: Bounds,
-        layers: Mapping[tuple[int, int], Layer],
+        all_orientations: bool = True,
     ) -> None:
-        self.marks, self.responses, self.bounds = marks, responses, bounds
+        self.marks, self.responses, self.bounds, self.all_orientations = marks, responses, bounds, all_orientations
+        self.camera_mm = np.array([mark.xy_mm for mark in marks])
         self.pitch = np.asarray(pitch_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
-        self.layers = layers
+        self.kinds: dict[str, tuple[int, ...]] = {}
+        self.placements: dict[str, list[Placement]] = {}
+        self.distinct: list[str] = []
+
+    def search_pose(self, pose: str, kinds: tuple[int, ...]) -> None:
+        """Search in an orientation; if it shows the same as another, it has the placements of that."""
+        misfit_mm = self.bounds.misfit_mm
+        same, similar = (
+            next((each for each in self.kinds if self._same_picture(each, pose, kinds, within_mm)), "")
+            for within_mm in (_SAME * misfit_mm, misfit_mm)
+        )
+        if same:
+            known = self.placements[same] if self.all_orientations else []
+            self.placements[pose] = [placement.posed(pose, self.camera_mm) for placement in known]
+        else:
+            self.placements[pose] = self.find_placements(pose, kinds)
+        self.kinds[pose] = kinds
+        if not similar:
+            self.distinct.append(pose)
+
+    def _same_picture(self, known: str, pose: str, kinds: tuple[int, ...], within_mm: float) -> bool:
+        return same_picture(self.marks, (known, self.kinds[known]), (pose, kinds), within_mm)
+
+    def response_map(self, placement: Placement, index: int) -> ResponseMap:
+        """The responses to a mark, by index, as a placement shows it."""
+        sign = mark_sign(self.marks[index].mark, placement.polarity)
+        return self.responses.by_key[self.kinds[placement.pose][index], sign]
 
     @cached_property
     def steps_mm(self) -> Array:
         """(n, 2) the steps from the middle mark to the nearest ones that take most marks to others."""
-        places = np.array([mark.xy_mm for mark in self.marks])
+        places = self.camera_mm
         tree = cKDTree(places)
         order = np.argsort(np.hypot(*(places - places.mean(axis=0)).T), kind="stable")
         middle = places[order[0]]
@@ -169,28 +199,26 @@ class PlacementSearch:
         onto = [np.mean(tree.query(places + step)[0] < self.bounds.misfit_mm) for step in steps]
         return np.asarray(steps[np.array(onto) > _ALIKE])
 
-    def of_pose(self, pose: str, look_of_mark: Sequence[int]) -> list[Placement]:
-        """The best placements of a pose that differ from one another, best first; none where no two marks respond.
-
-        look_of_mark: of the responses' kinds, that of each mark in this pose.
-        """
+    def find_placements(self, pose: str, kinds: Sequence[int]) -> list[Placement]:
+        """The best placements of an orientation that differ from one another, best first; none where no two marks
+        respond. kinds: of each mark's template in this orientation."""
         unsaid = any(mark.mark.polarity == "auto" for mark in self.marks)
         found: list[Placement] = []
         for polarity in (1, -1) if unsaid else (1,):
-            signs = [sign_of(mark.mark, polarity) for mark in self.marks]
-            layers = [self.layers[key] for key in zip(look_of_mark, signs, strict=True)]
-            found += _Constellation(self, pose, layers).placements(polarity)
+            signs = [mark_sign(mark.mark, polarity) for mark in self.marks]
+            maps = [self.responses.by_key[key] for key in zip(kinds, signs, strict=True)]
+            found += _Constellation(self, pose, maps).placements(polarity)
         found.sort(key=lambda placement: -placement.score)
-        return _different(found, self.marks, self.bounds.misfit_mm / float(self.pitch[0]))
+        return _different(found, self.camera_mm, self.bounds.misfit_mm / float(self.pitch[0]))
 
 
 class _Constellation:
-    """The marks as one pose names them, each with the layer that answers to it."""
+    """The marks as one pose names them, each with the map of its responses."""
 
-    def __init__(self, search: PlacementSearch, pose: str, layers: Sequence[Layer]) -> None:
-        self.search, self.pose, self.layers = search, pose, layers
+    def __init__(self, search: PlacementSearch, pose: str, maps: Sequence[ResponseMap]) -> None:
+        self.search, self.pose, self.maps = search, pose, maps
         self.responses, self.bounds, self.pitch = search.responses, search.bounds, search.pitch
-        turned = np.array([mark.xy_mm for mark in search.marks]) @ up_from_camera(pose).T
+        turned = search.camera_mm @ up_from_camera(pose).T
         self.camera: Complex = turned[:, 0] + 1j * turned[:, 1]
 
     def placements(self, polarity: int) -> list[Placement]:
@@ -199,10 +227,10 @@ class _Constellation:
             return []
         scores, _ = self._scores(self.search.tolerance_px, scale, offset)
         kept = np.argsort(-scores, kind="stable")[:_KEPT]
-        slid = self._slid(scale[kept[:_SLID]], offset[kept[:_SLID]])
-        starts = (np.concatenate(each) for each in zip((scale[kept], offset[kept]), slid, strict=True))
+        stepped = self._step_along_lattice(scale[kept[:_STEPPED]], offset[kept[:_STEPPED]])
+        starts = (np.concatenate(each) for each in zip((scale[kept], offset[kept]), stepped, strict=True))
         scale, offset = self._refined(*starts)
-        scores, supported = self._scores(narrowed(self.search.tolerance_px), scale, offset)
+        scores, supported = self._scores(narrow_tolerance_px(self.search.tolerance_px), scale, offset)
         return [
             Placement(
                 self.pose,
@@ -219,7 +247,7 @@ class _Constellation:
             )
         ]
 
-    def _slid(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
+    def _step_along_lattice(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
         """Of a lattice too large for all its marks to be candidates the best hypothesis may be many steps off: these,
         moved step by step as long as more marks answer. None where the marks are no lattice."""
         turned = self.search.steps_mm @ up_from_camera(self.pose).T
@@ -243,13 +271,11 @@ class _Constellation:
 
     def _hypotheses(self) -> tuple[Complex, Complex]:
         """Every similarity within bounds that takes two marks to two of their candidates."""
-        candidates = {
-            layer: self._complex(self.responses.scan_px(layer.candidates)) for layer in dict.fromkeys(self.layers)
-        }
+        candidates = {each: self._complex(self.responses.scan_px(each.candidates)) for each in dict.fromkeys(self.maps)}
         scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
         upright = np.cos(self.bounds.rotation_rad)
         for first, second in self._pairs():
-            of_first, of_second = candidates[self.layers[first]], candidates[self.layers[second]]
+            of_first, of_second = candidates[self.maps[first]], candidates[self.maps[second]]
             base = self.camera[second] - self.camera[first]
             scale = (of_second[None, :] - of_first[:, None]) / base
             size = np.abs(scale)
@@ -271,7 +297,7 @@ class _Constellation:
         """Scores and numbers of supporting marks, which answer within the radius, of many placements at once."""
         places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
         nearest = np.rint(places).astype(int)
-        answers = [layer.within(radius_px).strength(nearest[:, k]) for k, layer in enumerate(self.layers)]
+        answers = [each.dilated(radius_px).strength(nearest[:, k]) for k, each in enumerate(self.maps)]
         strength, inside = (np.stack(each, axis=1) for each in zip(*answers, strict=True))
         score = strength.sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
         return score, (strength > 0).sum(axis=1)
@@ -281,9 +307,9 @@ class _Constellation:
         widest = self.search.tolerance_px
         scale, offset = scale.copy(), offset.copy()
         moving = np.ones(len(scale), dtype=bool)
-        for tolerance_px in (widest, narrowed(widest)):
+        for tolerance_px in (widest, narrow_tolerance_px(widest)):
             predicted = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
-            found = [layer.highest(predicted[:, k], tolerance_px) for k, layer in enumerate(self.layers)]
+            found = [each.highest_about(predicted[:, k], tolerance_px) for k, each in enumerate(self.maps)]
             tops, heights = (np.stack(each, axis=1) for each in zip(*found, strict=True))
             weight = np.maximum(heights - _LEAST_WEIGHED, 0.0)
             moving &= (weight > 0).sum(axis=1) >= 2

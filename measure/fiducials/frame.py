@@ -1,6 +1,6 @@
 """One frame of a scan as a value: its marks as detected, those that agree, and the interior orientation by these."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from measure.detection.localisation import MarkPrediction
-from measure.fiducials.constellation import NARROW, Placement, sign_of
+from measure.fiducials.constellation import NARROW, Placement, mark_sign
 from measure.fiducials.interior_orientation import fit_frame, outliers
 from measure.fiducials.mark_fit import Detection
 from measure.fiducials.options import CLICK_SIGMA_PX, SCATTER_MM, FiducialOptions
@@ -132,7 +132,7 @@ class Frame:
             if click.point == mark.id:
                 place, search_px = np.array([click.col_px, click.row_px]), min(search_px, _CLICK_REACH_PX)
         start = np.column_stack([self.pixel_from_camera[:, :2], place])
-        sign = sign_of(mark.mark, self.placement.polarity)
+        sign = mark_sign(mark.mark, self.placement.polarity)
         return MarkPrediction(mark.mark, start, search_px, sign, self.weights, self.placement.surroundings)
 
     def is_clear(self, index: int) -> bool:
@@ -172,6 +172,11 @@ class Frame:
         """The fits of the inliers."""
         return [s.fit if ok else None for s, ok in zip(self.detections, self.inliers, strict=True)]
 
+    def centers_px(self, indices: Iterable[int]) -> dict[int, Array]:
+        """The places of inliers among some marks, by index."""
+        fits = {int(index): self.fits[index] for index in indices}
+        return {index: fit.center_px for index, fit in fits.items() if fit}
+
     @property
     def fitted_placement(self) -> Placement:
         """Where the inliers put the frame."""
@@ -210,7 +215,7 @@ class Frame:
         return [index for index in np.flatnonzero(near).tolist() if self.verdict(index)[0] is Status.MEASURED]
 
     @property
-    def measured(self) -> int:
+    def measured_count(self) -> int:
         """How many marks are measured without blemish."""
         return len(self.unblemished)
 
@@ -218,7 +223,7 @@ class Frame:
     def is_sure(self) -> bool:
         """Whether it is accepted, as many marks being measured as have to agree: a frame that is seen elsewhere than it
         lies has hardly any."""
-        return self.accepted and self.measured >= self._least
+        return self.accepted and self.measured_count >= self._least
 
     @property
     def is_whole(self) -> bool:
@@ -239,7 +244,7 @@ class Frame:
     def _least(self) -> int:
         return 2 if self.options.part else max(min(_AGREEING, len(self.detections)), 2)
 
-    def has_all_of(self, other: "Frame") -> bool:
+    def contains(self, other: "Frame") -> bool:
         """Whether the marks of the other frame are some of this one's, under other names: a frame moved on by the
         distance of two marks has its marks where this one has others."""
         own, others = ([fit.center_px for fit in frame.fits if fit] for frame in (self, other))

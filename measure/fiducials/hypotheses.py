@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.fiducials.options import FiducialOptions
-from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 
 _STRETCHES = (-0.015, 0.015, -0.03, 0.03)  # an office scanner's carriage may run by per cents too fast
@@ -19,11 +19,8 @@ Array = NDArray[np.float64]
 
 _LARGE_PX = 1 << 24  # a smaller scan is read whole in no time
 _REACH = 0.025  # of the frame's side: laid by hand it is off by some millimetres and a degree
-_BESIDE = 0.05  # of the frame's side: farther off a search of the whole scan finds it
-_TURNED_DEG = 1.0
 _LARGEST_SHARE = 0.25  # of the scan: where windows hold more, the whole of it tells more
 _BEYOND_MM = 3.0  # the scan's edge: a frame may be cut off there by less than its rim
-_CORNERS = 4  # a mark toward each of them
 _FINE = 0.05  # of how near steps are alike
 _ALIKE = 0.5  # of the marks: a lattice of which more fall on others one step aside could be one step off
 
@@ -89,23 +86,13 @@ def reach_mm(layout: FiducialLayout) -> float:
     return _REACH * max(layout.frame_mm)
 
 
-def beside_mm(layout: FiducialLayout) -> float:
-    """How far from its place in a centred frame a single mark is looked for, in scans that are dear to read."""
-    return _BESIDE * max(layout.frame_mm)
-
-
-def turned_mm(layout: FiducialLayout) -> float:
-    """How far a turn moves a mark from where another one of the frame puts it."""
-    return float(np.deg2rad(_TURNED_DEG)) * max(layout.frame_mm)
-
-
 def room_mm(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> float:
     """How far from the middle of the scan that of a frame may lie which is whole in it."""
     scan_mm = scan.width_px * pitch_mm[0], scan.height_px * pitch_mm[1]
     return max((max(scan_mm) - min(layout.frame_mm)) / 2, 0.0) + _BEYOND_MM
 
 
-def is_worth_a_look(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> bool:
+def is_searched_by_windows(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> bool:
     """Whether windows about the marks are a small part of a large scan, and would not mistake one mark for the next."""
     side_px = 2 * reach_mm(layout) / np.asarray(pitch_mm)
     size_px = scan.width_px * scan.height_px
@@ -123,14 +110,6 @@ def is_lattice(layout: FiducialLayout) -> bool:
     places = _FINE * near * np.stack([fine.real, fine.imag], axis=1)
     alike = [times[others].sum() for others in cKDTree(places).query_ball_point(places, near)] if len(places) else []
     return max(alike, default=0) > _ALIKE * len(xy)
-
-
-def outermost(marks: Sequence[LayoutMark]) -> tuple[LayoutMark, ...]:
-    """The four marks toward the corners, which say where a frame lies: the others are then looked for where these put
-    them. All marks where the constellation has no such four."""
-    diagonal = np.array([mark.xy_mm for mark in marks]) @ [(1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0)]
-    outer = np.unique(diagonal.argmax(axis=0))
-    return tuple(marks[index] for index in outer) if len(outer) == _CORNERS else tuple(marks)
 
 
 def centred_places_px(scan: Scan, layout: FiducialLayout, pixel_from_camera: Array) -> Array:

@@ -18,7 +18,7 @@ from measure.fiducials.options import FiducialOptions
 from measure.fiducials.rows import absent_frame, lost_frame, present_frame
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch
-from measure.fiducials.significance import doubt
+from measure.fiducials.significance import doubt_frame
 from measure.fiducials.stages import find_frame, likeliest_pose
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason, Status
 from measure.geometry import up_from_camera
@@ -92,9 +92,9 @@ def _searched(
         frame, pose = _rename(search, frame, pose)
     else:
         against = _against_the_set_pose(search, frame, lines or ())
-    chance = doubt(search, frame)
+    chance = doubt_frame(search, frame)
     problems = [each.reword(f"{each}.") for each in (*_rivals(search, found, frame), chance, against) if each]
-    doubts = problems if frame.measured else [_UNSURE, *problems]
+    doubts = problems if frame.measured_count else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
     return replace(present_frame(scan, layout, frame, pose, pitch_um, problems, chance), writing=lines)
@@ -138,7 +138,7 @@ def _read(
 def _against_the_set_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line]) -> Reason:
     """A sentence where what is seen decides for another pose than the one that the project sets."""
     likeliest = likeliest_pose(search, frame, lines)
-    if likeliest.name == frame.placement.pose or not frame.measured:
+    if likeliest.name == frame.placement.pose or not frame.measured_count:
         return NO_REASON
     own = frame.fitted_placement
     both = [own, own.posed(likeliest.name, frame.camera_mm)]
@@ -182,9 +182,9 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
 
 def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bool:
     """Whether a placement shows another frame, of as many marks: of two photographs in a scan one may answer better."""
-    if other.supported < frame.placement.supported or not search.was_everywhere(other):
+    if other.supported < frame.placement.supported or not search.is_exhaustive(other):
         return False
-    if search.expected_alike(other) > FRAMES_BY_CHANCE:
+    if search.false_placements(other) > FRAMES_BY_CHANCE:
         return False
     seen = measure_frame(search.scan, search.layout, other, search.options)
-    return seen.is_sure and not frame.has_all_of(seen)
+    return seen.is_sure and not frame.contains(seen)

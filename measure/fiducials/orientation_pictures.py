@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.detection.candidates import detail_px
+from measure.detection.mark_views import detail_px
 from measure.geometry import linear_scale, quarter_turned
 from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
 from measure.marks.shapes import Mark, MarkTemplate

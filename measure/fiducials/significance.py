@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 _SELDOM, _HOPELESS = 1e-3, 1e6  # expected frames: fewer are no question, and of more nothing becomes a frame
 _COUNTED = 3  # marks that at least are no chance
 _PLACES = 64  # that are looked at beside the marks: enough to tell three marks of four from chance
-_BESIDE = (2.5, 4.5)  # search radii off: beyond what the mark itself answers
+_OFFSETS = (2.5, 4.5)  # search radii off: beyond what the mark itself answers
 _FREE = 2  # marks that a similarity goes through wherever they lie
 _SURE = 12  # marks that agree: no speck feigns so many
 _FITTED_PX = 3.0  # the fitted place is no farther from the one that answers
@@ -30,7 +30,7 @@ _REDUCED_PX = 1.5  # of the reduced scan: so near to where it answers there a ma
 _APART = 2.0  # search radii off: beyond what a mark itself answers
 
 
-def doubt(search: FrameSearch, frame: Frame) -> Reason:
+def doubt_frame(search: FrameSearch, frame: Frame) -> Reason:
     """A sentence where chance may have made the frame, with the code no-frame where it is likelier to than not; empty
     where it is unlikely to. One that was found at a closer look is taken only where chance hardly makes it, though none
     of its marks may be clear."""
@@ -47,31 +47,25 @@ def doubt(search: FrameSearch, frame: Frame) -> Reason:
     if frame.inliers.sum() >= _SURE:
         return NO_REASON
     if len(clear) == len(inside):
-        return _by_the_scan(search, frame, clear)
-    return _by_places_beside(search, frame, inside, clear)
+        return _doubt_by_scan(search, frame, clear)
+    return _doubt_by_neighbourhood(search, frame, inside, clear)
 
 
-def expected_as_good(search: FrameSearch, frame: Frame) -> float:
-    """How many frames as good chance would make in the scan, only marks without blemish counting as seen."""
-    seen = {index: frame.fits[index] for index in frame.unblemished}
-    return expected_where_seen(search, frame, {index: fit.center_px for index, fit in seen.items() if fit})
-
-
-def expected_where_seen(search: FrameSearch, frame: Frame, seen_px: dict[int, Array]) -> float:
-    """The same with the marks that count as seen, by index, and where. Chance finds places that answer as strongly at
-    reduced size; few of them look so in the scan itself."""
-    expected = search.expected_where_seen(frame.placement, frame.inside, seen_px)
+def false_frames(search: FrameSearch, frame: Frame, found_px: dict[int, Array]) -> float:
+    """The expected number of false frames as good in the scan; found_px: of the marks that count, by index. Places that
+    answer as strongly at reduced size are many; few of them look so in the scan itself."""
+    expected = search.false_frames(frame.placement, frame.inside, found_px)
     if frame.placement.reduction == 1 or not _SELDOM < expected < _HOPELESS:
         return expected
-    return expected * _as_good_in_full(search, frame, seen_px) ** min(_COUNTED, len(seen_px))
+    return expected * _share_at_full_resolution(search, frame, found_px) ** min(_COUNTED, len(found_px))
 
 
-def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> Reason:
+def _doubt_by_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> Reason:
     """Where every mark was found: whether the scan has many places that answer as strongly. A frame that was looked for
     in the middle of its scan is not doubted: the windows about its marks tell of no other places."""
-    if len(clear) <= _FREE or not search.was_everywhere(frame.placement):
+    if len(clear) <= _FREE or not search.is_exhaustive(frame.placement):
         return NO_REASON
-    expected = expected_where_seen(search, frame, clear)
+    expected = false_frames(search, frame, clear)
     if expected <= FRAME_BY_CHANCE:
         return NO_REASON
     return Reason(
@@ -81,28 +75,30 @@ def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> 
     )
 
 
-def _as_good_in_full(search: FrameSearch, frame: Frame, seen_px: dict[int, Array]) -> float:
+def _share_at_full_resolution(search: FrameSearch, frame: Frame, found_px: dict[int, Array]) -> float:
     """Of the places that answer as strongly as the marks at reduced size, the share that does so in the scan itself."""
     marks_px, apart_px = (
-        np.array([*seen_px.values()]),
+        np.array([*found_px.values()]),
         _APART * first_search_px(frame.placement, search.layout, search.options),
     )
     others = [
         (index, place)
-        for index, seen in seen_px.items()
-        for place in search.places_as_good(frame.placement, index, seen)[: _PLACES // len(seen_px)]
+        for index, own in found_px.items()
+        for place in search.places_as_good(frame.placement, index, own)[: _PLACES // len(found_px)]
         if np.hypot(*(marks_px - place).T).min() > apart_px
     ]
-    weakest = min(_response(search, frame, index, place, _FITTED_PX) for index, place in seen_px.items())
+    weakest = min(_response(search, frame, index, place, _FITTED_PX) for index, place in found_px.items())
     radius = _REDUCED_PX * frame.placement.reduction
     hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in others)
     return _share(hits, len(others))
 
 
-def _by_places_beside(search: FrameSearch, frame: Frame, inside: Sequence[int], clear: dict[int, Array]) -> Reason:
+def _doubt_by_neighbourhood(
+    search: FrameSearch, frame: Frame, inside: Sequence[int], clear: dict[int, Array]
+) -> Reason:
     """Where some marks were not found: whether places beside them look as much like marks as those that were."""
     found, radius = len(clear), first_search_px(frame.placement, search.layout, search.options)
-    places = _beside(search.scan, frame, inside, radius)
+    places = _neighbouring_places(search.scan, frame, inside, radius)
     weakest = min((_response(search, frame, index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
     hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in places)
     chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, len(places))))
@@ -125,14 +121,14 @@ def _share(hits: int, places: int) -> float:
     return (hits + 1) / (places + 2)
 
 
-def _beside(scan: Scan, frame: Frame, inside: Sequence[int], radius_px: float) -> list[tuple[int, Array]]:
+def _neighbouring_places(scan: Scan, frame: Frame, inside: Sequence[int], radius_px: float) -> list[tuple[int, Array]]:
     """Places about the marks in the scan, in eight directions, each with the mark that is sought there."""
     angles = np.arange(8) * np.pi / 4
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     size = np.array([scan.width_px, scan.height_px])
     every = [
         (index, np.asarray(frame.pixel_from_camera @ (*frame.camera_mm[index], 1.0) + off * radius_px * direction))
-        for off in _BESIDE
+        for off in _OFFSETS
         for direction in directions
         for index in inside
     ]

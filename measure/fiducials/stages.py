@@ -1,7 +1,7 @@
 """The search for a frame as a list of attempts: where, under which pitches, and what beside a mark counts.
 
-One loop tries them in their order, as far as what was found before does not settle it; one limit judges what they find:
-the number of frames that chance would make in all attempts so far, or in those under the given pitch, which is likelier
+One loop makes them in their order, as far as what was found before does not settle it; one limit decides on what they
+find: the expected number of false frames in all attempts so far, or in those under the given pitch, which is likelier
 than all others together.
 """
 
@@ -9,28 +9,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.annotations.fields import Line
 from measure.detection.correlation import CLOSE, GRAINY
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.hypotheses import Hypotheses, is_worth_a_look, outermost, slightly_longer
+from measure.fiducials.hypotheses import Hypotheses, is_searched_by_windows, slightly_longer
 from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch
-from measure.fiducials.significance import doubt, expected_as_good, expected_where_seen
+from measure.fiducials.significance import doubt_frame, false_frames
 from measure.flags import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.results import Pose
-from measure.scans.remote import Address
 from measure.scans.scan import Scan
 
-Array = NDArray[np.float64]
-
-Seen = tuple[list[Placement], list[tuple[float, Frame]]]
+# Placements, best first, and frames, those first that are to be preferred, each with its expected number of false ones.
+Result = tuple[list[Placement], list[tuple[float, Frame]]]
 
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
@@ -38,10 +35,10 @@ _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What the attempts have found so far. search, placements: of the attempt that found the frame, the latter best
-    first. is_taken: whether chance hardly made it. unsure: frames that chance may have made under so many other
-    pitches, and that would be taken if theirs were given; faint: the likeliest that would not be taken even so, and how
-    many such frames chance would make. misfit: why there is none."""
+    """The result of the attempts so far. search, placements: of the attempt that found the frame, the latter best
+    first. is_taken: whether it is hardly a false one. unsure: frames found only under another pixel pitch, possible
+    false alarms, accepted if the user gives that pitch. faint: the best rejected frame and its expected number of false
+    alarms. misfit: why there is none."""
 
     search: FrameSearch
     placements: Sequence[Placement] = ()
@@ -57,21 +54,21 @@ class Found:
 
     @property
     def is_undoubted(self) -> bool:
-        return self.is_taken and self.frame is not None and not doubt(self.search, self.frame)
+        return self.is_taken and self.frame is not None and not doubt_frame(self.search, self.frame)
 
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One way of looking for a frame.
+    """One way to search a frame.
 
-    look: gives placements, best first, and the frames in some of them, those first that are to be preferred, each with
-    how many as good chance would make in so many hypotheses. is_settled: by what was found before. is_given: under what
-    is believed of the scan beforehand: what is found there takes the place of what was found before, taken or not.
+    find: the result by so many hypotheses in all. is_settled: by what was found before. is_given: under what is
+    believed of the scan beforehand: what is found there takes the place of what was found before, taken or not.
+    at_given: under the given pitch.
     """
 
     search: FrameSearch
     hypotheses: Hypotheses
-    look: Callable[[FrameSearch, Hypotheses, int], Seen]
+    find: Callable[[FrameSearch, Hypotheses, int], Result]
     is_settled: Callable[[Found], bool]
     is_given: bool = False
     at_given: bool = False
@@ -80,8 +77,13 @@ class Attempt:
 def find_frame(
     scan: Scan, layout: FiducialLayout, hypotheses: Sequence[Hypotheses], is_given: bool, options: FiducialOptions
 ) -> Found:
-    """The frame of a scan. hypotheses: about its pitch, the likelier groups first; is_given: whether the first is that
-    which the user or the file gives."""
+    """Find the frame of a scan.
+
+    Parameters
+    ----------
+    hypotheses : about its pitch, the likelier groups first.
+    is_given : whether the first is that which the user or the file gives.
+    """
     found, every, at_given = Found(FrameSearch(scan, layout, options)), 0, 0
     for attempt in _attempts(found.search, hypotheses, is_given):
         if attempt.is_settled(found):
@@ -89,7 +91,7 @@ def find_frame(
         every += len(attempt.hypotheses)
         at_given += len(attempt.hypotheses) if attempt.is_given or attempt.at_given else 0
         tried = at_given if attempt.at_given else every
-        placements, frames = attempt.look(attempt.search, attempt.hypotheses, tried)
+        placements, frames = attempt.find(attempt.search, attempt.hypotheses, tried)
         expected, frame = frames[0] if frames else (np.inf, None)
         if expected <= FRAMES_BY_CHANCE:
             found = replace(found, search=attempt.search, placements=placements, frame=frame, is_taken=True)
@@ -98,40 +100,35 @@ def find_frame(
             found = replace(found, placements=placements, frame=frame, is_taken=False, misfit=misfit)
         else:
             likely = [each for each in frames if _is_taken_if_given(each, attempt, at_given / tried)]
+            rejected = [each for each in (found.faint, *frames) if each and each not in likely]
             unsure = (*found.unsure, *(frame for _, frame in likely))
-            faint = min(
-                (each for each in (found.faint, *frames) if each and each not in likely), key=_expected, default=None
-            )
-            found = replace(found, unsure=unsure, faint=faint)
+            found = replace(found, unsure=unsure, faint=min(rejected, key=_expected, default=None))
     if found.is_taken:
         return found
     what_to_do = _pitch_to_try(found.unsure) or _too_faint(found.faint)
     return replace(found, frame=None, misfit=found.misfit + what_to_do)
 
 
-def _is_taken_if_given(seen: tuple[float, Frame], attempt: Attempt, at_given: float) -> bool:
+def _is_taken_if_given(result: tuple[float, Frame], attempt: Attempt, at_given: float) -> bool:
     """Whether a frame under another pitch would be taken if that were given; at_given: the share of the hypotheses that
     are under the given one."""
-    return not attempt.at_given and (seen[1].accepted or seen[0] * at_given <= FRAMES_BY_CHANCE)
+    return not attempt.at_given and (result[1].accepted or result[0] * at_given <= FRAMES_BY_CHANCE)
 
 
 def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: bool) -> list[Attempt]:
-    """In the middle of the scan where the pitch is given, of one that is fetched also beside it, then anywhere; where
-    what is found may be chance, under other pitches; where nothing is, at a closer look: less of what lies beside a
-    mark counts there, for the frame's edge may drown it else, and then less of what grain hides."""
+    """In the middle of a large scan where the pitch is given, then anywhere; where what is found may be a false alarm,
+    under other pitches; where nothing is, at a closer look: less of what lies beside a mark counts there, for the
+    frame's edge may drown it else, and then less of what grain hides."""
     given, *others = hypotheses
     closer = [FrameSearch(wide.scan, wide.layout, wide.options, surroundings) for surroundings in (CLOSE, GRAINY)]
     near, nearly = slightly_longer(given[0], _STRETCH) if is_given else ([], given)
-    is_whole = not wide.options.part
-    is_fetched = isinstance(wide.scan.path, Address)
-    is_centred = is_whole and is_given and is_worth_a_look(wide.scan, wide.layout, given[0].mm)
+    in_windows = is_given and not wide.options.part and is_searched_by_windows(wide.scan, wide.layout, given[0].mm)
     return [
-        *([Attempt(wide, given, _in_the_middle, lambda _: False, True)] if is_centred else []),
-        *([Attempt(wide, given, _beside_it, lambda found: found.is_taken, True)] if is_centred and is_fetched else []),
-        Attempt(wide, given, _anywhere, lambda found: found.is_complete, True),
-        *(Attempt(wide, group, _in_spite_of_pitch, lambda found: found.is_undoubted) for group in others),
+        *([Attempt(wide, given, _search_middle, lambda _: False, True)] if in_windows else []),
+        Attempt(wide, given, _search_scan, lambda found: found.is_complete, True),
+        *(Attempt(wide, group, _search_other_pitch, lambda found: found.is_undoubted) for group in others),
         *(
-            Attempt(close, group, _at_a_closer_look, lambda found: found.is_taken, at_given=group is near)
+            Attempt(close, group, _search_closer, lambda found: found.is_taken, at_given=group is near)
             for close in closer
             for group in (near, nearly)
             if group
@@ -139,64 +136,52 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
     ]
 
 
-def _in_the_middle(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Seen:
+def _search_middle(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Result:
     """The frame in the middle of a large scan, in the best of the placements there."""
-    return _best_measured(search, _of_few(search).in_the_middle(hypotheses[0]))
+    found = search.search_middle(hypotheses[0])
+    return found, _result(measure_frame(search.scan, search.layout, found[0], search.options) if found else None)
 
 
-def _beside_it(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Seen:
-    """The same of a frame that lies off the middle, where that takes less of the file than all of it."""
-    return _best_measured(search, _of_few(search).beside_the_middle(hypotheses[0]))
-
-
-def _of_few(search: FrameSearch) -> FrameSearch:
-    few = replace(search.layout, marks=outermost(search.layout.marks))
-    return FrameSearch(search.scan, few, search.options)
-
-
-def _best_measured(search: FrameSearch, found: list[Placement]) -> Seen:
-    return found, _believed(measure_frame(search.scan, search.layout, found[0], search.options) if found else None)
-
-
-def _anywhere(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Seen:
+def _search_scan(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Result:
     """The frame in the whole scan: in the first of the best placements that is sure and not outdone, or else the sure
     one of most measured marks, or else the first accepted, or else that of most marks; none where nothing looks like
     the marks."""
-    found = search.anywhere(hypotheses)
-    return found, _believed(best_of(search, found))
+    found = search.search_scan(hypotheses)
+    return found, _result(best_frame(search, found))
 
 
-def _believed(frame: Frame | None) -> list[tuple[float, Frame]]:
+def _result(frame: Frame | None) -> list[tuple[float, Frame]]:
     """Where what is known of the scan puts it, a frame that is accepted is believed."""
     return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
 
 
-def best_of(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
+def best_frame(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
     """The frame in the best of these placements, as above. A frame is no other one where all its marks are among those
     of an accepted one that was tried before it."""
     if not found:
         return None
-    placements, frames = [found[0], *_others(found)], list[Frame]()
+    placements, frames = [found[0], *_rivals(found)], list[Frame]()
     for placement in placements:
-        frame = _as_its_pictures_say(search, placement)
-        if any(before.accepted and before.has_all_of(frame) for before in frames):
+        frame = _measure_in_its_pose(search, placement)
+        if any(before.accepted and before.contains(frame) for before in frames):
             continue
         if frame.is_sure and not _is_outdone(search, frame, placements):
             return frame
         frames.append(frame)
     sure = [frame for frame in frames if frame.is_sure]
     if sure:
-        return max(sure, key=lambda frame: frame.measured)
+        return max(sure, key=lambda frame: frame.measured_count)
     accepted = [frame for frame in frames if frame.accepted]
     return accepted[0] if accepted else max(frames, key=lambda frame: int(frame.inliers.sum()))
 
 
 def _is_outdone(search: FrameSearch, frame: Frame, placements: Sequence[Placement]) -> bool:
-    """Whether more marks speak for another placement than the frame has measured ones, and chance may have made it."""
-    return any(placement.supported > frame.measured for placement in placements) and bool(doubt(search, frame))
+    """Whether more marks speak for another placement than the frame has measured ones, and it may be a false alarm."""
+    more = any(placement.supported > frame.measured_count for placement in placements)
+    return more and bool(doubt_frame(search, frame))
 
 
-def _as_its_pictures_say(search: FrameSearch, placement: Placement) -> Frame:
+def _measure_in_its_pose(search: FrameSearch, placement: Placement) -> Frame:
     """The frame in a placement. At the right place in a wrong pose unlike marks are not found under one another's
     names: where that is so, the pictures there decide the pose, and the frame is measured in it."""
     frame = measure_frame(search.scan, search.layout, placement, search.options)
@@ -208,60 +193,59 @@ def _as_its_pictures_say(search: FrameSearch, placement: Placement) -> Frame:
     return rename_frame(search.scan, frame, pose.name)
 
 
-def _in_spite_of_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Seen:
-    """The accepted frames under other pitches than the given one, those first that chance makes least, only marks
+def _search_other_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
+    """The accepted frames under other pitches than the given one, those first with the fewest false alarms, only marks
     without blemish counting. So much freedom finds false frames too."""
-    found = search.anywhere(hypotheses)
-    frames = [_as_its_pictures_say(search, place) for place in _hardly_by_chance(search, found, len(hypotheses))]
-    expected = [(tried * expected_as_good(search, frame), frame) for frame in frames if frame.accepted]
+    found = search.search_scan(hypotheses)
+    frames = [_measure_in_its_pose(search, place) for place in _likely_placements(search, found, len(hypotheses))]
+    expected = [
+        (tried * false_frames(search, frame, frame.centers_px(frame.unblemished)), frame)
+        for frame in frames
+        if frame.accepted
+    ]
     return found, sorted(expected, key=_expected)
 
 
-def _at_a_closer_look(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Seen:
-    """The frames in the whole scan on whose places enough marks agree, those first that chance is least expected to
-    make: estimated from the marks as measured, and as they answer at reduced size; the less counts, times two.
+def _search_closer(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
+    """The frames in the whole scan on whose places enough marks agree, those first with the fewest false alarms:
+    estimated from the marks as measured, and as they answer at reduced size; the less counts, times two.
 
     The marks' pictures need not be clear: whether a frame is there is one question, which pose it has another."""
-    found, seen = search.anywhere(hypotheses), list[tuple[float, Frame]]()
-    for place in _hardly_by_chance(search, found, tried):
-        frames = [frame for frame in _in_its_likeliest_poses(search, place) if frame.agrees]
+    found, results = search.search_scan(hypotheses), list[tuple[float, Frame]]()
+    for place in _likely_placements(search, found, tried):
+        frames = [frame for frame in _measure_in_likeliest_pose(search, place) if frame.agrees]
         if frames:
-            as_measured = min(expected_where_seen(search, frame, _seen_px(frame)) for frame in frames)
+            as_measured = min(
+                false_frames(search, frame, frame.centers_px(np.flatnonzero(frame.inliers))) for frame in frames
+            )
             most = max(frames, key=lambda frame: frame.inliers.sum())
-            seen.append((2 * tried * min(as_measured, search.expected_alike(place)), most))
-    return found, sorted(seen, key=_expected)
+            results.append((2 * tried * min(as_measured, search.false_placements(place)), most))
+    return found, sorted(results, key=_expected)
 
 
-def _expected(seen: tuple[float, Frame]) -> float:
-    return seen[0]
+def _expected(result: tuple[float, Frame]) -> float:
+    return result[0]
 
 
-def _in_its_likeliest_poses(search: FrameSearch, placement: Placement) -> list[Frame]:
-    """The frame in a placement, and in the pose that its pictures like best, for faint marks are not seen under one
+def _measure_in_likeliest_pose(search: FrameSearch, placement: Placement) -> list[Frame]:
+    """The frame in a placement, and in the pose that its pictures like best, for faint marks are not found under one
     another's names, though they say not surely which these are."""
     frame = measure_frame(search.scan, search.layout, placement, search.options)
     if search.options.pose != "auto" or not frame.inliers.any():
         return [frame]
     pose = likeliest_pose(search, frame)
-    if pose.name == placement.pose:
-        return [frame]
-    return [frame, rename_frame(search.scan, frame, pose.name)]
+    return [frame] if pose.name == placement.pose else [frame, rename_frame(search.scan, frame, pose.name)]
 
 
-def _seen_px(frame: Frame) -> dict[int, Array]:
-    """Where the marks that belong were seen, by index."""
-    return {index: fit.center_px for index, fit in enumerate(frame.fits) if fit}
+def _likely_placements(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
+    """The best placement and its rivals, without those that have many false ones as good."""
+    places = (*found[:1], *_rivals(found))
+    return [place for place in places if tried * search.false_placements(place) <= PLACEMENTS_BY_CHANCE]
 
 
-def _hardly_by_chance(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
-    """The best placement and its rivals elsewhere, without those of which chance makes many that answer as well."""
-    places = (*found[:1], *_others(found))
-    return [place for place in places if tried * search.expected_alike(place) <= PLACEMENTS_BY_CHANCE]
-
-
-def _others(found: Sequence[Placement]) -> list[Placement]:
-    """The placements that put the frame elsewhere, those first that many marks speak for: a few strong answers are
-    often false ones."""
+def _rivals(found: Sequence[Placement]) -> list[Placement]:
+    """The placements that put the frame elsewhere, those first that many marks speak for: a few high peaks are often
+    false ones."""
     others: list[Placement] = []
     for placement in sorted(found[1:], key=lambda placement: -placement.score * placement.supported):
         if not any(placement.same_place(other) for other in (found[0], *others)):
@@ -272,23 +256,23 @@ def _others(found: Sequence[Placement]) -> list[Placement]:
 
 
 def _pitch_to_try(unsure: Sequence[Frame]) -> str:
-    """A clause about the frame of most marks among those that chance may have made."""
+    """A clause about the frame of most marks among the possible false alarms."""
     if not unsure:
         return ""
-    best = max(unsure, key=lambda frame: (frame.measured, int(frame.inliers.sum())))
+    best = max(unsure, key=lambda frame: (frame.measured_count, int(frame.inliers.sum())))
     pair = ", ".join(f"{um:.2f}" for um in 1000 / np.hypot(*best.pixel_from_camera[:, :2].T))
-    seen = f"under another pitch {int(best.inliers.sum())} of them lie as they should, which may be chance"
-    return f"; {seen}: try pitch_um = [{pair}]"
+    agreeing = f"under another pitch {int(best.inliers.sum())} of them lie as they should, which may be chance"
+    return f"; {agreeing}: try pitch_um = [{pair}]"
 
 
 def _too_faint(likeliest: tuple[float, Frame] | None) -> str:
-    """A clause about a frame that no pitch tells from chance, where chance would make fewer than one."""
+    """A clause about a frame that no pitch tells from a false alarm, where less than one of these is expected."""
     if likeliest is None or likeliest[0] >= 1:
         return ""
     expected, frame = likeliest
-    seen = f"{int(frame.inliers.sum())} marks that are hardly there lie as they should"
+    agreeing = f"{int(frame.inliers.sum())} marks that are hardly there lie as they should"
     by_chance = f"where chance makes {expected:.1g} such frames"
-    return f"; {seen}, {by_chance}: no other pitch tells them from it, click those that you see in reseau review"
+    return f"; {agreeing}, {by_chance}: no other pitch tells them from it, click those that you see in reseau review"
 
 
 def likeliest_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line] = ()) -> Pose:

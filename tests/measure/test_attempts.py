@@ -25,7 +25,7 @@ class Stand:
     """What an attempt finds, in a frame's stead."""
 
     def __init__(self, name: str) -> None:
-        self.name, self.is_complete, self.accepted, self.measured = name, False, False, 0
+        self.name, self.is_complete, self.accepted, self.measured_count = name, False, False, 0
         self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
 
     def misfit(self, ids: Sequence[str]) -> str:

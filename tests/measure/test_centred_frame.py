@@ -9,7 +9,6 @@ import pytest
 import tifffile
 from brute_marks import Array, written_scan
 from drawn_frames import CORNERS, NUMBERED, RING_CROSS, assert_right, frame_picture, layout_of, pixel_from_camera
-from range_server import range_server
 
 from measure.fiducials.hypotheses import PitchHypothesis, is_lattice, room_mm
 from measure.fiducials.measurement import measure_fiducials
@@ -36,13 +35,13 @@ def measured(
 ) -> tuple[FrameMeasurement, bool]:
     """And whether the whole scan was searched."""
     searches: list[FrameSearch] = []
-    anywhere = FrameSearch.anywhere
+    search_scan = FrameSearch.search_scan
 
     def noted(search: FrameSearch, *given: Any) -> Any:
         searches.append(search)
-        return anywhere(search, *given)
+        return search_scan(search, *given)
 
-    monkeypatch.setattr(FrameSearch, "anywhere", noted)
+    monkeypatch.setattr(FrameSearch, "search_scan", noted)
     with written_scan(grey, folder) as scan:
         return measure_fiducials(scan, layout, PITCH_UM), bool(searches)
 
@@ -102,27 +101,6 @@ def test_of_a_large_scan_with_all_marks_clear_only_windows_are_read(bent_mm: flo
     assert len(read) * 64**2 < 0.4 * grey.size
 
 
-def test_of_a_scan_that_is_fetched_windows_are_read_beside_the_middle_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    places = [(4.5 * x, 4.5 * y) for x, y in (*CORNERS, (7.0, 0.0), (-7.0, 0.0), (0.0, 7.0), (0.0, -7.0))]
-    layout = layout_of([MarkShape(RING_CROSS)] * 8, places, (66.0, 66.0))
-    matrix = pixel_from_camera("0", center=(749.3, 650.6))
-    stored = np.clip(np.rint(frame_picture(layout, matrix, size=1400)), 0, 65535).astype(np.uint16)
-    tifffile.imwrite(tmp_path / "s.tif", stored, tile=(64, 64), compression="zlib")
-    with open_scan(tmp_path / "s.tif") as scan:
-        here = measure_fiducials(scan, layout, PITCH_UM)
-    monkeypatch.setattr(FrameSearch, "anywhere", None)
-    with range_server(tmp_path) as server, open_scan(f"{server.url}/s.tif") as scan:
-        result = measure_fiducials(scan, layout, PITCH_UM)
-        assert server.sent_bytes < 0.5 * (tmp_path / "s.tif").stat().st_size
-    for mark, other in zip(result.marks, here.marks, strict=True):
-        assert mark.status is other.status is Status.MEASURED
-        assert mark.center_px is not None
-        assert other.center_px is not None
-        np.testing.assert_allclose(mark.center_px, other.center_px, atol=1e-3)
-
-
 def test_a_lattice_is_told_from_a_frame() -> None:
     cross = MarkShape(ring_cross(0.5, 0.1, 0.8, 0.1))
     places = [(10.0 * i, 10.0 * j) for i in range(5) for j in range(5)]
@@ -140,14 +118,14 @@ def test_a_frame_that_the_scan_holds_is_found_by_windows_as_by_the_whole(
     pitch_mm = (PITCH_UM[0] / 1000, PITCH_UM[1] / 1000)
     with written_scan(frame_picture(NUMBERED, matrix), tmp_path) as scan:
         hypothesis = [PitchHypothesis(pitch_mm, 0.02, pitch_mm)]
-        whole = FrameSearch(scan, NUMBERED, FiducialOptions()).anywhere(hypothesis)[0]
+        whole = FrameSearch(scan, NUMBERED, FiducialOptions()).search_scan(hypothesis)[0]
         monkeypatch.setattr("measure.fiducials.search._WINDOWS_SHARE", np.inf)
-        monkeypatch.setattr(FrameSearch, "anywhere", None)
+        monkeypatch.setattr(FrameSearch, "search_scan", None)
         search = FrameSearch(scan, NUMBERED, FiducialOptions())
-        found = search.within(hypothesis)[0]
-        assert search.expected_alike(found) < 0.01
+        found = search.search_room(hypothesis)[0]
+        assert search.false_placements(found) < 0.01
         beside = np.add(found.pixel_from_camera, [[0.0, 0.0, 9999.0], [0.0, 0.0, 0.0]])
-        assert np.isinf(search.expected_alike(replace(found, pixel_from_camera=beside)))
+        assert np.isinf(search.false_placements(replace(found, pixel_from_camera=beside)))
     assert found.pose == whole.pose
     assert found.same_place(whole)
     assert np.hypot(*(found.pixel_from_camera - matrix)[:, 2]) < 3.0

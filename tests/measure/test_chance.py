@@ -20,7 +20,7 @@ from measure.fiducials.orientation_pictures import SPOILT, Shown, Site
 from measure.fiducials.rows import present_frame
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch
-from measure.fiducials.significance import doubt
+from measure.fiducials.significance import doubt_frame
 from measure.flags import Status
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, MarkShape, dot
@@ -78,7 +78,7 @@ def test_three_plain_dots_of_four_are_no_chance() -> None:
     scan = scan_of(picture(DOTS, "0", hidden=1))
     frame = frame_of(scan, DOTS)
     assert frame.inliers.tolist() == [True, False, True, True]
-    assert doubt(FrameSearch(scan, DOTS, OPTIONS), frame) == ""
+    assert doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame) == ""
 
 
 def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -> None:
@@ -89,9 +89,9 @@ def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -
     moved_on = placement("0").pixel_from_camera - np.array([[0.0, 0.0, 7.0 * PX_PER_MM], [0.0, 0.0, 0.0]])
     other = measure_frame(scan, layout, replace(placement("0"), pixel_from_camera=moved_on), OPTIONS)
     assert (int(frame.inliers.sum()), int(other.inliers.sum())) == (7, 4)
-    assert frame.has_all_of(other)
-    assert not other.has_all_of(frame)
-    assert not frame.has_all_of(frame)
+    assert frame.contains(other)
+    assert not other.contains(frame)
+    assert not frame.contains(frame)
 
 
 def test_three_marks_of_the_neighbouring_frame_are_no_frame_beside_five_of_its_own(
@@ -104,13 +104,13 @@ def test_three_marks_of_the_neighbouring_frame_are_no_frame_beside_five_of_its_o
     shifted = true + np.column_stack([np.zeros((2, 2)), aside_px])
     for index, matrix in [*((index, true) for index in own), *((index, shifted) for index in neighbours)]:
         paint(grey, layout.marks[index].mark, layout.marks[index].xy_mm, matrix, CONTRAST_DN, half=24)
-    whole = FrameSearch.anywhere
+    whole = FrameSearch.search_scan
 
     def false_first(search: FrameSearch, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         found = whole(search, hypotheses)
         return [replace(found[0], pixel_from_camera=shifted), *found]
 
-    monkeypatch.setattr(FrameSearch, "anywhere", false_first)
+    monkeypatch.setattr(FrameSearch, "search_scan", false_first)
     monkeypatch.setattr(measurement, "pitch_hypotheses", lambda *given: pitch_hypotheses(*given)[:1])
     result = measurement.measure_fiducials(scan_of(noisy(grey)), layout, (50.0, 50.0), replace(OPTIONS, pose="0"))
     assert [mark.status is Status.MEASURED for mark in result.marks] == [index in own for index in range(8)]
@@ -125,7 +125,7 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     scan = scan_of(strewn(np.concatenate([elsewhere[free], as_marks[1:]])))
     frame = frame_of(scan, DOTS)
     assert frame.inliers.tolist() == [False, True, True, True]
-    sentence = doubt(FrameSearch(scan, DOTS, OPTIONS), frame)
+    sentence = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
     assert "of 64 places beside them look as much like marks: chance finds as many with a probability of" in sentence
 
 
@@ -136,7 +136,7 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     grey[at[1] - 24 : at[1] + 25, at[0] - 24 : at[0] + 25] = 20000.0
     scan = scan_of(grey)
     frame = frame_of(scan, DOTS)
-    chance = doubt(FrameSearch(scan, DOTS, OPTIONS), frame)
+    chance = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
     assert "with a probability of 1.00" in chance
     result = present_frame(scan, DOTS, frame, Pose("0", False), (50.0, 50.0), (), chance)
     assert [mark.status for mark in result.marks] == [Status.PREDICTED] * 4

@@ -3,9 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.detection.candidates import Responses
-from measure.detection.response_layers import layers_of, peaks
-from measure.detection.scan_maps import Held
+from measure.detection.peaks import local_maxima
+from measure.detection.responses import ByteCache, Responses
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import LayoutMark, MarkShape, dot
@@ -25,12 +24,11 @@ def responses(places_px: NDArray[np.float64], heights: NDArray[np.float64], seed
     for (col, row), height in zip(np.rint(places_px).astype(int), heights, strict=True):
         light[row - 1 : row + 2, col - 1 : col + 2] = 0.6 * height
         light[row, col] = height
-    return Responses({(0, 1): light}, 1)
+    return Responses({(0, 1): light}, (0,), 1, ByteCache(1 << 30))
 
 
 def placements(pose: str, answers: Responses) -> list[Placement]:
-    layers = layers_of(answers, Held(1 << 30))
-    return PlacementSearch(MARKS, answers, (PITCH_MM, PITCH_MM), BOUNDS, layers).of_pose(pose, [0] * 6)
+    return PlacementSearch(MARKS, answers, (PITCH_MM, PITCH_MM), BOUNDS).find_placements(pose, [0] * 6)
 
 
 def seen(pose: str, scale: float = 1.015, angle: float = 0.03) -> NDArray[np.float64]:
@@ -70,21 +68,21 @@ def test_a_lattice_of_more_marks_than_candidates_is_not_a_step_off() -> None:
     true = camera @ np.array([[1.01, 0.02], [0.02, -1.01]]) / PITCH_MM + (268.0, 257.0)
     heights = np.interp(camera.min(axis=1), [-99.0, 99.0], [0.4, 0.7])
     answers = responses(true, heights)
-    search = PlacementSearch(lattice, answers, (PITCH_MM, PITCH_MM), BOUNDS, layers_of(answers, Held(1 << 30)))
-    best = search.of_pose("0", [0] * len(lattice))[0]
+    search = PlacementSearch(lattice, answers, (PITCH_MM, PITCH_MM), BOUNDS)
+    best = search.find_placements("0", [0] * len(lattice))[0]
     found = camera @ best.pixel_from_camera[:, :2].T + best.pixel_from_camera[:, 2]
     assert np.abs(found - true).max() < 1.5
 
 
 def test_nothing_that_answers_gives_no_placement() -> None:
-    assert placements("0", Responses({(0, 1): np.zeros((300, 300), np.float32)}, 1)) == []
+    assert placements("0", Responses({(0, 1): np.zeros((300, 300), np.float32)}, (0,), 1, ByteCache(0))) == []
 
 
 def test_peaks_come_in_order_and_apart() -> None:
     map_ = np.zeros((50, 60), np.float32)
     for col, row, height in ((10, 20, 0.5), (40, 30, 0.9), (12, 20, 0.4)):
         map_[row, col] = height
-    places, heights = peaks(map_, 10, 0.1)
+    places, heights = local_maxima(map_, 10, 0.1)
     assert places.tolist() == [[40, 30], [10, 20]]
     np.testing.assert_allclose(heights, [0.9, 0.5], rtol=1e-6)
 

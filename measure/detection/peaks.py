@@ -1,0 +1,65 @@
+"""Peaks of a correlation map: its highest local maxima, and the highest place about given ones."""
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.feature import peak_local_max
+
+from measure.detection.correlation import Map
+
+Array = NDArray[np.float64]
+
+
+def local_maxima(response: Map, count: int, least: float, apart_px: int = 3) -> tuple[Array, Array]:
+    """Find the highest local maxima.
+
+    Parameters
+    ----------
+    response : (rows, columns).
+    count, least : how many at most, and how high each is at least.
+    apart_px : how far peaks lie from one another.
+
+    Returns
+    -------
+    (n, 2) column and row, and (n,) heights, the highest first.
+    """
+    rows, cols = peak_local_max(
+        response, min_distance=apart_px, threshold_abs=least, exclude_border=False, num_peaks=count
+    ).T
+    return np.column_stack([cols, rows]).astype(float), response[rows, cols].astype(float)
+
+
+def highest_about(response: Map, places: Array, radius_px: float) -> tuple[Array, Array]:
+    """Find the highest place within a square about each of places (n, 2), refined by parabolas.
+
+    Returns
+    -------
+    (n, 2) column and row, and (n,) heights: 0 for a place outside of the map.
+    """
+    size = np.array(response.shape[::-1])
+    low = np.clip(np.floor(places - radius_px).astype(int), 0, None)
+    high = np.clip(np.ceil(places + radius_px).astype(int) + 1, None, size)
+    within = (low < high).all(axis=1)
+    tops, heights = places.astype(float), np.zeros(len(places))
+    if not within.any():
+        return tops, heights
+    low, high = low[within], high[within]
+    col, row = (low[:, axis, None] + np.arange((high - low)[:, axis].max()) for axis in (0, 1))
+    part = response[np.minimum(row, size[1] - 1)[:, :, None], np.minimum(col, size[0] - 1)[:, None, :]]
+    part = np.where((row < high[:, 1, None])[:, :, None] & (col < high[:, 0, None])[:, None, :], part, -np.inf)
+    best_row, best_col = np.divmod(part.reshape(len(part), -1).argmax(axis=1), part.shape[2])
+    top = low + np.column_stack([best_col, best_row])
+    heights[within] = response[top[:, 1], top[:, 0]]
+    inner = ((top > 0) & (top < size - 1)).all(axis=1)
+    col, row = top[inner].T
+    offset = np.zeros(top.shape)
+    offset[inner, 0] = _vertex(response[row, col - 1], response[row, col], response[row, col + 1])
+    offset[inner, 1] = _vertex(response[row - 1, col], response[row, col], response[row + 1, col])
+    tops[within] = top + offset
+    return tops, heights
+
+
+def _vertex(before: Map, middle: Map, after: Map) -> Array:
+    """Where parabolas through three values each, the middle one the highest, have their tops: -0.5 to 0.5."""
+    bend = before - 2 * middle + after
+    top = np.divide(before - after, 2 * bend, out=np.zeros(len(bend)), where=bend < 0)
+    return np.asarray(np.clip(top, -0.5, 0.5))
