@@ -10,14 +10,10 @@ from scipy.special import chdtrc
 
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.initial_values.approximations import initial_values
-from adjust.least_squares.iteration import factorise
 from adjust.least_squares.malloc_tuning import keep_freed_memory
-from adjust.least_squares.numbering import Numbering
-from adjust.problem.estimates import Cofactor, VarianceFactor
 from adjust.problem.network import STRAIGHT, Approximations, Network
 from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
-from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.rank_defect.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.rank_defect.datum_choice import chosen_coordinates, chosen_points, held_as_known
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
@@ -25,7 +21,7 @@ from adjust.solution.coordinate_blunders import Slip, far_points, few_points, fr
 from adjust.solution.left_out_images import fitting, with_lens, without_images
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import with_plausibility
-from adjust.solution.result import Adjustment, condition_count, redundancy_of_run, variance_of_run
+from adjust.solution.result import Adjustment, is_fixed, run_result
 from adjust.solution.reweighting import Run, again, run
 from adjust.validation import validate
 
@@ -299,7 +295,7 @@ def adjust_problem(
     solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted)
     if options.datum == "free":
         solution = _freed(problem, solution, members, options)
-    result = _result(problem, solution, members if options.datum == "free" else None, options)
+    result = run_result(problem, solution, members if options.datum == "free" else None, options.probabilities)
     return replace(result, network=problem.network)
 
 
@@ -327,7 +323,7 @@ def _freed(problem: Problem, last: Run, members: Indices, options: Options) -> R
     Where priors leave only some of the similarity transformations free, these are so to the first order alone: after
     each the network is adjusted again.
     """
-    if not _was_fixed(problem, last):
+    if not is_fixed(problem, last):
         return last
     extent = object_datum(problem, last.end.state).extent
     for _ in range(CENTERINGS):
@@ -344,69 +340,3 @@ def _freed(problem: Problem, last: Run, members: Indices, options: Options) -> R
 
 def _was_fixed(problem: Problem, last: Run) -> bool:
     return bool((last.problem.unknowns.sigma != problem.unknowns.sigma).any())
-
-
-def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
-    """The cofactor matrix in the datum of a run, or over the coordinates that carry inner constraints."""
-    state, factor = last.end.state, last.solution.factor
-    if factor is None:
-        return NoCofactor(len(problem.unknowns))
-    if members is None or not (last.converged and _was_fixed(problem, last)):
-        return free_cofactor(last.numbering, state, factor)
-    return inner_cofactor(problem, last.numbering, state, factor, members)
-
-
-def _result(given: Problem, last: Run, members: Indices | None, options: Options) -> Adjustment:
-    problem, state, weighting = last.problem, last.end.state, last.weighting
-    plain = _cofactor(given, last, members)
-    redundancy = redundancy_of_run(last, plain)
-    variance = variance_of_run(last, redundancy)
-    scaled = _with_given_apart(last, variance)
-    cofactor = plain if scaled is last else _cofactor(given, scaled, members)
-    return Adjustment(
-        network=problem.network,
-        termination=last.solution.termination,
-        iterations=len(last.solution.history),
-        conditions=condition_count(last, plain),
-        unknowns=len(last.numbering.free),
-        redundancy=redundancy,
-        vpv=last.vpv,
-        variance=variance,
-        parameters=problem.unknowns.parameters,
-        values=np.where(_meaningless(problem), np.nan, state.values),
-        cofactor=cofactor,
-        run=last,
-        scaled=scaled,
-        probabilities=options.probabilities,
-        singular=last.singular if last.solution.termination == "singular" else (),
-        history=last.solution.history,
-        mirrored=problem.mirrored,
-        weights=weighting.weights[: len(last.end.v_mm)],
-        variance_factors=weighting.factors,
-    )
-
-
-def _with_given_apart(last: Run, variance: VarianceFactor) -> Run:
-    """The run with such standard deviations of the given values that sigma0 leaves out that sigma0 times the cofactors
-    leaves them as they were given."""
-    if not len(variance.positions):
-        return last
-    unknowns = last.numbering.problem.unknowns
-    sigma = unknowns.sigma.copy()
-    sigma[variance.positions] /= variance.sigma0
-    numbering = Numbering(replace(last.numbering.problem, unknowns=replace(unknowns, sigma=sigma)))
-    factor = factorise(numbering, last.end)
-    return replace(last, numbering=numbering, solution=replace(last.solution, factor=factor), factor=factor)
-
-
-def _meaningless(problem: Problem) -> NDArray[np.bool_]:
-    """The quantities (n,) that nothing is given of and that nothing tells, for no object point is seen."""
-    network, unknowns = problem.network, problem.unknowns
-    meaningless = np.zeros(len(unknowns), dtype=bool)
-    for name in network.unoriented:
-        meaningless[unknowns.exterior[name]] = True
-    for name in network.idle_cameras & unknowns.camera.keys():
-        camera = network.camera_by_name[name]
-        given = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
-        meaningless[unknowns.camera[name][:3]] = [prior is None for prior in given]
-    return meaningless

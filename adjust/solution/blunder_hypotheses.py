@@ -16,6 +16,7 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
+from adjust.solution.left_out_images import without_images
 from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -231,7 +232,8 @@ def _mirrored_images(network: Network, given: Adjustment | None, tried: Tried, f
         return
     worst = _squares(network, given)
     for image in sorted(images, key=lambda image: (-worst[image.name], image.name))[:MOST_MIRRORED]:
-        rest = tried(_without_image(network, image.name))
+        others = without_images(network, [image.frame])
+        rest = None if others is None else tried(others)
         if rest is not None and explains(rest, family):
             yield Hypothesis(
                 f"image {image.name} is mirrored",
@@ -260,18 +262,6 @@ def _mirrored_image(network: Network, name: str, rest: Adjustment) -> Network:
     )
     images = tuple(replace(image, camera=own.name) if image.name == name else image for image in turned.images)
     return replace(turned, images=images, cameras=(*turned.cameras, own))
-
-
-def _without_image(network: Network, name: str) -> Network:
-    observations = network.observations
-    kept = np.flatnonzero(np.array(observations.image) != name)
-    seen = {observations.point[row] for row in kept}
-    return replace(
-        network,
-        images=tuple(image for image in network.images if image.name != name),
-        points=tuple(point for point in network.points if point.id in seen or point.id not in network.observed_points),
-        observations=observations.only(kept),
-    )
 
 
 def _turned(camera: Camera) -> Camera:

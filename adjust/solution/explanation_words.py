@@ -1,7 +1,9 @@
-"""Sentences on what explains large residuals: the cause with its figures, and the remedy."""
+"""Sentences on what explains large residuals: the cause with its figures, and the remedy.
+
+run: the adjustment with the hypothesis in the model; explained_um: rms of what it takes of residuals.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,19 +20,6 @@ Array = NDArray[np.float64]
 NAMED = 5  # images
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns within which two readings explain alike
 UM_PER_MM = 1000.0
-
-
-def sentence(hypothesis: ModelHypothesis, run: Run, explained_um: float) -> tuple[str, str]:
-    """The cause and the remedy of a hypothesis that was adjusted; explained_um: rms of what it takes of residuals."""
-    match hypothesis.kind:
-        case "radial" | "decentering":
-            return _lens(hypothesis, run, explained_um)
-        case "pixels":
-            return _pixels(hypothesis, run)
-        case "groups":
-            return _groups(hypothesis, run)
-        case _:
-            return _board(hypothesis, run)
 
 
 def noise_words(noise: AddedNoise, run: Run) -> tuple[str, str]:
@@ -55,16 +44,21 @@ def together(images: Sequence[str], count: int) -> str:
     return f"{shown} ({len(images)} of {count})"
 
 
-def _lens(hypothesis: ModelHypothesis, run: Run, explained_um: float) -> tuple[str, str]:
+def radial_words(hypothesis: ModelHypothesis, run: Run, explained_um: float) -> tuple[str, str]:
+    """Of a lens that lacks radial terms."""
+    degrees = ", ".join(name.removeprefix("+r") for name in _added_terms(hypothesis, run))
+    return _lens_words(hypothesis, run, "radial", f"a radial pattern, of the degrees {degrees} in r", explained_um)
+
+
+def decentering_words(hypothesis: ModelHypothesis, run: Run, explained_um: float) -> tuple[str, str]:
+    """Of a lens that lacks decentering terms."""
+    return _lens_words(hypothesis, run, "decentering", "a tangential pattern (decentering)", explained_um)
+
+
+def _lens_words(hypothesis: ModelHypothesis, run: Run, group: str, what: str, rms_um: float) -> tuple[str, str]:
     camera = run.problem.network.camera_by_name[hypothesis.camera]
-    radial = hypothesis.kind == "radial"
-    names = [family(camera.distortion.family).parameters[k - 3] for k in _within_camera(hypothesis, run)]
-    degrees = ", ".join(name.removeprefix("+r") for name in names)
-    what = f"a radial pattern, of the degrees {degrees} in r" if radial else "a tangential pattern (decentering)"
-    cause = (
-        f"The lens model of camera {camera.name} is too simple: the residuals have {what}, {explained_um:.2g} µm rms"
-    )
-    return cause, _lens_remedy(camera, "radial" if radial else "decentering")
+    cause = f"The lens model of camera {camera.name} is too simple: the residuals have {what}, {rms_um:.2g} µm rms"
+    return cause, _lens_remedy(camera, group)
 
 
 def _lens_remedy(camera: Camera, group: str) -> str:
@@ -79,12 +73,14 @@ def _lens_remedy(camera: Camera, group: str) -> str:
     return "Choose a distortion family with more terms, legendre(5) say; `reseau adjust --choose` compares some."
 
 
-def _within_camera(hypothesis: ModelHypothesis, run: Run) -> list[int]:
-    positions = run.problem.unknowns.camera[hypothesis.camera].tolist()
-    return [positions.index(int(at)) for at in hypothesis.added]
+def _added_terms(hypothesis: ModelHypothesis, run: Run) -> list[str]:
+    camera = run.problem.network.camera_by_name[hypothesis.camera]
+    positions = run.problem.unknowns.camera[camera.name].tolist()
+    return [family(camera.distortion.family).parameters[positions.index(int(at)) - 3] for at in hypothesis.added]
 
 
-def _pixels(hypothesis: ModelHypothesis, run: Run) -> tuple[str, str]:
+def pixel_words(hypothesis: ModelHypothesis, run: Run, _: float) -> tuple[str, str]:
+    """Of pixels that are not square."""
     network = run.problem.network
     value, covariance = _estimate(run, hypothesis.added)
     if hypothesis.added[0] not in run.problem.unknowns.camera[hypothesis.camera]:
@@ -103,7 +99,8 @@ def _pixels(hypothesis: ModelHypothesis, run: Run) -> tuple[str, str]:
     )
 
 
-def _board(hypothesis: ModelHypothesis, run: Run) -> tuple[str, str]:
+def board_words(hypothesis: ModelHypothesis, run: Run, _: float) -> tuple[str, str]:
+    """Of a board that is not flat."""
     value, covariance = _estimate(run, hypothesis.added)
     sigma = np.sqrt(np.diag(covariance))
     cause = (
@@ -113,16 +110,8 @@ def _board(hypothesis: ModelHypothesis, run: Run) -> tuple[str, str]:
     return cause, 'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object].'
 
 
-@dataclass(frozen=True)
-class _Reading:
-    """A reading of how two groups of images differ: the directions (3, k) in which (c, x0', y0') may, in words."""
-
-    along: Array
-    cause: str
-
-
-def _groups(hypothesis: ModelHypothesis, run: Run) -> tuple[str, str]:
-    """Which of the readings of the difference of two groups' interior orientation fit it."""
+def group_words(hypothesis: ModelHypothesis, run: Run, _: float) -> tuple[str, str]:
+    """Of two groups of images with an interior orientation each, in the readings that fit their difference."""
     camera, values = hypothesis.camera, run.end.state.values
     own = run.problem.unknowns.camera[camera][:3]
     base = values[own]
@@ -137,37 +126,27 @@ def _groups(hypothesis: ModelHypothesis, run: Run) -> tuple[str, str]:
     remedy = "Give these images a camera of their own (column camera of images.csv)."
     scale = 1.0 + float(difference @ base) / float(base @ base)
     readings = (
-        _Reading(
+        (
             np.eye(3)[:, :1],
             f"{who} have another principal distance than the others, by {difference[0]:+.4g} ± {sigma[0]:.1g} mm "
             "(zoom or focus changed)",
         ),
-        _Reading(
+        (
             np.eye(3)[:, 1:],
             f"{who} have another principal point than the others, by ({difference[1]:+.4g}, {difference[2]:+.4g}) ± "
             f"({sigma[1]:.1g}, {sigma[2]:.1g}) mm: images of different sizes in one camera (cropped)",
         ),
-        _Reading(
+        (
             base[:, None] / np.linalg.norm(base),
             f"{who} are {scale:.5g} times as large as the others: images of different sizes in one camera (scaled)",
         ),
-        _Reading(np.eye(3), f"{who} have another interior orientation than the others"),
+        (np.eye(3), f"{who} have another interior orientation than the others"),
     )
-    costs = [_misfit(difference, spread, each.along) + 2.0 * each.along.shape[1] for each in readings]
+    costs = [_misfit(difference, spread, along) + 2.0 * along.shape[1] for along, _ in readings]
     fitting = [each for each, cost in zip(readings, costs, strict=True) if cost < min(costs) + ALIKE]
-    if len(fitting) > 1:
-        fitting = [each for each in fitting if each.along.shape[1] < len(base)]
-    simplest = [each for each in fitting if not any(_contains(each, other) for other in fitting if other is not each)]
-    causes = "; or ".join(each.cause for each in simplest)
+    special = [cause for along, cause in fitting if along.shape[1] < len(base)]
+    causes = "; or ".join(special or [cause for _, cause in fitting])
     return f"{causes[0].upper()}{causes[1:]}", remedy
-
-
-def _contains(reading: _Reading, other: _Reading) -> bool:
-    """Whether the other one is a special case of a reading."""
-    if other.along.shape[1] >= reading.along.shape[1]:
-        return False
-    rest = other.along - reading.along @ (np.linalg.pinv(reading.along) @ other.along)
-    return bool(np.abs(rest).max() < 1e-6)
 
 
 def _misfit(difference: Array, covariance: Array, along: Array) -> float:

@@ -12,6 +12,7 @@ v'Pv plus twice the unknowns and the logarithm of the choices (Akaike); what com
 best. Nothing is named unless all that is named takes more than half of what v'Pv has beyond its redundancy.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,10 +24,26 @@ from adjust.errors import AdjustmentError
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.probabilities import Probabilities
+from adjust.problem.problem import Problem
 from adjust.quality.snooping import GrossError, Search, contradictions, rest_without, search
 from adjust.rank_defect.diagnosis import singular_directions
-from adjust.solution.explanation_words import noise_words, sentence
-from adjust.solution.model_hypotheses import ModelHypothesis, apart, model_hypotheses
+from adjust.solution.explanation_words import (
+    board_words,
+    decentering_words,
+    group_words,
+    noise_words,
+    pixel_words,
+    radial_words,
+)
+from adjust.solution.model_hypotheses import (
+    ModelHypothesis,
+    bent_board,
+    decentering_terms,
+    radial_terms,
+    second_interior_orientation,
+    separate_lenses,
+    unequal_pixels,
+)
 from adjust.solution.noise_hypothesis import AddedNoise, added_noise
 from adjust.solution.reweighting import Run, again
 
@@ -60,6 +77,25 @@ class Explanation:
 
 
 @dataclass(frozen=True)
+class HypothesisKind:
+    """What a model may lack: how it is extended by it, and the cause and the remedy in words."""
+
+    name: str
+    extensions: Callable[[Run], Iterator[ModelHypothesis]]
+    words: Callable[[ModelHypothesis, Run, float], tuple[str, str]]
+
+
+GROUPS = HypothesisKind("groups", second_interior_orientation, group_words)
+KINDS = (
+    HypothesisKind("radial", radial_terms, radial_words),
+    HypothesisKind("decentering", decentering_terms, decentering_words),
+    HypothesisKind("pixels", unequal_pixels, pixel_words),
+    GROUPS,
+    HypothesisKind("board", bent_board, board_words),
+)
+
+
+@dataclass(frozen=True)
 class Explained:
     """What explains the residuals, the most first, and the adjustment with it: as it was where nothing does."""
 
@@ -79,7 +115,7 @@ def explain(run: Run, redundancy: int, probabilities: Probabilities) -> Explaine
     if last.is_beyond(LEVEL) and not last.contradicting:
         noise = added_noise(last.run, last.redundancy)
         if noise is not None:
-            found = (*found, _of_noise(noise, last))
+            found = (*found, _noise_explanation(noise, last))
             last = replace(last, run=noise.run)
     explains = not last.is_beyond(probabilities.family)
     explains |= last.variance - 1.0 < LEFT * (first.variance - 1.0)
@@ -160,6 +196,7 @@ class _Candidate:
     has_rival: gross errors of single observations explain the residuals as well.
     """
 
+    kind: HypothesisKind
     hypothesis: ModelHypothesis
     model: _Model
     p: float
@@ -171,16 +208,12 @@ class _Candidate:
 
 def _best(model: _Model) -> list[_Candidate]:
     """The best hypotheses that explain what chance does not; several where they do so alike."""
-    hypotheses = list(model_hypotheses(model.run))
-    falls = [_fall(model.run, each) for each in hypotheses]
-    level = LEVEL / max(len(hypotheses), 1)
-    likely = [
-        (fall, each)
-        for fall, each in zip(falls, hypotheses, strict=True)
-        if fall > WORTH * max(falls) and _probability(each, model, fall) < level
-    ]
-    likely.sort(key=lambda pair: -pair[0])
-    candidates = [_adjusted(model, each) for _, each in likely[:MOST_ADJUSTED]]
+    tried = [(_first_order_fall(model.run, each), kind, each) for kind in KINDS for each in kind.extensions(model.run)]
+    level = LEVEL / max(len(tried), 1)
+    least = WORTH * max((fall for fall, _, _ in tried), default=0.0)
+    likely = [each for each in tried if each[0] > least and _probability(each[2], model, each[0]) < level]
+    likely.sort(key=lambda each: -each[0])
+    candidates = [_candidate(model, kind, each) for _, kind, each in likely[:MOST_ADJUSTED]]
     found = [each for each in candidates if each is not None and each.p < level]
     if not found:
         return []
@@ -193,7 +226,7 @@ def _best(model: _Model) -> list[_Candidate]:
     return [replace(each, has_rival=without < least + TOLD_APART) for each in alike]
 
 
-def _fall(run: Run, hypothesis: ModelHypothesis) -> float:
+def _first_order_fall(run: Run, hypothesis: ModelHypothesis) -> float:
     """By how much v'Pv falls with the added unknowns, to the first order; 0 where they are not determined."""
     weighted, covariance = run.weighting.applied(hypothesis.problem)
     numbering = Numbering(weighted)
@@ -203,26 +236,26 @@ def _fall(run: Run, hypothesis: ModelHypothesis) -> float:
     return at.factor.length() ** 2
 
 
-def _adjusted(model: _Model, hypothesis: ModelHypothesis) -> _Candidate | None:
+def _candidate(model: _Model, kind: HypothesisKind, hypothesis: ModelHypothesis) -> _Candidate | None:
     """The hypothesis adjusted; None where that has no solution."""
-    run = again(replace(model.run, problem=hypothesis.problem), model.run.weighting, STEPS, hypothesis.problem.start())
-    if not run.converged or run.found is None:
+    run = _refit(model.run, hypothesis.problem)
+    if run is None:
         return None
     left = model.redundancy - len(hypothesis.added)
     larger = _Model(run, left, model.probabilities, bool(model.contradicting))
-    return _Candidate(hypothesis, larger, _probability(hypothesis, model, model.vpv - larger.vpv))
+    return _Candidate(kind, hypothesis, larger, _probability(hypothesis, model, model.vpv - larger.vpv))
 
 
 def _probability(hypothesis: ModelHypothesis, model: _Model, fall: float) -> float:
     """Of such a fall of v'Pv, or a larger one, by chance."""
-    single = _of_fall(model, fall, len(hypothesis.added))
+    single = _fall_probability(model, fall, len(hypothesis.added))
     if not hypothesis.contrasts:
         return single
     bonferroni = np.exp(min(0.0, np.log(max(single, 1e-300)) + hypothesis.choices))
-    return float(min(bonferroni, _of_fall(model, fall, hypothesis.contrasts)))
+    return float(min(bonferroni, _fall_probability(model, fall, hypothesis.contrasts)))
 
 
-def _of_fall(model: _Model, fall: float, count: int) -> float:
+def _fall_probability(model: _Model, fall: float, count: int) -> float:
     left = model.redundancy - count
     if fall <= 0.0 or left < 1:
         return 1.0
@@ -233,40 +266,41 @@ def _of_fall(model: _Model, fall: float, count: int) -> float:
 def _following(candidate: _Candidate) -> _Model | None:
     """The adjustment in which more is sought: groups of images with all of their lens apart; None where that has no
     solution."""
-    hypothesis, model = candidate.hypothesis, candidate.model
-    if hypothesis.kind != "groups":
+    model = candidate.model
+    if candidate.kind is not GROUPS:
         return model
-    problem = apart(model.run)
-    if problem is None:
-        return None
-    run = again(replace(model.run, problem=problem), model.run.weighting, STEPS, problem.start())
-    if not run.converged or run.found is None:
+    problem = separate_lenses(model.run)
+    run = None if problem is None else _refit(model.run, problem)
+    if run is None:
         return None
     added = len(run.numbering.free) - len(model.run.numbering.free)
-    return _Model(run, model.redundancy - added, model.probabilities, model.has_suspects)
+    return replace(model, run=run, redundancy=model.redundancy - added)
+
+
+def _refit(run: Run, problem: Problem) -> Run | None:
+    """A larger problem adjusted from where it starts, with the same weights; None where that has no solution."""
+    larger = again(replace(run, problem=problem), run.weighting, STEPS, problem.start())
+    return larger if larger.converged and larger.found is not None else None
 
 
 def _explanation(candidate: _Candidate, model: _Model) -> Explanation:
     larger = candidate.model
-    coordinates = 2 * len(model.run.end.v_mm)
-    sigma_um = 1000.0 * float(np.sqrt(np.mean(np.trace(_covariance(model.run), axis1=1, axis2=2)) / 2.0))
+    covariance, coordinates = model.run.problem.network.observations.covariance_mm2, 2 * len(model.run.end.v_mm)
+    sigma_um = 1000.0 * float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2)) / 2.0))
     explained_um = sigma_um * float(np.sqrt(max(model.vpv - larger.vpv, 0.0) / coordinates))
-    cause, remedy = sentence(candidate.hypothesis, larger.run, explained_um)
-    sigma0 = float(np.sqrt(model.variance)), float(np.sqrt(larger.variance))
-    return _as_explanation(candidate.hypothesis.kind, cause, remedy, candidate.p, sigma0)
+    words = candidate.kind.words(candidate.hypothesis, larger.run, explained_um)
+    return _with_figures(candidate.kind.name, words, candidate.p, model.variance, larger.variance)
 
 
-def _covariance(run: Run) -> Array:
-    return run.problem.network.observations.covariance_mm2
+def _noise_explanation(noise: AddedNoise, model: _Model) -> Explanation:
+    p = float(chdtrc(model.redundancy, model.vpv))
+    variance = noise.run.end.vpv / model.redundancy
+    return _with_figures("noise", noise_words(noise, model.run), p, model.variance, variance)
 
 
-def _of_noise(noise: AddedNoise, model: _Model) -> Explanation:
-    cause, remedy = noise_words(noise, model.run)
-    sigma0 = float(np.sqrt(model.variance)), float(np.sqrt(noise.run.end.vpv / model.redundancy))
-    return _as_explanation("noise", cause, remedy, float(chdtrc(model.redundancy, model.vpv)), sigma0)
-
-
-def _as_explanation(kind: str, cause: str, remedy: str, p: float, sigma0: tuple[float, float]) -> Explanation:
+def _with_figures(kind: str, words: tuple[str, str], p: float, before: float, after: float) -> Explanation:
+    """before, after: the variance factors without and with what explains it."""
+    sigma0 = float(np.sqrt(before)), float(np.sqrt(after))
     chance = f"p = {p:.1g}" if p > 1e-99 else "p < 1e-99"
     figures = f"with this in the model σ₀ falls from {sigma0[0]:.3g} to {sigma0[1]:.3g} ({chance})"
-    return Explanation(kind, f"{cause}; {figures}.", remedy, p, sigma0)
+    return Explanation(kind, f"{words[0]}; {figures}.", words[1], p, sigma0)

@@ -2,7 +2,7 @@
 
 With the rows of one image, its orientation and film eliminated, the shift (c, x0', y0') of that image alone has normal
 equations N d = g; two groups with shifts of their own lower v'Pv by the sum of g' N⁻¹ g of both. The best partition is
-that of weighted two-means.
+that of weighted two-means, from the best thresholds of shifts in some directions.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 MOST_TURNS = 20  # of two-means
 FLAT = 1e-9  # part of the largest eigenvalue below which an image says nothing of a direction
-DIRECTIONS = 4  # in which groups are looked for: c, the principal point, the scale of the whole image, all three
+DIRECTIONS = 4  # in which groups are sought: c, x0', y0', the scale of the whole image
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,10 @@ def two_groups(run: Run, camera: str) -> ImageGroups | None:
     if len(names) < 3:
         return None
     interior = run.end.state.values[run.problem.unknowns.camera[camera][:3]]
-    scale = (interior / np.linalg.norm(interior))[:, None]
-    found = [_partition(normal, right, along) for along in (np.eye(3)[:, :1], np.eye(3)[:, 1:], scale, np.eye(3))]
-    mask = max(found, key=lambda each: _gain(normal, right, each, np.eye(3)))
+    along = np.vstack([np.eye(3), interior / np.linalg.norm(interior)])
+    single = (right @ along.T) / np.maximum(np.einsum("di,mij,dj->md", along, normal, along), 1e-300)
+    starts = [_threshold(normal, right, shift) for shift in np.hstack([_solved(normal, right), single]).T]
+    mask = max((_two_means(normal, right, start) for start in starts), key=lambda each: _gain(normal, right, each))
     smaller = mask if 2 * mask.sum() <= len(names) else ~mask
     images = tuple(name for name, is_in in zip(names, smaller, strict=True) if is_in)
     choices = (len(names) - 1) * float(np.log(2.0)) + float(np.log(DIRECTIONS))
@@ -80,16 +81,6 @@ def _basis(columns: Array) -> Array:
     return left[:, size > FLAT * size[0]]
 
 
-def _partition(normal: Array, right: Array, along: Array) -> Mask:
-    """The better of two-means from the best threshold of each coordinate, for shifts in the span of `along` (3, k)."""
-    normal, right = along.T @ normal @ along, right @ along
-    whole = np.eye(along.shape[1])
-    shifts = (np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right[..., None])[..., 0]
-    starts = [_threshold(normal, right, shift) for shift in shifts.T]
-    found = [_two_means(normal, right, start) for start in starts]
-    return max(found, key=lambda each: _gain(normal, right, each, whole))
-
-
 def _threshold(normal: Array, right: Array, shift: Array) -> Mask:
     """The images whose shift (m,) is above the best of all thresholds."""
     order = np.argsort(shift, kind="stable")
@@ -114,20 +105,16 @@ def _two_means(normal: Array, right: Array, mask: Mask) -> Mask:
     return mask
 
 
-def _gain(normal: Array, right: Array, mask: Mask, along: Array) -> float:
-    """By how much v'Pv falls with shifts (in the span of `along`) of two groups."""
-    return float(sum(_quadratic(*_summed(normal, right, members, along)) for members in (mask, ~mask)))
-
-
-def _summed(normal: Array, right: Array, members: Mask, along: Array) -> tuple[Array, Array]:
-    return along.T @ normal[members].sum(axis=0) @ along, right[members].sum(axis=0) @ along
+def _gain(normal: Array, right: Array, mask: Mask) -> float:
+    """By how much v'Pv falls with shifts of two groups."""
+    return float(sum(_quadratic(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)))
 
 
 def _quadratic(normal: Array, right: Array) -> Array:
     """g' N⁻¹ g of one (k, k), (k,) or many."""
-    solved = np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right[..., None]
-    return np.asarray((right[..., None, :] @ solved)[..., 0, 0])
+    return np.asarray((right * _solved(normal, right)).sum(axis=-1))
 
 
 def _solved(normal: Array, right: Array) -> Array:
-    return np.asarray(np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right)
+    """N⁻¹ g of one (k, k), (k,) or many."""
+    return np.asarray((np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right[..., None])[..., 0])

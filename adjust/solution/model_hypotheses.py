@@ -35,13 +35,11 @@ INTERIOR = ("c", "x0", "y0")
 class ModelHypothesis:
     """A model with added unknowns.
 
-    kind: "radial", "decentering", "pixels", "groups" or "board". camera: of which it is, empty of a board. problem: it
-    starts where the simpler model ended. added (k,): positions of the added unknowns. choices: natural logarithm of
-    how many such models it was chosen from; contrasts: the unknowns that all of these together would have. images: the
-    smaller group of "groups".
+    camera: of which it is, empty of a board. problem: it starts where the simpler model ended. added (k,): positions of
+    the added unknowns. choices: natural logarithm of how many such models it was chosen from; contrasts: the unknowns
+    that all of these together would have. images: the smaller of two groups.
     """
 
-    kind: str
     camera: str
     problem: Problem
     added: Indices
@@ -50,72 +48,30 @@ class ModelHypothesis:
     images: tuple[str, ...] = ()
 
 
-def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
-    """All that can be added to the model of an adjustment that has a solution."""
+def radial_terms(run: Run) -> Iterator[ModelHypothesis]:
+    """The next radial terms that a camera's own do not have."""
+    for camera in _cameras(run):
+        count = sum(name in _free_terms(camera) for name in (*_own_terms(camera, "radial"), *RADIAL))
+        first = min(count, len(RADIAL) - TERMS_TOGETHER)
+        yield _extended_lens(run, camera, RADIAL[first : first + TERMS_TOGETHER])
+
+
+def decentering_terms(run: Run) -> Iterator[ModelHypothesis]:
+    """Decentering, or the next terms of it."""
+    for camera in _cameras(run):
+        free = _free_terms(camera)
+        has_decentering = any(name in free for name in (*_own_terms(camera, "decentering"), *DECENTERING[0]))
+        if not free.intersection(DECENTERING[1]):
+            yield _extended_lens(run, camera, DECENTERING[int(has_decentering)])
+
+
+def unequal_pixels(run: Run) -> Iterator[ModelHypothesis]:
+    """A digital camera's, or those of a scanner that stretches one axis where film transformations do not take that."""
     network = run.problem.network
-    for camera in network.cameras:
-        if camera.name in run.problem.unknowns.camera and camera.name not in network.idle_cameras:
-            yield from _lens_terms(run, camera)
-            yield from _groups(run, camera)
-    yield from _unequal_scan_pixels(run)
-    yield from _bent_board(run)
-
-
-def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """The next radial and decentering terms that the camera's own do not have, and unequal pixels."""
-    groups = dict(family(camera.distortion.family.removesuffix(EXTENDED)).groups)
-    free = {name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0}
-    radial = sum(name in free for name in (*groups.get("radial", ()), *RADIAL))
-    first = min(radial, len(RADIAL) - TERMS_TOGETHER)
-    yield _with_terms(run, camera, "radial", RADIAL[first : first + TERMS_TOGETHER])
-    has_decentering = any(name in free for name in (*groups.get("decentering", ()), *DECENTERING[0]))
-    if not free.intersection(DECENTERING[1]):
-        yield _with_terms(run, camera, "decentering", DECENTERING[int(has_decentering)])
-    images = [image for image in run.problem.network.images if image.camera == camera.name]
-    affinity = dict(groups).get("affinity", ())
-    if all(image.transformation == "none" for image in images) and not free.intersection({*affinity[:1], "+b1"}):
-        yield _with_terms(run, camera, "pixels", ("+b1",))
-
-
-def _with_terms(run: Run, camera: Camera, kind: str, terms: Sequence[str]) -> ModelHypothesis:
-    distortion = camera.distortion
-    extended = distortion.family if distortion.family.endswith(EXTENDED) else distortion.family + EXTENDED
-    half_mm = distortion.half_mm if min(distortion.half_mm) > 0.0 else (_reach(run.problem.network, camera.name),) * 2
-    parameters = dict(distortion.parameters) | dict.fromkeys(terms, FREE)
-    changed = replace(camera, distortion=replace(distortion, family=extended, parameters=parameters, half_mm=half_mm))
-    cameras = tuple(changed if each is camera else each for each in run.problem.network.cameras)
-    problem = continued(run, replace(run.problem.network, cameras=cameras))
-    names = family(extended).parameters
-    added = problem.unknowns.camera[camera.name][[3 + names.index(term) for term in terms]]
-    return ModelHypothesis(kind, camera.name, problem, added)
-
-
-def _reach(network: Network, camera: str) -> float:
-    """Half the extent of the camera's images in mm, by their marks."""
-    return max(network.extent_by_image[image.name].half_mm for image in network.images if image.camera == camera)
-
-
-def _groups(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """Some of the camera's images with another principal distance and principal point."""
-    if any(each.name.endswith(OTHERS) for each in run.problem.network.cameras):
-        return
-    groups = two_groups(run, camera.name)
-    if groups is None:
-        return
-    others = camera.name + OTHERS
-    network = run.problem.network
-    images = tuple(replace(image, camera=others) if image.name in groups.images else image for image in network.images)
-    cameras = (*network.cameras, replace(camera, name=others))
-    problem = continued(run, replace(network, images=images, cameras=cameras), {others: camera.name})
-    added = problem.unknowns.camera[others][: len(INTERIOR)]
-    yield ModelHypothesis(
-        "groups", camera.name, problem, added, groups.choices, len(INTERIOR) * (groups.count - 1), groups.images
-    )
-
-
-def _unequal_scan_pixels(run: Run) -> Iterator[ModelHypothesis]:
-    """A scanner that stretches one axis, where film transformations do not take that."""
-    network = run.problem.network
+    for camera in _cameras(run):
+        digital = all(image.transformation == "none" for image in network.images if image.camera == camera.name)
+        if digital and not _free_terms(camera).intersection({*_own_terms(camera, "affinity")[:1], "+b1"}):
+            yield _extended_lens(run, camera, ("+b1",))
     films = [image for image in network.images if image.transformation != "none"]
     if not films or network.scanners or not all(is_left(image.transformation, "stretch") for image in films):
         return
@@ -125,10 +81,28 @@ def _unequal_scan_pixels(run: Run) -> Iterator[ModelHypothesis]:
     scanner = Scanner(SCANNER, {"stretch": FREE}, (float(middle[0]), float(middle[1])), (half_mm, half_mm))
     images = tuple(replace(image, scanner=SCANNER) if image in films else image for image in network.images)
     problem = continued(run, replace(network, images=images, scanners=(scanner,)))
-    yield ModelHypothesis("pixels", films[0].camera, problem, problem.unknowns.scanner[SCANNER])
+    yield ModelHypothesis(films[0].camera, problem, problem.unknowns.scanner[SCANNER])
 
 
-def _bent_board(run: Run) -> Iterator[ModelHypothesis]:
+def second_interior_orientation(run: Run) -> Iterator[ModelHypothesis]:
+    """Some of a camera's images with another principal distance and principal point."""
+    network = run.problem.network
+    if any(each.name.endswith(OTHERS) for each in network.cameras):
+        return
+    for camera in _cameras(run):
+        groups = two_groups(run, camera.name)
+        if groups is None:
+            continue
+        others, own = camera.name + OTHERS, groups.images
+        images = tuple(replace(image, camera=others) if image.name in own else image for image in network.images)
+        cameras = (*network.cameras, replace(camera, name=others))
+        problem = continued(run, replace(network, images=images, cameras=cameras), {others: camera.name})
+        added = problem.unknowns.camera[others][: len(INTERIOR)]
+        contrasts = len(INTERIOR) * (groups.count - 1)
+        yield ModelHypothesis(camera.name, problem, added, groups.choices, contrasts, own)
+
+
+def bent_board(run: Run) -> Iterator[ModelHypothesis]:
     """All given points as a board that is bent, where they are a flat one."""
     network = run.problem.network
     places = known_places(network)
@@ -139,10 +113,44 @@ def _bent_board(run: Run) -> Iterator[ModelHypothesis]:
     except ValueError:
         return
     problem = continued(run, replace(network, boards=(board,)))
-    yield ModelHypothesis("board", "", problem, problem.unknowns.board[BOARD])
+    yield ModelHypothesis("", problem, problem.unknowns.board[BOARD])
 
 
-def apart(run: Run) -> Problem | None:
+def _cameras(run: Run) -> list[Camera]:
+    """Those whose images show object points."""
+    network = run.problem.network
+    used = run.problem.unknowns.camera.keys() - network.idle_cameras
+    return [camera for camera in network.cameras if camera.name in used]
+
+
+def _free_terms(camera: Camera) -> set[str]:
+    return {name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0}
+
+
+def _own_terms(camera: Camera, group: str) -> tuple[str, ...]:
+    """The terms of a group of the camera's own family."""
+    return tuple(dict(family(camera.distortion.family.removesuffix(EXTENDED)).groups).get(group, ()))
+
+
+def _extended_lens(run: Run, camera: Camera, terms: Sequence[str]) -> ModelHypothesis:
+    distortion = camera.distortion
+    extended = distortion.family if distortion.family.endswith(EXTENDED) else distortion.family + EXTENDED
+    half_mm = distortion.half_mm if min(distortion.half_mm) > 0.0 else (_reach(run.problem.network, camera.name),) * 2
+    parameters = dict(distortion.parameters) | dict.fromkeys(terms, FREE)
+    changed = replace(camera, distortion=replace(distortion, family=extended, parameters=parameters, half_mm=half_mm))
+    cameras = tuple(changed if each is camera else each for each in run.problem.network.cameras)
+    problem = continued(run, replace(run.problem.network, cameras=cameras))
+    names = family(extended).parameters
+    added = problem.unknowns.camera[camera.name][[3 + names.index(term) for term in terms]]
+    return ModelHypothesis(camera.name, problem, added)
+
+
+def _reach(network: Network, camera: str) -> float:
+    """Half the extent of the camera's images in mm, by their marks."""
+    return max(network.extent_by_image[image.name].half_mm for image in network.images if image.camera == camera)
+
+
+def separate_lenses(run: Run) -> Problem | None:
     """The problem of an adjustment with two groups of images, whose lenses share nothing; None where marks do."""
     network = run.problem.network
     if any(camera.fiducials for camera in network.cameras):

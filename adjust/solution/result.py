@@ -1,18 +1,21 @@
 """The result of an adjustment: estimates, residuals and their tests, messages; each computed where it is asked for."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.least_squares.iteration import Iteration
+from adjust.least_squares.iteration import Iteration, factorise
+from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
 from adjust.problem.probabilities import Probabilities
+from adjust.problem.problem import Problem
 from adjust.problem.tested import TestedUnits
+from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.quality.contradiction import CalibrationTest, calibration_tests
 from adjust.quality.correlation import Correlation, correlations
 from adjust.quality.lens_reach import LensReach, lens_reach
@@ -28,6 +31,7 @@ from adjust.solution.reweighting import Run
 from adjust.solution.warnings import run_warnings
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, repr=False)
@@ -130,7 +134,7 @@ class Adjustment(Estimates):
             return ()
         run, variance = self._explained.run, self.variance
         if run is not self.run:
-            variance = variance_of_run(run, redundancy_of_run(run, self.cofactor))
+            variance = _run_variance(run, _run_redundancy(run, self.cofactor))
         tested = _reliability(run, variance, self.probabilities) if run is not self.run else self.reliability
         found = run.found if run.has_solution else None
         if found is None or tested is None:
@@ -160,7 +164,7 @@ class Adjustment(Estimates):
 
     @cached_property
     def _explained(self) -> Explained:
-        return explain(self.run, redundancy_of_run(self.run, self.cofactor), self.probabilities)
+        return explain(self.run, _run_redundancy(self.run, self.cofactor), self.probabilities)
 
     @property
     def _misfits(self) -> Misfits | None:
@@ -183,7 +187,87 @@ class Adjustment(Estimates):
         return f"<p>{escape(repr(self))}</p><table>{head}{rows}</table>"
 
 
-def condition_count(run: Run, cofactor: Cofactor) -> int:
+def is_fixed(problem: Problem, last: Run) -> bool:
+    """Whether a datum was held fixed in a run of a problem."""
+    return bool((last.problem.unknowns.sigma != problem.unknowns.sigma).any())
+
+
+def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
+    """The cofactor matrix in the datum of a run, or over the coordinates that carry inner constraints."""
+    state, factor = last.end.state, last.solution.factor
+    if factor is None:
+        return NoCofactor(len(problem.unknowns))
+    if members is None or not (last.converged and is_fixed(problem, last)):
+        return free_cofactor(last.numbering, state, factor)
+    return inner_cofactor(problem, last.numbering, state, factor, members)
+
+
+def run_result(given: Problem, last: Run, members: Indices | None, probabilities: Probabilities) -> Adjustment:
+    """The result of the last run.
+
+    Parameters
+    ----------
+    given : the problem before its datum was settled
+    last : the run, in that datum
+    members : positions of the coordinates that carry inner constraints, None without a free datum
+    probabilities : of the tests
+    """
+    problem, state, weighting = last.problem, last.end.state, last.weighting
+    plain = _cofactor(given, last, members)
+    redundancy = _run_redundancy(last, plain)
+    variance = _run_variance(last, redundancy)
+    scaled = _scaled_run(last, variance)
+    cofactor = plain if scaled is last else _cofactor(given, scaled, members)
+    return Adjustment(
+        network=problem.network,
+        termination=last.solution.termination,
+        iterations=len(last.solution.history),
+        conditions=_condition_count(last, plain),
+        unknowns=len(last.numbering.free),
+        redundancy=redundancy,
+        vpv=last.vpv,
+        variance=variance,
+        parameters=problem.unknowns.parameters,
+        values=np.where(_meaningless(problem), np.nan, state.values),
+        cofactor=cofactor,
+        run=last,
+        scaled=scaled,
+        probabilities=probabilities,
+        singular=last.singular if last.solution.termination == "singular" else (),
+        history=last.solution.history,
+        mirrored=problem.mirrored,
+        weights=weighting.weights[: len(last.end.v_mm)],
+        variance_factors=weighting.factors,
+    )
+
+
+def _scaled_run(last: Run, variance: VarianceFactor) -> Run:
+    """The run with such standard deviations of the given values that sigma0 leaves out that sigma0 times the cofactors
+    leaves them as they were given."""
+    if not len(variance.positions):
+        return last
+    unknowns = last.numbering.problem.unknowns
+    sigma = unknowns.sigma.copy()
+    sigma[variance.positions] /= variance.sigma0
+    numbering = Numbering(replace(last.numbering.problem, unknowns=replace(unknowns, sigma=sigma)))
+    factor = factorise(numbering, last.end)
+    return replace(last, numbering=numbering, solution=replace(last.solution, factor=factor), factor=factor)
+
+
+def _meaningless(problem: Problem) -> NDArray[np.bool_]:
+    """The quantities (n,) that nothing is given of and that nothing tells, for no object point is seen."""
+    network, unknowns = problem.network, problem.unknowns
+    meaningless = np.zeros(len(unknowns), dtype=bool)
+    for name in network.unoriented:
+        meaningless[unknowns.exterior[name]] = True
+    for name in network.idle_cameras & unknowns.camera.keys():
+        camera = network.camera_by_name[name]
+        given = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
+        meaningless[unknowns.camera[name][:3]] = [prior is None for prior in given]
+    return meaningless
+
+
+def _condition_count(run: Run, cofactor: Cofactor) -> int:
     """Equations, without what the adjustment does without; with what pseudo-observations determine."""
     problem = run.problem
     further = sum(len(each.observed) for each in problem.further)
@@ -191,12 +275,12 @@ def condition_count(run: Run, cofactor: Cofactor) -> int:
     return int(TestedUnits(problem).sizes[run.weighting.used].sum()) + further + held
 
 
-def redundancy_of_run(run: Run, cofactor: Cofactor) -> int:
+def _run_redundancy(run: Run, cofactor: Cofactor) -> int:
     """Equations less unknowns."""
-    return condition_count(run, cofactor) - len(run.numbering.free)
+    return _condition_count(run, cofactor) - len(run.numbering.free)
 
 
-def variance_of_run(run: Run, redundancy: int) -> VarianceFactor:
+def _run_variance(run: Run, redundancy: int) -> VarianceFactor:
     """sigma0 and what it comes from; redundancy: of all."""
     factor = run.solution.factor
     if factor is None:
