@@ -1,24 +1,19 @@
-"""What is measured again after what change: six small drawn frames, counted by the store's results.
-
-python -m benchmarks archive_changes
-"""
+"""What is measured again after what change: six small drawn frames, counted by the store's results."""
 
 import os
-import shutil
 import sqlite3
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import tifffile
+from drawn_project import write_project
 
+from benchmarks.harness import Row
 from pipeline.cli import run
 
-ROOT = Path(__file__).parents[1]
-sys.path += [str(ROOT / "tests" / "pipeline"), str(ROOT / "tests" / "measure")]
 NAMES = [f"f{number}" for number in range(1, 7)]
 
 
@@ -58,20 +53,20 @@ CHANGES: dict[str, Callable[[Path], object]] = {
 }
 
 
-def main() -> None:
-    from drawn_project import write_project
+COLUMNS = {"change": "", "measured again": "d", "and once more": "d"}
 
-    print(f"{len(NAMES)} scans measured; then...\n")
-    print(f"{'change':<36}{'measured again':>15}{'and once more':>15}")
+
+def cells() -> Iterator[Row]:
+    yield from ({"change": change} for change in CHANGES)
+
+
+def case(change: str) -> Row:
+    """All is measured, then changed, then measured twice."""
     with TemporaryDirectory() as place:
-        first = write_project(Path(place) / "first", NAMES).parent
-        measured(first)
-        for title, change in CHANGES.items():
-            folder = Path(place) / "changed"
-            shutil.copytree(first, folder)
-            change(folder)
-            print(f"{title:<36}{measured(folder):>15}{measured(folder):>15}", flush=True)
-            shutil.rmtree(folder)
+        folder = write_project(Path(place), NAMES).parent
+        measured(folder)
+        CHANGES[change](folder)
+        return {"measured again": measured(folder), "and once more": measured(folder)}
 
 
 def measured(folder: Path) -> int:
@@ -88,7 +83,3 @@ def results(folder: Path) -> int:
         return 0
     with sqlite3.connect(path) as db:
         return int(db.execute("select count(*) from result").fetchone()[0])
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,5 @@
 """Kills -9 of the parent and of workers at random moments of a run of 200 stand-in scans: each time it goes on.
 
-    python -m benchmarks archive_kills [KILLS] [SEED]
-
 At the end the store is held against that of an undisturbed run, all but times, and scans that were begun more than once
 are counted.
 """
@@ -14,17 +12,19 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.archive_stand_ins import use, write_project
+from benchmarks.archive_stand_ins import USE, write_project
+from benchmarks.harness import ROOT, START, Row, table
 from pipeline.archive.checked_statuses import judged_records, latest
 from pipeline.archive.results_database import Store
 
 _SCANS, _SCAN_S, _WORKERS = 200, 0.2, 2
 
 
-def main(kills: int, seed: int) -> None:
+def case(kills: int = 50, seed: int = 1) -> Row:
     rng = random.Random(seed)
     with TemporaryDirectory() as place:
         calm, wild = Path(place) / "calm", Path(place) / "wild"
@@ -33,18 +33,26 @@ def main(kills: int, seed: int) -> None:
         shutil.copytree(calm, wild)
         started(calm).wait()
         total: Counter[str] = Counter()
-        print(f"seed {seed}, {_SCANS} scans of {_SCAN_S} s, {_WORKERS} workers")
+        runs = []
         while total["parent"] + total["worker"] < kills:
             shutil.rmtree(wild / "out", ignore_errors=True)
             (wild / "starts").write_text("", encoding="utf-8")
             done = measured_to_its_end(wild, rng)
             starts = Counter((wild / "starts").read_text(encoding="utf-8").split())
             total += done
-            again, in_hand = starts.total() - len(starts), _WORKERS * done["parent"] + done["worker"]
-            print(f"kills of the parent {done['parent']}, of workers {done['worker']}:", end=" ")
-            print(f"store equal {content(wild) == content(calm)}, marks equal {marks(wild) == marks(calm)};", end=" ")
-            print(f"begun more than once {again}, in hand when killed at most {in_hand}", flush=True)
-        print(f"in all {dict(total)}")
+            runs.append({
+                "of the parent": done["parent"], "of workers": done["worker"],
+                "results equal": content(wild) == content(calm), "marks equal": marks(wild) == marks(calm),
+                "begun again": starts.total() - len(starts),
+                "in hand when killed": _WORKERS * done["parent"] + done["worker"],
+            })  # fmt: skip
+    return {"runs": runs, "kills": dict(total)}
+
+
+def report(rows: list[Row]) -> Iterator[str]:
+    for row in rows:
+        yield from table(dict.fromkeys(row["runs"][0], ""), row["runs"])
+        yield f"in all {row['kills']}"
 
 
 def measured_to_its_end(folder: Path, rng: random.Random) -> Counter[str]:
@@ -68,9 +76,10 @@ def measured_to_its_end(folder: Path, rng: random.Random) -> Counter[str]:
 
 
 def started(folder: Path) -> "subprocess.Popen[bytes]":
-    own = [sys.executable, __file__, "--measure", str(folder / "project.toml")]
     environment = os.environ | {"RESEAU_STAND_IN_S": str(_SCAN_S), "RESEAU_STAND_IN_LOG": str(folder / "starts")}
-    return subprocess.Popen(own, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    arguments = ["measure", str(folder / "project.toml"), "--workers", str(_WORKERS)]
+    command = [sys.executable, "-c", f"{USE}; {START}", *arguments]
+    return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def workers(parent: int) -> list[int]:
@@ -91,16 +100,3 @@ def content(folder: Path) -> list[str]:
 
 def marks(folder: Path) -> bytes:
     return (folder / "comparator.csv").read_bytes()
-
-
-def measure(project: str) -> int:
-    from pipeline.cli import run
-
-    use()
-    return run(["measure", project, "--workers", str(_WORKERS)])
-
-
-if __name__ == "__main__":
-    if sys.argv[1:2] == ["--measure"]:
-        sys.exit(measure(sys.argv[2]))
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 50, int(sys.argv[2]) if len(sys.argv) > 2 else 1)

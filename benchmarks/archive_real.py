@@ -1,72 +1,46 @@
 """Real measurings of many scans by `reseau measure`: scans an hour, CPU and memory a scan.
 
-    python -m benchmarks archive_real [SCANS] [--workers 2] [--side 2400] [--folder DIR]
-
 The scans are drawn anew, each with a place and grain of its own: tiled TIFF files of grainy film with eight
 ring-crosses, some 3 MB each at 2400 px. They are drawn first, and a line tells how many there are; then the command's
 own lines tell how many are measured, and how long the others will take. Given a folder, what is there already is
 neither drawn nor measured again: a run that was stopped goes on.
 """
 
-import argparse
-import os
-import resource
 import sqlite3
-import subprocess
-import sys
-import tempfile
 import time
+from contextlib import nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import tifffile
 
+from benchmarks.harness import Row, reseau
 from benchmarks.object_measuring import PITCH_UM, camera_text, drawn_frame
 from pipeline.files.camera_file import read_camera
 
 _A_FOLDER = 500
 _BEYOND_MM = 2.0  # of the marks, to the scan's edge
 _TOLD_S = 20.0
+COLUMNS = {
+    "verdicts": "", "scans an hour": ".0f", "seconds a scan": ".2f", "CPU s a scan": ".2f", "MB of a process": ".0f"
+}  # fmt: skip
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scans", type=int, nargs="?", default=2000)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--side", type=int, default=2400, help="of a scan, px")
-    parser.add_argument("--folder", type=Path)
-    options = parser.parse_args()
-    if options.folder is not None:
-        measured(options.folder, options.scans, options.side, options.workers)
-        return
-    with tempfile.TemporaryDirectory() as place:
-        measured(Path(place), options.scans, options.side, options.workers)
-
-
-def measured(folder: Path, scans: int, side: int, workers: int) -> None:
-    draw(folder, scans, side)
-    before = results(folder)
-    start_s = time.monotonic()
-    command = [
-        sys.executable,
-        "-c",
-        "from pipeline.main import main; main()",
-        "measure",
-        str(folder / "project.toml"),
-        "--workers",
-        str(workers),
-    ]
-    subprocess.run(command, check=False, stdout=subprocess.DEVNULL, env=os.environ | {"OPENBLAS_NUM_THREADS": "1"})
-    clock_s, used = time.monotonic() - start_s, resource.getrusage(resource.RUSAGE_CHILDREN)
-    with sqlite3.connect(folder / "out" / "measurement.db") as db:
-        told = dict(db.execute("select verdict, count(*) from result group by verdict"))
-    count, cpu_s = results(folder) - before, used.ru_utime + used.ru_stime
-    print(f"{count} scans of {side} x {side} px, {workers} processes: {told}")
-    print(f"{'scans an hour':>16}{'clock s a scan':>16}{'CPU s a scan':>14}{'MB at most of a process':>25}")
-    print(
-        f"{3600 * count / clock_s:16.0f}{clock_s / max(count, 1):16.2f}{cpu_s / max(count, 1):14.2f}"
-        f"{used.ru_maxrss / 1024:25.0f}"
-    )
+def case(scans: int = 2000, workers: int = 2, side: int = 2400, folder: Path | None = None) -> Row:
+    with nullcontext(folder) if folder else TemporaryDirectory() as place:
+        folder = Path(place)
+        draw(folder, scans, side)
+        before = results(folder)
+        used = reseau("measure", folder / "project.toml", "--workers", workers)
+        with sqlite3.connect(folder / "out" / "measurement.db") as db:
+            verdicts = dict(db.execute("select verdict, count(*) from result group by verdict"))
+        count = results(folder) - before
+    each = max(count, 1)
+    return {
+        "verdicts": str(verdicts), "scans an hour": 3600 * count / used.seconds, "seconds a scan": used.seconds / each,
+        "CPU s a scan": used.cpu_seconds / each, "MB of a process": used.mib,
+    }  # fmt: skip
 
 
 def draw(folder: Path, scans: int, side: int) -> None:
@@ -96,7 +70,3 @@ def results(folder: Path) -> int:
     with sqlite3.connect(path) as db:
         is_made = db.execute("select count(*) from sqlite_master where name = 'result'").fetchone()[0]
         return int(db.execute("select count(*) from result").fetchone()[0]) if is_made else 0
-
-
-if __name__ == "__main__":
-    main()

@@ -1,76 +1,91 @@
-"""Fifty thousand scans through the archive: memory, the store's share of a scan's time, status, and nothing to do.
+"""Fifty thousand scans through the archive: time, memory and files of each command, in a process of its own.
 
-    python -m benchmarks archive_scale [SCANS]
-
-Stand-ins for the measuring of a scan, so that only the rest is timed; two processes. Each command runs in a process of
-its own, whose largest memory and CPU time are printed.
+Stand-ins for the measuring of a scan, so that only the rest is timed; two processes. `report` follows on results of
+which every hundredth frame has lost a fiducial. `adjust` is of 10,000 frames of eight fiducials alone: these lie up to
+10 um beside their given places, every frame has an affine film and scan of its own, and marks scatter by 2 um.
 """
 
-import os
-import resource
-import subprocess
-import sys
-import tempfile
-import time
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from benchmarks.archive_stand_ins import use, write_project
+import numpy as np
 
-_COMMANDS = {
-    "measure": ["measure"],
-    "measure, nothing to do": ["measure"],
-    "status": ["status"],
-    "status --json": ["status", "--json"],
-}
+from benchmarks.archive_stand_ins import CAMERA, FIDUCIALS, USE, keep_results, write_project
+from benchmarks.harness import Row, reseau, table
+from pipeline.files.project_file import read_project
+
+OFF_MM, SCATTER_MM, STRETCH = 0.01, 0.002, 3e-4
+A_FOLDER = 500
+FILES = ("comparator.csv", "out/measurement.db", "out/adjustment.json", "out/adjustment.npz", "out/report.html")
+_COLUMNS = {"command": "", "seconds": ".1f", "cpu_seconds": ".1f", "ms_a_scan": ".2f", "mib": ".0f"}
 
 
-def main(scans: int) -> None:
-    with tempfile.TemporaryDirectory() as place:
+def cells(scans: int = 50_000, frames: int = 10_000) -> Iterator[Row]:
+    yield from ({"work": work, "scans": scans} for work in ("measure", "report"))
+    yield {"work": "adjust", "scans": frames}
+
+
+def case(work: str, scans: int, seed: int) -> Row:
+    with TemporaryDirectory() as place:
         folder = Path(place)
-        project = write_project(folder, scans)
-        print(f"{scans} scans of eight marks, two processes")
-        print(f"{'command':<28}{'clock s':>9}{'CPU s':>9}{'ms a scan':>11}{'MB at most':>12}")
-        for title, command in _COMMANDS.items():
-            _row(title, [*command, str(project)], scans)
-        one = folder / "scans" / "box00" / "one more.tif"
-        one.write_bytes(b"one more")
-        _row("measure, one scan more", ["measure", str(project)], scans)
-        size = sum(file.stat().st_size for file in (folder / "out").glob("measurement.db*"))
-        print(f"measurement.db {size / 1e6:.0f} MB, {size / scans / 1e3:.2f} kB a scan; "
-              f"comparator.csv {(folder / 'comparator.csv').stat().st_size / 1e6:.0f} MB")  # fmt: skip
+        rows = list(WORKS[work](folder, scans, seed))
+        sizes = {name: (folder / name).stat().st_size / 1e6 for name in FILES if (folder / name).exists()}
+    return {"rows": rows, "sizes_mb": sizes}
 
 
-def _row(title: str, arguments: list[str], scans: int) -> None:
-    start = time.monotonic()
-    cpu_s, peak_mb = told_of(arguments)
-    clock_s = time.monotonic() - start
-    print(f"{title:<28}{clock_s:9.1f}{cpu_s:9.1f}{1e3 * cpu_s / scans:11.2f}{peak_mb:12.0f}", flush=True)
+def report(rows: list[Row]) -> Iterator[str]:
+    for row in rows:
+        yield f"{row['work']}, {row['scans']} scans of eight marks; " + ", ".join(
+            f"{name} {size:.1f} MB" for name, size in row["sizes_mb"].items()
+        )
+        yield from table(_COLUMNS, row["rows"])
 
 
-def told_of(arguments: list[str]) -> tuple[float, float]:
-    """CPU seconds, and MB at most, of one command in a process of its own."""
-    own = [sys.executable, __file__, "--command", *arguments]
-    ended = subprocess.run(own, capture_output=True, text=True, check=False)
-    told = ended.stderr.strip().splitlines()[-1].split() if ended.stderr.strip() else []
-    if ended.returncode not in (0, 1) or len(told) != 3:
-        raise SystemExit(f"{' '.join(arguments)} ended with {ended.returncode}:\n{ended.stderr[-3000:]}")
-    return float(told[1]), float(told[2])
+def _measuring(folder: Path, scans: int, _seed: int) -> Iterator[Row]:
+    project = write_project(folder, scans)
+    measure = ("measure", project, "--workers", 2)
+    yield _row("measure", scans, *measure)
+    yield _row("measure, nothing to do", scans, *measure)
+    yield _row("status", scans, "status", project)
+    yield _row("status --json", scans, "status", "--json", project)
+    (folder / "scans" / "box00" / "one more.tif").write_bytes(b"one more")
+    yield _row("measure, one scan more", scans, *measure)
 
 
-def command(arguments: list[str]) -> int:
-    """One command in this process, and at its end what it took, processes that it started not counted."""
-    from pipeline.cli import run
-
-    if arguments[0] == "measure":
-        use()
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    code = run([*arguments, "--workers", "2"] if arguments[0] == "measure" else arguments)
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    print(f"used {used.ru_utime + used.ru_stime:.2f} {used.ru_maxrss / 1024:.0f}", file=sys.stderr)
-    return code
+def _reporting(folder: Path, scans: int, _seed: int) -> Iterator[Row]:
+    project = read_project(write_project(folder, scans))
+    keep_results(project)
+    yield _row("report", scans, "report", project.path)
+    yield _row("report --frames NAME", scans, "report", project.path, "--frames", sorted(project.scans)[1])
 
 
-if __name__ == "__main__":
-    if sys.argv[1:2] == ["--command"]:
-        sys.exit(command(sys.argv[2:]))
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 50_000)
+def _adjusting(folder: Path, scans: int, seed: int) -> Iterator[Row]:
+    project = write_comparator(folder, scans, np.random.default_rng(seed))
+    yield from (_row(command, scans, command, project) for command in ("adjust", "report"))
+
+
+def _row(title: str, scans: int, *arguments: object) -> Row:
+    figures = reseau(*arguments, before=USE).figures
+    return {"command": title, **figures, "ms_a_scan": 1e3 * figures["cpu_seconds"] / scans}
+
+
+def write_comparator(folder: Path, frames: int, rng: np.random.Generator) -> Path:
+    """A project of frames that are measured already."""
+    (folder / "camera.toml").write_text(CAMERA, encoding="utf-8")
+    (folder / "project.toml").write_text('camera = "camera.toml"\n', encoding="utf-8")
+    true_mm = np.array(FIDUCIALS) + rng.uniform(-OFF_MM, OFF_MM, (len(FIDUCIALS), 2))
+    with (folder / "comparator.csv").open("w", encoding="utf-8") as file:
+        file.write("image,point,kind,x_mm,y_mm,sx_mm,sy_mm\n")
+        for number in range(frames):
+            film = np.eye(2) + rng.normal(0, STRETCH, (2, 2))
+            places_mm = true_mm @ film.T + rng.uniform(100, 120, 2) + rng.normal(0, SCATTER_MM, true_mm.shape)
+            image = f"box{number // A_FOLDER:02d}/{number % A_FOLDER:04d}"
+            file.writelines(
+                f"{image},{point},fiducial,{x:.7f},{y:.7f},{SCATTER_MM},{SCATTER_MM}\n"
+                for point, (x, y) in enumerate(places_mm, 1)
+            )
+    return folder / "project.toml"
+
+
+WORKS = {"measure": _measuring, "report": _reporting, "adjust": _adjusting}

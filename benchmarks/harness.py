@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -40,6 +41,7 @@ Row = Mapping[str, Any]
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"  # real scans, which are not part of the project
 HELPERS = tuple(str(ROOT / "tests" / name) for name in ("", "measure", "adjust", "pipeline", "synthetic_images"))
+START = "from pipeline.main import main; main()"  # the program, in a process of its own
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
 
 
@@ -97,6 +99,8 @@ def _parser(module: ModuleType) -> argparse.ArgumentParser:
     for option, parameter in _own_options(module).items():
         given: dict[str, Any] = {"default": None}
         kind = parameter.annotation
+        if isinstance(kind, types.UnionType):  # or nothing
+            kind = next(one for one in typing.get_args(kind) if one is not types.NoneType)
         if kind is bool:
             given["action"] = "store_true"
         elif typing.get_origin(kind) is tuple:
@@ -224,7 +228,7 @@ def reseau(*arguments: object, before: str = "", environment: Mapping[str, str] 
     RuntimeError
         If the command ends with another exit code than 0 or 1.
     """
-    program = f"import sys; sys.path[:0] = {[str(ROOT), *HELPERS]}; {before}\nfrom pipeline.main import main; main()"
+    program = f"import sys; sys.path[:0] = {[str(ROOT), *HELPERS]}; {before}\n{START}"
     command = [sys.executable, "-c", program, *map(str, arguments)]
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
         start_s = time.perf_counter()
