@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from true_marks import Kind, TrueMark
 
 from benchmarks.search import lines
-from measure.fiducials.across_frames import judged
+from measure.fiducials.across_frames import check_frames
 from measure.fiducials.constellation import Placement
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
@@ -94,7 +94,7 @@ def compared(rng: np.random.Generator, kind: str, snr: float, radius_px: float, 
     layout = FiducialLayout(marks, (4 * apart_px * mm,) * 2)
     made = [place + rng.normal(0, GIVEN_MM, 2) for place in given]
     pairs = [drawn_and_measured(rng, layout, made, snr, mm, apart_px) for _ in range(2)]
-    checked = judged([frame for frame, _ in pairs], layout, [(1000 * mm, 1000 * mm)] * 2).frames
+    checked = check_frames([frame for frame, _ in pairs], layout, [(1000 * mm, 1000 * mm)] * 2).frames
     good, lost, reasons = 0, 0, Counter[str]()
     for frame, (_, truth_px) in zip(checked, pairs, strict=True):
         for mark, true in zip(frame.marks, truth_px, strict=True):

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from test_judgement import EIGHT, FILM_MM, FOUR, PX_PER_MM, SIGMA_PX, frames_of, layout_of, moved, weak
 
-from measure.fiducials.across_frames import Judgement, judged
+from measure.fiducials.across_frames import CheckedFrames, check_frames
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement
 
@@ -62,14 +62,14 @@ def kinds() -> list[tuple[str, list[tuple[float, float]], float, Made]]:
 def outcome(made: Made, layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[bool, bool]:
     """Whether what there is was told, and whether anything else was."""
     frames, expected = made(layout, count, rng)
-    result = judged(frames, layout, [(PITCH_UM, PITCH_UM)] * count)
+    result = check_frames(frames, layout, [(PITCH_UM, PITCH_UM)] * count)
     told = said(result)
     if count == 1 and expected not in ("", "mark"):
         expected = "frame"  # of one frame nobody can tell which it is
     return told == {expected} - {""}, bool(told - {expected})
 
 
-def said(result: Judgement) -> set[str]:
+def said(result: CheckedFrames) -> set[str]:
     """The causes that are told, the first frame being the one that may be another."""
     causes = {"mark" if where == ("0", "2") else "another mark" for where in weak(result.frames)}
     for number, frame in enumerate(result.frames):

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.reencoded_scans import CAMERAS
-from measure.fiducials.across_frames import judged
+from measure.fiducials.across_frames import check_frames
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
@@ -72,7 +72,7 @@ def measure_scan(task: Task, tone: Tone) -> dict[str, Any]:
     with open_scan(task.scan) as scan:
         pitch_um = task.pitch_um or scan.pitch_um
         frame = measure_fiducials(scan.replace_tone(tone), task.layout, pitch_um, FiducialOptions())
-    frame = judged([frame], task.layout, [pitch_um or (1.0, 1.0)]).frames[0]
+    frame = check_frames([frame], task.layout, [pitch_um or (1.0, 1.0)]).frames[0]
     marks = {
         mark.point: {
             "status": str(mark.status),

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fiducials.across_frames import judged
+from measure.fiducials.across_frames import check_frames
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Cause, Status
@@ -69,7 +69,7 @@ def copies(scan: Scan) -> dict[str, Scan]:
 def measured(scan: Scan, camera: str, tone: Tone, pitch_um: tuple[float, float] | None) -> FrameMeasurement:
     layout = read_camera(camera_path(f"library:{camera}", Path())).layout()
     frame = measure_fiducials(scan.replace_tone(tone), layout, pitch_um, FiducialOptions(pose="0"))
-    return judged([frame], layout, [pitch_um or (1.0, 1.0)]).frames[0]
+    return check_frames([frame], layout, [pitch_um or (1.0, 1.0)]).frames[0]
 
 
 def main() -> None:

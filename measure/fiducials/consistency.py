@@ -1,333 +1,341 @@
-"""Consistency of a camera's frames: the misfits of their marks to the given coordinates, and what explains them."""
+"""Consistency of a frame's marks with their given coordinates: one linear model with the film as a random effect.
 
-from collections.abc import Mapping, Sequence
+    o - g = F x + H a + K c + film + noise                     (mark by mark, mm, in the camera's axes)
+
+F: shifts, a rotation, and what the project's film model adds (free). H a: size, stretch and shear of the film, normal
+about what the camera's other frames show, or with `AFFINITY_SIGMA` in a lone frame. K c: a perspective, 0 unless the
+film was photographed obliquely. The film scatters each mark; each mark and given place has a covariance of its own.
+
+The chi-square of the residuals tests the frame, a mean shift of mark k tests the mark (data snooping: Baarda 1968).
+Hypotheses are compared by their evidence (marginal likelihood): the film is ordinary, bent, stretched by a wrong pitch,
+or photographed obliquely, and in each of these a mark k is wrong or none is.
+"""
+
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import pdist
-from scipy.special import chdtrc, chdtri, fdtrc, logsumexp
+from scipy.special import chdtri, fdtrc, logsumexp
 
-from measure.fiducials.doubts import TOLD, observed
-from measure.fiducials.options import MOST_BENT_MM, SCATTER_DEGREES
+from measure.fiducials.interior_orientation import film_terms, interleaved
+from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_DEGREES, SCATTER_MM
 from measure.flags import FALSE_DOUBT
-from measure.geometry import linear_scale, up_from_camera
-from measure.marks.shapes import FiducialLayout
-from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
-from measure.results import FrameMeasurement
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
 
-LEAST_MM, _FREE_MM = 1e-6, 10.0  # the least standard deviation, and that of a mark that is left out
-_WIDTHS = 24  # of a scatter that nobody knows: standard deviations from what is believed of film to the most it is bent
-_SAME_SITE = 1 / 3  # of how near marks are to one another: marks of two frames lie at one place of the scan
-_AS_ODD = 0.5  # of the logarithm of the least probability: frames that stand out as well are looked at together
-_LEAST_CHANCE = 1e-300
-_ROUNDS = 3
-
-
-@dataclass(frozen=True, eq=False)
-class Misfit:
-    """The n marks of a frame that are observations: index (n,) in the layout; site (n,) of the pattern they share;
-    given_mm (n, 2); off_mm (n, 2) from the given places, in the pattern's axes, but for an affine transformation;
-    variance_mm2 (n,) of a coordinate, film included; mm: of a pixel."""
-
-    index: Ints
-    site: Ints
-    given_mm: Array
-    off_mm: Array
-    variance_mm2: Array
-    mm: float
-
-    @classmethod
-    def of(cls, frame: FrameMeasurement, layout: FiducialLayout) -> "Misfit | None":
-        """With the marks' own variances, in the camera's axes; None of a frame that is not checked by its marks."""
-        number = {mark.id: place for place, mark in enumerate(layout.marks)}
-        marks = [mark for mark in observed(frame) if mark.point in number]
-        matrix = frame.pixel_from_camera
-        if matrix is None or len(marks) < 4:
-            return None
-        index = np.array([number[mark.point] for mark in marks], dtype=np.intp)
-        given = np.array([layout.marks[place].xy_mm for place in index])
-        if np.linalg.matrix_rank(_affine(given)) < 3:
-            return None
-        mm = float(1 / linear_scale(matrix))
-        centers = np.array([mark.center_px for mark in marks])
-        camera = (centers - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
-        variances = [np.trace(mark.covariance_px2) / 2 for mark in marks if mark.covariance_px2 is not None]
-        return cls(index, index, given, camera - given, np.maximum(mm * np.sqrt(variances), LEAST_MM) ** 2, mm)
-
-    @property
-    def degrees(self) -> int:
-        return 2 * (len(self.index) - 3)
-
-    @cached_property
-    def beyond_affine(self) -> Array:
-        """(n, n - 3) an orthonormal basis of what no affine transformation makes."""
-        return np.linalg.qr(_affine(self.given_mm), mode="complete")[0][:, 3:]
-
-    @cached_property
-    def z(self) -> Array:
-        """(n - 3, 2)."""
-        return np.asarray(self.beyond_affine.T @ self.off_mm)
-
-    @cached_property
-    def weight(self) -> Array:
-        """(n, n) of off_mm, any affine transformation being free."""
-        n = self.beyond_affine
-        return np.asarray(n @ np.linalg.solve(n.T @ (self.variance_mm2[:, None] * n), n.T))
-
-    def widened(self, more_mm2: Array | float) -> "Misfit":
-        return replace(self, variance_mm2=self.variance_mm2 + more_mm2)
-
-    def free(self, mark: int) -> "Misfit":
-        """With one mark left out, as good as."""
-        return self.widened(np.where(np.arange(len(self.index)) == mark, _FREE_MM**2, 0.0))
-
-    def in_scan_axes(self, pose: str, sites: Array) -> "Misfit":
-        """The same with the scan's axes, right and up, and with the sites (m, 2) of the scan that the marks lie at."""
-        turn = up_from_camera(pose)
-        places = self.given_mm @ turn.T
-        site = np.hypot(*np.moveaxis(places[:, None] - sites[None], -1, 0)).argmin(axis=1)
-        return replace(self, site=site, off_mm=self.off_mm @ turn.T)
-
-    def log_density(self, expected: Array, covariance: Array, more_mm2: Array | float = 0.0) -> float:
-        """Of the misfit where a pattern is expected (n, 2) with a covariance (n, n), and the marks vary by more."""
-        n = self.beyond_affine
-        spread = n.T @ (np.diag(self.variance_mm2 + more_mm2) + covariance) @ n
-        left = self.z - n.T @ expected
-        return -float(np.linalg.slogdet(spread)[1] + (left * np.linalg.solve(spread, left)).sum() / 2)
-
-    def chi_square(self, expected: Array, covariance: Array) -> float:
-        """Of the misfit, likewise."""
-        n = self.beyond_affine
-        left = self.z - n.T @ expected
-        return float((left * np.linalg.solve(n.T @ (np.diag(self.variance_mm2) + covariance) @ n, left)).sum())
-
-    def distances_mm(self, expected: Array) -> Array:
-        """(n,) of each mark from where the given places and the pattern have it, under the best affine one."""
-        off = self.off_mm - expected
-        design, weights = _affine(self.given_mm), 1 / np.sqrt(self.variance_mm2)[:, None]
-        return np.asarray(np.hypot(*(off - design @ np.linalg.lstsq(design * weights, off * weights, rcond=None)[0]).T))
+NAMED = float(np.log(100.0))  # log-odds from which one cause rather than another is taken for what is off
+_SUSPECT = -float(np.log(10.0))  # log-odds from which a mark may be the wrong one
+_RANK = 1e-9  # of the largest singular value: directions below it are not determined
+_LEAST_MM = 1e-6  # standard deviation of a mark
+_KNOWN = 1e6  # degrees of freedom of a variance that is known
+_MOST_OFF_MM = 0.5  # standard deviation of a wrong mark: none is sought farther off than some 1 mm
+_TURNED = 0.2  # of what a wrong pitch stretches: sheared in a frame that is turned by up to 6 degrees
+_MOST_STRETCHED = 0.05  # of a frame in a wrong pitch
+_MOST_PERSPECTIVE = 2e-4  # per mm: of film photographed from 0.6 m, tilted by 7 degrees
+_PRIOR = np.log(FALSE_DOUBT)  # of each thing that is wrong
+_QUANTILES = (np.arange(3) + 0.5) / 3  # by which a variance that is not known exactly is averaged
+_WIDTHS = 10  # of an effect of which the range is known only
+_TESTS = 2  # of a frame that do not depend on one another: beyond affine, as a whole or at each mark, and affine
 
 
-def _affine(places: Array) -> Array:
-    return np.column_stack([places, np.ones(len(places))])
+class Hypothesis(IntEnum):
+    """What may be said of a frame beside a wrong mark."""
 
-
-def scan_sites(misfits: Sequence[Misfit], poses: Sequence[str]) -> Array:
-    """(m, 2) places in the scan's axes at which marks lie in frames of those poses."""
-    places = [each.given_mm @ up_from_camera(pose).T for each, pose in zip(misfits, poses, strict=True)]
-    near = _SAME_SITE * min(float(pdist(own).min()) for own in places)
-    sites = list[Array]()
-    for place in np.unique(np.round(np.concatenate(places), 6), axis=0):
-        if not any(np.hypot(*(place - site)) < near for site in sites):
-            sites.append(place)
-    return np.array(sites)
-
-
-def log_densities_wider(misfit: Misfit, expected: Array, covariance: Array, film_mm: float) -> Array:
-    """(1 + n,) of a misfit whose marks all vary more than film does, and of one of which a single mark does; by how
-    much more nobody knows."""
-    widths = np.geomspace(film_mm, MOST_BENT_MM, _WIDTHS) ** 2
-    shares = np.concatenate([np.ones((1, len(misfit.index))), np.eye(len(misfit.index))])
-    found = [[misfit.log_density(expected, covariance, width * share) for width in widths] for share in shares]
-    return np.asarray(logsumexp(found, axis=1) - np.log(_WIDTHS))
-
-
-@dataclass(frozen=True, eq=False)
-class Pattern:
-    """How far off the given places marks lie in all frames alike, at m sites: information (m, m) and right-hand side
-    (m, 2) of what the frames say of it; sigma_mm (m,): of each site, and free_mm, by how much more it may be."""
-
-    sigma_mm: Array
-    free_mm: float
-    information: Array
-    right: Array
-
-    @classmethod
-    def of(cls, frames: Sequence[Misfit], sigma_mm: Array, free_mm: float) -> "Pattern":
-        information, right = np.zeros((len(sigma_mm),) * 2), np.zeros((len(sigma_mm), 2))
-        for frame in frames:
-            information[np.ix_(frame.site, frame.site)] += frame.weight
-            right[frame.site] += frame.weight @ frame.off_mm
-        return cls(sigma_mm, free_mm, information, right)
-
-    def without(self, frame: Misfit) -> tuple[Array, Array]:
-        """The pattern (n, 2) expected at a frame's marks by all others, and its covariance (n, n)."""
-        information, right = self._posterior.copy(), self.right.copy()
-        information[np.ix_(frame.site, frame.site)] -= frame.weight
-        right[frame.site] -= frame.weight @ frame.off_mm
-        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-        return (covariance @ right)[frame.site], covariance[np.ix_(frame.site, frame.site)]
-
-    @cached_property
-    def mm(self) -> Array:
-        """(m, 2) its estimate."""
-        return np.asarray(np.linalg.solve(self._posterior, self.right))
-
-    @property
-    def degrees(self) -> int:
-        return 2 * int(np.linalg.matrix_rank(self.information, hermitian=True))
-
-    def chi_square(self) -> float:
-        """Of the pattern against nothing but its sites' standard deviations."""
-        spread = self.information + self.information @ np.diag(self.sigma_mm**2) @ self.information
-        return float((self.right * (np.linalg.pinv(spread, hermitian=True) @ self.right)).sum())
-
-    def log_density(self, frames: Sequence[Misfit]) -> float:
-        """Of the misfits of the frames that it was made of, all together."""
-        nothing = [(np.zeros_like(frame.off_mm), np.zeros((len(frame.site),) * 2)) for frame in frames]
-        alone = sum(frame.log_density(*none) for frame, none in zip(frames, nothing, strict=True))
-        shared = np.log(self._prior_information).sum() - np.linalg.slogdet(self._posterior)[1]
-        return float(alone + shared + (self.right * self.mm).sum() / 2)
-
-    @cached_property
-    def _prior_information(self) -> Array:
-        return np.asarray(1 / (self.sigma_mm**2 + self.free_mm**2 + LEAST_MM**2))
-
-    @cached_property
-    def _posterior(self) -> Array:
-        return self.information + np.diag(self._prior_information)
+    SOUND = 0
+    BENT = 1
+    PITCH = 2
+    PERSPECTIVE = 3
 
 
 @dataclass(frozen=True)
-class Film:
-    """How marks scatter by film and scanner beside what all frames share: sigma_mm along an axis, known with so many
-    degrees of freedom. is_more: whether that is more than was believed beforehand, beyond chance."""
+class Scatter:
+    """A standard deviation, known with so many degrees of freedom."""
 
-    sigma_mm: float
-    degrees: float
-    is_more: bool = False
+    sigma: float
+    degrees: float = _KNOWN
 
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One frame's misfit, with its marks' own variances, and what explains it. chance: the probability that ordinary
-    film makes as much; film_mm: of film that stands out, None of ordinary film; off_mm: by how much marks are off, by
-    their number in the misfit, and variances_mm2 (n,), what that adds to theirs."""
-
-    misfit: Misfit
-    variances_mm2: Array
-    chance: float = 1.0
-    film_mm: float | None = None
-    off_mm: Mapping[int, float] = field(default_factory=dict)
-
-    def under(self, film: Film) -> Misfit:
-        """The misfit with all variances."""
-        return self.misfit.widened(self.variances_mm2 + (film.sigma_mm if self.film_mm is None else self.film_mm) ** 2)
+    def variances(self) -> Array:
+        """Equally likely ones, of the scaled inverse chi-square distribution."""
+        return np.asarray(self.sigma**2 * self.degrees / chdtri(self.degrees, 1 - _QUANTILES))
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
-    """Of all frames of a camera, by their places, with the pattern that they share."""
+class Affinity:
+    """Size, stretch and shear of the frames that lie alike: mean (3,) and the scatter of each."""
 
-    frames: Mapping[int, Frame]
-    pattern: Pattern
-    film: Film
+    mean: Array = field(default_factory=lambda: np.zeros(3))
+    scatter: Scatter = field(default_factory=lambda: Scatter(AFFINITY_SIGMA))
 
-    def expected_mm(self, place: int) -> tuple[Array, Array]:
-        """The pattern at a frame's marks, by all others, and its covariance."""
-        return self.pattern.without(self.frames[place].under(self.film))
+
+LONE_FILM, LONE_AFFINITY = Scatter(SCATTER_MM, SCATTER_DEGREES), Affinity()
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMarks:
+    """The n >= 3 marks of a frame: given_mm (n, 2); off_mm (n, 2) measured less given, in the camera's axes, rotated
+    and shifted upon the given places; covariance_mm2 (2n, 2n), the film's scatter left out. model: the film deformation
+    model that the project states."""
+
+    given_mm: Array
+    off_mm: Array
+    covariance_mm2: Array
+    model: str = "affine"
+
+    @classmethod
+    def from_places(
+        cls, given_mm: Array, measured_mm: Array, covariances_mm2: Array, model: str = "affine"
+    ) -> "FrameMarks":
+        """Of marks given at (n, 2) and measured at (n, 2), in any axes, with covariances (n, 2, 2) in these."""
+        centers = given_mm.mean(axis=0), measured_mm.mean(axis=0)
+        left, _, right = np.linalg.svd((given_mm - centers[0]).T @ (measured_mm - centers[1]))
+        turn = left @ right
+        n = len(given_mm)
+        covariance = np.zeros((n, 2, n, 2))
+        covariance[np.arange(n), :, np.arange(n)] = turn @ covariances_mm2 @ turn.T + _LEAST_MM**2 * np.eye(2)
+        off = (measured_mm - centers[1]) @ turn.T - (given_mm - centers[0])
+        return cls(given_mm - centers[0], off, covariance.reshape(2 * n, 2 * n), model)
 
     @property
-    def log_evidence(self) -> float:
-        """What is strange costs as much as it is rare."""
-        strange = sum((each.film_mm is not None) + len(each.off_mm) for each in self.frames.values())
-        misfits = [each.under(self.film) for each in self.frames.values()]
-        return self.pattern.log_density(misfits) + strange * float(np.log(FALSE_DOUBT))
+    def radius_mm(self) -> float:
+        return float(np.hypot(*self.given_mm.T).max())
+
+    @cached_property
+    def affine(self) -> Array:
+        """(2n, 3) by size, stretch and shear."""
+        x, y = self.given_mm.T
+        return interleaved((x, y), (x, -y), (y, x))
+
+    @cached_property
+    def perspective(self) -> Array:
+        """(2n, 2) by a perspective that moves the outermost mark by about a mm."""
+        return film_terms("projective", self.given_mm) / self.radius_mm**2
+
+    @cached_property
+    def _beyond_affine(self) -> "_Reduced":
+        return _Reduced.from_free(self, self.affine)
+
+    @cached_property
+    def _beyond_congruent(self) -> "_Reduced":
+        return _Reduced.from_free(self, np.zeros((self.off_mm.size, 0)))
 
     @property
-    def chance_of_pattern(self) -> float:
-        """That what the frames share is no more than its sites' standard deviations say."""
-        statistic = self.pattern.chi_square() / max(self.pattern.degrees, 1)
-        return float(fdtrc(max(self.pattern.degrees, 1), self.film.degrees, statistic))
+    def redundancy(self) -> int:
+        """Size, stretch and shear being free."""
+        return len(self._beyond_affine.variances)
+
+    def chi_square(self, film_mm: float) -> float:
+        """Likewise, of film that scatters by film_mm."""
+        reduced = self._beyond_affine
+        return float((reduced.residuals**2 / (reduced.variances + film_mm**2)).sum())
+
+    def film_variance_mm2(self) -> float:
+        """What scatters the marks beyond their own covariances, unbiased but never negative."""
+        reduced = self._beyond_affine
+        return max(float((reduced.residuals**2 - reduced.variances).sum()) / max(self.redundancy, 1), 0.0)
+
+    def log_density(self, film_mm: float) -> float:
+        """Of the misfit, likewise, but for a constant."""
+        return -0.5 * (float(np.log(self._beyond_affine.variances + film_mm**2).sum()) + self.chi_square(film_mm))
+
+    def precision(self, film_mm: float) -> Array:
+        """(2n, 2n) of off_mm, likewise."""
+        return self._beyond_affine.precision(film_mm)
+
+    def affinity(self, film_mm: float) -> tuple[Array, Array]:
+        """(3,) size, stretch and shear by least squares, and their covariance (3, 3)."""
+        moved = self._beyond_congruent.precision(film_mm) @ self.affine
+        covariance = np.linalg.pinv(self.affine.T @ moved, hermitian=True)
+        return covariance @ (moved.T @ self.off_mm.ravel()), covariance
+
+    def distances_mm(self) -> Array:
+        """(n,) of each mark from where the others have it, by least squares, all parameters of the film being free."""
+        basis = self._beyond_affine.basis
+        return np.asarray(np.hypot(*(basis @ (basis.T @ self.off_mm.ravel())).reshape(-1, 2).T))
+
+    def expecting(self, off_mm: Array, covariance_mm2: Array) -> "FrameMarks":
+        """Beside a misfit off_mm (n, 2) that is expected with a covariance (2n, 2n)."""
+        return replace(self, off_mm=self.off_mm - off_mm, covariance_mm2=self.covariance_mm2 + covariance_mm2)
+
+    def widen(self, variances_mm2: Array) -> "FrameMarks":
+        """Add (n,) to the variances of each mark's coordinates."""
+        return replace(self, covariance_mm2=self.covariance_mm2 + np.diag(np.repeat(variances_mm2, 2)))
+
+    def rotate(self, turn: Array) -> "FrameMarks":
+        """In axes turned by (2, 2)."""
+        every = np.kron(np.eye(len(self.given_mm)), turn)
+        return replace(
+            self,
+            given_mm=self.given_mm @ turn.T,
+            off_mm=self.off_mm @ turn.T,
+            covariance_mm2=every @ self.covariance_mm2 @ every.T,
+        )
 
 
-def explained(misfits: Mapping[int, Misfit], sigma_mm: Array, free_mm: float, believed_mm: float) -> Explanation:
-    """The frames beside what the others have: those that stand out beyond chance, the worst first, are explained by one
-    of their marks, where that alone does it far better than all else, or by their film.
+@dataclass(frozen=True, eq=False)
+class _Reduced:
+    """A frame's misfit less what its free parameters take: basis (2n, m), orthonormal, in which the covariance is
+    diagonal: variances (m,); residuals (m,)."""
 
-    sigma_mm: of the pattern's sites; free_mm: by how much it may differ from that beforehand; believed_mm: of film.
+    basis: Array
+    variances: Array
+    residuals: Array
+
+    @classmethod
+    def from_free(cls, marks: FrameMarks, also: Array) -> "_Reduced":
+        """also: (2n, k) what is free beside shift, rotation and the film model's terms."""
+        x, y = marks.given_mm.T
+        one, none = np.ones_like(x), np.zeros_like(x)
+        more = film_terms(marks.model, marks.given_mm / marks.radius_mm)
+        free = np.hstack([interleaved((one, none), (none, one), (-y, x)), also, more])
+        free = np.hstack([free, marks.affine]) if more.shape[1] else free
+        left, sizes, _ = np.linalg.svd(free / np.linalg.norm(free, axis=0))
+        basis = left[:, int((sizes > _RANK * sizes[0]).sum()) :]
+        variances, vectors = np.linalg.eigh(basis.T @ marks.covariance_mm2 @ basis)
+        basis = basis @ vectors
+        return cls(basis, np.maximum(variances, _LEAST_MM**2), basis.T @ marks.off_mm.ravel())
+
+    def precision(self, film_mm: float) -> Array:
+        return np.asarray((self.basis / (self.variances + film_mm**2)) @ self.basis.T)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameConsistency:
+    """What a frame's marks say. p_value: of the frame. log_evidence (4, n + 1): of the hypotheses, without a wrong mark
+    and with each, given that something is wrong; off_mm (n, 2): where each mark lies, if it alone is wrong."""
+
+    p_value: float
+    log_evidence: Array
+    off_mm: Array
+
+    @property
+    def log_odds(self) -> Array:
+        """(n,) of each mark being wrong against all else."""
+        whole = logsumexp(self.log_evidence, axis=0)
+        return np.array([whole[k] - logsumexp(np.delete(whole, k)) for k in range(1, len(whole))])
+
+    @property
+    def wrong_mark(self) -> int | None:
+        """The mark that is named."""
+        odds = self.log_odds
+        return int(odds.argmax()) if odds.max() > NAMED else None
+
+    @property
+    def suspects(self) -> NDArray[np.bool_]:
+        """(n,) the marks that may be wrong."""
+        return self.log_odds > _SUSPECT
+
+    @property
+    def best_hypothesis(self) -> Hypothesis:
+        """What explains the frame far better than all else together, bent film where nothing does."""
+        own = self.log_evidence[:, 0]
+        best = Hypothesis(int(own.argmax()))
+        rest = np.delete(self.log_evidence, best, axis=0)
+        return best if own[best] - logsumexp(rest) > NAMED else Hypothesis.BENT
+
+
+def frame_p_value(marks: FrameMarks, film: Scatter = LONE_FILM, affinity: Affinity = LONE_AFFINITY) -> float:
+    """That film and affinity as they are known make as large a misfit, beyond affinity or by it, or at one mark."""
+    off, weight = marks.off_mm.ravel(), marks.precision(film.sigma)
+    chi_square, degrees = marks.chi_square(film.sigma), marks.redundancy
+    p_values = [1.0]
+    if degrees:
+        p_values.append(float(fdtrc(degrees, film.degrees, chi_square / degrees)))
+    fitted, covariance = marks.affinity(film.sigma)
+    if np.linalg.matrix_rank(covariance, tol=_RANK * np.trace(covariance)) == len(fitted):
+        apart, spread = fitted - affinity.mean, covariance + affinity.scatter.sigma**2 * np.eye(3)
+        p_values.append(float(fdtrc(3, affinity.scatter.degrees, apart @ np.linalg.solve(spread, apart) / 3)))
+    if degrees > 2:
+        n = len(marks.given_mm)
+        pulls = (weight @ off).reshape(n, 2)
+        blocks = weight.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+        share = np.einsum("ki,kij,kj->k", pulls, np.linalg.pinv(blocks, hermitian=True), pulls).max()
+        known = film.degrees + degrees - 2
+        ratio = share / 2 * known / (film.degrees + max(chi_square - share, 0.0))
+        p_values.append(n * float(fdtrc(2, known, ratio)))
+    return min(1.0, _TESTS * min(p_values))
+
+
+def frame_consistency(
+    marks: FrameMarks, film: Scatter = LONE_FILM, affinity: Affinity = LONE_AFFINITY
+) -> FrameConsistency:
+    """Test a frame and compare what may be wrong with it.
+
+    Parameters
+    ----------
+    marks: the frame's marks. film: scatter of marks along an axis, mm. affinity: of frames that lie alike.
+
+    Returns
+    -------
+    FrameConsistency
+        With the p-value of the frame, the evidence of each hypothesis, and each mark's own shift.
+
+    Notes
+    -----
+    Normal distributions throughout; unknown widths are averaged over equal steps of their logarithm, so that what needs
+    a larger width is the less likely the narrower its part of the range is. That nothing is wrong is for the p-value to
+    refuse: the evidence compares what else may be. Random effects of low rank are added by the
+    matrix determinant lemma (Harville 1997, 18.1).
     """
-    frames = {place: Frame(each, np.zeros(len(each.index))) for place, each in misfits.items()}
-    film = Film(believed_mm, SCATTER_DEGREES)
-    while True:
-        for _ in range(_ROUNDS):  # film tells the weights of the pattern, and the pattern what is left for film
-            own = {place: each.under(film) for place, each in frames.items()}
-            pattern = Pattern.of(list(own.values()), sigma_mm, free_mm)
-            ordinary = [own[place] for place, each in frames.items() if each.film_mm is None]
-            film = _film(ordinary, pattern, film, believed_mm)
-        pattern = Pattern.of([each.under(film) for each in frames.values()], sigma_mm, free_mm)
-        result = Explanation(frames, pattern, film)
-        open_ = [place for place, each in frames.items() if each.film_mm is None]
-        chances = {place: _chance(frames[place], pattern, film, believed_mm) for place in open_}
-        least = min(chances.values(), default=1.0)
-        if least * len(frames) >= FALSE_DOUBT:
-            return result
-        odd = [p for p in open_ if chances[p] * len(frames) < FALSE_DOUBT and _log(chances[p]) < _AS_ODD * _log(least)]
-        frames = {
-            place: _explained(replace(each, chance=chances[place]), result, place) if place in odd else each
-            for place, each in frames.items()
-        }
+    states = _states(marks, film, affinity)
+    reduced, n = marks._beyond_congruent, len(marks.given_mm)
+    residual = marks.off_mm.ravel() - marks.affine @ affinity.mean
+    columns = reduced.basis.T @ np.column_stack([marks.affine, marks.perspective, residual, np.eye(2 * n)])
+    spread = reduced.variances + states.film[:, None]
+    gram = np.einsum("mi,sm,mj->sij", columns, 1 / spread, columns, optimize=True)
+    known = states.log_prior - 0.5 * np.log(spread).sum(axis=1)
+    width = np.sqrt(states.effects)
+    inner = np.eye(5) + width[:, :, None] * gram[:, :5, :5] * width[:, None, :]
+    cross = width[:, :, None] * gram[:, :5, 5:]
+    gram = gram[:, 5:, 5:] - np.einsum("sij,sik->sjk", cross, np.linalg.solve(inner, cross))
+    known = known - 0.5 * (np.linalg.slogdet(inner)[1] + gram[:, 0, 0])
+    pulls = gram[:, 0, 1:].reshape(-1, n, 2)
+    blocks = gram[:, 1:, 1:].reshape(-1, n, 2, n, 2)[:, np.arange(n), :, np.arange(n)].swapaxes(0, 1)
+    off_variances = _widths(_MOST_OFF_MM)[:, None, None, None] ** 2
+    wider = np.eye(2) + off_variances[..., None] * blocks
+    shifted = np.linalg.solve(wider, (off_variances * pulls)[..., None])[..., 0]
+    gain = 0.5 * (shifted * pulls).sum(axis=-1) - 0.5 * np.log(np.linalg.det(wider))
+    by_mark = logsumexp(gain, axis=0) - np.log(_WIDTHS) + _PRIOR
+    every = known[:, None] + np.column_stack([np.zeros(len(known)), by_mark])
+    evidence = np.array([logsumexp(every[states.hypothesis == each], axis=0) for each in Hypothesis])
+    evidence[Hypothesis.SOUND, 0] = -np.inf
+    weights = np.exp(every - logsumexp(every, axis=0))
+    shifts = np.einsum("sk,skij,skj->ki", weights[:, 1:], np.linalg.pinv(blocks, hermitian=True), pulls)
+    return FrameConsistency(frame_p_value(marks, film, affinity), evidence, shifts)
 
 
-def _log(chance: float) -> float:
-    return float(np.log(max(chance, _LEAST_CHANCE)))
+@dataclass(frozen=True, eq=False)
+class _States:
+    """s states of film and scan: hypothesis (s,), film (s,) variance, effects (s, 5) variances of affinity and
+    perspective, log_prior (s,)."""
+
+    hypothesis: NDArray[np.intp]
+    film: Array
+    effects: Array
+    log_prior: Array
 
 
-def _chance(frame: Frame, pattern: Pattern, film: Film, believed_mm: float) -> float:
-    """That film as it is believed, or as the other frames show it, makes as large a misfit, or one mark lie so far from
-    where the others have it."""
-    expected, covariance = pattern.without(frame.under(film))
-    chances = [1.0]
-    for sigma_mm, known in ((film.sigma_mm, film.degrees), (believed_mm, SCATTER_DEGREES)):
-        own = frame.under(Film(sigma_mm, known))
-        whole, degrees = own.chi_square(expected, covariance), own.degrees
-        chances.append(float(fdtrc(degrees, known, whole / degrees)))
-        if degrees > 2:
-            rest = np.array([own.free(mark).chi_square(expected, covariance) for mark in range(len(own.index))])
-            known += degrees - 2
-            ratios = (whole - rest) / 2 / ((known - degrees + 2 + rest) / known)
-            chances.append(len(rest) * float(fdtrc(2, known, ratios.max())))
-    return min(chances)
+def _states(marks: FrameMarks, film: Scatter, affinity: Affinity) -> _States:
+    films, stretches, bends = film.variances(), affinity.scatter.variances(), _widths(MOST_BENT_MM)
+    bent = (films.mean() + bends**2, stretches, np.zeros(1))
+    pitch = (films, np.geomspace(AFFINITY_SIGMA / 10, _MOST_STRETCHED, _WIDTHS) ** 2, np.zeros(1))
+    most_mm = max(_MOST_PERSPECTIVE * marks.radius_mm**2, 2 * SCATTER_MM)
+    oblique = (films.mean(keepdims=True), stretches.mean(keepdims=True), _widths(most_mm) ** 2)
+    # The more film is bent, the rarer it is: a density of the inverse square of the width.
+    rarity = {Hypothesis.BENT: np.repeat(1 / bends, len(stretches))}
+    parts = []
+    for hypothesis, each in enumerate(((films, stretches, np.zeros(1)), bent, pitch, oblique)):
+        grid = np.stack(np.meshgrid(*each, indexing="ij"), axis=-1).reshape(-1, 3)
+        weights = rarity.get(Hypothesis(hypothesis), np.ones(len(grid)))
+        prior = np.log(weights / weights.sum()) + (_PRIOR if hypothesis else 0.0)
+        parts.append(np.column_stack([np.full(len(grid), hypothesis), grid, prior]))
+    hypothesis, film_mm2, stretch, perspective, prior = np.concatenate(parts).T
+    effects = np.repeat([stretch, perspective], [3, 2], axis=0).T
+    is_pitch = hypothesis == Hypothesis.PITCH
+    effects[is_pitch, :3] = stretches.mean() + stretch[is_pitch, None] * (1.0, 1.0, _TURNED**2)
+    return _States(hypothesis.astype(np.intp), film_mm2, effects, prior)
 
 
-def _explained(frame: Frame, result: Explanation, place: int) -> Frame:
-    """A frame that stands out."""
-    expected, covariance = result.expected_mm(place)
-    own, film = frame.under(result.film), result.film
-    densities = log_densities_wider(own, expected, covariance, film.sigma_mm)
-    mark = int(densities[1:].argmax())
-    if densities[mark + 1] - np.delete(densities, mark + 1).max() > TOLD:
-        off_mm = float(own.free(mark).distances_mm(expected)[mark])
-        variances = frame.variances_mm2 + np.where(np.arange(len(own.index)) == mark, off_mm**2, 0.0)
-        return replace(frame, variances_mm2=variances, off_mm={**frame.off_mm, mark: off_mm})
-    shown = _film_mm2(own.widened(-(film.sigma_mm**2)), expected, covariance)
-    known = SCATTER_DEGREES * film.sigma_mm**2 + own.degrees * shown
-    return replace(frame, film_mm=float(np.sqrt(known / (SCATTER_DEGREES + own.degrees))))
-
-
-def _film_mm2(misfit: Misfit, expected: Array, covariance: Array) -> float:
-    """What of the misfit's mean square its marks' own variances and the pattern's do not make."""
-    n = misfit.beyond_affine
-    made = 2 * float(np.trace(n.T @ (np.diag(misfit.variance_mm2) + covariance) @ n))
-    return max(float(((misfit.z - n.T @ expected) ** 2).sum()) - made, 0.0) / misfit.degrees
-
-
-def _film(misfits: list[Misfit], pattern: Pattern, before: Film, believed_mm: float) -> Film:
-    """From the lower median of the frames, which those that stand out do not widen, beside what is believed."""
-    if len(misfits) < 2:
-        return Film(believed_mm, SCATTER_DEGREES)
-    shown = sorted(
-        _film_mm2(each.widened(-(before.sigma_mm**2)), *pattern.without(each))
-        * each.degrees
-        / float(chdtri(each.degrees, 0.5))
-        for each in misfits
-    )[(len(misfits) - 1) // 2]
-    degrees = MEDIAN_EFFICIENCY * sum(each.degrees for each in misfits)
-    variance = (SCATTER_DEGREES * believed_mm**2 + degrees * shown) / (SCATTER_DEGREES + degrees)
-    is_more = bool(chdtrc(degrees, degrees * shown / believed_mm**2) < FALSE_DOUBT)
-    return Film(float(np.sqrt(variance)), SCATTER_DEGREES + degrees, is_more)
+def _widths(most_mm: float) -> Array:
+    return np.geomspace(SCATTER_MM, most_mm, _WIDTHS)

@@ -15,6 +15,33 @@ _LINEAR = [0, 1, 4, 5]  # of the unknowns: all but the shift
 _LEAST_GATE = 0.1  # of the gate: film bends marks so far off, however well most agree
 
 
+def interleaved(*columns: tuple[Array, Array]) -> Array:
+    """(2n, k) of k columns, each of them (n,) in x and (n,) in y."""
+    return np.stack([np.stack(each, axis=1).ravel() for each in columns], axis=1)
+
+
+def film_terms(model: str, places: Array) -> Array:
+    """(2n, k) what a film model adds to an affine transformation at places (n, 2), to first order.
+
+    model: projective, bilinear, conformal(n) or polynomial(n); any other adds nothing.
+    """
+    x, y = places.T
+    none = np.zeros_like(x)
+    name, _, order = model.rstrip(")").partition("(")
+    powers = range(2, int(order) + 1) if order.isdigit() else range(0)
+    if name == "projective":
+        return interleaved((x**2, x * y), (x * y, y**2))
+    if name == "bilinear":
+        return interleaved((x * y, none), (none, x * y))
+    if name == "conformal" and powers:
+        z = [(x + 1j * y) ** power for power in powers]
+        return interleaved(*[(each.real, each.imag) for each in z], *[(-each.imag, each.real) for each in z])
+    if name == "polynomial" and powers:
+        terms = [x ** (degree - q) * y**q for degree in powers for q in range(degree + 1)]
+        return interleaved(*[(each, none) for each in terms], *[(none, each) for each in terms])
+    return np.zeros((2 * len(places), 0))
+
+
 @dataclass(frozen=True, eq=False)
 class FrameFit:
     """up_from_camera: (2, 3), camera mm to the scan's mm (right, up). residuals_mm: (n, 2) measured less predicted.

@@ -11,7 +11,7 @@ import numpy as np
 from measure.annotations.fields import KnownLine, Line, masked_text
 from measure.annotations.orientation_from_text import bounded, line_score
 from measure.boards.corners import one_definition
-from measure.fiducials.across_frames import judged
+from measure.fiducials.across_frames import check_frames
 from measure.fiducials.options import BelievedFilm
 from measure.fiducials.scan_orientation import DECIDED, TOLD
 from measure.flags import Code, Reason, Status
@@ -226,7 +226,7 @@ def _judged(
     """The fiducials judged together, if the camera has any."""
     if not camera.drawn:
         return frames
-    return judged(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames
+    return check_frames(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames
 
 
 def with_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:
