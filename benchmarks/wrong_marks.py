@@ -54,7 +54,9 @@ def outcome(
     error_px = PX_PER_MM * off_mm * np.array([np.cos(angle), np.sin(angle)])
     marks = list(frames[0].marks)
     mark = marks[wrong]
-    marks[wrong] = MarkMeasurement(mark.point, "fiducial", mark.center_px + error_px, mark.covariance, mark.status)
+    marks[wrong] = MarkMeasurement(
+        mark.point, "fiducial", np.asarray(mark.center_px) + error_px, mark.covariance, mark.status
+    )
     frames[0] = FrameMeasurement("0", tuple(marks), frames[0].pose, frames[0].pixel_from_camera)
     checked = check_frames(frames, layout_of(FOUR), [(1000 / PX_PER_MM,) * 2] * count).frames
     named = {(f.image, m.point) for f in checked for m in f.marks if m.status is not Status.MEASURED}

@@ -65,18 +65,16 @@ def check_frames(
     layout: FiducialLayout,
     pitches_um: Sequence[tuple[float, float]],
     film: BelievedFilm = ANY_FILM,
-    model: str = "affine",
 ) -> CheckedFrames:
     """Check all measured frames of one camera together.
 
     Parameters
     ----------
-    pitches_um: of each scan, in x and y. film: what is believed of it beforehand. model: the film deformation model
-    that the project states.
+    pitches_um: of each scan, in x and y. film: what is believed of it beforehand.
     """
     checked = [_doubt_marks(frame, own) for frame, own in zip(frames, second_place_doubts(frames), strict=True)]
     films = [film.sigma_mm] * len(frames)
-    found = {i: _frame_marks(*pair, layout, model) for i, pair in enumerate(zip(checked, pitches_um, strict=True))}
+    found = {i: _frame_marks(*pair, layout, film.model) for i, pair in enumerate(zip(checked, pitches_um, strict=True))}
     marks = {place: each for place, each in found.items() if each is not None}
     if not marks:
         return CheckedFrames(tuple(checked), tuple(films))
@@ -204,7 +202,7 @@ def _frame_marks(
         return None
     mm = np.diag([pitch_um[0], -pitch_um[1]]) / 1000
     measured = np.array([mm @ np.asarray(mark.center_px) for mark in marks])
-    covariances = np.array([mm @ mark.covariance_px2 @ mm.T for mark in marks])
+    covariances = np.array([mm @ np.asarray(mark.covariance_px2) @ mm.T for mark in marks])
     return _Frame(FrameMarks.from_places(given, measured, covariances, model), sites)
 
 
@@ -238,7 +236,7 @@ class _Pattern:
         information, right = self._posterior.copy(), self.right.copy()
         information[np.ix_(frame.places, frame.places)] -= weight
         right[frame.places] -= weight @ frame.marks.off_mm.ravel()
-        covariance = np.linalg.inv(information)
+        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         if is_pooled:
             covariance = self._beyond_affine @ covariance @ self._beyond_affine
         off = (covariance @ right)[frame.places].reshape(-1, 2)

@@ -21,10 +21,12 @@ CLICK_SIGMA_PX = 0.5  # of a place at which a person points, in a picture that i
 @dataclass(frozen=True)
 class BelievedFilm:
     """The scatter of marks by film and scanner, along an axis. is_stated: somebody says so, and adds it to every mark
-    where it is adjusted; else a frame that scatters more has to bring all of its scatter along."""
+    where it is adjusted; else a frame that scatters more has to bring all of its scatter along. model: the film
+    deformation model that the project states."""
 
     sigma_mm: float = SCATTER_MM
     is_stated: bool = False
+    model: str = "affine"
 
     @property
     def added_later_mm(self) -> float:
