@@ -7,6 +7,7 @@ the range: quadratic (what moves corners across one another) or mark by mark. In
 """
 
 import argparse
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +58,7 @@ def outcome(
     marks[wrong] = MarkMeasurement(
         mark.point, "fiducial", np.asarray(mark.center_px) + error_px, mark.covariance, mark.status
     )
-    frames[0] = FrameMeasurement("0", tuple(marks), frames[0].pose, frames[0].pixel_from_camera)
+    frames[0] = replace(frames[0], marks=tuple(marks))
     checked = check_frames(frames, layout_of(FOUR), [(1000 / PX_PER_MM,) * 2] * count).frames
     named = {(f.image, m.point) for f in checked for m in f.marks if m.status is not Status.MEASURED}
     own = ("0", mark.point)

@@ -146,7 +146,7 @@ class FrameMarks:
     def affinity(self, film_mm: float) -> tuple[Array, Array]:
         """(3,) size, stretch and shear by least squares, and their covariance (3, 3)."""
         moved = self._beyond_congruent.precision(film_mm) @ self.affine
-        covariance = np.linalg.pinv(self.affine.T @ moved, hermitian=True)
+        covariance = np.asarray(np.linalg.pinv(self.affine.T @ moved, hermitian=True), dtype=np.float64)
         return covariance @ (moved.T @ self.off_mm.ravel()), covariance
 
     def distances_mm(self) -> Array:
