@@ -55,7 +55,7 @@ def print_table(comparison: Comparison, summary: Summary) -> None:
         off = f"{(value - truth) / sigma:10.2f}" if sigma > 0.0 else f"{'fixed':>10}"
         print(f"{name:34} {value:16.8g} {sigma:12.3g} {truth:16.8g} {off}")
     if summary.adjustment:
-        print(f"sigma0 {summary.adjustment['sigma0']:.4f}, redundancy {summary.adjustment['redundancy']}")
+        print(f"sigma0 {summary.adjustment.sigma0:.4f}, redundancy {summary.adjustment.redundancy}")
     print(summary.verdict.sentence)
 
 

@@ -28,6 +28,7 @@ from adjust.quality.variance_factor import LEAST_REDUNDANCY, NO_EVIDENCE, TOO_GO
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.report.fiducials import figure_of_films
+from pipeline.results.adjustment_record import FiducialRecord, GivenQuantity, Quantity
 
 Array = NDArray[np.float64]
 Figures = dict[str, tuple[Array, Array]]  # by kind of quantity: errors and claims (trials, quantities)
@@ -307,16 +308,17 @@ def _printed(result: Adjustment, given: Array) -> tuple[Array, Array] | None:
     """Corrections and their standard deviations (2m,) in mm as the report prints them."""
     marks = dict(_marks(result, given))
     films = {image.name: adjusted_image(result, image.name).film for image in result.network.images}
-    form = figure_of_films(CAMERA, {"fiducials": marks}, Known(result), films)  # type: ignore[arg-type]
+    form = figure_of_films(CAMERA, marks, Known(result), films)  # type: ignore[arg-type]
     if form is None:
         return None
     return 1e-3 * form.change_um.ravel(), 1e-3 * np.sqrt(np.maximum(np.diag(form.covariance_um2), 0.0))
 
 
-def _marks(result: Adjustment, given: Array) -> Iterator[tuple[str, dict[str, object]]]:
+def _marks(result: Adjustment, given: Array) -> Iterator[tuple[str, FiducialRecord]]:
     for id_, place in zip(result.network.cameras[0].fiducials, given.tolist(), strict=True):
-        values = {axis: result.value(f"FID.{CAMERA}.{id_}.{axis}") for axis in "xy"}
-        yield id_, {f"{axis}_mm": {"value": values[axis], "given": {"value": place[k]}} for k, axis in enumerate("xy")}
+        values = [result.value(f"FID.{CAMERA}.{id_}.{axis}") for axis in "xy"]
+        x, y = (Quantity(value, 0.0, GivenQuantity(own, 0.0)) for value, own in zip(values, place, strict=True))
+        yield id_, FiducialRecord(x, y, 0.0)
 
 
 def _sigmas(covariance: Array) -> Array:

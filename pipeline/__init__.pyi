@@ -5,7 +5,7 @@ from .files.camera_file import read_camera as read_camera
 from .files.images_file import read_images as read_images
 from .files.points_file import read_points as read_points
 from .files.project_file import read_project as read_project
+from .results.adjustment_file import read_adjustment as read_adjustment
 from .results.adjustment_file import write_adjustment as write_adjustment
-from .results.adjustment_reader import read_adjustment as read_adjustment
 from .results.comparator_file import read_comparator as read_comparator
 from .results.comparator_file import write_comparator as write_comparator

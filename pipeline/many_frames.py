@@ -96,7 +96,7 @@ def reduced(
     if stored is not None:
         totals.add_plain(stored.plain, stored.columns(), camera_of)
     with_pose = not is_film_alone(data)
-    suspect = {row["image"] for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
+    suspect = {row.image for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
     for one in _one_by_one(data, scans):
         (frame,) = frames(one)
         verdict, problems = _verdict(frame, with_pose), list(problems_of(frame, with_pose))
@@ -142,11 +142,13 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
     rows: dict[str, list[ComparatorPoint]] = defaultdict(list)
     for row in data.comparator:
         rows[row.image].append(row)
-    residuals = residuals_by_image(data)
+    residuals, others = residuals_by_image(data), data.adjustment.images if data.adjustment else {}
     seen = set[str]()
 
     def of(image: str, scan: MeasuredScan | None) -> ReportData:
-        own = {"images": {image: {}}, "residuals": residuals.get(image, [])} if data.adjustment else None
+        images = {name: known for name, known in [(image, others.get(image))] if known is not None}
+        rows_of = tuple(residuals.get(image, ()))
+        own = replace(data.adjustment, images=images, residuals=rows_of) if data.adjustment else None
         return replace(
             data, comparator=rows.get(image, []), measurement={image: scan} if scan else {}, adjustment=own, totals=None
         )
@@ -155,7 +157,6 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
         if scan.frame.image in rows or not scan.frame.marks:  # others were taken out of the comparator file
             seen.add(scan.frame.image)
             yield of(scan.frame.image, scan)
-    others = data.adjustment["images"] if data.adjustment else ()
     for image in sorted({*rows, *others} - seen):
         yield of(image, None)
 

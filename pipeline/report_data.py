@@ -4,7 +4,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from pipeline.archive.measurement import StoredMarks, made_from_of, measured_scans
 from pipeline.archive.results_database import Store
@@ -25,7 +24,7 @@ from pipeline.publishing.made_from import (
 )
 from pipeline.publishing.publishing import outside_note
 from pipeline.report.data import Problem, ReportData
-from pipeline.results.adjustment_reader import read_adjustment, read_covariance
+from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.check_file import read_check
 from pipeline.results.comparator_file import (
     ComparatorPoint,
@@ -34,10 +33,10 @@ from pipeline.results.comparator_file import (
     measurement_of,
     read_comparator,
 )
+from pipeline.results.covariance_file import read_covariance
 from pipeline.results.measured_scan import FailureCode, MeasuredScan
 from pipeline.text.wording import did_you_mean, listed
 
-Json = dict[str, Any]
 At = Callable[[Path], Path]
 
 
@@ -142,7 +141,7 @@ def adjusted(project: Project, at: At, most_frames: int | None = None) -> Report
     if not path.exists():
         return data
     adjustment, covariance, fingerprint = read_adjustment(path), read_covariance(path), of_file(path)
-    made = adjustment.get("made_from") or {}
+    made = adjustment.made_from
     others = differing(made, adjusted_from(project, data.comparator))
     if others:
         what = f"of other {' and '.join(others)} than there are now" if made else "of what it does not say"
@@ -158,7 +157,7 @@ def adjusted(project: Project, at: At, most_frames: int | None = None) -> Report
         check = read_check(check_path)
     except FileNotFoundError:
         return data
-    if check.get("made_from") != {path.name: fingerprint}:
+    if check.made_from != {path.name: fingerprint}:
         return _with_problem(
             data, f"{check_path.name} is of another adjustment: it is not shown.", "Run `reseau check`."
         )

@@ -3,7 +3,6 @@
 What only one stage needs is imported by it: adjusting takes no pictures, and measuring no other program's adjustment.
 """
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
@@ -47,8 +46,7 @@ from pipeline.publishing.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
 from pipeline.report.page import write_frame_page, write_report
 from pipeline.report_data import adjusted, frame_data, measured, report_data
-from pipeline.results.adjustment_file import write_adjustment
-from pipeline.results.adjustment_reader import covariance_path, read_adjustment
+from pipeline.results.adjustment_file import read_adjustment, write_adjustment
 from pipeline.results.comparator_file import (
     ComparatorPoint,
     measurement_of,
@@ -56,11 +54,12 @@ from pipeline.results.comparator_file import (
     read_comparator,
     write_comparator,
 )
+from pipeline.results.covariance_file import covariance_path
 from pipeline.results.frames_file import for_images, write_frames
 from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.record_json import write_record
 from pipeline.summary import Summary, summarise
-from pipeline.text.atomic import write_atomically
 
 if TYPE_CHECKING:
     from pipeline.opencv_check.opencv_corners import BoardPictures
@@ -312,7 +311,7 @@ def _frames_mm(project: Project, new: Unpublished) -> dict[str, tuple[float, flo
 def _check_adjusted(project: Project, marks: Sequence[ComparatorPoint]) -> None:
     """Raises InputError where there is no adjustment of these marks and of the project as it is."""
     path = project.adjustment_path
-    made_from = read_adjustment(path).get("made_from") or {}
+    made_from = read_adjustment(path).made_from
     if others := differing(made_from, adjusted_from(project, marks)):
         raise InputError(f"{path}: is of other {' and '.join(others)} than there are now. Run `reseau adjust` first.")
 
@@ -322,9 +321,7 @@ def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> 
 
     made_from = {project.adjustment_path.name: of_file(new.at(project.adjustment_path))}
     found = check_against_opencv(adjustment, _board_pictures(project, new))
-    check = {"reseau": version("reseau"), "made_from": made_from, **found.to_json()}
-    text = json.dumps(check, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    write_atomically(new.place(project.check_path), text)
+    write_record(replace(found, reseau=version("reseau"), made_from=made_from), new.place(project.check_path))
 
 
 def _board_pictures(project: Project, new: Unpublished) -> "BoardPictures | None":

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -12,17 +11,18 @@ from rich.table import Table
 from rich.text import Text
 
 from measure.flags import Status
+from measure.results import Pose
 from pipeline.report.camera_views import fiducial_form
 from pipeline.report.data import ReportData
 from pipeline.report.fiducials import Figure
-from pipeline.report.frame_views import camera_of
 from pipeline.report.marks import current_scans
 from pipeline.report.numbers import value_and_sigma
-from pipeline.report.verdict import Verdict, camera_is_calibrated, has_sigma0, judge
+from pipeline.report.verdict import Verdict, judge
+from pipeline.results.adjustment_record import AdjustmentRecord
+from pipeline.results.check_file import Check
 from pipeline.results.measured_record import pose_record
 
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
-Json = dict[str, Any]
 FRAME_ROWS = 50  # of frames at most in a table in the terminal: the report has all
 
 
@@ -33,13 +33,13 @@ class Summary:
 
     verdict: Verdict
     frames: Mapping[str, Mapping[str, int]]
-    poses: Mapping[str, Json]
-    adjustment: Json | None
-    check: Json | None
+    poses: Mapping[str, Pose]
+    adjustment: AdjustmentRecord | None
+    check: Check | None
     files: Mapping[str, Path] = field(default_factory=dict)
     forms: Mapping[str, Figure] = field(default_factory=dict)
 
-    def as_json(self) -> Json:
+    def as_json(self) -> dict[str, object]:
         return {
             "reseau": version("reseau"),
             "verdict": self.verdict.level,
@@ -47,9 +47,9 @@ class Summary:
             "problems": [{"what": problem.what, "next_step": problem.next_step} for problem in self.verdict.problems],
             "notes": list(self.verdict.notes),
             "frames": {name: dict(counts) for name, counts in self.frames.items()},
-            "poses": dict(self.poses),
+            "poses": {name: pose_record(pose) for name, pose in self.poses.items()},
             "adjustment": self.adjustment and _main_numbers(self.adjustment),
-            "check": self.check and {"verdict": self.check["verdict"], "reason": self.check["reason"]},
+            "check": self.check and {"verdict": self.check.verdict, "reason": self.check.reason},
             "files": {word: str(path) for word, path in self.files.items()},
         }
 
@@ -62,17 +62,16 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
         counts[mark.status] += 1
     if data.totals:
         frames = {name: {str(s): counts.get(s, 0) for s in Status} for name, counts in data.totals.marks.items()}
-    poses = {name: pose_record(scan.frame.pose) for name, scan in current_scans(data).items() if scan.frame.pose}
+    poses = {name: scan.frame.pose for name, scan in current_scans(data).items() if scan.frame.pose}
     return Summary(judge(data), frames, poses, data.adjustment, data.check, files, _forms(data))
 
 
 def _forms(data: ReportData) -> dict[str, Figure]:
     stored, covariance = data.adjustment, data.covariance
-    if stored is None or covariance is None or not stored["converged"]:
+    if stored is None or covariance is None or not stored.converged:
         return {}
-    uncalibrated = [name for name, camera in stored["cameras"].items() if not camera_is_calibrated(camera)]
-    images = {name: [image for image in stored["images"] if camera_of(data, image) == name] for name in uncalibrated}
-    found = {name: fiducial_form(name, stored, covariance, images[name]) for name in uncalibrated}
+    uncalibrated = [name for name, camera in stored.cameras.items() if not camera.is_calibrated]
+    found = {name: fiducial_form(name, stored, covariance) for name in uncalibrated}
     return {name: form for name, form in found.items() if form is not None}
 
 
@@ -86,10 +85,10 @@ def print_summary(summary: Summary, console: Console) -> None:
     if summary.frames:
         console.print(_frame_table(summary.frames, summary.poses))
         for name, pose in summary.poses.items():
-            if pose["decided"]:
-                console.print(Text(f"{name}: pose {pose['name']}. {' '.join(pose['evidence'])}", style="dim"))
+            if pose.decided:
+                console.print(Text(f"{name}: pose {pose.name}. {' '.join(pose.evidence)}", style="dim"))
     if summary.adjustment:
-        calibrated = any(camera_is_calibrated(camera) for camera in summary.adjustment["cameras"].values())
+        calibrated = any(camera.is_calibrated for camera in summary.adjustment.cameras.values())
         console.print((_camera_table if calibrated else _film_table)(summary.adjustment))
         for name, form in summary.forms.items():
             console.print(_form_table(name, form))
@@ -99,12 +98,13 @@ def print_summary(summary: Summary, console: Console) -> None:
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _main_numbers(adjustment: Json) -> Json:
-    how = ("converged", "termination", "iterations", "observations", "unknowns", "redundancy")
-    return {key: adjustment[key] for key in (*how, "sigma0", "sigma0_from", "cameras")}
+def _main_numbers(adjustment: AdjustmentRecord) -> dict[str, object]:
+    how = ("converged", "termination", "iterations", "observations", "unknowns", "redundancy", "sigma0")
+    numbers = {key: getattr(adjustment, key) for key in how}
+    return {**numbers, "sigma0_from": adjustment.variance_factor, "cameras": adjustment.cameras}
 
 
-def _frame_table(frames: Mapping[str, Mapping[str, int]], poses: Mapping[str, Json]) -> Table:
+def _frame_table(frames: Mapping[str, Mapping[str, int]], poses: Mapping[str, Pose]) -> Table:
     columns = ("image", "pose", *Status) if poses else ("image", *Status)
     title, fewest_measured = "Marks", sorted(frames, key=lambda name: frames[name][str(Status.MEASURED)])
     shown = set(fewest_measured[:FRAME_ROWS])
@@ -114,37 +114,37 @@ def _frame_table(frames: Mapping[str, Mapping[str, int]], poses: Mapping[str, Js
     for name, counts in frames.items():
         if name in shown:
             pose = poses.get(name)
-            told = "" if pose is None else pose["name"] + ("" if pose["decided"] else ", assumed")
-            row = [told] if poses else []
+            name_of_pose = "" if pose is None else pose.name + ("" if pose.decided else ", assumed")
+            row = [name_of_pose] if poses else []
             table.add_row(Text(name), *row, *(str(counts[status]) for status in Status))
     return table
 
 
-def _sigma0(adjustment: Json) -> str:
+def _sigma0(adjustment: AdjustmentRecord) -> str:
     """sigma0 with the redundancy of what it comes from; without any, what standard deviations are."""
-    if not has_sigma0(adjustment):
+    if not adjustment.has_sigma0:
         return "standard deviations a priori"
-    return f"sigma0 = {adjustment['sigma0']:.3f}, redundancy {adjustment['sigma0_from']['redundancy']:.0f}"
+    return f"sigma0 = {adjustment.sigma0:.3f}, redundancy {adjustment.variance_factor.redundancy:.0f}"
 
 
-def _film_table(adjustment: Json) -> Table:
+def _film_table(adjustment: AdjustmentRecord) -> Table:
     """What an adjustment of fiducials alone gives of every image."""
     title = f"Film transformations ({_sigma0(adjustment)})"
-    datum = adjustment["groups"].get("datum")
+    datum = adjustment.groups.get("datum")
     if datum:
-        title += f"; given fiducials: rms {datum['rms_x_um']:.2f}, {datum['rms_y_um']:.2f} um"
+        title += f"; given fiducials: rms {datum.rms_x_um:.2f}, {datum.rms_y_um:.2f} um"
     columns = ("image", "transformation", "fiducials", "rms x, um", "rms y, um")
     squares: dict[str, list[tuple[float, float]]] = {}
-    for row in adjustment["residuals"]:
-        squares.setdefault(row["image"], []).append((row["vx_um"] ** 2, row["vy_um"] ** 2))
+    for row in adjustment.residuals:
+        squares.setdefault(row.image, []).append((row.vx_um**2, row.vy_um**2))
     rms = {name: np.sqrt(np.mean(of_image, axis=0)) for name, of_image in squares.items()}
     worst = sorted(rms, key=lambda name: -float(np.hypot(*rms[name])))[:FRAME_ROWS]
-    shown = [name for name in adjustment["images"] if name in set(worst)]
+    shown = [name for name in adjustment.images if name in set(worst)]
     if len(shown) < len(rms):
         title += f"; the {len(shown)} of {len(rms)} frames with the largest residuals"
     table = Table(*columns, title=title, title_justify="left")
     for name in shown:
-        kind = adjustment["images"][name]["transformation"]["kind"]
+        kind = adjustment.images[name].transformation.kind
         table.add_row(Text(name), kind, str(len(squares[name])), *(f"{value:.2f}" for value in rms[name]))
     return table
 
@@ -163,19 +163,11 @@ def _form_table(name: str, form: Figure) -> Table:
     return table
 
 
-def _camera_table(adjustment: Json) -> Table:
+def _camera_table(adjustment: AdjustmentRecord) -> Table:
     title = f"Camera ({_sigma0(adjustment)})"
     table = Table("camera", "parameter", "value", "sigma", title=title, title_justify="left")
-    for name, camera in adjustment["cameras"].items():
-        if not camera_is_calibrated(camera):
-            continue
-        point = camera["principal_point_mm"]
-        rows = {
-            "principal distance, mm": camera["principal_distance_mm"],
-            "principal point x', mm": point["x"],
-            "principal point y', mm": point["y"],
-            **{word: part for word, part in camera["distortion"].items() if isinstance(part, dict)},
-        }
-        for word, quantity in rows.items():
-            table.add_row(Text(name), word, *value_and_sigma(quantity["value"], quantity["sigma"]))
+    words = {"c": "principal distance, mm", "x0": "principal point x', mm", "y0": "principal point y', mm"}
+    for name, camera in adjustment.cameras.items():
+        for word, each in camera.interior.items() if camera.is_calibrated else ():
+            table.add_row(Text(name), words.get(word, word), *value_and_sigma(each.value, each.sigma))
     return table

@@ -1,11 +1,7 @@
 """`reseau choose`: which transformation and distortion the observations of a project ask for, to choose.json."""
 
-import json
-from collections.abc import Mapping
-from dataclasses import asdict, replace
-from importlib.metadata import version
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -13,22 +9,20 @@ from rich.text import Text
 
 from adjust.model_selection.candidates import Candidate
 from adjust.model_selection.model_choice import Choice, choose
-from adjust.model_selection.models import Model
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.adjusting.scanners import with_scanner_names
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.publishing.made_from import adjusted_from
 from pipeline.publishing.publishing import unpublished
+from pipeline.results.choice_file import ChoiceRecord, choice_record
 from pipeline.results.comparator_file import read_comparator
-from pipeline.text.atomic import write_atomically
-from pipeline.text.text_file import without_nan
-
-Json = dict[str, Any]
+from pipeline.results.record_json import write_record
 
 
-def run_choose(project: Project, reporter: Reporter) -> Choice:
-    """Compare models on the observations that the project's own adjustment uses, disks corrected, and write the result.
+def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceRecord]:
+    """Compare models on the observations that the project's own adjustment uses, disks corrected; write and hand back
+    the result.
 
     Raises InputError or AdjustmentError where the project cannot be adjusted at all.
     """
@@ -43,32 +37,10 @@ def run_choose(project: Project, reporter: Reporter) -> Choice:
                 half_mm,
                 lambda name, done: count(name, done, done + 1),
             )
-        made_from = {"reseau": version("reseau"), "made_from": adjusted_from(project, marks)}
-        text = json.dumps(made_from | without_nan(choice_json(choice)), indent=1, ensure_ascii=False, allow_nan=False)
-        write_atomically(new.place(project.choice_path), text + "\n")
+        record = choice_record(choice, adjusted_from(project, marks))
+        write_record(record, new.place(project.choice_path))
         new.publish()
-    return choice
-
-
-def choice_json(choice: Choice) -> Json:
-    """The choice as choose.json holds it; numbers that mean nothing are still infinite."""
-    return {
-        "chosen": choice.chosen and _model(choice.chosen.model),
-        "given": _model(choice.given),
-        "verdict": choice.verdict,
-        "reasons": list(choice.reasons),
-        "candidates": [_candidate(each) for each in choice.candidates],
-        "tests": [
-            {
-                "simpler": test.simpler.name,
-                "richer": test.richer.name,
-                "F": test.f,
-                "degrees": list(test.degrees),
-                "p": test.p,
-            }
-            for test in choice.tests
-        ],
-    }
+    return choice, record
 
 
 def print_choice(choice: Choice, console: Console, path: Path) -> None:
@@ -99,35 +71,6 @@ def _numbers(candidate: Candidate) -> tuple[str, ...]:
         "none" if predicted is None else f"{predicted.rms_um:.2f}",
         str(len(candidate.correlated)),
     )
-
-
-def _candidate(candidate: Candidate) -> Json:
-    entry = {"name": candidate.model.name, **_model(candidate.model)}
-    if candidate.problem:
-        return entry | {"problem": candidate.problem}
-    predicted = candidate.cross_validation
-    return entry | {
-        "problem": "",
-        "observations": candidate.observations,
-        "unknowns": candidate.unknowns,
-        "redundancy": candidate.redundancy,
-        "vpv": candidate.vpv,
-        "sigma0": candidate.sigma0,
-        "aic": candidate.aic,
-        "aicc": candidate.aicc,
-        "cross_validation": None if predicted is None else asdict(predicted),
-        "correlated": [{"parameters": [a, b], "correlation": rho} for a, b, rho in candidate.correlated],
-        "warnings": list(candidate.warnings),
-    }
-
-
-def _model(model: Model) -> Mapping[str, Any]:
-    return {
-        "transformation": model.transformation,
-        "family": model.family,
-        "parameters": list(model.parameters),
-        "bends": {scanner: list(terms) for scanner, terms in model.bends},
-    }
 
 
 def _half(frame_mm: tuple[float, float]) -> tuple[float, float]:

@@ -1,11 +1,9 @@
 """`reseau compare`: the calibrations of a camera in several adjustment.json, compared as a field over the frame."""
 
-import json
 from collections import defaultdict
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,21 +15,21 @@ from adjust.problem.parameter import Parameter
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
 from pipeline.adjusting.compare_picture import draw_comparison
 from pipeline.errors import InputError
-from pipeline.results.adjustment_reader import calibrated_lens, read_adjustment, read_own_covariance
-from pipeline.text.atomic import check_writable, write_atomically
-from pipeline.text.text_file import without_nan
+from pipeline.results.adjustment_file import observed_mm, read_adjustment
+from pipeline.results.adjustment_record import AdjustmentRecord
+from pipeline.results.comparison_file import DRIFT, ComparisonRecord, ParameterDifference, comparison_record
+from pipeline.results.covariance_file import read_own_covariance
+from pipeline.results.record_json import write_record
+from pipeline.text.atomic import check_writable
 from pipeline.text.wording import did_you_mean, listed
 
 Array = NDArray[np.float64]
-Json = dict[str, Any]
-
-DRIFT, NO_DRIFT = "drift", "no drift"
 
 
 def run_compare(
     paths: Sequence[Path], camera: str | None, times: Sequence[float] | None, use: Use, level: float, out: Path | None
-) -> tuple[Comparison, tuple[str, ...]]:
-    """The comparison of the camera in all files, and remarks on it; compare.json and compare.svg into `out`, if any.
+) -> tuple[Comparison, ComparisonRecord]:
+    """The comparison of the camera in all files, and the record of it; compare.json and compare.svg into `out`, if any.
 
     Raises InputError or AdjustmentError for a file that holds no calibration of the camera, or for what cannot be
     compared.
@@ -42,18 +40,12 @@ def run_compare(
     calibrations = [_calibration(*each) for each in zip(paths, contents, names, labels, strict=True)]
     halves = [_half_mm(*each) for each in zip(paths, contents, names, strict=True)]
     comparison = compare(calibrations, (min(x for x, _ in halves), min(y for _, y in halves)), times, use)
-    remarks = _remarks(paths, contents, names)
+    record = comparison_record(comparison, _remarks(paths, contents, names), level)
     if out is not None:
         check_writable(out)
-        content = json.dumps(without_nan(comparison_json(comparison, remarks, level)), indent=1, ensure_ascii=False)
-        write_atomically(out / "compare.json", content + "\n")
+        write_record(record, out / "compare.json")
         draw_comparison(comparison, out / "compare.svg")
-    return comparison, remarks
-
-
-def verdict(comparison: Comparison, level: float) -> str:
-    """`drift` where calibrations that are the same would differ as much in fewer than `level` of all cases."""
-    return DRIFT if comparison.probability < level else NO_DRIFT
+    return comparison, record
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
@@ -68,8 +60,8 @@ def _labels(paths: Sequence[Path]) -> list[str]:
     return ["/".join(each[-enough:]) for each in parts]
 
 
-def _camera(path: Path, content: Json, name: str | None) -> str:
-    cameras: list[str] = list(content["cameras"])
+def _camera(path: Path, content: AdjustmentRecord, name: str | None) -> str:
+    cameras = list(content.cameras)
     if name is None and len(cameras) == 1:
         return cameras[0]
     if name is None:
@@ -79,43 +71,36 @@ def _camera(path: Path, content: Json, name: str | None) -> str:
     return name
 
 
-def _calibration(path: Path, content: Json, name: str, label: str) -> CameraCalibration:
-    if not content["converged"]:
+def _calibration(path: Path, content: AdjustmentRecord, name: str, label: str) -> CameraCalibration:
+    if not content.converged:
         raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
-    camera = content["cameras"][name]
-    lens = calibrated_lens(camera)
+    camera = content.cameras[name]
+    lens = camera.lens()
     if not np.isfinite(lens.values).all():
         raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
-    marks = {id: np.array([mark["x_mm"]["value"], mark["y_mm"]["value"]]) for id, mark in camera["fiducials"].items()}
+    marks = {id: np.array(mark.xy_mm) for id, mark in camera.fiducials.items()}
     unknowns = [Parameter.interior(name, each) for each in lens.quantities]
     unknowns += [Parameter.fiducial(name, id, axis) for id in marks for axis in "xy"]
-    covariance, redundancy = read_own_covariance(path).of(unknowns), content["sigma0_from"]["redundancy"]
+    covariance, redundancy = read_own_covariance(path).of(unknowns), content.variance_factor.redundancy
     return CameraCalibration(label, lens, marks, covariance, redundancy)
 
 
-def _half_mm(path: Path, content: Json, name: str) -> tuple[float, float]:
+def _half_mm(path: Path, content: AdjustmentRecord, name: str) -> tuple[float, float]:
     """As far as the camera was calibrated: where its images have observations."""
-    seen = [
-        (abs(row["camera_x_mm"]), abs(row["camera_y_mm"]))
-        for row in content["residuals"]
-        if content["images"].get(row["image"], {}).get("camera", name) == name and row["camera_x_mm"] is not None
-    ]
-    if not seen:
-        raise InputError(f"{path}: no image of {name!r} has an observation, so nothing says how large its frame is.")
-    x, y = np.max(seen, axis=0)
+    x, y = np.abs(observed_mm(path, content, name)).max(axis=0)
     return float(x), float(y)
 
 
-def _remarks(paths: Sequence[Path], contents: Sequence[Json], names: Sequence[str]) -> tuple[str, ...]:
+def _remarks(paths: Sequence[Path], contents: Sequence[AdjustmentRecord], names: Sequence[str]) -> tuple[str, ...]:
     remarks = [
         f"{path}: was adjusted with an earlier calibration as an observation. If that one is among those compared, "
         "they are not independent, and the test is milder than it says."
         for path, content in zip(paths, contents, strict=True)
-        if content["calibrations"]
+        if content.calibrations
     ]
     alike = defaultdict(list)
     for path, content in zip(paths, contents, strict=True):
-        alike[content.get("made_from", {}).get("marks")].append(str(path))
+        alike[content.made_from.get("marks")].append(str(path))
     remarks += [
         f"{listed(same)} were adjusted from the same measured marks: they are not independent, and that they agree "
         "says nothing of the camera."
@@ -127,82 +112,13 @@ def _remarks(paths: Sequence[Path], contents: Sequence[Json], names: Sequence[st
     return tuple(remarks)
 
 
-def comparison_json(comparison: Comparison, remarks: Sequence[str], level: float) -> Json:
-    """The comparison as compare.json holds it."""
-    first, *others = comparison.calibrations
-    return {
-        "verdict": verdict(comparison, level),
-        "probability": comparison.probability,
-        "level": level,
-        "use": comparison.use,
-        "same": _test(comparison.same),
-        "trend": comparison.trend and _test(comparison.trend),
-        "calibrations": [
-            {"name": each.name, "time": time, "family": each.lens.distortion.family}
-            for each, time in zip(comparison.calibrations, comparison.times.tolist(), strict=True)
-        ],
-        "places_mm": comparison.places_mm.tolist(),
-        "differences": [
-            {
-                "parameters": parameter_differences(first, other),
-                "field_um": comparison.field_um[k].tolist(),
-                "field_sigma_um": sigmas(comparison.field_covariance_um2[k]).tolist(),
-                "fiducials": {
-                    id: {"um": um.tolist(), "sigma_um": sigma.tolist()}
-                    for id, um, sigma in zip(
-                        comparison.fiducials,
-                        comparison.fiducials_um[k],
-                        sigmas(comparison.fiducials_covariance_um2[k]),
-                        strict=True,
-                    )
-                },
-            }
-            for k, other in enumerate(others)
-        ],
-        "trend_um": comparison.trend_um.tolist() if comparison.trend else None,
-        "trend_sigma_um": sigmas(comparison.trend_covariance_um2).tolist() if comparison.trend else None,
-        "remarks": list(remarks),
-    }
-
-
-def _test(test: Test) -> Json:
-    return {"chi_square": test.chi_square, "freedom": test.freedom, "probability": test.probability}
-
-
-def parameter_differences(first: CameraCalibration, other: CameraCalibration) -> list[Json]:
-    """The parameters that both have, as they stand: difference and its standard deviation, mm and powers of it."""
-    if first.lens.distortion.family != other.lens.distortion.family:
-        shared: tuple[str, ...] = first.lens.quantities[:3]
-    else:
-        shared = first.lens.quantities
-    values = [each.lens.values for each in (first, other)]
-    sigmas = [np.sqrt(np.diag(each.covariance)) for each in (first, other)]
-    rows = []
-    for k, name in enumerate(shared):
-        joint = float(np.hypot(sigmas[0][k], sigmas[1][k]))
-        difference = float(values[1][k] - values[0][k])
-        rows.append(
-            {
-                "name": name,
-                "first": float(values[0][k]),
-                "other": float(values[1][k]),
-                "difference": difference,
-                "sigma": joint,
-                "sigmas": difference / joint if joint > 0 else None,
-            }
-        )
-    return rows
-
-
-def print_comparison(comparison: Comparison, remarks: Sequence[str], level: float, console: Console) -> None:
+def print_comparison(comparison: Comparison, record: ComparisonRecord, console: Console) -> None:
     """The verdict first, then a table for each calibration after the first, then remarks."""
-    told = verdict(comparison, level)
-    console.print(Text(told, style="bold red" if told == DRIFT else "bold green"))
-    console.print(Text(_why(comparison, level)))
-    first, *others = comparison.calibrations
-    for k, other in enumerate(others):
-        _print_difference(comparison, k, first, other, console)
-    for remark in remarks:
+    console.print(Text(record.verdict, style="bold red" if record.verdict == DRIFT else "bold green"))
+    console.print(Text(_why(comparison, record.level)))
+    for k, rows in enumerate(record.differences):
+        _print_difference(comparison, k, rows.parameters, console)
+    for remark in record.remarks:
         console.print(Text(f"Note: {remark}"))
 
 
@@ -232,16 +148,16 @@ def _counted(test: Test) -> str:
 
 
 def _print_difference(
-    comparison: Comparison, k: int, first: CameraCalibration, other: CameraCalibration, console: Console
+    comparison: Comparison, k: int, parameters: Sequence[ParameterDifference], console: Console
 ) -> None:
-    columns = ("parameter", first.name, other.name, "difference", "in joint sigmas")
-    table = Table(*columns, title=f"{other.name} less {first.name}", title_justify="left")
-    for row in parameter_differences(first, other):
-        if row["sigmas"] is None and row["difference"] == 0.0:
+    first, *others = (each.name for each in comparison.calibrations)
+    columns = ("parameter", first, others[k], "difference", "in joint sigmas")
+    table = Table(*columns, title=f"{others[k]} less {first}", title_justify="left")
+    for row in parameters:
+        if np.isnan(row.sigmas) and row.difference == 0.0:
             continue
-        sigmas = "both fixed" if row["sigmas"] is None else f"{row['sigmas']:+.1f}"
-        values = (f"{row[key]:.7g}" for key in ("first", "other"))
-        table.add_row(row["name"], *values, f"{row['difference']:+.3g}", sigmas)
+        size = "both fixed" if np.isnan(row.sigmas) else f"{row.sigmas:+.1f}"
+        table.add_row(row.name, f"{row.first:.7g}", f"{row.other:.7g}", f"{row.difference:+.3g}", size)
     console.print(table)
     field = comparison.field_um[k]
     x, y = comparison.places_mm[np.hypot(*field.T).argmax()]

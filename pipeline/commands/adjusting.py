@@ -40,12 +40,12 @@ def check(project: ProjectFile, as_json: AsJson = False) -> int:
 
 def choose(project: ProjectFile, as_json: AsJson = False) -> int:
     """Which transformation and distortion the observations ask for, in choose.json."""
-    from pipeline.adjusting.choose_stage import choice_json, print_choice, run_choose
+    from pipeline.adjusting.choose_stage import print_choice, run_choose
     from pipeline.progress import Reporter
 
     settings = read(project)
-    choice = run_choose(settings, Reporter())
-    show(as_json, lambda: choice_json(choice), lambda console: print_choice(choice, console, settings.choice_path))
+    choice, record = run_choose(settings, Reporter())
+    show(as_json, lambda: record, lambda console: print_choice(choice, console, settings.choice_path))
     return DONE if choice.chosen and choice.chosen.model == choice.given else LOOK
 
 
@@ -86,16 +86,13 @@ def compare(
     as_json: AsJson = False,
 ) -> int:
     """Calibrations of a camera: where and by how much they differ over the frame; `drift` or `no drift`."""
-    from pipeline.adjusting.compare_stage import DRIFT, comparison_json, print_comparison, run_compare, verdict
+    from pipeline.adjusting.compare_stage import print_comparison, run_compare
+    from pipeline.results.comparison_file import DRIFT
 
     when = None if times is None else _numbers(times)
-    comparison, remarks = run_compare(adjustments, camera, when, "flat" if flat else "space", level, out)
-    show(
-        as_json,
-        lambda: comparison_json(comparison, remarks, level),
-        lambda console: print_comparison(comparison, remarks, level, console),
-    )
-    return LOOK if verdict(comparison, level) == DRIFT else DONE
+    comparison, record = run_compare(adjustments, camera, when, "flat" if flat else "space", level, out)
+    show(as_json, lambda: record, lambda console: print_comparison(comparison, record, console))
+    return LOOK if record.verdict == DRIFT else DONE
 
 
 def design(

@@ -3,7 +3,6 @@
 Each command imports what it needs when it runs: numpy and what stands on it take longer than the help.
 """
 
-import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -14,7 +13,6 @@ import typer
 
 from pipeline.files.project_file import FINEST_PITCH_UM
 from pipeline.terminal import PlainConsole, plain
-from pipeline.text.text_file import without_nan
 
 if TYPE_CHECKING:
     from pipeline.files.project_file import Project
@@ -71,7 +69,9 @@ def show(as_json: bool, content: Callable[[], Any], printed: Callable[[PlainCons
         printed(PlainConsole())
         return
     letters = (sys.stdout.encoding or "").lower().startswith("utf")  # others get them as JSON's own codes
-    typer.echo(json.dumps(without_nan(content()), indent=1, ensure_ascii=not letters, allow_nan=False))
+    from pipeline.results.record_json import json_text
+
+    typer.echo("".join(json_text(content(), ensure_ascii=not letters)), nl=False)
 
 
 def say(*lines: str) -> None:

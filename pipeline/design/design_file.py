@@ -14,7 +14,7 @@ from adjust.problem.parameter import Parameter
 from pipeline.design.alternatives import Alternative
 from pipeline.design.expected import Expected, error_unit, rms
 from pipeline.design.sweeps import Layouts, Swept, Variations
-from pipeline.results.adjustment_file import ANGLES, DEG_PER_RAD
+from pipeline.results.adjustment_content import ANGLES, DEG_PER_RAD
 from pipeline.text.text_file import without_nan
 
 Json = dict[str, Any]

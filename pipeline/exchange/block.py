@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +17,13 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import UNITS_MM, Project
 from pipeline.publishing.made_from import adjusted_from, differing
 from pipeline.resampling.frame_chain import FrameChain, image_chain
-from pipeline.results.adjustment_reader import Covariance, calibrated_lens, read_adjustment, read_own_covariance
+from pipeline.results.adjustment_file import read_adjustment
+from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint, pitches_of, pixel_from_comparator, read_comparator
-from pipeline.results.lens_known import estimated_lenses, reach_sentence
+from pipeline.results.covariance_file import Covariance, read_own_covariance
 
 Array = NDArray[np.float64]
-Json = dict[str, Any]
 
-ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
 NO_PITCH = (1000.0, 1000.0)  # where pixels are not asked for
 
 
@@ -152,7 +150,7 @@ class Block:
 
     project: Project
     frames: tuple[OutFrame, ...]
-    adjustment: Json | None
+    adjustment: AdjustmentRecord | None
 
     @cached_property
     def covariance(self) -> Covariance:
@@ -161,18 +159,24 @@ class Block:
     @cached_property
     def points(self) -> dict[str, Array]:
         """Adjusted coordinates (3,) of the object points, in the user's unit."""
-        adjusted = self.adjustment["points"] if self.adjustment else {}
-        return {id: np.array([point[axis]["value"] for axis in "XYZ"]) for id, point in adjusted.items()}
+        return {id: point.xyz for id, point in self.adjustment.points.items()} if self.adjustment else {}
 
     @cached_property
     def lens_reach(self) -> dict[str, str]:
         """By camera a sentence on how far out its lens is known: what lies beyond goes out extrapolated."""
-        lenses = estimated_lenses(self.adjustment) if self.adjustment else ()
-        return {name: reach_sentence(name, known) for name, known in lenses if known["share"] < 1.0}
+        lenses = self.adjustment.estimated_lenses() if self.adjustment else ()
+        return {name: known.sentence(name) for name, known in lenses if known.share < 1.0}
 
     def camera_file(self, name: str) -> CameraFile:
         """The file of a camera, by the camera's name."""
         return next(camera for camera in self.project.cameras.values() if camera.name == name)
+
+    def fiducials_mm(self, camera: str) -> dict[str, tuple[float, float]]:
+        """A camera's fiducial marks as adjusted; as given, where nothing is adjusted."""
+        adjusted = self.adjustment.cameras.get(camera) if self.adjustment else None
+        if adjusted is not None:
+            return {id: mark.xy_mm for id, mark in adjusted.fiducials.items()}
+        return {fiducial.id: fiducial.xy_mm for fiducial in self.camera_file(camera).fiducials}
 
     def size_px(self, frame: OutFrame) -> tuple[int, int]:
         """Width and height of an image's scan. Raises InputError where there is none."""
@@ -230,14 +234,14 @@ def read_block(project: Project) -> Block:
     return Block(project, tuple(frames), adjustment)
 
 
-def _adjustment(project: Project, marks: tuple[ComparatorPoint, ...]) -> Json | None:
+def _adjustment(project: Project, marks: tuple[ComparatorPoint, ...]) -> AdjustmentRecord | None:
     path = project.adjustment_path
     if not path.exists():
         return None
     adjustment = read_adjustment(path)
-    if not adjustment["converged"]:
+    if not adjustment.converged:
         return None
-    made_from = adjustment.get("made_from")
+    made_from = adjustment.made_from
     changed = differing(made_from, adjusted_from(project, marks)) if made_from else []
     if changed:
         raise InputError(
@@ -248,38 +252,37 @@ def _adjustment(project: Project, marks: tuple[ComparatorPoint, ...]) -> Json | 
 
 def _frame(
     project: Project,
-    adjustment: Json | None,
+    adjustment: AdjustmentRecord | None,
     image: str,
     marks: tuple[ComparatorPoint, ...],
     pitch_um: tuple[float, float] | None,
 ) -> OutFrame:
-    known = adjustment["images"].get(image) if adjustment else None
+    known = adjustment.images.get(image) if adjustment else None
     camera = project.camera_of(image).name
     if adjustment is None or known is None:
         return OutFrame(image, camera, project.scans.get(image), pitch_um, marks, None, None, False)
-    lens = calibrated_lens(adjustment["cameras"][known["camera"]])
+    lens = adjustment.cameras[adjustment.camera_of(image)].lens()
     model = _model(project, adjustment, image, marks, lens)
-    oriented = all(known["exterior"][element]["sigma"] is not None for element in ELEMENTS)
-    return OutFrame(image, camera, project.scans.get(image), pitch_um, marks, model, lens, oriented)
+    return OutFrame(image, camera, project.scans.get(image), pitch_um, marks, model, lens, known.exterior.is_oriented)
 
 
 def _model(
-    project: Project, adjustment: Json, image: str, marks: tuple[ComparatorPoint, ...], lens: Lens
+    project: Project, adjustment: AdjustmentRecord, image: str, marks: tuple[ComparatorPoint, ...], lens: Lens
 ) -> ImageModel:
     """The image as `adjust` has it, from what it wrote."""
     places = _places_mm(marks)
     middle_mm = (places.min(axis=0) + places.max(axis=0)) / 2.0 if len(places) else np.zeros(2)
     chain = image_chain(image, adjustment, NO_PITCH, middle_mm, False)
-    own = adjustment["images"][image]
-    exterior = np.array([own["exterior"][element]["value"] for element in ELEMENTS], dtype=float)
+    elements = adjustment.images[image].exterior.elements.values()
+    exterior = np.array([element.value for element in elements])
     return ImageModel(
         lens,
         rotation_from_angles(np.radians(exterior[3:])),
         exterior[:3],
         chain.film,
         LineOfSight(
-            bool(adjustment.get("earth_curvature", False)),
-            bool(adjustment.get("refraction", False)),
+            adjustment.earth_curvature,
+            adjustment.refraction,
             project.unit_mm / UNITS_MM["m"],
         ),
         chain.bend,

@@ -1,13 +1,11 @@
 """`reseau convert`: a camera's lens in the words of another distortion family, with its covariance."""
 
 import io
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,19 +20,20 @@ from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.mark_table import Picture, picture_file
 from pipeline.provenance import of_content
-from pipeline.results.adjustment_file import distortion_settings
-from pipeline.results.adjustment_reader import (
-    Covariance,
-    calibrated_lens,
-    covariance_path,
-    read_adjustment,
-    read_own_covariance,
+from pipeline.results.adjustment_file import observed_mm, read_adjustment
+from pipeline.results.adjustment_record import (
+    CameraRecord,
+    ConvertedFrom,
+    DistortionRecord,
+    PrincipalPointRecord,
+    Quantity,
 )
+from pipeline.results.covariance_file import Covariance, covariance_path, read_own_covariance
+from pipeline.results.record_json import json_text, plain_json
 from pipeline.text.text_file import read_bytes
 from pipeline.text.wording import did_you_mean, listed
 
 Array = NDArray[np.float64]
-Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -60,6 +59,12 @@ class Conversion:
     @property
     def misfit_um(self) -> float:
         return 1e3 * self.lens.largest_mm
+
+    @property
+    def values(self) -> dict[str, tuple[float, float]]:
+        """c, x0, y0 and the parameters with their standard deviations."""
+        names, pairs = self.lens.lens.quantities, zip(self.lens.lens.values.tolist(), self.sigmas.tolist(), strict=True)
+        return dict(zip(names, pairs, strict=True))
 
 
 def run_convert(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
@@ -107,25 +112,27 @@ def _converted(
 def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
     """The whole adjustment.json and adjustment.npz, with one camera's lens converted."""
     content, covariance = read_adjustment(path), read_own_covariance(path)
-    if not content["converged"]:
+    if not content.converged:
         raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
-    cameras = list(content["cameras"])
+    cameras = list(content.cameras)
     name = options.camera or cameras[0]
     if name not in cameras or (options.camera is None and len(cameras) > 1):
         raise InputError(f"{path}: holds the cameras {listed(cameras)}. Say which one: --camera NAME.")
-    camera = content["cameras"][name]
-    given = calibrated_lens(camera)
+    camera = content.cameras[name]
+    given = camera.lens()
     if not np.isfinite(given.values).all():
         raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
     known = np.sqrt(np.diag(covariance.of(_parameters(name, given)[3:])))
-    lens, told = _converted(given, known, _observed_corners_mm(path, content, name), options)
+    places = observed_mm(path, content, name)
+    corners_mm = np.array([places.min(axis=0), places.max(axis=0)])
+    lens, told = _converted(given, known, corners_mm, options)
     moved = _moved_covariance(covariance, name, given, lens)
     sigmas = np.sqrt(np.diag(moved.of(_parameters(name, lens.lens))))
     entry = _camera_entry(camera, given.distortion, lens, sigmas)
     gone = {Parameter.interior(name, each).text for each in given.quantities[3:]}
-    correlations = [row for row in content["correlations"] if not gone & set(row["parameters"])]
-    content |= {"cameras": content["cameras"] | {name: entry}, "correlations": correlations}
-    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    correlations = tuple(row for row in content.correlations if not gone & set(row.parameters))
+    converted = replace(content, cameras={**content.cameras, name: entry}, correlations=correlations)
+    text = "".join(json_text(converted))
     arrays = io.BytesIO()
     with np.load(io.BytesIO(read_bytes(covariance_path(path))), allow_pickle=False) as stored:
         kept = {key: stored[key] for key in stored.files}
@@ -138,18 +145,6 @@ def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion
     np.savez_compressed(arrays, allow_pickle=False, **kept)
     files: dict[str, str | bytes] = {"adjustment.json": text, "adjustment.npz": arrays.getvalue()}
     return _written(path, folder, files, Conversion(lens, sigmas, told, tuple(files)))
-
-
-def _observed_corners_mm(path: Path, content: Json, name: str) -> Array:
-    """(2, 2) two corners of where the camera was observed."""
-    seen = [
-        (row["camera_x_mm"], row["camera_y_mm"])
-        for row in content["residuals"]
-        if content["images"].get(row["image"], {}).get("camera") == name and row["camera_x_mm"] is not None
-    ]
-    if not seen:
-        raise InputError(f"{path}: no image of {name!r} has an observation, so nothing says how large its frame is.")
-    return np.array([np.min(seen, axis=0), np.max(seen, axis=0)])
 
 
 def _parameters(camera: str, lens: Lens) -> tuple[Parameter, ...]:
@@ -169,23 +164,21 @@ def _moved_covariance(covariance: Covariance, camera: str, source: Lens, lens: C
     return Covariance((*new, *others), values, (matrix + matrix.T) / 2.0)
 
 
-def _camera_entry(camera: Json, source: Distortion, lens: ConvertedLens, sigmas: Array) -> Json:
+def _camera_entry(camera: CameraRecord, source: Distortion, lens: ConvertedLens, sigmas: Array) -> CameraRecord:
     c, x0, y0, *parameters = (
-        {"value": float(value), "sigma": float(sigma)} for value, sigma in zip(lens.lens.values, sigmas, strict=True)
+        Quantity(float(value), float(sigma)) for value, sigma in zip(lens.lens.values, sigmas, strict=True)
     )
     named = dict(zip(lens.lens.quantities[3:], parameters, strict=True))
-    return camera | {
-        "principal_distance_mm": c,
-        "principal_point_mm": {"x": x0, "y": y0},
-        "distortion": distortion_settings(lens.lens.distortion) | named,
-        "significance": [],
-        "converted": {
-            "from": distortion_settings(source),
-            "same": lens.is_same,
-            "largest_um": 1e3 * lens.largest_mm,
-            "rms_um": 1e3 * lens.rms_mm,
-        },
-    }
+    return replace(
+        camera,
+        principal_distance_mm=c,
+        principal_point_mm=PrincipalPointRecord(x0, y0),
+        distortion=DistortionRecord.of(lens.lens.distortion, named),
+        significance=(),
+        converted=ConvertedFrom(
+            DistortionRecord.of(source, {}), lens.is_same, 1e3 * lens.largest_mm, 1e3 * lens.rms_mm
+        ),
+    )
 
 
 def _camera_file(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
@@ -252,28 +245,25 @@ def _written(path: Path, folder: Path, files: dict[str, str | bytes], conversion
     return conversion
 
 
-def conversion_json(conversion: Conversion) -> Json:
+def conversion_json(conversion: Conversion) -> dict[str, object]:
     """As `--json` prints it."""
-    lens = conversion.lens
-    names, values = lens.lens.quantities, lens.lens.values.tolist()
-    sigmas = [sigma if math.isfinite(sigma) else "free" for sigma in conversion.sigmas.tolist()]
     return {
-        **distortion_settings(lens.lens.distortion),
-        "same": lens.is_same,
+        **plain_json(DistortionRecord.of(conversion.lens.lens.distortion, {})),
+        "same": conversion.lens.is_same,
         "largest_um": conversion.misfit_um,
-        "rms_um": 1e3 * lens.rms_mm,
+        "rms_um": 1e3 * conversion.lens.rms_mm,
         "values": {
-            name: {"value": value, "sigma": sigma} for name, value, sigma in zip(names, values, sigmas, strict=True)
+            name: {"value": value, "sigma": sigma if math.isfinite(sigma) else "free"}
+            for name, (value, sigma) in conversion.values.items()
         },
     }
 
 
 def conversion_lines(conversion: Conversion) -> Sequence[str]:
     """As it is printed: what holds, and the parameters."""
-    rows = conversion_json(conversion)["values"].items()
     numbers = [
-        f"  {name:6s} {row['value']:>16.9g}  {row['sigma'] if row['sigma'] == 'free' else format(row['sigma'], '.2g')}"
-        for name, row in rows
-        if row["value"] != 0.0 or row["sigma"] != 0.0
+        f"  {name:6s} {value:>16.9g}  {format(sigma, '.2g') if math.isfinite(sigma) else 'free'}"
+        for name, (value, sigma) in conversion.values.items()
+        if value != 0.0 or sigma != 0.0
     ]
     return (*conversion.told, *numbers)

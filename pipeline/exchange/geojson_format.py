@@ -2,7 +2,6 @@
 
 import json
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +70,7 @@ def _outline(corners_mm: Array) -> Array:
     return np.concatenate([start + share * (end - start) for start, end in pairwise(turns)])
 
 
-def _feature(frame: WholeFrame, outline: Array, height: float) -> dict[str, Any]:
+def _feature(frame: WholeFrame, outline: Array, height: float) -> dict[str, object]:
     ring = outline if _area(outline) > 0.0 else outline[::-1]  # from the other side of a plane it runs clockwise
     closed = [*ring.tolist(), ring[0].tolist()]
     return {

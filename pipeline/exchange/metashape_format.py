@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -78,23 +77,18 @@ def _hindrance(frame: OutFrame) -> str:
     return ""
 
 
-def _camera(block: Block, name: str, files: dict[str, str | bytes]) -> dict[str, Any]:
+def _camera(block: Block, name: str, files: dict[str, str | bytes]) -> dict[str, object]:
     file = block.camera_file(name)
-    adjusted = block.adjustment["cameras"].get(name) if block.adjustment else None
-    fiducials = (
-        {id: (mark["x_mm"]["value"], mark["y_mm"]["value"]) for id, mark in adjusted["fiducials"].items()}
-        if adjusted
-        else {fiducial.id: fiducial.xy_mm for fiducial in file.fiducials}
-    )
+    adjusted = block.adjustment.cameras.get(name) if block.adjustment else None
     calibration = f"{file_word(name)}.xml"
     return {
-        "focal_length_mm": adjusted["principal_distance_mm"]["value"] if adjusted else file.principal_distance_mm,
+        "focal_length_mm": adjusted.principal_distance_mm.value if adjusted else file.principal_distance_mm,
         "calibration": calibration if calibration in files else None,
-        "fiducials_mm": {id: [x, -y] for id, (x, y) in fiducials.items()},
+        "fiducials_mm": {id: [x, -y] for id, (x, y) in block.fiducials_mm(name).items()},
     }
 
 
-def _image(frame: OutFrame) -> dict[str, Any]:
+def _image(frame: OutFrame) -> dict[str, object]:
     pitch = frame.known_pitch_um
     marks = {
         key: {

@@ -116,12 +116,7 @@ def picture_box(block: Block, frame: OutFrame) -> Canvas:
 
 def _fiducials(block: Block, camera: str) -> dict[str, Array]:
     """Camera mm with y down, as adjusted; as given, where nothing is adjusted."""
-    adjusted = block.adjustment["cameras"].get(camera) if block.adjustment else None
-    if adjusted is not None:
-        places = {id: (each["x_mm"]["value"], each["y_mm"]["value"]) for id, each in adjusted["fiducials"].items()}
-    else:
-        places = {fiducial.id: fiducial.xy_mm for fiducial in block.camera_file(camera).fiducials}
-    return {id: np.array(place) * _Y_DOWN for id, place in places.items()}
+    return {id: np.array(place) * _Y_DOWN for id, place in block.fiducials_mm(camera).items()}
 
 
 def _marks(image: str, places: Mapping[str, Array], sigmas_px: Mapping[str, float] | None = None) -> list[str]:
@@ -200,7 +195,7 @@ def _ground(block: Block) -> str:
     assert block.adjustment is not None
     points = []
     for id, place in block.points.items():
-        sigmas = [block.adjustment["points"][id][axis]["sigma"] or 0.0 for axis in "XYZ"]
+        sigmas = [each.sigma if np.isfinite(each.sigma) else 0.0 for each in block.adjustment.points[id].axes]
         content = [
             *xml_lines("Pt", _numbers(place)),
             *xml_lines("NamePt", id),

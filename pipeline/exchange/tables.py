@@ -1,10 +1,10 @@
 """Everything that goes out, as tables in this program's own conventions: csv and parquet write the same ones."""
 
-from collections.abc import Mapping
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
 
 from adjust.problem.parameter import Parameter
-from pipeline.exchange.block import ELEMENTS, Block, OutFrame
+from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention
 from pipeline.results.comparator_file import ComparatorPoint
 
@@ -14,9 +14,8 @@ CONVENTION = Convention(
     "this program's own, docs/theory.md",
 )
 
-Table = dict[str, list[Any]]
-
-_EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+Cell = str | float | bool | None
+Table = dict[str, list[Cell]]
 
 
 def tables(block: Block) -> Mapping[str, Table]:
@@ -38,7 +37,7 @@ def _marks(block: Block) -> Table:
     return _table(rows)
 
 
-def _mark(frame: OutFrame, mark: ComparatorPoint) -> dict[str, Any]:
+def _mark(frame: OutFrame, mark: ComparatorPoint) -> dict[str, Cell]:
     assert mark.xy_mm is not None
     place, sigma = mark.xy_mm, mark.sigma_mm
     col, row = frame.pixels((mark,))[0].tolist() if frame.pitch_um else (None, None)
@@ -64,27 +63,26 @@ def _mark(frame: OutFrame, mark: ComparatorPoint) -> dict[str, Any]:
 
 def _images(block: Block) -> Table:
     assert block.adjustment is not None
-    rows = []
+    rows: list[Mapping[str, Cell]] = []
     for frame in block.oriented():
-        exterior = block.adjustment["images"][frame.image]["exterior"]
-        values = {element: exterior[element]["value"] for element in ELEMENTS}
-        sigmas = {f"s{element}": exterior[element]["sigma"] for element in ELEMENTS}
+        elements = block.adjustment.images[frame.image].exterior.elements
+        values = {name: element.value for name, element in elements.items()}
+        sigmas = {f"s{name}": _number(element.sigma) for name, element in elements.items()}
         rows.append({"image": frame.image, "camera": frame.camera, **values, **sigmas})
     return _table(rows)
 
 
 def _transformations(block: Block) -> Table:
     assert block.adjustment is not None
-    rows = []
+    rows: list[Mapping[str, Cell]] = []
     for frame in block.frames:
         if frame.model is None:
             continue
-        stored = block.adjustment["images"][frame.image]["transformation"]
-        known = {"image": frame.image, "kind": stored["kind"], "mirrored": bool(stored.get("mirrored", False))}
+        film = block.adjustment.images[frame.image].transformation
+        known: dict[str, Cell] = {"image": frame.image, "kind": film.kind, "mirrored": film.mirrored}
         rows += [
-            {**known, "parameter": name, "value": quantity["value"], "sigma": quantity["sigma"]}
-            for name, quantity in stored.items()
-            if isinstance(quantity, dict)
+            {**known, "parameter": name, "value": each.value, "sigma": _number(each.sigma)}
+            for name, each in film.parameters.items()
         ]
     return _table(rows)
 
@@ -95,7 +93,7 @@ def _covariances(block: Block) -> Table:
     for each in block.covariance.parameters:
         if each.kind in ("exterior", "film"):
             of_image.setdefault(each.owner, []).append(each)
-    rows = []
+    rows: list[Mapping[str, Cell]] = []
     for frame in block.frames:
         own = of_image.get(frame.image, [])
         matrix = block.covariance.of(own)
@@ -109,29 +107,34 @@ def _covariances(block: Block) -> Table:
 
 def _points(block: Block) -> Table:
     assert block.adjustment is not None
-    rows = []
-    for id, point in block.adjustment["points"].items():
-        values = {axis: point[axis]["value"] for axis in "XYZ"}
-        rows.append({"point": id, **values, **{f"s{axis}": point[axis]["sigma"] for axis in "XYZ"}})
+    rows: list[Mapping[str, Cell]] = []
+    for id, point in block.adjustment.points.items():
+        values = {axis: each.value for axis, each in zip("XYZ", point.axes, strict=True)}
+        sigmas = {f"s{axis}": _number(each.sigma) for axis, each in zip("XYZ", point.axes, strict=True)}
+        rows.append({"point": id, **values, **sigmas})
     return _table(rows)
 
 
 def _cameras(block: Block) -> Table:
     assert block.adjustment is not None
-    rows = []
-    for name, camera in block.adjustment["cameras"].items():
-        point, distortion = camera["principal_point_mm"], camera["distortion"]
-        quantities = {"c_mm": camera["principal_distance_mm"], "x0_mm": point["x"], "y0_mm": point["y"]}
-        quantities |= {key: value for key, value in distortion.items() if isinstance(value, dict)}
-        for id, fiducial in camera["fiducials"].items():
-            quantities |= {f"fiducial {id} x_mm": fiducial["x_mm"], f"fiducial {id} y_mm": fiducial["y_mm"]}
-        known = {"camera": name, "distortion": distortion["family"]}
+    rows: list[Mapping[str, Cell]] = []
+    for name, camera in block.adjustment.cameras.items():
+        point, distortion = camera.principal_point_mm, camera.distortion
+        quantities = {"c_mm": camera.principal_distance_mm, "x0_mm": point.x, "y0_mm": point.y}
+        quantities |= distortion.parameters
+        for id, fiducial in camera.fiducials.items():
+            quantities |= {f"fiducial {id} x_mm": fiducial.x_mm, f"fiducial {id} y_mm": fiducial.y_mm}
+        known = {"camera": name, "distortion": distortion.family}
         rows += [
-            {**known, "parameter": key, "value": each["value"], "sigma": each["sigma"]}
+            {**known, "parameter": key, "value": _number(each.value), "sigma": _number(each.sigma)}
             for key, each in quantities.items()
         ]
     return _table(rows)
 
 
-def _table(rows: list[dict[str, Any]]) -> Table:
+def _number(value: float) -> Cell:
+    return value if math.isfinite(value) else None
+
+
+def _table(rows: Sequence[Mapping[str, Cell]]) -> Table:
     return {column: [row[column] for row in rows] for column in (rows[0] if rows else ())}

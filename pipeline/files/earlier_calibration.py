@@ -14,7 +14,10 @@ from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
-from pipeline.results.adjustment_reader import Covariance, covariance_path, read_adjustment, read_covariance
+from pipeline.results.adjustment_file import read_adjustment
+from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, DistortionRecord, Quantity
+from pipeline.results.covariance_file import Covariance, covariance_path, read_covariance
+from pipeline.results.record_json import plain_json
 from pipeline.text.tables import Table
 
 Array = NDArray[np.float64]
@@ -86,36 +89,36 @@ def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
         return None
     path = sigma.file.parent / sigma.text("calibration")
     content, covariance = read_adjustment(path), read_covariance(path)
-    if not content["converged"]:
+    if not content.converged:
         raise sigma.error("calibration", f"{path} holds no calibration: its adjustment did not converge.")
     name = _camera_in(sigma, path, content, camera.name)
-    distortion = content["cameras"][name]["distortion"]
+    distortion = content.cameras[name].distortion
     _check_family(sigma, path, distortion, camera.distortion)
     earlier = _taken(path, distortion, covariance, name, camera, fiducials)
     if not np.isfinite(earlier.values).all():
         raise sigma.error("calibration", f"{path} holds no interior orientation: no object point told it.")
-    _check_agreement(sigma, path, name, content["cameras"][name], covariance)
+    _check_agreement(sigma, path, name, content.cameras[name], covariance)
     _check_held(sigma, earlier, camera)
     return earlier
 
 
-def _check_agreement(sigma: Table, path: Path, name: str, camera: Mapping[str, Any], covariance: Covariance) -> None:
+def _check_agreement(sigma: Table, path: Path, name: str, camera: CameraRecord, covariance: Covariance) -> None:
     """Both files are to say the same of the camera: what the network takes is the covariance's."""
-    told = _told(name, camera)
+    stored = _quantities(name, camera)
     listed = {each for each in covariance.parameters if each.kind in ("interior", "fiducial") and each.owner == name}
-    for each in sorted(told.keys() ^ listed):
-        has, lacks = (path, covariance_path(path)) if each in told else (covariance_path(path), path)
+    for each in sorted(stored.keys() ^ listed):
+        has, lacks = (path, covariance_path(path)) if each in stored else (covariance_path(path), path)
         raise sigma.error("calibration", f"{has} holds {each.label}, and {lacks.name} does not. {_TOGETHER}")
-    parameters = tuple(told)
+    parameters = tuple(stored)
     values = dict(zip(covariance.parameters, covariance.values.tolist(), strict=True))
     matrix = covariance.of(parameters)
     for each, variance in zip(parameters, np.diag(matrix).tolist(), strict=True):
-        here = told[each]
+        here = stored[each]
         for what, in_json, in_npz in (
-            ("value", here["value"], values[each]),
-            ("standard deviation", here["sigma"], math.sqrt(variance) if variance >= 0.0 else -math.inf),
+            ("value", here.value, values[each]),
+            ("standard deviation", here.sigma, math.sqrt(variance) if variance >= 0.0 else -math.inf),
         ):
-            if in_json is not None and not math.isclose(in_json, in_npz, rel_tol=_ALIKE):
+            if math.isfinite(in_json) and not math.isclose(in_json, in_npz, rel_tol=_ALIKE):
                 raise sigma.error(
                     "calibration",
                     f"{path} gives {each.label} the {what} {in_json:.10g}, and {covariance_path(path).name} "
@@ -125,19 +128,15 @@ def _check_agreement(sigma: Table, path: Path, name: str, camera: Mapping[str, A
         raise sigma.error("calibration", f"{covariance_path(path)}: {wrong}. {_TOGETHER}")
 
 
-def _told(name: str, camera: Mapping[str, Any]) -> dict[Parameter, Mapping[str, Any]]:
+def _quantities(name: str, camera: CameraRecord) -> dict[Parameter, Quantity]:
     """What adjustment.json says of a camera."""
-    point = camera["principal_point_mm"]
-    interior = {"c": camera["principal_distance_mm"], "x0": point["x"], "y0": point["y"]}
-    interior |= {key: value for key, value in camera["distortion"].items() if isinstance(value, dict)}
-    told = {Parameter.interior(name, key): quantity for key, quantity in interior.items()}
-    for id, mark in camera["fiducials"].items():
-        told |= {Parameter.fiducial(name, id, axis): mark[f"{axis}_mm"] for axis in "xy"}
-    return {each: quantity for each, quantity in told.items() if _is_quantity(quantity)}
-
-
-def _is_quantity(entry: Mapping[str, Any]) -> bool:
-    return all(isinstance(entry.get(key, ""), float | int | None) for key in ("value", "sigma"))
+    quantities = {Parameter.interior(name, key): quantity for key, quantity in camera.interior.items()}
+    for id, mark in camera.fiducials.items():
+        quantities[Parameter.fiducial(name, id, "x")], quantities[Parameter.fiducial(name, id, "y")] = (
+            mark.x_mm,
+            mark.y_mm,
+        )
+    return quantities
 
 
 def _no_covariance(parameters: Sequence[Parameter], matrix: Array) -> str:
@@ -160,9 +159,9 @@ def _no_covariance(parameters: Sequence[Parameter], matrix: Array) -> str:
     return ""
 
 
-def _camera_in(sigma: Table, path: Path, content: Mapping[str, Any], name: str) -> str:
+def _camera_in(sigma: Table, path: Path, content: AdjustmentRecord, name: str) -> str:
     """The camera of that name; where the file has just one, that one."""
-    names = list(content["cameras"])
+    names = list(content.cameras)
     if name not in names and len(names) != 1:
         raise sigma.error(
             "calibration", f"{path} holds the cameras {', '.join(names)}, but none with the name {name!r} of this file."
@@ -170,16 +169,16 @@ def _camera_in(sigma: Table, path: Path, content: Mapping[str, Any], name: str) 
     return name if name in names else names[0]
 
 
-def _check_family(sigma: Table, path: Path, earlier: Mapping[str, Any], distortion: Distortion) -> None:
+def _check_family(sigma: Table, path: Path, earlier: DistortionRecord, distortion: Distortion) -> None:
     here = {
         "family": distortion.family,
         "r0_mm": distortion.r0_mm,
         "decentering": distortion.decentering,
-        "half_mm": list(distortion.half_mm),
+        "half_mm": distortion.half_mm,
     }
     for key, value in here.items():
-        there = earlier.get(key, value)
-        if there != value:
+        there = getattr(earlier, key)
+        if there not in (value, None):
             raise sigma.error(
                 "calibration",
                 f"{path} was adjusted with {key} = {there!r}, and this camera has {value!r}. A calibration can be "
@@ -188,7 +187,7 @@ def _check_family(sigma: Table, path: Path, earlier: Mapping[str, Any], distorti
 
 
 def _taken(
-    path: Path, distortion: Mapping[str, Any], covariance: Covariance, there: str, camera: Camera, fiducials: bool
+    path: Path, distortion: DistortionRecord, covariance: Covariance, there: str, camera: Camera, fiducials: bool
 ) -> EarlierCalibration:
     parameters = [Parameter.interior(there, name) for name in (*INTERIOR, *parameter_names(camera.distortion.family))]
     if fiducials:
@@ -200,7 +199,7 @@ def _taken(
     free = np.diag(matrix) > 0.0
     return EarlierCalibration(
         path=path,
-        distortion=distortion,
+        distortion=plain_json(distortion),
         parameters=tuple(each for each, is_free in zip(parameters, free, strict=True) if is_free),
         values=values[free],
         covariance=matrix[np.ix_(free, free)],

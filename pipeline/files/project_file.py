@@ -24,7 +24,7 @@ from pipeline.files.points_file import GivenDistance, GivenPoints, read_distance
 from pipeline.files.scan_files import FoundScans, as_named, find_scans, with_cuts
 from pipeline.files.target_table import TargetSettings, TieSettings, read_targets, read_ties
 from pipeline.provenance import of_content
-from pipeline.results.adjustment_reader import covariance_path
+from pipeline.results.covariance_file import covariance_path
 from pipeline.text.names import path_below
 from pipeline.text.tables import Table, read_toml
 

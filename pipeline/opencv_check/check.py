@@ -24,7 +24,7 @@ from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrat
 from pipeline.opencv_check.opencv_conversion import Converted, converted
 from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners
 from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, Freedom, model_names
-from pipeline.results.check_file import CameraCheck, Check, Row, Verdict
+from pipeline.results.check_file import CameraCheck, Check, Estimate, Row, Verdict
 
 LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, for the two models are not quite the same
 LARGEST_SIGMA_RATIO = 1.2  # of the standard deviations; 1.006 to 1.03 is usual
@@ -51,7 +51,7 @@ def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None 
     says which.
     """
     names = [camera.name for camera in adjustment.network.cameras]
-    return Check({name: _check_camera(adjustment, name, pictures) for name in names})
+    return Check.of({name: _check_camera(adjustment, name, pictures) for name in names})
 
 
 def _check_camera(adjustment: Adjustment, name: str, pictures: BoardPictures | None) -> CameraCheck:
@@ -189,11 +189,11 @@ def _rows(
     names: Sequence[str], freedom: Freedom, conversion: Converted, sigma0: float, opencv: OpenCvCalibration
 ) -> tuple[Row, ...]:
     return tuple(
-        Row(
+        Row.of(
             name,
             "mm" if name in INTERIOR else "rad" if name in ("tau_x", "tau_y") else "1",
-            *(float(each[k]) for each in (conversion.parameters, sigma0 * conversion.sigmas)),
-            *(float(each[k]) for each in (opencv.parameters, opencv.sigmas)),
+            Estimate(float(conversion.parameters[k]), float(sigma0 * conversion.sigmas[k])),
+            Estimate(float(opencv.parameters[k]), float(opencv.sigmas[k])),
         )
         for k, name in enumerate(names)
         if name in freedom.names
@@ -214,7 +214,7 @@ def _agreement(rows: Sequence[Row], sigmas_tell: bool) -> tuple[Verdict, str]:
 
 
 def _sigma_ratio(row: Row) -> float:
-    smaller, larger = sorted((row.sigma, row.opencv_sigma))
+    smaller, larger = sorted((row.reseau.sigma, row.opencv.sigma))
     return larger / smaller if smaller > 0 else np.inf
 
 

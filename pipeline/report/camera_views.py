@@ -9,13 +9,14 @@ from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import parameter_from_text
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.certificate import CertificateView, certificate_view
-from pipeline.report.data import Json, ReportData
-from pipeline.report.frame_views import camera_of, residuals_by_image
+from pipeline.report.data import ReportData
+from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.lens_map import LensMap, lens_map
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import ParameterRow, axes_sentence, group_sentences, high_correlations, parameter_rows
-from pipeline.report.verdict import camera_is_calibrated
-from pipeline.results.adjustment_reader import Covariance, stored_films
+from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity, ResidualRecord
+from pipeline.results.check_file import CameraCheck, Row
+from pipeline.results.covariance_file import Covariance
 
 PLOT_PX = 560.0
 LONGEST_VECTOR_PX = 60.0
@@ -79,35 +80,35 @@ class CameraView:
     fiducials: list[FiducialRow]
     figure: Markup | None
     vectors: Markup | None
-    check: Json | None
+    check: CameraCheck | None
     check_rows: list[CheckRow]
 
 
 def camera_views(data: ReportData) -> list[CameraView]:
     """All cameras of the adjustment; none where there is no adjustment."""
-    return [_view(data, name, camera) for name, camera in data.adjustment["cameras"].items()] if data.adjustment else []
+    stored = data.adjustment
+    return [_view(data, stored, name, camera) for name, camera in stored.cameras.items()] if stored else []
 
 
-def _view(data: ReportData, name: str, camera: Json) -> CameraView:
-    stored: Json = data.adjustment or {}
-    images = [image for image in stored["images"] if camera_of(data, image) == name]
+def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraRecord) -> CameraView:
+    images = stored.images_of(name)
     by_image = residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
-    known = data.covariance if stored["converged"] else None
+    known = data.covariance if stored.converged else None
     # Where there is no solution, none of what is missing was left out.
-    calibrated = camera_is_calibrated(camera) or not stored["converged"]
+    calibrated = camera.is_calibrated or not stored.converged
     covariance = known if calibrated else None
     radius_mm, frame_mm = _observed_radius_mm(camera, rows), data.frame_mm.get(name)
-    form = fiducial_form(name, stored, known, images) if known else None
+    form = fiducial_form(name, stored, known) if known else None
     curve = _curves(name, camera, covariance, radius_mm, frame_mm) if covariance else None
-    check: Json | None = data.check["cameras"].get(name) if data.check else None
+    check = data.check.cameras.get(name) if data.check else None
     return CameraView(
         name=name,
         calibrated=calibrated,
         images=len(images),
         radius_mm=radius_mm,
         parameters=parameter_rows(name, camera, _prior_scale(name, stored), radius_mm) if calibrated else [],
-        groups=group_sentences(camera),
+        groups=group_sentences(camera.significance),
         axes=axes_sentence(camera),
         in_given_figure=_in_given_figure(form) if form and calibrated else [],
         distances=form.distances if form else (),
@@ -120,46 +121,43 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
         certificate=certificate_view(lens.lens(name, camera, covariance), _reach_mm(curve, radius_mm))
         if curve and covariance
         else None,
-        fiducials=[_fiducial_row(id, fiducial, form) for id, fiducial in camera["fiducials"].items()],
+        fiducials=[_fiducial_row(id, fiducial, form) for id, fiducial in camera.fiducials.items()],
         figure=fiducials.figure_plot(form) if form else None,
         vectors=_vectors(rows, frame_mm),
         check=check,
-        check_rows=[_check_row(row) for row in check.get("rows", ())] if check else [],
+        check_rows=[_check_row(row) for row in check.rows] if check else [],
     )
 
 
-def _observed_radius_mm(camera: Json, rows: list[Json]) -> float:
+def _observed_radius_mm(camera: CameraRecord, rows: list[ResidualRecord]) -> float:
     """From the principal point to the outermost target."""
-    targets = [row for row in rows if row["kind"] not in ("fiducial", "join")]
-    if not targets:
-        return 0.0
-    point = camera["principal_point_mm"]
-    offsets = vectors.places_mm(targets) - (point["x"]["value"], point["y"]["value"])
-    return float(np.hypot(*offsets.T).max())
+    point = camera.principal_point_mm
+    targets = ((row.camera_x_mm, row.camera_y_mm) for row in rows if row.kind not in ("fiducial", "join"))
+    return max((float(np.hypot(x - point.x.value, y - point.y.value)) for x, y in targets), default=0.0)
 
 
-def _prior_scale(name: str, stored: Json) -> float:
+def _prior_scale(name: str, stored: AdjustmentRecord) -> float:
     """What sigma0 multiplies the given standard deviations of an interior orientation by."""
-    is_left_out = {"group": "interior", "owner": name} in stored["sigma0_from"]["left_out"]
-    return 1.0 if is_left_out else stored["sigma0"] or 1.0
+    is_left_out = ("interior", name) in stored.variance_factor.left_out
+    return stored.sigma0 if stored.sigma0 > 0.0 and not is_left_out else 1.0
 
 
-def _trade_offs(name: str, stored: Json) -> list[str]:
+def _trade_offs(name: str, stored: AdjustmentRecord) -> list[str]:
     """What of a camera trades off, in words."""
-    firsts = (parameter_from_text(each["parameters"][0]) for each in stored["correlations"])
+    firsts = (parameter_from_text(each.parameters[0]) for each in stored.correlations)
     return [
-        f"{each['cause']} {each['remedy']}"
-        for each, first in zip(stored["correlations"], firsts, strict=True)
+        f"{each.cause} {each.remedy}"
+        for each, first in zip(stored.correlations, firsts, strict=True)
         if first.kind == "interior" and first.owner == name
     ]
 
 
-def fiducial_form(name: str, stored: Json, covariance: Covariance, images: list[str]) -> fiducials.Figure | None:
+def fiducial_form(name: str, stored: AdjustmentRecord, covariance: Covariance) -> fiducials.Figure | None:
     """The figure of a camera's fiducials, free of its datum: with its interior orientation, or by its films alone."""
-    camera = stored["cameras"][name]
-    if camera_is_calibrated(camera):
+    camera = stored.cameras[name]
+    if camera.is_calibrated:
         return fiducials.figure(name, camera, covariance)
-    return fiducials.figure_of_films(name, camera, covariance, stored_films(stored, images))
+    return fiducials.figure_of_films(name, camera.fiducials, covariance, stored.films(stored.images_of(name)))
 
 
 def _in_given_figure(form: fiducials.Figure) -> list[tuple[str, str, str]]:
@@ -169,15 +167,17 @@ def _in_given_figure(form: fiducials.Figure) -> list[tuple[str, str, str]]:
 
 
 def _curves(
-    name: str, camera: Json, covariance: Covariance, radius_mm: float, frame_mm: tuple[float, float] | None
+    name: str, camera: CameraRecord, covariance: Covariance, radius_mm: float, frame_mm: tuple[float, float] | None
 ) -> lens.Curves | None:
     """Out to the frame's corner where its size is known, else to the outermost target.
 
     Of a family that is defined over the frame: on circles that lie in it.
     """
-    half_diagonal_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
-    largest = max(radius_mm, camera.get("lens_known", {}).get("corner_mm") or half_diagonal_mm)
-    if not parameter_names(camera["distortion"]["family"]) or largest == 0.0:
+    corner_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
+    if camera.lens_known is not None and camera.lens_known.corner_mm > 0.0:
+        corner_mm = camera.lens_known.corner_mm
+    largest = max(radius_mm, corner_mm)
+    if not parameter_names(camera.distortion.family) or largest == 0.0:
         return None
     of = lens.lens(name, camera, covariance)
     return lens.curves(of, min(largest, *of.distortion.half_mm) if lens.is_of_frame(of) else largest)
@@ -190,20 +190,18 @@ def _reach_mm(curve: lens.Curves, observed_mm: float) -> float:
 
 def _lens_map(
     name: str,
-    camera: Json,
+    camera: CameraRecord,
     covariance: Covariance,
-    rows: list[Json],
+    rows: list[ResidualRecord],
     radius_mm: float,
     frame_mm: tuple[float, float] | None,
 ) -> LensMap | None:
-    if not parameter_names(camera["distortion"]["family"]) or not rows:
+    if not parameter_names(camera.distortion.family) or not rows:
         return None
-    corners_mm = camera.get("lens_known", {}).get("frame_mm")
-    if corners_mm:
-        low, high = np.array(corners_mm, float)
-        on = vectors.plane_about(low, high, PLOT_PX)
+    if camera.lens_known is not None and camera.lens_known.frame_mm is not None:
+        on = vectors.plane_about(np.array(camera.lens_known.frame_mm), PLOT_PX)
     else:
-        on = vectors.plane(rows, frame_mm, PLOT_PX)
+        on = vectors.plane(vectors.VectorField.of_residuals(rows).places_mm, frame_mm, PLOT_PX)
     return lens_map(lens.lens(name, camera, covariance), on, radius_mm)
 
 
@@ -219,8 +217,8 @@ def _curve_rows(curve: lens.Curves) -> list[CurveRow]:
     ]
 
 
-def _fiducial_row(id: str, fiducial: Json, form: fiducials.Figure | None) -> FiducialRow:
-    x, y = fiducial["x_mm"], fiducial["y_mm"]
+def _fiducial_row(id: str, fiducial: FiducialRecord, form: fiducials.Figure | None) -> FiducialRow:
+    x, y = fiducial.x_mm, fiducial.y_mm
     changed = changed_sigma = (fixed(None), fixed(None))
     if form and id in form.ids:
         at = form.ids.index(id)
@@ -230,32 +228,31 @@ def _fiducial_row(id: str, fiducial: Json, form: fiducials.Figure | None) -> Fid
         changed_sigma = (fixed(sigma[0], digits), fixed(sigma[1], digits))
     return FiducialRow(
         id=id,
-        x=value_and_sigma(x["value"], x["sigma"]),
-        y=value_and_sigma(y["value"], y["sigma"]),
+        x=value_and_sigma(x.value, x.sigma),
+        y=value_and_sigma(y.value, y.sigma),
         moved_um=(_moved_um(x), _moved_um(y)),
         form_um=changed,
         form_sigma_um=changed_sigma,
     )
 
 
-def _moved_um(quantity: Json) -> str:
-    given = quantity.get("given")
-    return fixed(1e3 * (quantity["value"] - given["value"]) if given else None, 1, sign=True)
+def _moved_um(quantity: Quantity) -> str:
+    return fixed(1e3 * (quantity.value - quantity.given.value) if quantity.given else None, 1, sign=True)
 
 
-def _vectors(rows: list[Json], frame_mm: tuple[float, float] | None) -> Markup | None:
+def _vectors(rows: list[ResidualRecord], frame_mm: tuple[float, float] | None) -> Markup | None:
     if not rows:
         return None
-    scale = vectors.vector_scale(rows, LONGEST_VECTOR_PX)
-    rows = rows[:: -(-len(rows) // MOST_VECTORS)]  # evenly over the frames
-    return vectors.all_images_plot(rows, vectors.plane(rows, frame_mm, PLOT_PX), scale)
+    scale = vectors.VectorField.of_residuals(rows).scale(LONGEST_VECTOR_PX)
+    residuals = vectors.VectorField.of_residuals(rows[:: -(-len(rows) // MOST_VECTORS)])  # evenly over the frames
+    return vectors.all_images_plot(residuals, vectors.plane(residuals.places_mm, frame_mm, PLOT_PX), scale)
 
 
-def _check_row(row: Json) -> CheckRow:
+def _check_row(row: Row) -> CheckRow:
     return CheckRow(
-        name=row["name"],
-        unit=row.get("unit") or "–",
-        reseau=value_and_sigma(row["reseau"]["value"], row["reseau"]["sigma"]),
-        opencv=value_and_sigma(row["opencv"]["value"], row["opencv"]["sigma"]),
-        difference_sigmas=fixed(row["difference_sigmas"], 2, sign=True),
+        name=row.name,
+        unit=row.unit or "–",
+        reseau=value_and_sigma(row.reseau.value, row.reseau.sigma),
+        opencv=value_and_sigma(row.opencv.value, row.opencv.sigma),
+        difference_sigmas=fixed(row.difference_sigmas, 2, sign=True),
     )

@@ -2,17 +2,16 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.results.adjustment_reader import Covariance
+from pipeline.results.adjustment_record import AdjustmentRecord
+from pipeline.results.check_file import Check
 from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.results.covariance_file import Covariance
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.results.thumbnail import Thumbnail
-
-Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,8 @@ class FrameTotals:
 class ReportData:
     """Everything a report can show.
 
-    comparator: the rows of comparator.csv. measurement: the scans of measurement.db by image. adjustment, check: the
-    contents of adjustment.json and check.json; covariance: adjustment.npz. frame_mm: width and height of the exposed
+    comparator: the rows of comparator.csv. measurement: the scans of measurement.db by image. adjustment, check: as
+    adjustment.json and check.json keep them; covariance: adjustment.npz. frame_mm: width and height of the exposed
     frame by camera name. thumbnail: from image, point and kind (a fiducial and a target may share a name) to the mark's
     picture. problems, notes: what the caller has to say beyond the files. made_from: their fingerprints by name. unit:
     of the object coordinates. totals: of all frames where they are many; comparator and measurement are then of those
@@ -57,9 +56,9 @@ class ReportData:
     project: str
     comparator: Sequence[ComparatorPoint] = ()
     measurement: Mapping[str, MeasuredScan] | None = None
-    adjustment: Json | None = None
+    adjustment: AdjustmentRecord | None = None
     covariance: Covariance | None = None
-    check: Json | None = None
+    check: Check | None = None
     frame_mm: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     thumbnail: Callable[[str, str, str], Thumbnail | None] | None = None
     problems: tuple[Problem, ...] = ()

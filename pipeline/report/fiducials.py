@@ -11,8 +11,8 @@ from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.parameter import Parameter
 from adjust.quality.fiducial_corrections import KEEPS_DISTANCES, corrections_to_given
 from pipeline.drawing import svg
-from pipeline.report.data import Json
-from pipeline.results.adjustment_reader import Covariance
+from pipeline.results.adjustment_record import CameraRecord, FiducialRecord
+from pipeline.results.covariance_file import Covariance
 
 Array = NDArray[np.float64]
 
@@ -74,18 +74,17 @@ def _distances(ids: tuple[str, ...], places_mm: Array, given_mm: Array, covarian
     return tuple(found)
 
 
-def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
+def figure(name: str, camera: CameraRecord, covariance: Covariance) -> Figure | None:
     """A camera's entry of adjustment.json, free of its datum; None with fewer than three given fiducials.
 
     The datum that the fiducials stand in is itself uncertain, by a shift, a rotation and a scale that all of them and
     the interior orientation share. Values are laid over the given marks by a Helmert transformation, and the covariance
     by the S-transformation (Baarda 1973) C' = S C S' with S = I - G (G_f'G_f)^-1 G_f', G_f the rows of the marks.
     """
-    ids, given, estimated = _marks(camera)
+    ids, given, estimated = _marks(camera.fiducials)
     if len(ids) < 3:
         return None
-    point = camera["principal_point_mm"]
-    c, x0, y0 = (q["value"] for q in (camera["principal_distance_mm"], point["x"], point["y"]))
+    c, x0, y0 = (camera.interior[name].value for name in ("c", "x0", "y0"))
     turn_and_scale, shift = _helmert(estimated, given)
     interior = [Parameter.interior(name, each) for each in ("c", "x0", "y0")]
     s = _s_transformation(_similarities(estimated, c, (x0, y0)), 2 * len(ids))
@@ -104,13 +103,15 @@ def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
     )
 
 
-def figure_of_films(name: str, camera: Json, covariance: Covariance, films: Mapping[str, Film]) -> Figure | None:
+def figure_of_films(
+    name: str, fiducials: Mapping[str, FiducialRecord], covariance: Covariance, films: Mapping[str, Film]
+) -> Figure | None:
     """The same of a camera of which only fiducials were adjusted, with these films by image.
 
     Nothing but the films holds the marks' figure: its datum takes up all that each film can. None where that is more
     than the marks tell.
     """
-    ids, given, estimated = _marks(camera)
+    ids, given, estimated = _marks(fiducials)
     left = corrections_to_given(list(films.values()), estimated, given) if len(ids) else None
     if left is None:
         return None
@@ -158,17 +159,11 @@ def figure_plot(change: Figure) -> Markup:
     )
 
 
-def _marks(camera: Json) -> tuple[tuple[str, ...], Array, Array]:
+def _marks(fiducials: Mapping[str, FiducialRecord]) -> tuple[tuple[str, ...], Array, Array]:
     """The ids of the given marks, where they are given and where they are estimated (n, 2)."""
-    known = {id: fiducial for id, fiducial in camera["fiducials"].items() if _given(fiducial) is not None}
-    given = np.array([_given(fiducial) for fiducial in known.values()]).reshape(-1, 2)
-    estimated = np.array([(fiducial["x_mm"]["value"], fiducial["y_mm"]["value"]) for fiducial in known.values()])
-    return tuple(known), given, estimated.reshape(-1, 2)
-
-
-def _given(fiducial: Json) -> tuple[float, float] | None:
-    x, y = fiducial["x_mm"].get("given"), fiducial["y_mm"].get("given")
-    return None if x is None or y is None else (x["value"], y["value"])
+    known = {id: (mark.given_mm, mark.xy_mm) for id, mark in fiducials.items() if mark.given_mm is not None}
+    given, estimated = np.array(list(known.values()), dtype=float).reshape(-1, 2, 2).swapaxes(0, 1)
+    return tuple(known), given, estimated
 
 
 def _places(camera: str, ids: Iterable[str]) -> list[Parameter]:

@@ -1,7 +1,7 @@
 """What the report shows of each frame: a line of the summary, pictures of its marks, its residuals, its orientation."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +10,12 @@ from markupsafe import Markup
 from measure.flags import CAUSE_MEANING, Status
 from measure.results import Covariance
 from pipeline.report import thumbnails, vectors
-from pipeline.report.data import Json, ReportData
+from pipeline.report.data import ReportData
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.verdict import suspect_rows
 from pipeline.report.writing import written
+from pipeline.results.adjustment_record import Quantity, ResidualRecord
 from pipeline.results.thumbnail import Thumbnail
 
 OPEN_FRAMES = 12  # with more frames, only those with a lost mark are unfolded
@@ -61,26 +62,26 @@ def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) 
     shown = {frame.image: list(frame.marks) for frame in shots} if every_mark else thumbnails.shown_marks(shots)
     px_per_um, most_px = thumbnail_scale(shots), thumbnails.stored_px(shown)
     by_image = residuals_by_image(data)
-    suspect = suspect_rows(data.adjustment) if data.adjustment else []
-    plots = _plots(data, by_image, suspect, [frame.image for frame in shots if frame.image in by_image])
+    suspects = suspect_rows(data.adjustment) if data.adjustment else frozenset[ResidualRecord]()
+    plots = _plots(data, by_image, suspects, [frame.image for frame in shots if frame.image in by_image])
     views = []
     for frame in shots:
-        stored: Json = data.adjustment["images"].get(frame.image, {}) if data.adjustment else {}
+        stored = data.adjustment.images.get(frame.image) if data.adjustment else None
         residuals = by_image.get(frame.image, [])
-        cards = tuple(_card(mark, data.thumbnail, px_per_um, most_px, suspect) for mark in shown[frame.image])
+        cards = tuple(_card(mark, data.thumbnail, px_per_um, most_px, suspects) for mark in shown[frame.image])
         views.append(
             FrameView(
                 frame=frame,
                 fiducials=_found([mark for mark in frame.marks if mark.is_fiducial]),
                 targets=_found([mark for mark in frame.marks if not mark.is_fiducial]),
                 rms_um=_rms_um(residuals),
-                largest_w=max((abs(row["w"]) for row in residuals if row["w"] is not None), default=None),
+                largest_w=max((abs(row.w) for row in residuals if np.isfinite(row.w)), default=None),
                 cards=cards,
                 hidden=len(frame.marks) - len(cards),
                 plot=plots.get(frame.image),
                 writing=written(frame.scan),
-                orientation=_quantities(stored.get("exterior", {})),
-                transformation=_quantities(stored.get("transformation", {})),
+                orientation=_quantities(stored.exterior.elements) if stored else (),
+                transformation=_quantities(stored.transformation.parameters) if stored else (),
                 is_open=len(shots) <= OPEN_FRAMES or (data.totals is None and _lost_fiducial(frame)),
             )
         )
@@ -92,33 +93,26 @@ def thumbnail_scale(shots: list[Frame]) -> float:
     return thumbnails.arrow_scale([mark for frame in shots for mark in frame.marks])
 
 
-def residuals_by_image(data: ReportData) -> dict[str, list[Json]]:
-    rows: dict[str, list[Json]] = defaultdict(list)
-    for row in data.adjustment["residuals"] if data.adjustment else ():
-        rows[row["image"]].append(row)
+def residuals_by_image(data: ReportData) -> dict[str, list[ResidualRecord]]:
+    rows: dict[str, list[ResidualRecord]] = defaultdict(list)
+    for row in data.adjustment.residuals if data.adjustment else ():
+        rows[row.image].append(row)
     return dict(rows)
 
 
-def camera_of(data: ReportData, image: str) -> str:
-    """The camera's name; the only one where the file does not say."""
-    if not data.adjustment:
-        return ""
-    return str(data.adjustment["images"][image].get("camera", next(iter(data.adjustment["cameras"]))))
-
-
 def _plots(
-    data: ReportData, by_image: dict[str, list[Json]], suspect: list[Json], images: list[str]
+    data: ReportData,
+    by_image: dict[str, list[ResidualRecord]],
+    suspects: Collection[ResidualRecord],
+    images: list[str],
 ) -> dict[str, Markup]:
-    rows = [row for residuals in by_image.values() for row in residuals]
-    if not rows:
+    stored = data.adjustment
+    if stored is None or not by_image:
         return {}
-    scale = vectors.vector_scale(rows, LONGEST_VECTOR_PX)
-    frame_mm = {image: data.frame_mm.get(camera_of(data, image)) for image in images}
+    scale = vectors.VectorField.of_residuals(stored.residuals).scale(LONGEST_VECTOR_PX)
+    frame_mm = {image: data.frame_mm.get(stored.camera_of(image)) for image in images}
     return {
-        image: vectors.image_plot(
-            image, by_image[image], vectors.plane(by_image[image], frame_mm[image], PLOT_PX), scale, suspect
-        )
-        for image in images
+        image: vectors.image_plot(image, by_image[image], frame_mm[image], PLOT_PX, scale, suspects) for image in images
     }
 
 
@@ -127,7 +121,7 @@ def _card(
     picture_of: Callable[[str, str, str], Thumbnail | None] | None,
     px_per_um: float,
     most_px: float,
-    suspect: list[Json],
+    suspects: Collection[ResidualRecord],
 ) -> Card:
     thumbnail = picture_of(mark.image, mark.point, mark.kind) if picture_of else None
     residual = mark.residual
@@ -137,11 +131,9 @@ def _card(
         sigma=_sigma(mark),
         causes=_causes(mark.covariance),
         by_edges=_by_edges(mark.quality),
-        residual=f"{fixed(residual['vx_um'], 1, sign=True)}, {fixed(residual['vy_um'], 1, sign=True)}"
-        if residual
-        else "",
+        residual=", ".join(fixed(v, 1, sign=True) for v in residual.v_um) if residual else "",
         w=fixed(mark.w, 1, sign=True) if mark.w is not None else "no check" if residual else "",
-        is_suspect=residual is not None and residual in suspect,
+        is_suspect=residual in suspects,
     )
 
 
@@ -185,19 +177,17 @@ def _found(marks: list[Mark]) -> str:
     return f"{observed} of {len(marks)}" + (f" ({others})" if others else "")
 
 
-def _rms_um(residuals: list[Json]) -> tuple[float, float] | None:
+def _rms_um(residuals: list[ResidualRecord]) -> tuple[float, float] | None:
     if not residuals:
         return None
-    v = np.array([(row["vx_um"], row["vy_um"]) for row in residuals], dtype=float)
+    v = np.array([row.v_um for row in residuals])
     x, y = np.sqrt((v**2).mean(axis=0))
     return float(x), float(y)
 
 
-def _quantities(entries: Json) -> tuple[tuple[str, str, str], ...]:
+def _quantities(entries: Mapping[str, Quantity]) -> tuple[tuple[str, str, str], ...]:
     return tuple(
-        (name, *value_and_sigma(quantity["value"], quantity["sigma"]))
-        for name, quantity in entries.items()
-        if isinstance(quantity, dict) and quantity["value"] is not None
+        (name, *value_and_sigma(each.value, each.sigma)) for name, each in entries.items() if np.isfinite(each.value)
     )
 
 

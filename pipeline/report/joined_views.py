@@ -6,8 +6,9 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report import vectors
-from pipeline.report.data import Json, ReportData
+from pipeline.report.data import ReportData
 from pipeline.report.numbers import fixed
+from pipeline.results.adjustment_record import JoinedFrameRecord
 
 PLOT_PX = 420.0
 LONGEST_VECTOR_PX = 40.0
@@ -28,35 +29,24 @@ class JoinedView:
 
 def joined_views(data: ReportData) -> list[JoinedView]:
     """All frames that were scanned in parts; none where there is no solution."""
-    frames: Json = (data.adjustment or {}).get("frames", {})
+    frames = data.adjustment.frames if data.adjustment else {}
     return [_view(name, frame) for name, frame in sorted(frames.items())]
 
 
-def _view(name: str, frame: Json) -> JoinedView:
-    parts = [(part, fixed(known["corner_sigma_um"], 1)) for part, known in frame["parts"].items()]
-    joins = frame["joins"]
+def _view(name: str, frame: JoinedFrameRecord) -> JoinedView:
+    parts = [(part, fixed(known.corner_sigma_um, 1)) for part, known in frame.parts.items()]
+    joins = frame.joins
     if not joins:
         return JoinedView(name, parts, 0, ("–", "–"), "–", None)
-    apart_um = np.array([(join["dx_um"], join["dy_um"]) for join in joins])
-    worst = joins[int(np.argmax(np.hypot(*apart_um.T)))]
-    rows = [
-        {
-            "kind": "join",
-            "camera_x_mm": join["x_mm"],
-            "camera_y_mm": join["y_mm"],
-            "camera_vx_um": join["dx_um"],
-            "camera_vy_um": join["dy_um"],
-        }
-        for join in joins
-    ]
-    rms = np.sqrt(np.mean(apart_um**2, axis=0))
+    apart = vectors.VectorField.of_joins(joins)
+    lengths_um = np.hypot(*apart.vectors_um.T)
+    rms = np.sqrt(np.mean(apart.vectors_um**2, axis=0))
+    on = vectors.plane(apart.places_mm, None, PLOT_PX)
     return JoinedView(
         name,
         parts,
         len(joins),
         (fixed(float(rms[0]), 2), fixed(float(rms[1]), 2)),
-        f"{worst['point']}: {fixed(float(np.hypot(worst['dx_um'], worst['dy_um'])), 1)} µm",
-        vectors.all_images_plot(
-            rows, vectors.plane(rows, None, PLOT_PX), vectors.vector_scale(rows, LONGEST_VECTOR_PX)
-        ),
+        f"{joins[int(lengths_um.argmax())].point}: {fixed(float(lengths_um.max()), 1)} µm",
+        vectors.all_images_plot(apart, on, apart.scale(LONGEST_VECTOR_PX)),
     )

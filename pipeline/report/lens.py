@@ -10,8 +10,8 @@ from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
-from pipeline.report.data import Json
-from pipeline.results.adjustment_reader import Covariance, calibrated_lens
+from pipeline.results.adjustment_record import CameraRecord
+from pipeline.results.covariance_file import Covariance
 
 Array = NDArray[np.float64]
 
@@ -36,9 +36,9 @@ class Curves:
     asymmetric_sigma_um: Array
 
 
-def lens(name: str, camera: Json, covariance: Covariance | None = None) -> Lens:
-    """From a camera's entry in adjustment.json, with its covariance where that is known."""
-    of = calibrated_lens(camera)
+def lens(name: str, camera: CameraRecord, covariance: Covariance | None = None) -> Lens:
+    """The lens of a camera of adjustment.json, with its covariance where that is known."""
+    of = camera.lens()
     if covariance is None:
         return of
     return replace(of, covariance=covariance.of(Parameter.interior(name, each) for each in of.quantities))

@@ -10,7 +10,7 @@ from adjust.functional_model.lens import Lens
 from pipeline.drawing import svg
 from pipeline.report.lens import displacement_covariance
 from pipeline.report.numbers import value_and_sigma
-from pipeline.report.vectors import FOOT_PX, Plane, scale_bar
+from pipeline.report.vectors import Plane, strokes_and_dots
 
 Array = NDArray[np.float64]
 
@@ -73,17 +73,13 @@ def _drawn(xy_mm: Array, value_um: Array, beyond: NDArray[np.bool_], edge: Marku
     px_per_um = svg.round_step(LONGEST * mesh_px / longest_um) if longest_um > 0.0 else 1.0
     ends = on.page(xy_mm)
     starts = ends - px_per_um * value_um * (1.0, -1.0)
-    return svg.picture(
-        on.width_px,
-        on.height_px + FOOT_PX,
+    return on.picture(
         "Distortion vectors over the camera frame",
-        on.drawn(),
+        px_per_um,
         edge,
         *(
-            svg.strokes(from_[rows], ends[rows], f"{what} {kind}")
+            strokes_and_dots(starts[rows], ends[rows], kind, ends[rows])
             for rows, kind in ((~beyond, "target"), (beyond, "extrapolated"))
-            for from_, what in ((starts, "vector"), (ends, "dot"))
             if rows.any()
         ),
-        scale_bar(on, px_per_um),
     )

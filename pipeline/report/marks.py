@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from measure.flags import Code, Reason, Status
 from measure.results import Covariance, MarkMeasurement
-from pipeline.report.data import Json, ReportData
+from pipeline.report.data import ReportData
+from pipeline.results.adjustment_record import ResidualRecord
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_scan import MeasuredScan
 
@@ -34,7 +35,7 @@ class Mark:
     center_px: Array | None
     covariance: Covariance | None
     sigma_um: Array | None
-    residual: Json | None
+    residual: ResidualRecord | None
     quality: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -54,7 +55,7 @@ class Mark:
     @property
     def w(self) -> float | None:
         """The standardised residual; None where nothing checks the mark."""
-        return self.residual["w"] if self.residual else None
+        return self.residual.w if self.residual and np.isfinite(self.residual.w) else None
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ def frames(data: ReportData) -> list[Frame]:
     marks: dict[str, dict[tuple[bool, str], Mark]] = defaultdict(dict)
     for mark in _marks(data, scans):
         marks[mark.image][mark.is_fiducial, mark.point] = mark
-    names = {*scans, *marks, *(data.adjustment["images"] if data.adjustment and not data.totals else {})}
+    names = {*scans, *marks, *(data.adjustment.images if data.adjustment and not data.totals else {})}
     return [
         Frame(name, tuple(sorted(marks[name].values(), key=_order)), scans.get(name))
         for name in sorted(names, key=natural)
@@ -98,15 +99,18 @@ def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> list[Mark]:
         (image, mark.kind == "fiducial", mark.point): mark for image, scan in scans.items() for mark in scan.frame.marks
     }
     residuals = {
-        (row["image"], row["kind"] == "fiducial", row["point"]): row
-        for row in (data.adjustment["residuals"] if data.adjustment else ())
+        (row.image, row.kind == "fiducial", row.point): row
+        for row in (data.adjustment.residuals if data.adjustment else ())
     }
     given = {(row.image, row.kind == "fiducial", row.point): row for row in data.comparator}
     return [_mark(key, measured.get(key), given.get(key), residuals.get(key)) for key in {**measured, **given}]
 
 
 def _mark(
-    key: tuple[str, bool, str], pixel: MarkMeasurement | None, row: ComparatorPoint | None, residual: Json | None
+    key: tuple[str, bool, str],
+    pixel: MarkMeasurement | None,
+    row: ComparatorPoint | None,
+    residual: ResidualRecord | None,
 ) -> Mark:
     """Where the comparator file and the measurement differ, the file holds: the user may have changed it."""
     image, _, point = key
@@ -126,10 +130,10 @@ def _mark(
     )
 
 
-def _sigma_um(residual: Json | None, row: ComparatorPoint | None) -> Array | None:
+def _sigma_um(residual: ResidualRecord | None, row: ComparatorPoint | None) -> Array | None:
     """As the adjustment took it, the film's share included, or else as it was measured."""
     if residual:
-        return np.array([residual["sx_um"], residual["sy_um"]])
+        return np.array([residual.sx_um, residual.sy_um])
     return 1e3 * row.sigma_mm if row and row.sigma_mm is not None else None
 
 

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -14,7 +14,7 @@ from measure import flags
 from pipeline.drawing import svg
 from pipeline.report.camera_views import camera_views
 from pipeline.report.charts import fraction_plot
-from pipeline.report.data import Json, ReportData
+from pipeline.report.data import ReportData
 from pipeline.report.fractions import LEAST_MARKS, Array, FractionTest, fraction_test, places_px
 from pipeline.report.frame_views import frame_views, thumbnail_scale
 from pipeline.report.joined_views import joined_views
@@ -23,7 +23,8 @@ from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.parameters import spoken_name
 from pipeline.report.scanner_views import scanner_views
 from pipeline.report.totals import totals_view
-from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, has_sigma0, judge, sigma0_bounds
+from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, judge, sigma0_bounds
+from pipeline.results.adjustment_record import AdjustmentRecord, PointRecord
 from pipeline.text.atomic import write_atomically
 
 LIST_LIMIT = 200  # rows of a long table
@@ -63,12 +64,12 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals["drawing_css"] = Markup(svg.style())
-    environment.globals["quantity"] = lambda entry: value_and_sigma(entry["value"], entry["sigma"])
+    environment.globals["quantity"] = lambda entry: value_and_sigma(entry.value, entry.sigma)
     environment.filters |= {"fixed": fixed, "significant": significant}
     return environment
 
 
-def _context(data: ReportData) -> dict[str, Any]:
+def _context(data: ReportData) -> dict[str, object]:
     shots = frames(data)
     adjustment = data.adjustment
     cameras = camera_views(data)
@@ -82,16 +83,16 @@ def _context(data: ReportData) -> dict[str, Any]:
         "verdict": judge(data),
         "check": data.check,
         "totals": totals_view(data) if data.totals else None,
-        "contradiction": lambda test: contradiction(test, adjustment["cameras"] if adjustment else {}),
-        "spoken": lambda name: spoken_name(name, adjustment["cameras"] if adjustment else ()),
+        "contradiction": lambda test: contradiction(test, adjustment.cameras if adjustment else {}),
+        "spoken": lambda name: spoken_name(name, adjustment.cameras if adjustment else ()),
         "measured": bool(data.measurement),
         "cameras": cameras,
         "scanners": scanner_views(data),
         "joined": joined_views(data),
         "fractions": list(_fractions(places)),
         "least_marks": LEAST_MARKS,
-        "sigma0_bounds": sigma0_bounds(adjustment["sigma0_from"]["redundancy"])
-        if adjustment and has_sigma0(adjustment)
+        "sigma0_bounds": sigma0_bounds(adjustment.variance_factor.redundancy)
+        if adjustment and adjustment.has_sigma0
         else None,
         "a_priori": A_PRIORI,
         "points": _points(adjustment) if adjustment else [],
@@ -99,21 +100,21 @@ def _context(data: ReportData) -> dict[str, Any]:
     }
 
 
-def _common(data: ReportData) -> dict[str, Any]:
+def _common(data: ReportData) -> dict[str, object]:
     return {
         "project": data.project,
         "version": version("reseau"),
         "made_from": ", ".join(f"{name} {fingerprint}" for name, fingerprint in data.made_from.items()) or "memory",
         "unit": data.unit,
         "adjustment": data.adjustment,
-        "critical_w": critical_w(2 * len(data.adjustment["residuals"])) if data.adjustment else 0.0,
+        "critical_w": critical_w(2 * len(data.adjustment.residuals)) if data.adjustment else 0.0,
         "has_pictures": data.thumbnail is not None,
         "meaning": flags.STATUS_MEANING,
         "codes": flags.CODE_MEANING,
     }
 
 
-def _of_frames(data: ReportData, shots: list[Frame], every_mark: bool = False) -> dict[str, Any]:
+def _of_frames(data: ReportData, shots: list[Frame], every_mark: bool = False) -> dict[str, object]:
     return {
         "frames": frame_views(data, shots, every_mark),
         "points_word": _points_word(shots),
@@ -145,7 +146,7 @@ def _arrow_bar(shots: list[Frame]) -> tuple[float, float]:
     return um, um * px_per_um
 
 
-def _points(adjustment: Json) -> list[tuple[str, Json]]:
+def _points(adjustment: AdjustmentRecord) -> list[tuple[str, PointRecord]]:
     """Object points that were estimated, the least certain first."""
-    free = [(id, point) for id, point in adjustment["points"].items() if any(q["sigma"] != 0.0 for q in point.values())]
-    return sorted(free, key=lambda item: -max(q["sigma"] or 0.0 for q in item[1].values()))
+    free = [(id, point) for id, point in adjustment.points.items() if any(each.sigma != 0.0 for each in point.axes)]
+    return sorted(free, key=lambda item: -np.nan_to_num([each.sigma for each in item[1].axes]).max())

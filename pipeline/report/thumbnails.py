@@ -8,9 +8,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from pipeline.drawing import svg
-from pipeline.report.data import Json
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.vectors import LEAST_UM
+from pipeline.results.adjustment_record import ResidualRecord
 from pipeline.results.thumbnail import Thumbnail
 
 SIZE_PX = 92.0  # a picture's width and height on the page
@@ -51,7 +51,7 @@ def _badness(mark: Mark) -> tuple[bool, bool, float]:
 
 def arrow_scale(marks: list[Mark]) -> float:
     """How many page pixels 1 um of a residual is drawn: a round number at which the longest arrow fits."""
-    lengths = [np.hypot(mark.residual["vx_um"], mark.residual["vy_um"]) for mark in marks if mark.residual]
+    lengths = [float(np.hypot(*mark.residual.v_um)) for mark in marks if mark.residual]
     return svg.round_step(ARROW_PX / max(*lengths, LEAST_UM)) if lengths else 1.0
 
 
@@ -91,9 +91,9 @@ def _crosshair(x: float, y: float, mark: Mark) -> Markup:
     )
 
 
-def _arrow(x: float, y: float, residual: Json, px_per_um: float) -> Markup:
+def _arrow(x: float, y: float, residual: ResidualRecord, px_per_um: float) -> Markup:
     """The residual from the measured centre; y of the comparator points up, rows point down."""
-    v = px_per_um * np.array([residual["vx_um"], -residual["vy_um"]])
+    v = px_per_um * np.array([residual.vx_um, -residual.vy_um])
     length = float(np.hypot(*v))
     start = np.array([x, y])
     end = start + v

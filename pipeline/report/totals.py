@@ -38,8 +38,8 @@ def totals_view(data: ReportData) -> TotalsView:
     named = dict.fromkeys(verdict for each in counts.values() for verdict in each)
     verdicts = tuple(verdict for verdict in named if any(each[verdict] for each in counts.values()))
     rows = tuple((*kind, tuple(each[verdict] for verdict in verdicts)) for kind, each in counts.items())
-    residuals = data.adjustment["residuals"] if data.adjustment else ()
-    v_um = {axis: np.array([row[f"v{axis}_um"] for row in residuals], dtype=float) for axis in "xy"}
+    residuals = data.adjustment.residuals if data.adjustment else ()
+    v_um = dict(zip("xy", np.array([row.v_um for row in residuals]).reshape(-1, 2).T, strict=True))
     return TotalsView(
         frames=len(data.totals.marks),
         needs_look=data.totals.needs_look,

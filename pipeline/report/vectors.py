@@ -1,5 +1,6 @@
 """Residuals as vectors over the camera frame, of one image and of all."""
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,8 +8,8 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from pipeline.drawing import svg
-from pipeline.report.data import Json
 from pipeline.report.numbers import fixed
+from pipeline.results.adjustment_record import JoinRecord, ResidualRecord
 
 Array = NDArray[np.float64]
 
@@ -37,82 +38,101 @@ class Plane:
         low_x, high_y = self.corners_mm[0, 0], self.corners_mm[1, 1]
         return MARGIN_PX + self.px_per_mm * np.stack([xy_mm[:, 0] - low_x, high_y - xy_mm[:, 1]], axis=1)
 
-    def drawn(self) -> Markup:
+    def picture(self, title: str, px_per_um: float, *content: Markup) -> Markup:
+        """The frame's outline with vectors in it, and below a bar of a round length in um, and one of mm."""
         (x0, y0), (x1, y1) = self.page(self.corners_mm)
-        return svg.tag("rect", x=x0, y=y1, width=x1 - x0, height=y0 - y1, class_="frame")
+        outline = svg.tag("rect", x=x0, y=y1, width=x1 - x0, height=y0 - y1, class_="frame")
+        return svg.picture(
+            self.width_px, self.height_px + FOOT_PX, title, outline, *content, _scale_bar(self, px_per_um)
+        )
 
 
-def plane(residuals: list[Json], frame_mm: tuple[float, float] | None, width_px: float) -> Plane:
+@dataclass(frozen=True)
+class VectorField:
+    """Vectors (n, 2) in um at places (n, 2) in mm of the camera frame; is_fiducial (n,): of fiducial marks."""
+
+    places_mm: Array
+    vectors_um: Array
+    is_fiducial: NDArray[np.bool_]
+
+    @classmethod
+    def of_residuals(cls, rows: Sequence[ResidualRecord]) -> "VectorField":
+        """The residuals along the camera's axes."""
+        numbers = [(row.camera_x_mm, row.camera_y_mm, row.camera_vx_um, row.camera_vy_um) for row in rows]
+        places, vectors = np.hsplit(np.array(numbers, dtype=float).reshape(-1, 4), 2)
+        return cls(places, vectors, np.array([row.kind == "fiducial" for row in rows], dtype=bool))
+
+    @classmethod
+    def of_joins(cls, rows: Sequence[JoinRecord]) -> "VectorField":
+        """How far two scans of a frame differ."""
+        places, vectors = np.hsplit(np.array([(row.x_mm, row.y_mm, row.dx_um, row.dy_um) for row in rows]), 2)
+        return cls(places, vectors, np.zeros(len(rows), dtype=bool))
+
+    def scale(self, longest_px: float) -> float:
+        """Page pixels to 1 um, a round number: all but the largest per cent are shorter than `longest_px`."""
+        length = float(np.percentile(np.hypot(*self.vectors_um.T), 99.0))
+        return svg.round_step(longest_px / max(length, LEAST_UM))
+
+    def ends(self, on: Plane, px_per_um: float) -> tuple[Array, Array]:
+        """Starts and ends (n, 2) on the page."""
+        starts = on.page(self.places_mm)
+        return starts, starts + px_per_um * self.vectors_um * (1.0, -1.0)
+
+
+def plane(places_mm: Array, frame_mm: tuple[float, float] | None, width_px: float) -> Plane:
     """The camera's frame, or where it is not known or not about the origin (a digital camera), what is observed."""
-    xy = places_mm(residuals)
-    low, high = xy.min(axis=0), xy.max(axis=0)
+    low, high = places_mm.min(axis=0), places_mm.max(axis=0)
     half = 0.5 * np.array(frame_mm) if frame_mm is not None else np.zeros(2)
     if np.all(np.abs([low, high]) <= half):
         low, high = -half, half
-    return plane_about(low, high, width_px)
+    return plane_about(np.stack([low, high]), width_px)
 
 
-def plane_about(low: Array, high: Array, width_px: float) -> Plane:
-    """The rectangle between two corners (2,), with a little room about it."""
+def plane_about(corners_mm: Array, width_px: float) -> Plane:
+    """The rectangle between two corners (2, 2), with a little room about it."""
     # A single point, or points in a row, still need a plane to stand in.
-    room = 0.02 * max(float(np.max(high - low)), 1.0)
-    return Plane(np.stack([low - room, high + room]), width_px)
+    room = 0.02 * max(float(np.ptp(corners_mm, axis=0).max()), 1.0)
+    return Plane(corners_mm + np.array([[-room], [room]]), width_px)
 
 
-def places_mm(residuals: list[Json]) -> Array:
-    """(n, 2) where the observations lie in the camera frame."""
-    return np.array([(row["camera_x_mm"], row["camera_y_mm"]) for row in residuals], dtype=float)
-
-
-def _vectors_um(residuals: list[Json]) -> Array:
-    """(n, 2) the residuals along the camera's axes."""
-    return np.array([(row["camera_vx_um"], row["camera_vy_um"]) for row in residuals], dtype=float)
-
-
-def vector_scale(residuals: list[Json], longest_px: float) -> float:
-    """Page pixels to 1 um, a round number: all but the largest per cent are shorter than `longest_px`."""
-    length = float(np.percentile(np.hypot(*_vectors_um(residuals).T), 99.0))
-    return svg.round_step(longest_px / max(length, LEAST_UM))
-
-
-def image_plot(image: str, residuals: list[Json], on: Plane, px_per_um: float, suspect: list[Json]) -> Markup:
+def image_plot(
+    image: str,
+    rows: Sequence[ResidualRecord],
+    frame_mm: tuple[float, float] | None,
+    width_px: float,
+    px_per_um: float,
+    suspects: Collection[ResidualRecord],
+) -> Markup:
     """The residuals of one image, each with its name and numbers to point at."""
-    starts = on.page(places_mm(residuals))
-    ends = starts + px_per_um * _vectors_um(residuals) * (1.0, -1.0)
+    residuals = VectorField.of_residuals(rows)
+    on = plane(residuals.places_mm, frame_mm, width_px)
     marks = [
-        svg.tag("g", svg.tag("title", _hint(row)), _stroke(start, end, row, suspect))
-        for start, end, row in zip(starts, ends, residuals, strict=True)
+        svg.tag("g", svg.tag("title", _hint(row)), _stroke(start, end, row, suspects))
+        for start, end, row in zip(*residuals.ends(on, px_per_um), rows, strict=True)
     ]
-    return svg.picture(
-        on.width_px,
-        on.height_px + FOOT_PX,
-        f"Residual vectors of {image}",
-        on.drawn(),
-        *marks,
-        scale_bar(on, px_per_um),
-    )
+    return on.picture(f"Residual vectors of {image}", px_per_um, *marks)
 
 
-def all_images_plot(residuals: list[Json], on: Plane, px_per_um: float) -> Markup:
+def all_images_plot(residuals: VectorField, on: Plane, px_per_um: float) -> Markup:
     """The residuals of all images in one frame: what they have in common is the camera's, not the film's."""
-    starts = on.page(places_mm(residuals))
-    ends = starts + px_per_um * _vectors_um(residuals) * (1.0, -1.0)
-    is_fiducial = np.array([row["kind"] == "fiducial" for row in residuals])
-    return svg.picture(
-        on.width_px,
-        on.height_px + FOOT_PX,
+    starts, ends = residuals.ends(on, px_per_um)
+    return on.picture(
         "Residual vectors of all images over the camera frame",
-        on.drawn(),
-        svg.strokes(starts[~is_fiducial], ends[~is_fiducial], "vector target"),
-        svg.strokes(starts[~is_fiducial], starts[~is_fiducial], "dot target"),
-        svg.strokes(starts[is_fiducial], ends[is_fiducial], "vector fiducial"),
-        svg.strokes(starts[is_fiducial], starts[is_fiducial], "dot fiducial"),
-        scale_bar(on, px_per_um),
+        px_per_um,
+        *(
+            strokes_and_dots(starts[rows], ends[rows], kind)
+            for kind, rows in (("target", ~residuals.is_fiducial), ("fiducial", residuals.is_fiducial))
+        ),
     )
 
 
-def scale_bar(on: Plane, px_per_um: float) -> Markup:
-    """A bar of a round length in um, and under it one of mm."""
+def strokes_and_dots(starts: Array, ends: Array, kind: str, dots: Array | None = None) -> Markup:
+    """Vectors with a dot where each starts, or at other places."""
+    at = starts if dots is None else dots
+    return svg.strokes(starts, ends, f"vector {kind}") + svg.strokes(at, at, f"dot {kind}")
+
+
+def _scale_bar(on: Plane, px_per_um: float) -> Markup:
     um, mm = svg.round_step(60.0 / px_per_um), svg.round_step(60.0 / on.px_per_mm)
     x = MARGIN_PX
     bars = Markup("")
@@ -125,12 +145,11 @@ def scale_bar(on: Plane, px_per_um: float) -> Markup:
     return bars
 
 
-def _stroke(start: Array, end: Array, row: Json, suspect: list[Json]) -> Markup:
-    kind = "suspect" if row in suspect else "fiducial" if row["kind"] == "fiducial" else "target"
-    at, to = start[None], end[None]
-    return svg.strokes(at, to, f"vector {kind}") + svg.strokes(at, at, f"dot {kind}")
+def _stroke(start: Array, end: Array, row: ResidualRecord, suspects: Collection[ResidualRecord]) -> Markup:
+    kind = "suspect" if row in suspects else "fiducial" if row.kind == "fiducial" else "target"
+    return strokes_and_dots(start[None], end[None], kind)
 
 
-def _hint(row: Json) -> str:
-    vx, vy = fixed(row["vx_um"], 1, sign=True), fixed(row["vy_um"], 1, sign=True)
-    return f"{row['kind']} {row['point']}: v = ({vx}, {vy}) µm in the scan, w = {fixed(row['w'], 1)}"
+def _hint(row: ResidualRecord) -> str:
+    vx, vy = (fixed(v, 1, sign=True) for v in row.v_um)
+    return f"{row.kind} {row.point}: v = ({vx}, {vy}) µm in the scan, w = {fixed(row.w, 1)}"

@@ -1,6 +1,7 @@
 """The verdict on a calibration, and what needs a look."""
 
-from collections.abc import Callable, Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,13 +10,22 @@ from scipy.special import chdtri, ndtri
 
 from adjust.problem.parameter import description, parameter_from_text
 from measure.flags import Status
-from pipeline.report.data import Json, Problem, ReportData
+from pipeline.report.data import Problem, ReportData
 from pipeline.report.fractions import places_px
 from pipeline.report.frame_problems import assumed_poses, frame_problems, pixel_locking, said_by
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import spoken_name
-from pipeline.results.lens_known import estimated_lenses, reach_sentence
+from pipeline.results.adjustment_record import (
+    AdjustmentRecord,
+    CameraRecord,
+    ContradictionRecord,
+    DistanceRecord,
+    ObservedQuantity,
+    ResidualRecord,
+    SuspectRecord,
+)
+from pipeline.results.check_file import Check, PixelCalibration
 from pipeline.text.wording import counted, listed
 
 Level = Literal["good", "look", "failed"]
@@ -26,7 +36,7 @@ A_PRIORI = (
     "their own that would tell σ₀. Given coordinates with a large sigma place the datum and check nothing."
 )
 CONTRADICTED = 0.01  # probability of so much against an earlier calibration, below which it is a problem
-TOLD = 3  # of its quantities
+MOST_QUANTITIES = 3  # of it that are named
 LEAST_SHARE = 0.5  # of the corner's radius within which an estimated lens is known
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
 
@@ -77,16 +87,6 @@ def judge(data: ReportData) -> Verdict:
     return Verdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
 
 
-def camera_is_calibrated(camera: Json) -> bool:
-    """Whether a camera's entry of adjustment.json has an interior orientation, and not just fiducials."""
-    return camera["principal_distance_mm"]["sigma"] is not None
-
-
-def has_sigma0(adjustment: Json) -> bool:
-    """Whether sigma0 was estimated, and standard deviations are not a priori ones."""
-    return not adjustment["sigma0_from"]["a_priori"]
-
-
 def sigma0_bounds(redundancy: float) -> tuple[float, float]:
     """Where sigma0 lies, with a probability of 99 %, when the a-priori standard deviations are right."""
     low, high = (chdtri(redundancy, 0.5 * above) for above in (1.0 + CONFIDENCE, 1.0 - CONFIDENCE))
@@ -98,26 +98,26 @@ def critical_w(tests: int) -> float:
     return -float(ndtri(0.5 * (1.0 - CONFIDENCE) / max(tests, 1)))
 
 
-def suspect_rows(adjustment: Json) -> list[Json]:
+def suspect_rows(adjustment: AdjustmentRecord) -> frozenset[ResidualRecord]:
     """The residuals of image points that contradict the others beyond chance."""
-    names = {(row["group"], row["owner"], row["point"]) for row in adjustment["suspects"]}
-    return [row for row in adjustment["residuals"] if (row["kind"], row["image"], row["point"]) in names]
+    names = {(row.group, row.owner, row.point) for row in adjustment.suspects}
+    return frozenset(row for row in adjustment.residuals if (row.kind, row.image, row.point) in names)
 
 
-def _no_solution(adjustment: Json) -> Iterator[Problem]:
-    for null in adjustment["singular"]:
-        together = description(parameter_from_text(text, adjustment["cameras"]) for text in null["parameters"])
-        yield Problem(f"{null['cause']} The observations do not see it (together move {together}).", null["remedy"])
-    if not adjustment["converged"] and not adjustment["singular"]:
+def _no_solution(adjustment: AdjustmentRecord) -> Iterator[Problem]:
+    for null in adjustment.singular:
+        together = description(parameter_from_text(text, adjustment.cameras) for text in null.parameters)
+        yield Problem(f"{null.cause} The observations do not see it (together move {together}).", null.remedy)
+    if not adjustment.converged and not adjustment.singular:
         yield Problem(
-            f"The iteration did not come to rest ({adjustment['termination']}, {adjustment['iterations']} iterations).",
+            f"The iteration did not come to rest ({adjustment.termination}, {adjustment.iterations} iterations).",
             _why_no_rest(adjustment),
         )
 
 
-def _why_no_rest(adjustment: Json) -> str:
+def _why_no_rest(adjustment: AdjustmentRecord) -> str:
     """What to look at where an iteration does not come to rest."""
-    if any(warning.startswith("Practically singular") for warning in adjustment["warnings"]):
+    if any(warning.startswith("Practically singular") for warning in adjustment.warnings):
         return (
             "The images hardly determine what is named below as practically singular: add what is advised there, or "
             "fix it."
@@ -128,85 +128,83 @@ def _why_no_rest(adjustment: Json) -> str:
     )
 
 
-def _unchecked(adjustment: Json) -> Iterator[Problem]:
-    if adjustment["redundancy"] <= 0:
+def _unchecked(adjustment: AdjustmentRecord) -> Iterator[Problem]:
+    if adjustment.redundancy <= 0:
         yield Problem(
             "Nothing checks the result: there are as many unknowns as observations.",
             "Add points or frames; until then no standard deviation here has been confirmed by the data.",
         )
 
 
-def _suspects(rows: list[Json]) -> Iterator[Problem]:
-    kept, removed = ([row for row in rows if row["removed"] is removed] for removed in (False, True))
+def _suspects(rows: Sequence[SuspectRecord]) -> Iterator[Problem]:
+    kept, removed = ([row for row in rows if row.removed is removed] for removed in (False, True))
     if kept:
         yield Problem(
-            f"{counted(len(kept), 'observation')} beyond chance: {listed([_told(row) for row in kept])}.",
+            f"{counted(len(kept), 'observation')} beyond chance: {listed([_suspect(row) for row in kept])}.",
             "Look at the picture or the records: a wrong point number or a disturbed mark is rejected in "
             "comparator.csv (status rejected), a wrong given coordinate corrected, and the adjustment run again; "
             "snooping = true under [adjust] leaves them out.",
         )
     if removed:
         yield Problem(
-            f"Left out, for beyond chance: {listed([_told(row) for row in removed])}.",
+            f"Left out, for beyond chance: {listed([_suspect(row) for row in removed])}.",
             "The adjustment does without them. Look at the picture or the records, and reject or correct them there.",
         )
 
 
-def _told(row: Json) -> str:
-    alike = f"; it cannot be told apart from {', '.join(row['alike'])}" if row["alike"] else ""
-    return f"{row['name']} (w = {fixed(row['w'], 1)}{alike})"
+def _suspect(row: SuspectRecord) -> str:
+    alike = f"; it cannot be told apart from {', '.join(row.alike)}" if row.alike else ""
+    return f"{row.name} (w = {fixed(row.w, 1)}{alike})"
 
 
-def _further_problems(adjustment: Json) -> Iterator[Problem]:
+def _further_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     """Distances, earlier calibrations and antennas that the images contradict."""
+    further: dict[str, Sequence[DistanceRecord | ObservedQuantity]] = {
+        "distances": adjustment.distances,
+        "calibrations": adjustment.calibrations,
+        "antennas": adjustment.antennas,
+    }
     for group, one, many, remedy in FURTHER:
-        whole = [test for test in adjustment.get("calibration_tests", ()) if test["p"] < CONTRADICTED]
+        whole = [test for test in adjustment.calibration_tests if test.p < CONTRADICTED]
         if group == "calibrations" and whole:
             for test in whole:
-                yield Problem(f"{one}: {contradiction(test, adjustment['cameras'])}.", remedy)
+                yield Problem(f"{one}: {contradiction(test, adjustment.cameras)}.", remedy)
             continue
-        bad = _beyond_chance(adjustment, adjustment[group])
+        bad = _beyond_chance(adjustment, further[group])
         if bad:
             heading = (one if len(bad) == 1 else many).format(len(bad))
-            named = [_with_residual(row, _further_name(row, group, adjustment["cameras"])) for row in bad]
+            names = [spoken_name(row.name, adjustment.cameras) if group == "calibrations" else row.name for row in bad]
+            named = [f"{name} (v = {row.v:.4g}, w = {fixed(row.w, 1)})" for name, row in zip(names, bad, strict=True)]
             yield Problem(f"{heading}: {listed(named)}.", remedy)
 
 
-def contradiction(test: Json, cameras: Json) -> str:
+def contradiction(test: ContradictionRecord, cameras: Mapping[str, CameraRecord]) -> str:
     """What the images say against an earlier calibration as a whole, and in which direction."""
-    told = [row for row in test["direction"] if row["difference"] is not None and row["sigma"]][:TOLD]
+    known = [row for row in test.direction if math.isfinite(row.difference) and row.sigma > 0.0][:MOST_QUANTITIES]
     by = ", ".join(
-        f"{spoken_name(row['name'], cameras)} {row['difference']:+.3g} (its sigma {row['sigma']:.2g})" for row in told
+        f"{spoken_name(row.name, cameras)} {row.difference:+.3g} (its sigma {row.sigma:.2g})" for row in known
     )
     return (
-        f"so much comes by chance with a probability of {test['p']:.2g} (F = {fixed(test['F'], 1)}, {test['freedom']} "
+        f"so much comes by chance with a probability of {test.p:.2g} (F = {fixed(test.F, 1)}, {test.freedom} "
         f"degrees of freedom). They put it elsewhere most in {by}, in mm and powers of it"
     )
 
 
-def _further_name(row: Json, group: str, cameras: Json) -> str:
-    if group == "distances":
-        return f"{row['from']} to {row['to']}"
-    return spoken_name(row["name"], cameras) if group == "calibrations" else str(row["name"])
+def _beyond_chance(
+    adjustment: AdjustmentRecord, rows: Sequence[DistanceRecord | ObservedQuantity]
+) -> list[DistanceRecord | ObservedQuantity]:
+    limit = critical_w(len(rows)) * (adjustment.sigma0 if adjustment.sigma0 > 1.0 else 1.0)
+    return [row for row in rows if abs(row.w) > limit]
 
 
-def _with_residual(row: Json, name: str) -> str:
-    return f"{name} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})"
-
-
-def _beyond_chance(adjustment: Json, rows: list[Json]) -> list[Json]:
-    limit = critical_w(len(rows)) * max(1.0, adjustment["sigma0"] or 1.0)
-    return [row for row in rows if abs(row["w"] or 0.0) > limit]
-
-
-def _too_large(adjustment: Json) -> Iterator[Problem]:
+def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     """A sigma0 beyond chance, with what explains it where something does."""
-    _, high = sigma0_bounds(adjustment["sigma0_from"]["redundancy"])
-    explained = [Problem(each["cause"], each["remedy"]) for each in adjustment.get("explanations", ())]
-    if adjustment["sigma0"] <= high:
+    _, high = sigma0_bounds(adjustment.variance_factor.redundancy)
+    explained = [Problem(each.cause, each.remedy) for each in adjustment.explanations]
+    if adjustment.sigma0 <= high:
         yield from explained
         return
-    size = f"{_sigma0_and('above', high, adjustment['sigma0'])}: the residuals are larger than the sigmas given"
+    size = f"{_sigma0_and('above', high, adjustment.sigma0)}: the residuals are larger than the sigmas given"
     if explained:
         yield replace(explained[0], what=f"{size}. {explained[0].what}")
         yield from explained[1:]
@@ -218,21 +216,21 @@ def _too_large(adjustment: Json) -> Iterator[Problem]:
     )
 
 
-def _too_small(adjustment: Json) -> Iterator[str]:
+def _too_small(adjustment: AdjustmentRecord) -> Iterator[str]:
     """Better than promised is no harm: a note."""
-    low, _ = sigma0_bounds(adjustment["sigma0_from"]["redundancy"])
-    if adjustment["sigma0"] < low:
+    low, _ = sigma0_bounds(adjustment.variance_factor.redundancy)
+    if adjustment.sigma0 < low:
         yield (
-            f"{_sigma0_and('below', low, adjustment['sigma0'])}: the marks fit better than the sigmas given "
+            f"{_sigma0_and('below', low, adjustment.sigma0)}: the marks fit better than the sigmas given "
             f"({_by_group(adjustment)}). Lower the sigmas of the group that is below 1 (sigma_target_um, "
             "sigma_fiducial_um, film_sigma_um, or comparator.csv; datum: sigma_mm of the fiducials); all sigmas of the "
             "result are already multiplied by σ₀."
         )
 
 
-def _by_group(adjustment: Json) -> str:
-    groups = {name: group for name, group in adjustment["groups"].items() if (group["redundancy"] or 0.0) >= 1.0}
-    return ", ".join(f"{name} {fixed(group['sigma0'])}" for name, group in groups.items())
+def _by_group(adjustment: AdjustmentRecord) -> str:
+    groups = {name: group for name, group in adjustment.groups.items() if group.redundancy >= 1.0}
+    return ", ".join(f"{name} {fixed(group.sigma0)}" for name, group in groups.items())
 
 
 def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
@@ -241,47 +239,46 @@ def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
     return f"σ₀ = {sigma0:.{digits}f} is {side} {bound:.{digits}f}"
 
 
-def _lens_problems(adjustment: Json) -> Iterator[Problem]:
+def _lens_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     """Lenses that were estimated in less than half of the picture: from half the radius to the corner the seventh power
     of k3 grows by 128, so that a hundredth of a pixel inside is more than a pixel there."""
-    for name, known in estimated_lenses(adjustment):
-        if known["share"] < LEAST_SHARE:
+    for name, known in adjustment.estimated_lenses():
+        if known.share < LEAST_SHARE:
             yield Problem(
-                reach_sentence(name, known),
+                known.sentence(name),
                 "Observe targets out to the corners of the picture, or use the lens within that radius only.",
             )
 
 
-def _lens_notes(adjustment: Json) -> Iterator[str]:
-    for name, known in estimated_lenses(adjustment):
-        if known["share"] >= LEAST_SHARE:
-            yield reach_sentence(name, known)
+def _lens_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
+    for name, known in adjustment.estimated_lenses():
+        if known.share >= LEAST_SHARE:
+            yield known.sentence(name)
 
 
-def _check_problems(check: Json) -> Iterator[Problem]:
-    if check["verdict"] == "differs":
+def _check_problems(check: Check) -> Iterator[Problem]:
+    if check.verdict == "differs":
         yield Problem(
-            f"OpenCV's calibration of the same observations differs. {check['reason']}",
+            f"OpenCV's calibration of the same observations differs. {check.reason}",
             "See the table of the check: a parameter that differs by many sigmas points to the cause.",
         )
 
 
-def _corners_notes(check: Json) -> Iterator[str]:
+def _corners_notes(check: Check) -> Iterator[str]:
     """What OpenCV's own points of a board give in the place of those that were measured here."""
-    for name, camera in check.get("cameras", {}).items():
-        corners = camera.get("corners_px")
+    for name, camera in check.cameras.items():
+        corners = camera.corners_px
         if corners:
-            measured, own = (_pixel_figures(corners[each]) for each in ("reseau", "opencv"))
-            lost = f" OpenCV found no board in {listed(corners['not_found'])}." if corners["not_found"] else ""
+            lost = f" OpenCV found no board in {listed(corners.not_found)}." if corners.not_found else ""
             yield (
-                f"OpenCV's calibration of {name} from {corners['points']} points of {corners['images']} pictures: with "
-                f"the points measured here {measured}; with OpenCV's own ({corners['detector']}) {own}.{lost}"
+                f"OpenCV's calibration of {name} from {corners.points} points of {corners.images} pictures: with the "
+                f"points measured here {_pixel_figures(corners.reseau)}; with OpenCV's own ({corners.detector}) "
+                f"{_pixel_figures(corners.opencv)}.{lost}"
             )
 
 
-def _pixel_figures(figures: Json) -> str:
-    named = ", ".join(f"{name} {figures[name]:.2f}" for name in ("fx", "fy", "cx", "cy"))
-    return f"{named} px, rms {figures['rms']:.3f} px a point"
+def _pixel_figures(of: PixelCalibration) -> str:
+    return f"fx {of.fx:.2f}, fy {of.fy:.2f}, cx {of.cx:.2f}, cy {of.cy:.2f} px, rms {of.rms:.3f} px a point"
 
 
 def _is_solved(data: ReportData) -> bool:
@@ -290,14 +287,14 @@ def _is_solved(data: ReportData) -> bool:
 
 def is_film_alone(data: ReportData) -> bool:
     """Whether fiducial marks are all there was to adjust."""
-    return data.adjustment is not None and not any(map(camera_is_calibrated, data.adjustment["cameras"].values()))
+    return data.adjustment is not None and not any(camera.is_calibrated for camera in data.adjustment.cameras.values())
 
 
-def _of_solution(look: Callable[[Json], Iterator[Problem]], checked: bool = False) -> Look:
+def _of_solution(look: Callable[[AdjustmentRecord], Iterator[Problem]], checked: bool = False) -> Look:
     """What an adjustment needs a look at where it has a solution, and redundancy if that is asked for."""
 
     def of(data: ReportData, _: list[Frame]) -> Iterator[Problem]:
-        if data.adjustment is not None and _is_solved(data) and (not checked or has_sigma0(data.adjustment)):
+        if data.adjustment is not None and _is_solved(data) and (not checked or data.adjustment.has_sigma0):
             yield from look(data.adjustment)
 
     return of
@@ -318,12 +315,12 @@ NEEDS_A_LOOK: dict[str, Look] = {
     "made from": lambda data, _: data.problems,
     "frames": _of_frames,
     "pixel locking": lambda data, shots: pixel_locking(data.totals.places_px if data.totals else places_px(shots)),
-    "warnings": lambda data, _: map(Problem, data.adjustment["warnings"] if data.adjustment else ()),
+    "warnings": lambda data, _: map(Problem, data.adjustment.warnings if data.adjustment else ()),
     "σ₀": _of_solution(_too_large, checked=True),
     "redundancy": _of_solution(_unchecked),
     "reach of the lens": _of_solution(_lens_problems),
     "distances, calibrations, antennas": _of_solution(_further_problems),
-    "gross errors": _of_solution(lambda adjustment: _suspects(adjustment["suspects"])),
+    "gross errors": _of_solution(lambda adjustment: _suspects(adjustment.suspects)),
     "OpenCV": lambda data, _: _check_problems(data.check) if data.check else (),
 }
 
@@ -336,19 +333,19 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     if not data.adjustment:
         if _observed(data, shots):
             yield "These marks are not adjusted yet: run `reseau adjust`."
-    elif not data.adjustment["converged"]:
+    elif not data.adjustment.converged:
         yield "There is no solution: all values and residuals of this report are those of the last iteration."
     elif not data.check:
         yield "There is no check against OpenCV yet: run `reseau check`."
-    elif data.check["verdict"] == "not possible" and not is_film_alone(data):
-        yield f"OpenCV cannot check this calibration. {data.check['reason']}"
+    elif data.check.verdict == "not possible" and not is_film_alone(data):
+        yield f"OpenCV cannot check this calibration. {data.check.reason}"
     if data.check:
         yield from _corners_notes(data.check)
     if data.adjustment:
-        yield from data.adjustment.get("notes", ())
+        yield from data.adjustment.notes
         yield from _lens_notes(data.adjustment)
         yield from _weight_notes(data.adjustment)
-        if _is_solved(data) and has_sigma0(data.adjustment):
+        if _is_solved(data) and data.adjustment.has_sigma0:
             yield from _too_small(data.adjustment)
         elif _is_solved(data):
             yield A_PRIORI
@@ -371,20 +368,20 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
                 yield f"{counted(number, *words)} {status} (their reasons stand with the marks)."
 
 
-def _weight_notes(adjustment: Json) -> Iterator[str]:
+def _weight_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
     """What the adjustment itself has changed of the weights."""
-    lowered = [row for row in adjustment["residuals"] if row["weight"] < 1.0]
+    lowered = [row for row in adjustment.residuals if row.weight < 1.0]
     if lowered:
-        least = min(lowered, key=lambda row: row["weight"])
+        least = min(lowered, key=lambda row: row.weight)
         yield (
             f"Robust estimation lowered the weight of {counted(len(lowered), 'observation')}, most that of "
-            f"{least['image']}/{least['point']}, to {least['weight']:.2f} of what was given."
+            f"{least.image}/{least.point}, to {least.weight:.2f} of what was given."
         )
-    for group, factor in adjustment["variance_factors"].items():
-        doubt = (adjustment["variance_sigmas"].get(group) or 0.0) / (2.0 * factor**0.5)
+    for group, factor in adjustment.variance_factors.items():
+        sigma = adjustment.variance_sigmas.get(group, 0.0) / (2.0 * factor**0.5)
         yield (
-            f"Variance components: the sigmas of the group {group} were multiplied by {factor**0.5:.2f} ± {doubt:.2f}."
-            if doubt
+            f"Variance components: the sigmas of the group {group} were multiplied by {factor**0.5:.2f} ± {sigma:.2f}."
+            if sigma > 0.0
             else f"Variance components: the group {group} has too little redundancy and kept its sigmas."
         )
 
@@ -398,15 +395,15 @@ def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int)
     if not data.adjustment:
         return f"Measured: {found}{ending}"
     if level == "failed":
-        why = "the network is singular" if data.adjustment["singular"] else "the iteration did not come to rest"
+        why = "the network is singular" if data.adjustment.singular else "the iteration did not come to rest"
         return f"There is no calibration: {why}."
-    calibrated = {name: each for name, each in data.adjustment["cameras"].items() if camera_is_calibrated(each)}
+    calibrated = {name: each for name, each in data.adjustment.cameras.items() if each.is_calibrated}
     if not calibrated:
         return f"Film transformations from {found}; no frame is oriented, and no camera calibrated{ending}"
     constants = "; ".join(
         f"{name} has c = {value} ± {sigma} mm" if sigma != "fixed" else f"{name} has c = {value} mm, fixed"
         for name, camera in calibrated.items()
-        for value, sigma in [value_and_sigma(*(camera["principal_distance_mm"][key] for key in ("value", "sigma")))]
+        for value, sigma in [value_and_sigma(camera.principal_distance_mm.value, camera.principal_distance_mm.sigma)]
     )
     return f"Calibrated from {found}: {constants}{ending}"
 
@@ -416,4 +413,4 @@ def _observed(data: ReportData, shots: list[Frame]) -> int:
     if data.totals:
         return sum(count[status] for count in data.totals.marks.values() for status in (Status.MEASURED, Status.WEAK))
     marks = sum(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
-    return marks or (len(data.adjustment["residuals"]) if data.adjustment else 0)
+    return marks or (len(data.adjustment.residuals) if data.adjustment else 0)

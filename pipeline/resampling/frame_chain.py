@@ -1,8 +1,6 @@
 """The way from a place in the camera's frame to a pixel of the scan: lens, film transformation, scanner, pitch."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +8,12 @@ from numpy.typing import NDArray
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
-from pipeline.results.adjustment_reader import calibrated_lens
+from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
 from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Json = Mapping[str, Any]
-
-_RAD_PER_DEG = np.pi / 180.0
 
 
 @dataclass(frozen=True)
@@ -51,30 +46,20 @@ class FrameChain:
         return self.lens.ideal_from_observed(observed)
 
 
-def adjusted_chain(measured: MeasuredScan, adjustment: Json, with_lens: bool) -> FrameChain:
+def adjusted_chain(measured: MeasuredScan, adjustment: AdjustmentRecord, with_lens: bool) -> FrameChain:
     """The chain of an image of adjustment.json, with the film transformation and the scanner that were adjusted."""
     return image_chain(measured.frame.image, adjustment, measured.pitch_um, _middle_mm(measured), with_lens)
 
 
 def image_chain(
-    name: str, adjustment: Json, pitch_um: tuple[float, float], middle_mm: Array, with_lens: bool
+    name: str, adjustment: AdjustmentRecord, pitch_um: tuple[float, float], middle_mm: Array, with_lens: bool
 ) -> FrameChain:
     """The same. middle_mm (2,): a place about in the middle of the image, in the comparator."""
-    image = adjustment["images"][name]
-    stored = image["transformation"]
-    names = film_parameter_names(stored["kind"])
-    values = [
-        stored[name]["value"] if name in stored else stored[f"{name}_deg"]["value"] * _RAD_PER_DEG for name in names
-    ]
-    film = Film(stored["kind"], np.array(values, float), middle_mm, bool(stored.get("mirrored", False)))
-    scanner = adjustment.get("scanners", {}).get(image.get("scanner"))
-    bend, bend_parameters = NO_BEND, np.empty(0)
-    if scanner is not None:
-        terms = scanner["terms"]
-        bend = Bend(tuple(terms), tuple(scanner["center_mm"]), tuple(scanner["half_mm"]))
-        bend_parameters = np.array([term["value"] for term in terms.values()], float)
-    lens = calibrated_lens(adjustment["cameras"][image["camera"]]) if with_lens else None
-    return FrameChain(pitch_um, film, bend, bend_parameters, lens)
+    image = adjustment.images[name]
+    scanner = adjustment.scanners.get(image.scanner)
+    bend = (NO_BEND, np.empty(0)) if scanner is None else scanner.bend()
+    lens = adjustment.cameras[adjustment.camera_of(name)].lens() if with_lens else None
+    return FrameChain(pitch_um, image.transformation.film(middle_mm), *bend, lens)
 
 
 def measured_chain(measured: MeasuredScan) -> FrameChain | None:

@@ -25,7 +25,8 @@ from pipeline.resampling.frame_file import TILE_PX, Description, read_descriptio
 from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile
 from pipeline.resampling.seam import Part, beside_one_another, joined_tile, seams_mm
 from pipeline.resampling.source import source_of
-from pipeline.results.adjustment_reader import read_adjustment
+from pipeline.results.adjustment_file import read_adjustment
+from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.atomic import check_writable
 from pipeline.text.names import path_below
@@ -118,7 +119,7 @@ def resample_tasks(
 ) -> tuple[list[ResampleTask], list[Resampled]]:
     """What is to be done, and what cannot be."""
     adjustment = read_adjustment(project.adjustment_path) if project.adjustment_path.exists() else None
-    if with_lens and (adjustment is None or not adjustment["converged"]):
+    if with_lens and (adjustment is None or not adjustment.converged):
         raise InputError("--lens needs an adjusted lens. Run `reseau adjust` first, or resample without it.")
     tasks: dict[str, ResampleTask] = {}
     failed = []
@@ -150,10 +151,10 @@ def resample_tasks(
 
 
 def _chain(
-    measured: MeasuredScan, adjustment: dict[str, Any] | None, with_lens: bool, is_part: bool
+    measured: MeasuredScan, adjustment: AdjustmentRecord | None, with_lens: bool, is_part: bool
 ) -> FrameChain | str:
     """The adjusted chain of an image, or that of its fiducials; else why there is none."""
-    if adjustment is not None and adjustment["converged"] and measured.frame.image in adjustment["images"]:
+    if adjustment is not None and adjustment.converged and measured.frame.image in adjustment.images:
         return adjusted_chain(measured, adjustment, with_lens)
     if with_lens:
         return "it has no part in the adjustment, so its lens is not known: resample it without --lens"
@@ -209,6 +210,6 @@ def _rows_at_a_time(chain: FrameChain, pitch_mm: float, width_px: int) -> int:
     return int(np.ptp(pixels[:, 1])) + 2 * MARGIN_PX
 
 
-def resampled_json(results: Sequence[Resampled]) -> list[dict[str, Any]]:
+def resampled_json(results: Sequence[Resampled]) -> list[dict[str, object]]:
     """The results for a script."""
     return [asdict(result) | {"path": result.path and str(result.path)} for result in results]

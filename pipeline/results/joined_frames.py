@@ -2,7 +2,6 @@
 scans in the one camera frame."""
 
 from collections import defaultdict
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +11,16 @@ from adjust.problem.images import adjusted_image
 from adjust.problem.network import Image, Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
+from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord, PartMarkRecord, PartRecord
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Json = dict[str, Any]
 
 _UM_PER_MM = 1000.0
 _STEP = 1e-6  # of a parameter, for derivatives by it: films are linear in theirs, or nearly
 
 
-def frames_json(adjustment: Adjustment) -> Json:
+def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
     """By frame: its scans (parts), each with the standard deviation of its film transformation at its corners; joins,
     where they differ between the scans; marks, where each was measured. All in mm of the camera frame, sigmas a
     posteriori. Empty where no frame was scanned in parts, or without a solution.
@@ -35,7 +34,7 @@ def frames_json(adjustment: Adjustment) -> Json:
     return {frame: _frame(adjustment, frame, own) for frame, own in parts.items()}
 
 
-def _frame(adjustment: Adjustment, frame: str, parts: list[Image]) -> Json:
+def _frame(adjustment: Adjustment, frame: str, parts: list[Image]) -> JoinedFrameRecord:
     network = adjustment.network
     scans = {part.name: _Part(adjustment, part) for part in parts}
     marks = [row for scan in scans.values() for row in scan.marks()]
@@ -46,21 +45,9 @@ def _frame(adjustment: Adjustment, frame: str, parts: list[Image]) -> Json:
             places = [scans[name].camera_mm([row])[0] for name, row in zip(names, rows.tolist(), strict=True)]
             apart_um = _UM_PER_MM * (places[1] - places[0])
             middle = np.mean(places, axis=0)
-            joins.append(
-                {
-                    "point": point,
-                    "images": names,
-                    "x_mm": float(middle[0]),
-                    "y_mm": float(middle[1]),
-                    "dx_um": float(apart_um[0]),
-                    "dy_um": float(apart_um[1]),
-                }
-            )
-    return {
-        "parts": {name: {"corner_sigma_um": scan.corner_sigma_um()} for name, scan in scans.items()},
-        "joins": joins,
-        "marks": marks,
-    }
+            joins.append(JoinRecord(point, tuple(names), *middle.tolist(), *apart_um.tolist()))
+    known = {name: PartRecord(scan.corner_sigma_um()) for name, scan in scans.items()}
+    return JoinedFrameRecord(known, tuple(joins), tuple(marks))
 
 
 class _Part:
@@ -76,7 +63,7 @@ class _Part:
         """(n, 2) where the film transformation puts observations."""
         return np.asarray(self.model.camera_from_comparator(self.adjustment.network.observations.xy_mm[rows]))
 
-    def marks(self) -> list[Json]:
+    def marks(self) -> list[PartMarkRecord]:
         """Every mark that is an observation. A join's place and a fiducial's is the adjusted one. A target's is the
         measured one, with its own covariance and that of the film transformation, taken as independent."""
         network = self.adjustment.network
@@ -92,18 +79,9 @@ class _Part:
                 place = self.adjustment.values_of(own)
                 covariance = self.adjustment.sigma0**2 * self.adjustment.cofactor_of(own)
             sx, sy = np.sqrt(np.diag(covariance))
-            found.append(
-                {
-                    "image": self.image.name,
-                    "point": observations.point[row],
-                    "kind": observations.kind[row],
-                    "x_mm": float(place[0]),
-                    "y_mm": float(place[1]),
-                    "sx_mm": float(sx),
-                    "sy_mm": float(sy),
-                    "rho": float(covariance[0, 1] / (sx * sy)) if sx * sy > 0.0 else 0.0,
-                }
-            )
+            rho = float(covariance[0, 1] / (sx * sy)) if sx * sy > 0.0 else 0.0
+            named = self.image.name, observations.point[row], observations.kind[row]
+            found.append(PartMarkRecord(*named, float(place[0]), float(place[1]), float(sx), float(sy), rho))
         return found
 
     def corner_sigma_um(self) -> float:

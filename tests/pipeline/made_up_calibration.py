@@ -24,13 +24,13 @@ from adjust.solution.result import Adjustment
 from measure.flags import Cause, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline.report import ReportData, Thumbnail
-from pipeline.results.adjustment_file import write_adjustment
-from pipeline.results.adjustment_reader import read_adjustment, read_covariance
+from pipeline.results.adjustment_file import read_adjustment, write_adjustment
+from pipeline.results.check_file import CameraCheck, Check, Estimate, Row
 from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.results.covariance_file import read_covariance
 from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
-Json = dict[str, Any]
 
 PITCH_UM = 20.0
 
@@ -266,25 +266,9 @@ def _with(result: Adjustment) -> ReportData:
         path = Path(folder) / "adjustment.json"
         write_adjustment(result, path)
         stored, covariance = read_adjustment(path), read_covariance(path)
-    rows = [
-        {
-            "name": name,
-            "unit": unit,
-            "reseau": {"value": value, "sigma": sigma},
-            "opencv": {"value": value + 0.1 * sigma, "sigma": sigma},
-            "difference_sigmas": -0.1,
-        }
+    rows = tuple(
+        Row.of(name, unit, Estimate(value, sigma), Estimate(value + 0.1 * sigma, sigma))
         for name, unit, value, sigma in CHECKED
-    ]
-    camera = {
-        "verdict": "agrees",
-        "reason": "All parameters agree within 0.1 sigma.",
-        "rms_opencv_um": 4.61,
-        "rms_reseau_um": 4.60,
-        "refit_residual_um": 0.012,
-        "images": 5,
-        "points": 120,
-        "rows": rows,
-    }
-    check = {"verdict": "agrees", "reason": "All parameters agree within 0.1 sigma.", "cameras": {"RC 20": camera}}
-    return replace(measured(), adjustment=stored, covariance=covariance, check=check)
+    )
+    camera = CameraCheck("agrees", "All parameters agree within 0.1 sigma.", 5, 120, 4.61, 4.60, 0.012, rows)
+    return replace(measured(), adjustment=stored, covariance=covariance, check=Check.of({CAMERA: camera}))

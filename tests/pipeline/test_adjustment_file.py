@@ -20,10 +20,11 @@ from adjust.quality.residuals import Residuals
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
-from pipeline.results import covariance_arrays
-from pipeline.results.adjustment_file import write_adjustment
-from pipeline.results.adjustment_reader import covariance_path, read_adjustment, read_covariance
-from pipeline.results.check_file import CameraCheck, Check, CornersCheck, PixelCalibration, Row, read_check
+from pipeline.results import covariance_file
+from pipeline.results.adjustment_file import read_adjustment, write_adjustment
+from pipeline.results.check_file import CameraCheck, Check, CornersCheck, Estimate, PixelCalibration, Row, read_check
+from pipeline.results.covariance_file import covariance_path, read_covariance
+from pipeline.results.record_json import plain_json
 
 
 @pytest.fixture
@@ -37,8 +38,13 @@ def path(adjustment: Adjustment, tmp_path: Path) -> Path:
     return tmp_path / "adjustment.json"
 
 
+def file_content(path: Path) -> Any:
+    """What the file holds."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
 def test_values_stand_with_their_a_posteriori_sigma_and_what_was_given(adjustment: Adjustment, path: Path) -> None:
-    camera = read_adjustment(path)["cameras"]["RC 20"]
+    camera = file_content(path)["cameras"]["RC 20"]
     sigma0 = np.sqrt(262.1 / 257)
     assert camera["principal_distance_mm"]["value"] == 153.664
     assert camera["principal_distance_mm"]["sigma"] == pytest.approx(0.0041 * sigma0, rel=1e-12)
@@ -50,11 +56,11 @@ def test_values_stand_with_their_a_posteriori_sigma_and_what_was_given(adjustmen
 
 
 def test_a_fixed_quantity_has_sigma_zero(path: Path) -> None:
-    assert read_adjustment(path)["points"]["3"]["Z"]["sigma"] == 0.0
+    assert file_content(path)["points"]["3"]["Z"]["sigma"] == 0.0
 
 
 def test_angles_are_in_degrees_in_the_json_and_in_rad_in_the_covariance(adjustment: Adjustment, path: Path) -> None:
-    omega = read_adjustment(path)["images"]["f3"]["exterior"]["omega_deg"]
+    omega = file_content(path)["images"]["f3"]["exterior"]["omega_deg"]
     assert omega["value"] == pytest.approx(np.rad2deg(adjustment.value("EO.f3.omega")), rel=1e-14)
     assert omega["sigma"] == pytest.approx(np.rad2deg(3e-5) * adjustment.sigma0, rel=1e-12)
     variance = read_covariance(path).of(["EO.f3.omega"])
@@ -62,10 +68,10 @@ def test_angles_are_in_degrees_in_the_json_and_in_rad_in_the_covariance(adjustme
 
 
 def test_an_observed_attitude_is_given_in_degrees_and_a_mere_approximation_without_sigma(path: Path) -> None:
-    exterior = read_adjustment(path)["images"]["f1"]["exterior"]
+    exterior = file_content(path)["images"]["f1"]["exterior"]
     assert exterior["Z0"]["given"] == {"value": 1500.0, "sigma": None}
     assert exterior["kappa_deg"]["given"]["sigma"] == pytest.approx(np.rad2deg(0.5))
-    assert "given" not in read_adjustment(path)["images"]["f2"]["exterior"]["Z0"]
+    assert "given" not in file_content(path)["images"]["f2"]["exterior"]["Z0"]
 
 
 def test_the_covariance_is_a_posteriori_and_holds_correlations(adjustment: Adjustment, path: Path) -> None:
@@ -78,7 +84,7 @@ def test_the_covariance_is_a_posteriori_and_holds_correlations(adjustment: Adjus
 def test_residuals_stand_in_the_scan_and_in_the_camera(adjustment: Adjustment, path: Path) -> None:
     """f2 is mirrored: x' = 0.1 - x + 0.02 y, y' = 0.2 + 0.02 x + y."""
     i = adjustment.network.observations.image.index("f2")
-    row = read_adjustment(path)["residuals"][i]
+    row = file_content(path)["residuals"][i]
     x, y = adjustment.network.observations.xy_mm[i]
     assert (row["image"], row["point"], row["kind"]) == ("f2", "1", "fiducial")
     assert row["camera_x_mm"] == pytest.approx(0.1 - x + 0.02 * y)
@@ -95,7 +101,7 @@ def test_w_is_the_larger_of_the_two_axes_with_its_sign(adjustment: Adjustment, t
     made_up = made_up_calibration.adjustment()
     changed = replace(made_up, known={**made_up.known, "residuals": residuals})
     write_adjustment(changed, tmp_path / "adjustment.json")
-    rows = read_adjustment(tmp_path / "adjustment.json")["residuals"]
+    rows = file_content(tmp_path / "adjustment.json")["residuals"]
     assert [row["w"] for row in rows[:3]] == [-2.5, 0.5, None]
 
 
@@ -107,7 +113,7 @@ def test_a_singular_result_has_its_causes_no_sigmas_and_no_nan(tmp_path: Path) -
         raise AssertionError(f"{constant} is no JSON")
 
     json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
-    content = read_adjustment(path)
+    content = file_content(path)
     assert not content["converged"]
     assert content["singular"][0]["parameters"] == ["IO.RC 20.c", "EO.f1.Z0"]
     assert content["singular"][0]["remedy"] == "Fix c."
@@ -118,14 +124,14 @@ def test_points_that_nobody_saw_are_left_out(adjustment: Adjustment, tmp_path: P
     unseen = ObjectPoint("unseen", Prior(1.0), Prior(2.0), None)
     network = replace(adjustment.network, points=(*adjustment.network.points, unseen))
     write_adjustment(replace(adjustment, network=network), tmp_path / "adjustment.json")
-    assert "unseen" not in read_adjustment(tmp_path / "adjustment.json")["points"]
+    assert "unseen" not in file_content(tmp_path / "adjustment.json")["points"]
 
 
 def test_what_trades_off_stands_in_words(tmp_path: Path) -> None:
     """A low relief under vertical photographs: c and the flying height."""
     network, start = Setup(vertical(0.0, 1.6, 3.1, -1.5), relief=20.0, prior=1.0).network()
     write_adjustment(adjust(network, start), tmp_path / "adjustment.json")
-    first = read_adjustment(tmp_path / "adjustment.json")["correlations"][0]
+    first = file_content(tmp_path / "adjustment.json")["correlations"][0]
     assert first["parameters"] == ["IO.K.c", "EO.*.Z0"]
     assert 0.95 < first["rho"] <= 1.0
     assert "flying height and principal distance trade off" in first["cause"]
@@ -137,6 +143,32 @@ def test_the_files_are_equal_when_written_twice(adjustment: Adjustment, path: Pa
     write_adjustment(adjustment, path)
     assert path.read_bytes() == before
     assert sorted(file.name for file in path.parent.iterdir()) == ["adjustment.json", "adjustment.npz"]
+
+
+def test_what_is_read_is_what_was_written(path: Path) -> None:
+    assert plain_json(read_adjustment(path)) == file_content(path)
+
+
+def test_the_file_has_the_keys_of_its_contract(path: Path) -> None:
+    """As docs and users' scripts know them; more may come."""
+    content = file_content(path)
+    assert list(content)[:16] == [
+        "reseau", "made_from", "converged", "termination", "iterations", "observations", "conditions", "unknowns",
+        "redundancy", "vpv", "sigma0", "sigma0_from", "covariance", "singular", "correlations", "warnings",
+    ]  # fmt: skip
+    assert set(content) >= {
+        "notes", "left_out", "variance_factors", "variance_sigmas", "explanations", "suspects", "reliability",
+        "cameras", "scanners", "boards", "images", "frames", "points", "residuals", "refraction", "earth_curvature",
+        "distances", "calibrations", "calibration_tests", "antennas", "groups", "history",
+    }  # fmt: skip
+    assert list(content["images"]["f1"]) == ["camera", "scanner", "transformation", "exterior"]
+    film = content["images"]["f1"]["transformation"]
+    assert list(film) == ["kind", "mirrored", "a1", "a2", "a3", "b1", "b2", "b3"]
+    assert list(content["residuals"][0])[:11] == [
+        "image", "point", "kind", "vx_um", "vy_um", "redundancy_x", "redundancy_y", "w", "w_x", "w_y", "weight",
+    ]  # fmt: skip
+    assert list(content["history"][0]) == ["vpv", "largest_step_sigmas", "damping", "attempts"]
+    assert list(content["groups"]["target"]) == ["sigma0", "rms_x_um", "rms_y_um", "redundancy"]
 
 
 def test_a_missing_file_says_what_to_run(tmp_path: Path) -> None:
@@ -159,10 +191,16 @@ def test_text_that_is_no_json_is_named_with_its_line(path: Path) -> None:
         (("cameras", "RC 20", "principal_distance_mm"), {"value": 1.0}, r"\['RC 20'\]\.principal_distance_mm has no"),
         (("made_from",), 5, r"made_from is 5; it should be a table"),
         (("residuals",), [{"image": "f1"}], r"residuals\[0\] has no key 'point'"),
+        (("cameras", "RC 20", "distortion", "family"), "no such", "a distortion family must be one of"),
+        (("cameras", "RC 20", "distortion", "k3"), 5, r"distortion\['k3'\] is 5; it should be a table"),
+        (("images", "f1", "camera"), "other", r"images\['f1'\].camera is 'other', which cameras do not hold"),
+        (("images", "f1", "transformation"), {"kind": "affine"}, "transformation has no key 'a1'"),
+        (("sigma0_from", "redundancy"), None, "sigma0_from.redundancy is None; it should be a number"),
+        (("vpv",), 10**400, "vpv is .*; it should be a finite number"),
     ],
 )  # fmt: skip
 def test_a_broken_file_names_the_place(path: Path, keys: tuple[str, ...], value: object, message: str) -> None:
-    content: dict[str, Any] = read_adjustment(path)
+    content = file_content(path)
     inner = content
     for key in keys[:-1]:
         inner = inner[key]
@@ -196,12 +234,12 @@ def test_of_a_large_network_points_and_images_stand_by_themselves(
         (len(adjustment.names) - 1, [*cameras, *images], ("point",)),
         (len(cameras), cameras, ("point", "image")),
     ):
-        monkeypatch.setattr(covariance_arrays, "AFFORDABLE", affordable)
+        monkeypatch.setattr(covariance_file, "AFFORDABLE", affordable)
         write_adjustment(adjustment, path)
         covariance = read_covariance(path)
         assert sorted(each.text for each in covariance.parameters) == sorted(together)
         np.testing.assert_array_equal(covariance.of(cameras), whole.of(cameras))
-        assert f"every {' and every '.join(kinds)} by itself" in read_adjustment(path)["covariance"]
+        assert f"every {' and every '.join(kinds)} by itself" in file_content(path)["covariance"]
         with np.load(covariance_path(path)) as arrays:
             for kind in kinds:
                 for names, matrix in zip(arrays[f"{kind}_names"], arrays[f"{kind}_matrices"], strict=True):
@@ -217,7 +255,7 @@ def test_names_that_would_run_together_have_results_of_their_own(tmp_path: Path)
     plain = adjust(*two_cameras(("K", "W"), (str, str), str, str))
     other = adjust(*two_cameras(("A", "A.B"), ("B.{}".format, str), str, str))
     write_adjustment(other, tmp_path / "adjustment.json")
-    cameras = read_adjustment(tmp_path / "adjustment.json")["cameras"]
+    cameras = file_content(tmp_path / "adjustment.json")["cameras"]
     covariance = read_covariance(tmp_path / "adjustment.json")
     assert covariance.parameters == other.parameters
     for plain_name, name, mark in of:
@@ -250,11 +288,21 @@ def places_in(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ..
 def test_a_check_with_a_value_of_a_wrong_type_is_refused_with_its_place(tmp_path: Path) -> None:
     pixels = PixelCalibration(1.0, 2.0, 3.0, 4.0, 0.5)
     corners = CornersCheck("findChessboardCorners", 3, 12, ("a",), pixels, pixels)
-    camera = CameraCheck("agrees", "All agree.", 3, 12, 1.0, 1.1, 0.1, (Row("k1", "", 1.0, 0.1, 1.0, 0.1),), corners)
-    content = json.loads(json.dumps(Check({"K": camera}).to_json()))
+    camera = CameraCheck(
+        "agrees",
+        "All agree.",
+        3,
+        12,
+        1.0,
+        1.1,
+        0.1,
+        (Row.of("k1", "", Estimate(1.0, 0.1), Estimate(1.0, 0.1)),),
+        corners,
+    )
+    content = plain_json(Check.of({"K": camera}))
     path = tmp_path / "check.json"
     path.write_text(json.dumps(content), encoding="utf-8")
-    assert read_check(path) == content
+    assert plain_json(read_check(path)) == content
     for place in places_in(content):
         spoilt: dict[Any, Any] = {"file": json.loads(json.dumps(content))}
         *way, last = ("file", *place)
@@ -267,4 +315,4 @@ def test_a_check_with_a_value_of_a_wrong_type_is_refused_with_its_place(tmp_path
             read_check(path)
     del content["cameras"]["K"]["corners_px"]  # of an earlier version
     path.write_text(json.dumps(content), encoding="utf-8")
-    assert read_check(path)["cameras"]["K"]["corners_px"] is None
+    assert read_check(path).cameras["K"].corners_px is None

@@ -11,8 +11,9 @@ from reference_cases import CASES, CAUSES, DROPPED
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
-from pipeline.results.adjustment_file import adjustment_json
+from pipeline.results.adjustment_content import adjustment_record
 from pipeline.results.comparator_file import read_comparator
+from pipeline.results.record_json import plain_json
 
 USUAL = ("F5-F9", "F7-F9")  # what is not left to the slow tests
 NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))
@@ -24,7 +25,7 @@ def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
     write_project(case, tmp_path)
     project = read_project(tmp_path / "project.toml")
     adjustment = adjust_marks(project, read_comparator(project.comparator))
-    result, reference = adjustment_json(adjustment), case["result"]
+    result, reference = plain_json(adjustment_record(adjustment)), case["result"]
     assert result["converged"]
     assert (result["unknowns"], result["redundancy"]) == (reference["unknowns"], reference["redundancy"])
     exact = reference["vpv"] < 1e-12

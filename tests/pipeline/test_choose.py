@@ -11,6 +11,8 @@ from simulated_project import write_project
 
 from adjust.functional_model.lens import Distortion, Prior
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
+from pipeline.results.choice_file import read_choice
+from pipeline.results.record_json import plain_json
 
 
 @pytest.mark.parametrize("given", ["none", "torlegard"])
@@ -28,6 +30,7 @@ def test_the_project_is_told_what_its_data_ask_for(
     assert "The data ask for no distortion." in shown
     assert ("That is the model as it is given." in shown) is (given == "none")
     result = json.loads((tmp_path / "out" / "choose.json").read_text(encoding="utf-8"))
+    assert plain_json(read_choice(tmp_path / "out" / "choose.json")) == result
     assert result["chosen"] == {"transformation": "none", "family": "none", "parameters": [], "bends": {}}
     names = [each["name"] for each in result["candidates"]]
     assert names[:3] == ["no distortion", "torlegard k3", "torlegard k3 k5"]

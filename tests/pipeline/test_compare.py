@@ -11,6 +11,8 @@ import pytest
 from pipeline.adjusting.compare_stage import _labels
 from pipeline.cli import run
 from pipeline.provenance import of_file
+from pipeline.results.comparison_file import read_comparison
+from pipeline.results.record_json import plain_json
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -47,6 +49,7 @@ def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.Cap
     drawn = ElementTree.parse(out / "compare.svg").getroot()
     assert len(drawn.findall(f".//{SVG}ellipse")) == 49  # one a place of the field
     content = json.loads((out / "compare.json").read_text(encoding="utf-8"))
+    assert plain_json(read_comparison(out / "compare.json")) == content
     (difference,) = content["differences"]
     corner = np.array(difference["field_um"])[np.abs(content["places_mm"]).sum(axis=1).argmax()]
     assert content["verdict"] == "drift"

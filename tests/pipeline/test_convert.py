@@ -10,7 +10,8 @@ from simulated_project import write_project
 
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.files.camera_file import read_camera
-from pipeline.results.adjustment_reader import read_adjustment, read_covariance
+from pipeline.results.adjustment_file import read_adjustment
+from pipeline.results.covariance_file import read_covariance
 
 CAMERA = """\
 name = "C"
@@ -52,16 +53,19 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
     there, back = tmp_path / "brown", tmp_path / "back"
     assert run(["convert", str(first), "brown", str(there)]) == DONE
     assert run(["convert", str(there / "adjustment.json"), "australis", str(back)]) == DONE
-    before, after = (read_adjustment(path)["cameras"]["L"] for path in (first, back / "adjustment.json"))
+    before, after = (read_adjustment(path).cameras["L"] for path in (first, back / "adjustment.json"))
     for name in ("k1", "k2", "p1", "p2", "b1", "b2"):
         for key in ("value", "sigma"):
-            assert after["distortion"][name][key] == pytest.approx(before["distortion"][name][key], rel=1e-6)
+            found, given = (getattr(each.distortion.parameters[name], key) for each in (after, before))
+            assert found == pytest.approx(given, rel=1e-6)
     names = ["IO.L.c", "IO.L.k1", "EO.i0.omega", "EO.i3.X0"]
     one, other = (read_covariance(path).of(names) for path in (first, back / "adjustment.json"))
     np.testing.assert_allclose(other, one, rtol=1e-5)
-    converted = read_adjustment(there / "adjustment.json")["cameras"]["L"]
-    assert converted["converted"]["same"]
-    assert converted["distortion"]["k1"]["value"] == pytest.approx(-before["distortion"]["k1"]["value"], rel=1e-9)
+    converted = read_adjustment(there / "adjustment.json").cameras["L"]
+    assert converted.converted is not None
+    assert converted.converted.same
+    k1, given = (each.distortion.parameters["k1"].value for each in (converted, before))
+    assert k1 == pytest.approx(-given, rel=1e-9)
     assert run(["compare", str(first), str(there / "adjustment.json")]) == DONE
     (there / "adjustment.npz").write_bytes(first.with_suffix(".npz").read_bytes())
     assert run(["convert", str(there / "adjustment.json"), "australis", str(tmp_path / "mixed")]) == 2
@@ -76,7 +80,7 @@ def test_a_converted_calibration_is_taken_in(tmp_path: Path) -> None:
     text = text.replace("r0_mm = 13.0\n", "").replace("[sigma]\n", '[sigma]\ncalibration = "brown/adjustment.json"\n')
     (tmp_path / "camera.toml").write_text(text, encoding="utf-8")
     assert run(["adjust", str(project)]) in (DONE, LOOK)
-    assert len(read_adjustment(tmp_path / "out" / "adjustment.json")["calibrations"]) == 9
+    assert len(read_adjustment(tmp_path / "out" / "adjustment.json").calibrations) == 9
 
 
 def test_what_does_not_fit_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,6 @@
 """The form of fiducials that frames of fiducials alone determine: its standard deviations against many realisations."""
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.report.fiducials import Figure, figure_of_films
+from pipeline.results.adjustment_record import FiducialRecord, GivenQuantity, Quantity
 
 Array = NDArray[np.float64]
 
@@ -38,16 +38,15 @@ class Known:
         return self.adjustment.sigma0**2 * self.adjustment.cofactor_of(list(names))
 
 
-def stored(result: Adjustment) -> dict[str, Any]:
-    """What adjustment.json has of the fiducials, and no more."""
+def stored(result: Adjustment) -> dict[str, FiducialRecord]:
+    """What adjustment.json has of the fiducials."""
+
+    def quantity(id: str, axis: str, given: float) -> Quantity:
+        return Quantity(result.value(f"FID.K.{id}.{axis}"), 0.0, GivenQuantity(given, 1.0))
+
     return {
-        "fiducials": {
-            id: {
-                f"{axis}_mm": {"value": result.value(f"FID.K.{id}.{axis}"), "given": {"value": float(place[k])}}
-                for k, axis in enumerate("xy")
-            }
-            for id, place in zip(IDS, GIVEN_MM, strict=True)
-        }
+        id: FiducialRecord(quantity(id, "x", x), quantity(id, "y", y), 0.0)
+        for id, (x, y) in zip(IDS, GIVEN_MM.tolist(), strict=True)
     }
 
 

@@ -16,7 +16,7 @@ from adjust.problem.parameter import Parameter
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
-from pipeline.results.adjustment_reader import read_own_covariance
+from pipeline.results.covariance_file import read_own_covariance
 
 CASE = "i_five_images_affine_reduced"
 POINT = "7"

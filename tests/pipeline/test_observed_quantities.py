@@ -21,8 +21,7 @@ from pipeline.files.project_file import read_project
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.report import ReportData
 from pipeline.report.verdict import judge
-from pipeline.results.adjustment_file import write_adjustment
-from pipeline.results.adjustment_reader import read_adjustment
+from pipeline.results.adjustment_file import read_adjustment, write_adjustment
 from pipeline.results.comparator_file import read_comparator
 
 CASE = "iii_selfcal_all_unknown_datum_A"
@@ -70,12 +69,12 @@ def test_distances_through_files(tmp_path: Path) -> None:
     result = adjusted(tmp_path)
     write_adjustment(result, tmp_path / "adjustment.json")
     written = read_adjustment(tmp_path / "adjustment.json")
-    assert [(row["from"], row["to"]) for row in written["distances"]] == [("1", "2"), ("3", "9"), ("5", "7")]
-    assert written["groups"]["distance"]["redundancy"] == pytest.approx(1.8, abs=0.2)
-    assert sum(group["redundancy"] for group in written["groups"].values()) == pytest.approx(written["redundancy"])
+    assert [(row.start, row.end) for row in written.distances] == [("1", "2"), ("3", "9"), ("5", "7")]
+    assert written.groups["distance"].redundancy == pytest.approx(1.8, abs=0.2)
+    assert sum(group.redundancy for group in written.groups.values()) == pytest.approx(written.redundancy)
     verdict = judge(ReportData("t", adjustment=written))
     assert any("beyond chance" in each.what and "5 to 7 (v = " in each.what for each in verdict.problems)
-    assert written["redundancy"] == case["result"]["redundancy"] + 2
+    assert written.redundancy == case["result"]["redundancy"] + 2
 
 
 @pytest.mark.parametrize(
@@ -126,7 +125,7 @@ def test_refraction_and_curvature_through_files(tmp_path: Path) -> None:
     assert abs(first.value("IO.C.c") - straight["value"]) > 1e-4
     write_adjustment(first, tmp_path / "adjustment.json")
     written = read_adjustment(tmp_path / "adjustment.json")
-    assert (written["refraction"], written["earth_curvature"]) == (True, True)
+    assert (written.refraction, written.earth_curvature) == (True, True)
     assert check_against_opencv(first).cameras["C"].verdict == "not possible"
 
 
@@ -174,9 +173,9 @@ def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], tmp_p
         assert result.sigma(name) < first.sigma(name)
     write_adjustment(result, tmp_path / "adjustment.json")
     written = read_adjustment(tmp_path / "adjustment.json")
-    assert len(written["antennas"]) == 3 * len(first.network.images)
-    assert written["groups"]["antenna"]["redundancy"] > 0.0
-    assert sum(group["redundancy"] for group in written["groups"].values()) == pytest.approx(written["redundancy"])
+    assert len(written.antennas) == 3 * len(first.network.images)
+    assert written.groups["antenna"].redundancy > 0.0
+    assert sum(group.redundancy for group in written.groups.values()) == pytest.approx(written.redundancy)
 
 
 @one_case
@@ -207,12 +206,12 @@ def test_an_earlier_calibration_through_files(earlier: tuple[Path, Adjustment], 
         assert second.sigma(f"IO.C.{name}") < 0.95 * sigma
     write_adjustment(second, tmp_path / "second.json")
     written = read_adjustment(tmp_path / "second.json")
-    rows = {row["name"]: row for row in written["calibrations"]}
-    assert rows["IO.C.c"]["value"] == first.value("IO.C.c")
-    assert rows["IO.C.c"]["sigma"] == pytest.approx(first.sigma("IO.C.c"), rel=1e-9)  # a posteriori
+    rows = {row.name: row for row in written.calibrations}
+    assert rows["IO.C.c"].value == first.value("IO.C.c")
+    assert rows["IO.C.c"].sigma == pytest.approx(first.sigma("IO.C.c"), rel=1e-9)  # a posteriori
     assert {f"FID.C.{i}.{axis}" for i in range(1, 5) for axis in "xy"} <= set(rows)
     assert "IO.C.k7" not in rows  # fixed in both
-    assert sum(group["redundancy"] for group in written["groups"].values()) == pytest.approx(written["redundancy"])
+    assert sum(group.redundancy for group in written.groups.values()) == pytest.approx(written.redundancy)
 
 
 @one_case

@@ -32,7 +32,7 @@ def test_the_example_measures_adjusts_and_plots(names: dict[str, Any], tmp_path:
     assert sum(mark.status is measure.Status.MEASURED for mark in frame.marks) >= 6
     assert result.converged
     assert result.value("IO.metric 6 x 6.c") == pytest.approx(
-        truth["cameras"]["metric 6 x 6"]["principal_distance_mm"]["value"], abs=0.05
+        truth.cameras["metric 6 x 6"].principal_distance_mm.value, abs=0.05
     )
     assert (tmp_path / "residuals.png").stat().st_size > 5000
     for each in (

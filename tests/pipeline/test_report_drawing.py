@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from measure.flags import NO_REASON, Status
 from pipeline.drawing.svg import Axes, round_step, ticks
 from pipeline.report import Thumbnail
-from pipeline.report.data import Json
 from pipeline.report.marks import Mark, natural
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.thumbnails import SIZE_PX, arrow_scale, drawn
-from pipeline.report.vectors import all_images_plot, plane, vector_scale
+from pipeline.report.vectors import VectorField, all_images_plot, plane
+from pipeline.results.adjustment_record import ResidualRecord
+
+RESIDUAL = ResidualRecord("f1", "7", "target", *[0.0] * 16)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +66,7 @@ def test_names_sort_by_their_numbers() -> None:
     assert sorted(["f10", "f2", "a", "10", "9", "x²"], key=natural) == ["9", "10", "a", "f2", "f10", "x²"]
 
 
-def mark(center: tuple[float, float], residual: Json | None = None) -> Mark:
+def mark(center: tuple[float, float], residual: ResidualRecord | None = None) -> Mark:
     return Mark("f1", "7", "target", Status.MEASURED, NO_REASON, np.array(center), None, None, residual)
 
 
@@ -117,7 +119,7 @@ def test_a_large_picture_is_stored_small_and_a_flat_one_is_no_error() -> None:
 
 def test_the_residual_points_up_where_y_grows() -> None:
     """The comparator's y points up, the page's down."""
-    residual = {"vx_um": 3.0, "vy_um": 4.0, "w": 1.0}
+    residual = replace(RESIDUAL, vx_um=3.0, vy_um=4.0)
     thumbnail = Thumbnail(np.eye(41), (0.0, 0.0))
     svg = drawn(mark((20.0, 20.0), residual), thumbnail, 2.0, SIZE_PX)
     x0, y0, x1, y1 = np.array(
@@ -127,7 +129,7 @@ def test_the_residual_points_up_where_y_grows() -> None:
 
 
 def test_the_longest_arrow_fits() -> None:
-    rows = [{"vx_um": v, "vy_um": 0.0, "w": 0.0} for v in (1.0, -13.0)]
+    rows = [replace(RESIDUAL, vx_um=v) for v in (1.0, -13.0)]
     scale = arrow_scale([mark((0.0, 0.0), row) for row in rows])
     assert 13.0 <= 13.0 * scale <= 34.0
     assert arrow_scale([replace(mark((0.0, 0.0)))]) == 1.0
@@ -135,26 +137,24 @@ def test_the_longest_arrow_fits() -> None:
 
 def test_vectors_over_the_camera_are_to_scale() -> None:
     """A point at (50, 20) mm of a frame of 200 x 100 mm, moved by (10, -5) µm."""
-    row = {
-        "image": "f1", "point": "1", "kind": "target", "camera_x_mm": 50.0, "camera_y_mm": 20.0,
-        "camera_vx_um": 10.0, "camera_vy_um": -5.0,
-    }  # fmt: skip
-    on = plane([row], (200.0, 100.0), 560.0)
+    row = replace(RESIDUAL, camera_x_mm=50.0, camera_y_mm=20.0, camera_vx_um=10.0, camera_vy_um=-5.0)
+    field = VectorField.of_residuals([row])
+    on = plane(field.places_mm, (200.0, 100.0), 560.0)
     assert on.height_px < on.width_px
     (x, y), (right, top) = on.page(np.array([(50.0, 20.0), (60.0, 30.0)]))
     assert (right - x, y - top) == pytest.approx((10.0 * on.px_per_mm, 10.0 * on.px_per_mm))
-    picture = all_images_plot([row], on, 4.0)
+    picture = all_images_plot(field, on, 4.0)
     stroke = re.search(r'<path d="([^"]+)" class="vector target"', picture)
     assert stroke
     x0, y0, x1, y1 = np.array(re.findall(r"-?\d+\.?\d*", stroke[1]), dtype=float)
     assert (x1 - x0, y1 - y0) == pytest.approx((40.0, 20.0), abs=0.11)
-    assert vector_scale([row], 60.0) == 5.0
+    assert field.scale(60.0) == 5.0
 
 
 def test_the_vectors_of_a_digital_camera_stand_in_what_was_observed() -> None:
     """Its coordinates begin at the picture's corner, so that a frame about the origin would be half empty."""
-    rows = [{"camera_x_mm": x, "camera_y_mm": y} for x, y in ((1.0, -20.0), (31.0, -2.0))]
-    (left, low), (right, high) = plane(rows, (36.0, 24.0), 560.0).corners_mm
+    places_mm = np.array([(1.0, -20.0), (31.0, -2.0)])
+    (left, low), (right, high) = plane(places_mm, (36.0, 24.0), 560.0).corners_mm
     assert (left, right, low, high) == pytest.approx((1.0, 31.0, -20.0, -2.0), abs=0.7)
 
 

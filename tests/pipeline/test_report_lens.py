@@ -1,7 +1,7 @@
 """Distortion curves and their sigmas against closed forms and OpenCV; fiducial figures against their invariances."""
 
 import re
-from typing import Any
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,21 +15,27 @@ from pipeline.report.lens_map import lens_map
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import high_correlations, parameter_rows
 from pipeline.report.vectors import Plane
-from pipeline.results.adjustment_reader import Covariance
+from pipeline.results.adjustment_record import (
+    CameraRecord,
+    DistortionRecord,
+    FiducialRecord,
+    GivenQuantity,
+    PrincipalPointRecord,
+    Quantity,
+)
+from pipeline.results.covariance_file import Covariance
 
 Array = NDArray[np.float64]
-Json = dict[str, Any]
 RADIUS_MM = 150.0
 
 
-def camera(family: str, c_mm: float = 153.0, **parameters: float) -> Json:
-    distortion = {"family": family, "r0_mm": 0.0} | {n: {"value": v, "sigma": 1.0} for n, v in parameters.items()}
-    return {
-        "principal_distance_mm": {"value": c_mm, "sigma": 0.004},
-        "principal_point_mm": {"x": {"value": 0.3, "sigma": 0.0}, "y": {"value": -0.2, "sigma": 0.0}},
-        "distortion": distortion,
-        "fiducials": {},
-    }
+def camera(family: str, c_mm: float = 153.0, **parameters: float) -> CameraRecord:
+    return CameraRecord(
+        principal_distance_mm=Quantity(c_mm, 0.004),
+        principal_point_mm=PrincipalPointRecord(Quantity(0.3, 0.0), Quantity(-0.2, 0.0)),
+        distortion=DistortionRecord(family=family, parameters={n: Quantity(v, 1.0) for n, v in parameters.items()}),
+        fiducials={},
+    )
 
 
 def covariance(name: str, parameters: tuple[str, ...], matrix: Array) -> Covariance:
@@ -123,7 +129,7 @@ def test_the_map_shows_what_lies_beyond_the_outermost_target() -> None:
 def test_of_a_set_over_the_frame_the_effect_is_the_largest_within_it() -> None:
     """2 (ξ² - 2/3) is largest in the middle, 4/3 mm, where ξη is 0."""
     entry = camera("ebner", b3=0.01)
-    entry["distortion"]["half_mm"] = [114.0, 90.0]
+    entry = replace(entry, distortion=replace(entry.distortion, half_mm=(114.0, 90.0)))
     assert largest_effects_um(lens("A", entry), RADIUS_MM)["b3"] > 1e3 * 4 / 3 * np.sqrt(90 / 114)
 
 
@@ -134,11 +140,13 @@ def test_the_curve_shows_where_no_target_was() -> None:
 
 
 def test_parameters_say_what_is_significant_and_what_the_prior_carried() -> None:
-    entry = camera("brown", k1=5e-8, p1=1e-7)
-    entry["distortion"]["k1"] |= {"sigma": 1e-9, "p": 1e-30}
-    entry["distortion"]["p1"] |= {"sigma": 1e-7, "p": 0.32}
-    entry["principal_distance_mm"] |= {"sigma": 0.5, "given": {"value": 152.5, "sigma": 1.0}}
-    entry["principal_point_mm"]["x"] |= {"sigma": 0.99, "given": {"value": 0.0, "sigma": 1.0}}
+    lens_terms = {"k1": Quantity(5e-8, 1e-9, p=1e-30), "p1": Quantity(1e-7, 1e-7, p=0.32)}
+    entry = replace(
+        camera("brown"),
+        distortion=DistortionRecord(family="brown", parameters=lens_terms),
+        principal_distance_mm=Quantity(153.0, 0.5, GivenQuantity(152.5, 1.0)),
+        principal_point_mm=PrincipalPointRecord(Quantity(0.3, 0.99, GivenQuantity(0.0, 1.0)), Quantity(-0.2, 0.0)),
+    )
     rows = {row.symbol: row for row in parameter_rows("A", entry, 1.0, 100.0)}
     assert rows["k1"].meaning == "significant (50.0 σ, p < 0.001)"
     assert rows["k1"].unit == "mm⁻²"
@@ -160,20 +168,21 @@ def test_high_correlations_are_listed_by_name() -> None:
 GIVEN = np.array([(100.0, 100.0), (-100.0, 100.0), (-100.0, -100.0), (100.0, -100.0), (0.0, 110.0)])
 
 
-def fiducials(estimated: Array) -> Json:
+def fiducials(estimated: Array) -> dict[str, FiducialRecord]:
     return {
-        f"{i}": {
-            f"{axis}_mm": {"value": float(new[k]), "sigma": 0.002, "given": {"value": float(old[k]), "sigma": 1.0}}
-            for k, axis in enumerate("xy")
-        }
-        for i, (new, old) in enumerate(zip(estimated, GIVEN, strict=True))
+        f"{i}": FiducialRecord(
+            Quantity(new[0], 0.002, GivenQuantity(old[0], 1.0)),
+            Quantity(new[1], 0.002, GivenQuantity(old[1], 1.0)),
+            0.0,
+        )
+        for i, (new, old) in enumerate(zip(estimated.tolist(), GIVEN.tolist(), strict=True))
     }
 
 
 def changed(estimated: Array, matrix: Array) -> Figure:
     places = tuple(Parameter.fiducial("A", str(i), axis) for i in range(len(GIVEN)) for axis in "xy")
     form = figure(
-        "A", camera("none") | {"fiducials": fiducials(estimated)}, Covariance(places, estimated.ravel(), matrix)
+        "A", replace(camera("none"), fiducials=fiducials(estimated)), Covariance(places, estimated.ravel(), matrix)
     )
     assert form is not None
     return form
@@ -211,4 +220,4 @@ def test_one_displaced_mark_is_the_one_that_changed_most() -> None:
 
 def test_two_marks_have_no_form() -> None:
     few = dict(list(fiducials(GIVEN).items())[:2])
-    assert figure("A", camera("none") | {"fiducials": few}, Covariance((), np.empty(0), np.empty((0, 0)))) is None
+    assert figure("A", replace(camera("none"), fiducials=few), Covariance((), np.empty(0), np.empty((0, 0)))) is None

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import made_up_calibration
 import pytest
@@ -12,6 +13,8 @@ import pytest
 from measure.flags import CODE_MEANING, STATUS_MEANING, Code, Reason, Status
 from measure.results import FrameMeasurement
 from pipeline.report import Problem, ReportData, render_report, write_report
+from pipeline.results.adjustment_record import CorrelationRecord, Sigma0Record
+from pipeline.results.check_file import Check
 from pipeline.results.comparator_file import ComparatorPoint
 
 
@@ -132,15 +135,15 @@ def test_no_check_stands_where_the_redundancy_is_zero() -> None:
 def test_a_priori_standard_deviations_are_named(adjusted: ReportData) -> None:
     """One frame whose given coordinates only place the datum has redundancy, but none that tells sigma0."""
     assert adjusted.adjustment is not None
-    nothing = {"redundancy": 0.0, "a_priori": True, "left_out": []}
-    text = rendered(replace(adjusted, adjustment={**adjusted.adjustment, "sigma0": 1.0, "sigma0_from": nothing})).text
+    content = replace(adjusted.adjustment, sigma0=1.0, sigma0_from=Sigma0Record(0.0, True, ()))
+    text = rendered(replace(adjusted, adjustment=content)).text
     assert text.count("Standard deviations are a priori ones") == 2  # as a note, and with the groups
 
 
 def test_an_adjustment_without_any_redundancy_is_not_called_good(adjusted: ReportData) -> None:
     assert adjusted.adjustment is not None
-    nothing = {"redundancy": 0.0, "a_priori": True, "left_out": []}
-    content = {**adjusted.adjustment, "redundancy": 0, "sigma0": 1.0, "sigma0_from": nothing}
+    nothing = Sigma0Record(0.0, True, ())
+    content = replace(adjusted.adjustment, redundancy=0, sigma0=1.0, sigma0_from=nothing)
     text = rendered(replace(adjusted, adjustment=content)).text
     assert "Nothing checks the result" in text
     assert "The redundancy is 0: no check." in text
@@ -216,10 +219,11 @@ def test_a_singular_network_names_cause_and_remedy(singular: ReportData) -> None
 
 
 def test_what_trades_off_is_told_with_the_cameras_parameters(adjusted: ReportData) -> None:
-    stored = adjusted.adjustment or {}
-    (camera,) = stored["cameras"]
-    pair = {"parameters": [f"IO.{camera}.c", "EO.*.Z0"], "rho": 0.98, "cause": "c and Z0 trade off.", "remedy": "Tilt."}
-    text = rendered(replace(adjusted, adjustment={**stored, "correlations": [pair]})).text
+    stored = adjusted.adjustment
+    assert stored is not None
+    (camera,) = stored.cameras
+    pair = CorrelationRecord((f"IO.{camera}.c", "EO.*.Z0"), 0.98, "c and Z0 trade off.", "Tilt.")
+    text = rendered(replace(adjusted, adjustment=replace(stored, correlations=(pair,)))).text
     assert "What trades off, with the datum of the fiducials taken out:" in text
     assert "c and Z0 trade off. Tilt." in text
 
@@ -244,10 +248,8 @@ def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted: ReportData) 
     rejected = replace(adjusted.comparator[2], status=Status.REJECTED, reason=reason)
     rows = [*adjusted.comparator[:2], rejected, *adjusted.comparator[3:]]
     assert adjusted.adjustment is not None
-    kept = [
-        row for row in adjusted.adjustment["residuals"] if (row["image"], row["kind"], row["point"]) != _key(rejected)
-    ]
-    text = rendered(replace(adjusted, comparator=rows, adjustment={**adjusted.adjustment, "residuals": kept})).text
+    kept = tuple(row for row in adjusted.adjustment.residuals if (row.image, row.kind, row.point) != _key(rejected))
+    text = rendered(replace(adjusted, comparator=rows, adjustment=replace(adjusted.adjustment, residuals=kept))).text
     assert "! Needs a look" in text
     assert "1 thing needs a look" in text
     assert "f1: 1 fiducial mark not measured, 7 measured (3 rejected: 4.2 px off the other marks' places)." in text
@@ -292,8 +294,8 @@ def test_the_file_is_written_whole_and_the_same_each_time(adjusted: ReportData, 
 
 
 @pytest.mark.parametrize("verdict", ["differs", "not possible"])
-def test_the_verdict_of_the_check_stands_with_its_reason(adjusted: ReportData, verdict: str) -> None:
-    check = {"verdict": verdict, "reason": "One flat vertical frame.", "cameras": {}}
+def test_the_verdict_of_the_check_stands_with_its_reason(adjusted: ReportData, verdict: Any) -> None:
+    check = Check(verdict=verdict, reason="One flat vertical frame.", cameras={})
     text = rendered(replace(adjusted, check=check)).text
     assert f"{verdict} : One flat vertical frame." in text
     assert ("! Needs a look" in text) == (verdict == "differs")

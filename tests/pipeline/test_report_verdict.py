@@ -8,6 +8,7 @@ import made_up_calibration
 import numpy as np
 import pytest
 
+from adjust.solution.explanations import Explanation
 from measure.flags import Status
 from measure.results import MarkMeasurement, Pose
 from pipeline.report import Problem, ReportData, judge
@@ -15,9 +16,9 @@ from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import frames
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
+from pipeline.results.adjustment_record import Quantity, SuspectRecord
+from pipeline.results.check_file import Check
 from pipeline.results.measured_scan import MeasuredScan
-
-Json = dict[str, Any]
 
 
 @pytest.fixture
@@ -42,9 +43,9 @@ def test_the_critical_w_grows_with_the_number_of_tests() -> None:
     assert critical_w(100) == pytest.approx(3.891, abs=1e-3)
 
 
-def changed(data: ReportData, **values: object) -> ReportData:
+def changed(data: ReportData, **values: Any) -> ReportData:
     assert data.adjustment is not None
-    return replace(data, adjustment={**data.adjustment, **values})
+    return replace(data, adjustment=replace(data.adjustment, **values))
 
 
 def told(data: ReportData) -> str:
@@ -71,43 +72,47 @@ def test_sigma0_above_and_below_its_bounds(adjusted: ReportData) -> None:
 
 
 def test_what_explains_a_large_sigma0_stands_in_place_of_advice_on_gross_errors(adjusted: ReportData) -> None:
-    found = [
-        {"kind": "pixels", "cause": "The pixels are not square.", "remedy": "Give b1.", "p": 1e-9, "sigma0": [1.6, 1]}
-    ]
+    found = (Explanation("pixels", "The pixels are not square.", "Give b1.", 1e-9, (1.6, 1.0)),)
     text = told(changed(adjusted, sigma0=1.6, explanations=found))
     assert "larger than the sigmas given. The pixels are not square. Give b1." in text
     assert "gross errors" not in text
     assert told(changed(adjusted, explanations=found)) == "The pixels are not square. Give b1."
 
 
-def suspect(**values: object) -> Json:
-    row: Json = {"name": "target 1 in image f2", "group": "target", "owner": "f2", "point": "1", "w": -9.3, "alike": []}
-    return row | {"removed": False} | values
+def suspect(**values: Any) -> tuple[SuspectRecord]:
+    numbers = (86.5, 2, 20.0, -9.3, -9.3, 4.0)
+    row = SuspectRecord("target 1 in image f2", "target", "f2", "1", ("x", "y"), *numbers, (0.03, 0.0), (), False)
+    return (replace(row, **values),)
 
 
 def test_a_gross_error_is_named_with_its_image(adjusted: ReportData) -> None:
-    text = told(changed(adjusted, suspects=[suspect()]))
+    text = told(changed(adjusted, suspects=suspect()))
     assert "1 observation beyond chance: target 1 in image f2 (w = −9.3)." in text
     assert "snooping = true" in text
 
 
 def test_what_could_as_well_be_wrong_is_named_too(adjusted: ReportData) -> None:
-    text = told(changed(adjusted, suspects=[suspect(alike=["control point 1 Z"])]))
+    text = told(changed(adjusted, suspects=suspect(alike=("control point 1 Z",))))
     assert "target 1 in image f2 (w = −9.3; it cannot be told apart from control point 1 Z)." in text
 
 
 def test_what_was_left_out_needs_a_look(adjusted: ReportData) -> None:
     given = suspect(name="given fiducial 7 (camera RC 20)", group="datum", removed=True)
-    text = told(changed(adjusted, suspects=[given]))
+    text = told(changed(adjusted, suspects=given))
     assert "Left out, for beyond chance: given fiducial 7 (camera RC 20) (w = −9.3)." in text
 
 
 def test_warnings_of_the_adjustment_need_a_look(adjusted: ReportData) -> None:
-    assert "c is carried by its prior." in told(changed(adjusted, warnings=["c is carried by its prior."]))
+    assert "c is carried by its prior." in told(changed(adjusted, warnings=("c is carried by its prior.",)))
 
 
 def test_no_convergence_is_no_result(adjusted: ReportData) -> None:
-    stopped = {"converged": False, "termination": "iteration limit", "iterations": 50, "warnings": ["Not final."]}
+    stopped: dict[str, Any] = {
+        "converged": False,
+        "termination": "iteration limit",
+        "iterations": 50,
+        "warnings": ("Not final.",),
+    }
     verdict = judge(changed(adjusted, **stopped))
     assert verdict.level == "failed"
     assert "There is no calibration: the iteration did not come to rest." in verdict.sentence
@@ -138,10 +143,10 @@ def test_a_pose_assumed_is_a_note_where_fiducials_are_all_there_is(adjusted: Rep
     assert adjusted.measurement is not None
     scans = posed(adjusted)
     bare = {
-        name: {**camera, "principal_distance_mm": {"value": 153.0, "sigma": None}}
-        for name, camera in adjusted.adjustment["cameras"].items()
+        name: replace(camera, principal_distance_mm=Quantity(153.0, np.nan))
+        for name, camera in adjusted.adjustment.cameras.items()
     }
-    check = {"verdict": "not possible", "reason": "No camera is calibrated."}
+    check = Check(verdict="not possible", reason="No camera is calibrated.", cameras={})
     data = replace(changed(adjusted, cameras=bare), measurement=scans, check=check)
     verdict = judge(data)
     assert verdict.exit_code == 0
@@ -202,19 +207,19 @@ def test_single_targets_outside_the_scan_are_ordinary(measured: ReportData) -> N
 
 
 def test_when_opencv_differs_it_needs_a_look_and_when_it_cannot_it_is_a_note(adjusted: ReportData) -> None:
-    check: Json = {"verdict": "differs", "reason": "k1 differs by 7 sigma.", "cameras": {}}
+    check = Check(verdict="differs", reason="k1 differs by 7 sigma.", cameras={})
     assert "k1 differs by 7 sigma." in told(replace(adjusted, check=check))
-    verdict = judge(replace(adjusted, check={**check, "verdict": "not possible", "reason": "One flat frame."}))
+    verdict = judge(replace(adjusted, check=replace(check, verdict="not possible", reason="One flat frame.")))
     assert verdict.level == "good"
     assert "OpenCV cannot check this calibration. One flat frame." in verdict.notes
 
 
 def test_weights_that_the_adjustment_changed_are_noted(adjusted: ReportData) -> None:
     assert adjusted.adjustment is not None
-    rows = [*adjusted.adjustment["residuals"]]
-    rows[5] = {**rows[5], "weight": 0.25}
-    factors = {"variance_factors": {"target": 4.0}, "variance_sigmas": {"target": 0.4}}
-    notes = " ".join(judge(changed(adjusted, residuals=rows, **factors)).notes)
+    rows = [*adjusted.adjustment.residuals]
+    rows[5] = replace(rows[5], weight=0.25)
+    factors: dict[str, Any] = {"variance_factors": {"target": 4.0}, "variance_sigmas": {"target": 0.4}}
+    notes = " ".join(judge(changed(adjusted, residuals=tuple(rows), **factors)).notes)
     assert "lowered the weight of 1 observation, most that of f1/6, to 0.25" in notes
     assert "the sigmas of the group target were multiplied by 2.00 ± 0.10" in notes
 

@@ -21,7 +21,8 @@ from pipeline.rendered.against_truth import Comparison, bend_quantities
 from pipeline.rendered.scene_file import read_scene
 from pipeline.rendered.scene_project import write_project as write_rendered
 from pipeline.report.scanner_views import bend_field
-from pipeline.results.adjustment_reader import read_covariance
+from pipeline.results.adjustment_file import read_adjustment
+from pipeline.results.covariance_file import read_covariance
 from synthetic_images.film import frame_geometry, scanner_bend
 from synthetic_images.frame import frame_truth
 
@@ -70,11 +71,12 @@ def test_the_field_of_the_report_has_the_band_of_its_terms(tmp_path: Path) -> No
     """At the corner of the extent a Legendre polynomial is 1: the field there is the sum of the terms."""
     network = films(QUARTERS, TRUTH, {}, np.random.default_rng(1))
     assert run(["adjust", str(project(tmp_path, network, '["a20", "a02"]'))]) == LOOK  # b11 is missing, sigma0 says
-    scanner, covariance = stored(tmp_path)["scanners"]["1"], read_covariance(tmp_path / "out" / "adjustment.json")
-    corner = np.array([scanner["center_mm"]]) + scanner["half_mm"]
+    path = tmp_path / "out" / "adjustment.json"
+    scanner, covariance = read_adjustment(path).scanners["1"], read_covariance(path)
+    corner = np.array([scanner.center_mm]) + scanner.half_mm
     field = bend_field("1", scanner, covariance, corner)
-    terms = scanner["terms"]
-    assert field.value_um[0, 0] == pytest.approx(1e3 * (terms["a20"]["value"] + terms["a02"]["value"]))
+    terms = scanner.terms
+    assert field.value_um[0, 0] == pytest.approx(1e3 * (terms["a20"].value + terms["a02"].value))
     matrix = covariance.of(["SC.1.a20", "SC.1.a02"])
     assert field.covariance_um2[0, 0, 0] == pytest.approx(1e6 * matrix.sum())
     assert field.covariance_um2[0, 1, 1] == pytest.approx(0.0)

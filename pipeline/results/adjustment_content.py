@@ -1,0 +1,378 @@
+"""From the adjustment to the record of it that `adjustment.json` keeps."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from importlib.metadata import version
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.board import BOARD_NAMES
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Prior
+from adjust.functional_model.transformation import film_parameter_names
+from adjust.problem.camera import Camera
+from adjust.problem.images import adjusted_image
+from adjust.problem.network import EXTERIOR_NAMES, Image, ObjectPoint
+from adjust.problem.parameter import Kind, Parameter
+from adjust.problem.tested import Tested
+from adjust.quality.contradiction import CalibrationTest
+from adjust.quality.reliability import Reliability
+from adjust.quality.residuals import FurtherResidual
+from adjust.quality.significance import SignificanceTest
+from adjust.quality.snooping import Suspect
+from adjust.solution.result import Adjustment
+from pipeline.results.adjustment_record import (
+    AdjustmentRecord,
+    BoardRecord,
+    CameraRecord,
+    ContradictionDirection,
+    ContradictionRecord,
+    CorrelationRecord,
+    DistanceRecord,
+    DistortionRecord,
+    ExteriorRecord,
+    FiducialRecord,
+    FilmRecord,
+    GivenQuantity,
+    GroupTestRecord,
+    ImageRecord,
+    LensReachRecord,
+    NullDirectionRecord,
+    ObservedQuantity,
+    OuterRecord,
+    PointRecord,
+    PrincipalPointRecord,
+    Quantity,
+    ReliabilityRecord,
+    ResidualRecord,
+    ScannerRecord,
+    Sigma0Record,
+    SuspectRecord,
+    TestedGiven,
+)
+from pipeline.results.covariance_file import covariance_note
+from pipeline.results.joined_frames import joined_frames
+
+Array = NDArray[np.float64]
+
+ANGLES = ("omega", "phi", "kappa", "angle")
+DEG_PER_RAD = 180.0 / math.pi
+UM_PER_MM = 1e3
+
+
+def adjustment_record(
+    adjustment: Adjustment,
+    frames_mm: Mapping[str, tuple[float, float]] | None = None,
+    made_from: Mapping[str, str] | None = None,
+) -> AdjustmentRecord:
+    """The record of an adjustment; see `write_adjustment` for the parameters."""
+    network, variance = adjustment.network, adjustment.variance
+    used = {image.camera for image in network.images}
+    sizes_mm = frames_mm or {}
+    reliability = adjustment.reliability
+    return AdjustmentRecord(
+        reseau=version("reseau"),
+        made_from=dict(made_from or {}),
+        converged=adjustment.converged,
+        termination=adjustment.termination,
+        iterations=adjustment.iterations,
+        observations=adjustment.conditions,
+        conditions=adjustment.conditions,
+        unknowns=adjustment.unknowns,
+        redundancy=adjustment.redundancy,
+        vpv=adjustment.vpv,
+        sigma0=adjustment.sigma0,
+        sigma0_from=Sigma0Record(variance.redundancy, variance.is_a_priori, variance.left_out),
+        covariance=covariance_note(adjustment),
+        singular=tuple(
+            NullDirectionRecord(_texts(null.parameters), null.cause, null.remedy) for null in adjustment.singular
+        ),
+        correlations=tuple(
+            CorrelationRecord(_texts(each.parameters), each.rho, each.cause, each.remedy)
+            for each in adjustment.correlations
+        ),
+        warnings=adjustment.warnings,
+        notes=adjustment.notes,
+        left_out=adjustment.left_out,
+        variance_factors=adjustment.variance_factors,
+        variance_sigmas=adjustment.variance_sigmas,
+        explanations=adjustment.explanations,
+        suspects=tuple(map(_suspect, adjustment.suspects)),
+        reliability=None if reliability is None else _reliability(reliability, len(network.observations)),
+        cameras={
+            camera.name: _camera(adjustment, camera, sizes_mm.get(camera.name))
+            for camera in network.cameras
+            if camera.name in used
+        },
+        scanners={
+            each.name: ScannerRecord(
+                each.center_mm,
+                each.half_mm,
+                *_terms(adjustment, "scanner", each.name, each.terms),
+            )
+            for each in network.scanners
+        },
+        boards={each.name: _board(adjustment, number) for number, each in enumerate(network.boards)},
+        images={image.name: _image(adjustment, image) for image in network.images},
+        frames=joined_frames(adjustment),
+        points={
+            point.id: _point(adjustment, point)
+            for point in network.points
+            if adjustment.has(Parameter.point(point.id, "X"))
+        },
+        residuals=_residuals(adjustment),
+        refraction=network.line_of_sight.refraction,
+        earth_curvature=network.line_of_sight.curvature,
+        distances=_distances(adjustment),
+        calibrations=_observed(adjustment, "calibration"),
+        calibration_tests=tuple(map(_contradiction, adjustment.contradictions)),
+        antennas=_observed(adjustment, "antenna"),
+        groups=adjustment.groups,
+        history=adjustment.history,
+    )
+
+
+def _texts(parameters: Sequence[Parameter]) -> tuple[str, ...]:
+    return tuple(each.text for each in parameters)
+
+
+def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float] | None) -> CameraRecord:
+    is_idle = camera.name in adjustment.network.idle_cameras
+    tests, together = _tests(adjustment, "interior", camera.name)
+
+    def quantity(name: str, given: Prior | None) -> Quantity:
+        known = _quantity(adjustment, Parameter.interior(camera.name, name), given)
+        return replace(known, sigma=math.nan) if is_idle else _tested(known, tests.get(name))
+
+    given = camera.distortion.parameters
+    parameters = {
+        name: quantity(name, given.get(name, Prior(0.0))) for name in parameter_names(camera.distortion.family)
+    }
+    reach = adjustment.lens_reach(camera, frame_mm)
+    return CameraRecord(
+        principal_distance_mm=quantity("c", camera.principal_distance_mm),
+        principal_point_mm=PrincipalPointRecord(quantity("x0", camera.x0_mm), quantity("y0", camera.y0_mm)),
+        distortion=DistortionRecord.of(camera.distortion, parameters),
+        significance=together,
+        fiducials={
+            id: FiducialRecord(
+                _quantity(adjustment, x, mark.x_mm), _quantity(adjustment, y, mark.y_mm), _correlation(adjustment, x, y)
+            )
+            for id, mark in camera.fiducials.items()
+            for x, y in [[Parameter.fiducial(camera.name, id, axis) for axis in "xy"]]
+        },
+        lens_known=None if reach is None else LensReachRecord(**asdict(reach), share=reach.share),
+    )
+
+
+def _board(adjustment: Adjustment, number: int) -> BoardRecord:
+    board = adjustment.network.boards[number]
+    bends = dict(zip(BOARD_NAMES, board.bends, strict=True))
+    terms, together = _terms(adjustment, "board", board.name, bends)
+    return BoardRecord(points=len(board.places), terms=terms, significance=together)
+
+
+def _terms(
+    adjustment: Adjustment, kind: Kind, owner: str, terms: Mapping[str, Prior]
+) -> tuple[dict[str, Quantity], tuple[GroupTestRecord, ...]]:
+    """Every term with its test, and the test of all together."""
+    tests, together = _tests(adjustment, kind, owner)
+    quantities = {
+        name: _tested(_quantity(adjustment, Parameter(kind, owner, "", name), prior), tests.get(name))
+        for name, prior in terms.items()
+    }
+    return quantities, together
+
+
+def _tests(
+    adjustment: Adjustment, kind: Kind, owner: str
+) -> tuple[dict[str, SignificanceTest], tuple[GroupTestRecord, ...]]:
+    """Tests of significance: of single parameters by name, and of groups."""
+    tests = adjustment.significance.get((kind, owner), ())
+    groups = (GroupTestRecord(each.name, each.parameters, each.statistic, each.p) for each in tests if each.is_group)
+    return {each.name: each for each in tests if not each.is_group}, tuple(groups)
+
+
+def _tested(quantity: Quantity, test: SignificanceTest | None) -> Quantity:
+    return quantity if test is None else replace(quantity, t=test.statistic, p=test.p)
+
+
+def _image(adjustment: Adjustment, image: Image) -> ImageRecord:
+    film = {}
+    for parameter in film_parameter_names(image.transformation):
+        key, scale = (f"{parameter}_deg", DEG_PER_RAD) if parameter in ANGLES else (parameter, 1.0)
+        film[key] = _quantity(adjustment, Parameter.film(image.name, parameter), None, scale)
+    elements, known = [], image.exterior
+    for i, element in enumerate(EXTERIOR_NAMES):
+        is_antenna = known is not None and known.has_antenna and i < 3
+        given = None if known is None or is_antenna else Prior(float(known.values[i]), float(known.sigmas[i]))
+        scale = DEG_PER_RAD if element in ANGLES else 1.0
+        elements.append(_quantity(adjustment, Parameter.exterior(image.frame, element), given, scale))
+    if image.name in adjustment.network.unoriented:
+        elements = [replace(each, sigma=math.nan) for each in elements]
+    return ImageRecord(
+        camera=image.camera,
+        scanner=image.scanner,
+        part_of=image.part_of or None,
+        transformation=FilmRecord(
+            kind=image.transformation, mirrored=image.name in adjustment.mirrored, parameters=film
+        ),
+        exterior=ExteriorRecord(*elements),
+    )
+
+
+def _point(adjustment: Adjustment, point: ObjectPoint) -> PointRecord:
+    """Where it is, and what was given of it; a point of a bent board is off the place that is given."""
+    given = {"X": point.X, "Y": point.Y, "Z": point.Z}
+    place = {axis: _quantity(adjustment, Parameter.point(point.id, axis), prior) for axis, prior in given.items()}
+    for board in adjustment.network.boards:
+        if point.id in board.places:
+            unknowns = [Parameter.point(point.id, axis) for axis in "XYZ"]
+            unknowns += [Parameter.board(board.name, each) for each in BOARD_NAMES]
+            by_unknowns = np.hstack([np.eye(3), board.lifted_by[point.id].T])
+            values = by_unknowns @ adjustment.values_of(unknowns)
+            variances = np.diag(by_unknowns @ adjustment.cofactor_of(unknowns) @ by_unknowns.T)
+            for axis, value, variance in zip("XYZ", values, variances, strict=True):
+                sigma = adjustment.sigma0 * math.sqrt(variance) if _has_solution(adjustment) else math.nan
+                place[axis] = replace(place[axis], value=float(value), sigma=sigma)
+    return PointRecord(**place)
+
+
+def _quantity(adjustment: Adjustment, parameter: Parameter, given: Prior | None = None, scale: float = 1.0) -> Quantity:
+    """Value and a-posteriori sigma, NaN without a solution: a zero would say that the quantity was fixed."""
+    return Quantity(
+        value=scale * adjustment.value(parameter),
+        sigma=scale * adjustment.sigma(parameter) if _has_solution(adjustment) else math.nan,
+        given=None if given is None else GivenQuantity(scale * given.value, scale * given.sigma),
+    )
+
+
+def _correlation(adjustment: Adjustment, x: Parameter, y: Parameter) -> float:
+    q = adjustment.cofactor_of([x, y])
+    product = q[0, 0] * q[1, 1]
+    return float(q[0, 1] / math.sqrt(product)) if product > 0.0 and _has_solution(adjustment) else 0.0
+
+
+def _has_solution(adjustment: Adjustment) -> bool:
+    return adjustment.termination in ("converged", "iteration limit")
+
+
+def _residuals(adjustment: Adjustment) -> tuple[ResidualRecord, ...]:
+    observations, residuals = adjustment.network.observations, adjustment.residuals
+    camera_mm = _in_camera(adjustment, observations.xy_mm)
+    columns = [
+        UM_PER_MM * residuals.v_mm,
+        residuals.redundancy,
+        np.column_stack([list(map(_larger, residuals.w)), residuals.w]),
+        adjustment.weights[:, None] if adjustment.weights.size else np.ones((len(observations), 1)),
+        UM_PER_MM * np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2)),
+        observations.xy_mm,
+        camera_mm,
+        UM_PER_MM * (_in_camera(adjustment, observations.xy_mm + residuals.v_mm) - camera_mm),
+    ]
+    if (result := adjustment.reliability) is not None:
+        rows = slice(len(observations))
+        effect = np.max(result.effect[rows], axis=1)
+        columns += [result.tau[rows], result.statistic[rows, None], UM_PER_MM * result.smallest[rows], effect[:, None]]
+    names = zip(observations.image, observations.point, observations.kind, strict=True)
+    return tuple(ResidualRecord(*name, *row) for name, row in zip(names, np.hstack(columns).tolist(), strict=True))
+
+
+def _in_camera(adjustment: Adjustment, xy_mm: Array) -> Array:
+    """Every observation's comparator coordinates (n, 2) in its own camera, mm."""
+    images = np.array(adjustment.network.observations.image)
+    camera_mm = np.empty_like(xy_mm)
+    for name in sorted(set(images)):
+        rows = images == name
+        camera_mm[rows] = adjusted_image(adjustment, name).camera_from_comparator(xy_mm[rows])
+    return camera_mm
+
+
+def _larger(w: Array) -> float:
+    """The standardised residual of the axis that fits worse; NaN where neither axis is checked."""
+    known = w[np.isfinite(w)]
+    return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
+
+
+def _distances(adjustment: Adjustment) -> tuple[DistanceRecord, ...]:
+    rows = (row for row in adjustment.further if row.group == "distance")
+    return tuple(
+        DistanceRecord(given.start, given.end, *_numbers(row))
+        for given, row in zip(adjustment.network.distances, rows, strict=True)
+    )
+
+
+def _observed(adjustment: Adjustment, group: str) -> tuple[ObservedQuantity, ...]:
+    return tuple(ObservedQuantity(row.name, *_numbers(row)) for row in adjustment.further if row.group == group)
+
+
+def _numbers(row: FurtherResidual) -> tuple[float, ...]:
+    return row.observed, row.sigma, row.v, row.redundancy, row.w, row.detectable
+
+
+def _contradiction(test: CalibrationTest) -> ContradictionRecord:
+    direction = tuple(
+        ContradictionDirection(test.parameters[i].text, float(test.difference[i]), float(test.sigma[i]))
+        for i in test.direction
+    )
+    return ContradictionRecord(test.statistic, test.freedom, test.probability, direction)
+
+
+def _reliability(result: Reliability, marks: int) -> ReliabilityRecord:
+    """marks: the first that are tested, whose numbers stand with the residuals."""
+    return ReliabilityRecord(
+        result.probabilities.alpha,
+        result.probabilities.power,
+        result.probabilities.family,
+        result.critical_tau,
+        tuple(OuterRecord(each.parameter.text, each.effect, each.in_sigmas, each.cause) for each in result.outer),
+        result.unchecked,
+        tuple(
+            _tested_given(result, unit, axis)
+            for unit in range(marks, len(result.tested))
+            for axis in range(len(result.tested[unit].coordinates))
+        ),
+    )
+
+
+def _tested_given(result: Reliability, unit: int, axis: int) -> TestedGiven:
+    """An error is infinite where nothing checks the coordinate."""
+    tested = result.tested[unit]
+    scale, at = _scale(tested, axis), (unit, axis)
+    return TestedGiven(
+        name=tested.coordinate_name(axis),
+        group=tested.group,
+        v=scale * float(result.v[at]),
+        sigma=scale * float(result.sigma[at]),
+        redundancy=float(result.redundancy[at]),
+        w=float(result.w[at]),
+        tau=float(result.tau[at]),
+        smallest_error=scale * float(result.smallest[at]),
+        effect_sigmas=float(result.effect[at]),
+    )
+
+
+def _scale(tested: Tested, axis: int) -> float:
+    return DEG_PER_RAD if tested.coordinates[axis] in ANGLES else 1.0
+
+
+def _suspect(suspect: Suspect) -> SuspectRecord:
+    tested = suspect.tested
+    return SuspectRecord(
+        name=tested.name,
+        group=tested.group,
+        owner=tested.owner,
+        point=tested.point,
+        coordinates=tested.coordinates,
+        statistic=suspect.statistic,
+        size=suspect.size,
+        critical=suspect.critical,
+        w=suspect.w,
+        tau=suspect.tau,
+        critical_tau=suspect.critical_tau,
+        error=tuple(_scale(tested, axis) * value for axis, value in enumerate(suspect.error)),
+        alike=suspect.alike,
+        removed=suspect.removed,
+    )

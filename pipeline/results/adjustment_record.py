@@ -1,0 +1,603 @@
+"""What `adjustment.json` holds, as its readers take it: one class a table of the file.
+
+Angles are in degrees, other units stand in the names; NaN is a number that means nothing. Defaults are for files of
+earlier versions.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.families import family, parameter_names
+from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Lens
+from adjust.functional_model.scanner import Bend, is_term
+from adjust.functional_model.transformation import Film, film_parameter_names
+from adjust.least_squares.iteration import Iteration
+from adjust.problem.estimates import GivenGroup
+from adjust.problem.parameter import parameter_from_text
+from adjust.quality.residuals import Group
+from adjust.solution.explanations import Explanation
+from pipeline.results.record_json import KEY, REST, Finite
+
+Array = NDArray[np.float64]
+
+ParameterText = Annotated[str, parameter_from_text]  # as `Parameter.text`
+
+
+@dataclass(frozen=True, slots=True)
+class GivenQuantity:
+    """What was known beforehand; sigma 0: it was fixed, NaN: nothing was."""
+
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """An estimate with its a-posteriori standard deviation, 0 of a fixed value and NaN without a solution.
+
+    given: what was known of it; t, p: its significance test, where there is one.
+    """
+
+    value: float
+    sigma: float
+    given: GivenQuantity | None = None
+    t: float | None = None
+    p: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GroupTestRecord:
+    """An F-test of several parameters together."""
+
+    group: str
+    parameters: tuple[str, ...]
+    F: float
+    p: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DistortionRecord:
+    """A distortion family with its settings; axes: said where they are not the camera's; parameters: by name."""
+
+    family: str
+    r0_mm: float = 0.0
+    decentering: Literal["reduced", "paper"] | None = None
+    half_mm: tuple[float, float] | None = None
+    axes: str | None = None
+    parameters: Mapping[str, Quantity] = field(default_factory=dict, metadata={REST: True})
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for settings that there are not."""
+        self.settings()
+
+    def settings(self) -> Distortion:
+        """The distortion without what is known of its parameters."""
+        return Distortion(
+            self.family,
+            decentering=self.decentering or "reduced",
+            r0_mm=self.r0_mm,
+            half_mm=self.half_mm or (0.0, 0.0),
+        )
+
+    @classmethod
+    def of(cls, distortion: Distortion, parameters: Mapping[str, Quantity]) -> "DistortionRecord":
+        """Of a distortion with the estimates of its parameters."""
+        model = family(distortion.family)
+        return cls(
+            family=distortion.family,
+            r0_mm=distortion.r0_mm,
+            decentering=distortion.decentering if distortion.family == "torlegard" else None,
+            half_mm=distortion.half_mm if model.needs == "half_mm" else None,
+            axes="x right, y down" if model.y_down else None,
+            parameters=parameters,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PrincipalPointRecord:
+    """x0', y0' in mm."""
+
+    x: Quantity
+    y: Quantity
+
+
+@dataclass(frozen=True, slots=True)
+class FiducialRecord:
+    """rho: correlation of x and y."""
+
+    x_mm: Quantity
+    y_mm: Quantity
+    rho: float
+
+    @property
+    def xy_mm(self) -> tuple[float, float]:
+        return self.x_mm.value, self.y_mm.value
+
+    @property
+    def given_mm(self) -> tuple[float, float] | None:
+        x, y = self.x_mm.given, self.y_mm.given
+        return None if x is None or y is None else (x.value, y.value)
+
+
+@dataclass(frozen=True, slots=True)
+class LensReachRecord:
+    """How far out a lens is known (see `LensReach`); share: of the way to the corner of the frame."""
+
+    radius_mm: float
+    corner_mm: float
+    sigma_um: float
+    corner_sigma_um: float
+    frame_mm: tuple[tuple[float, float], tuple[float, float]] | None
+    share: float
+
+    def sentence(self, camera: str) -> str:
+        """How far out the lens of a camera is known, how well there and beyond."""
+        is_known = math.isfinite(self.corner_sigma_um)
+        beyond = (
+            f"there its standard deviation is {self.corner_sigma_um:.2g} µm"
+            if is_known
+            else "the lens shows nothing there"
+        )
+        inside = f", with a standard deviation of up to {self.sigma_um:.2g} µm" if math.isfinite(self.sigma_um) else ""
+        return (
+            f"The distortion of {camera} is known up to {self.radius_mm:.3g} mm from the principal point{inside}, "
+            f"{100.0 * self.share:.0f} % of the way to the corner of the picture; beyond it is extrapolated, {beyond}."
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ConvertedFrom:
+    """Of a converted lens: the family that it was given in, and how far the two are apart over the frame."""
+
+    source: DistortionRecord = field(metadata={KEY: "from"})
+    same: bool
+    largest_um: float
+    rms_um: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraRecord:
+    """An interior orientation, its distortion, and the fiducial marks by their names."""
+
+    principal_distance_mm: Quantity
+    principal_point_mm: PrincipalPointRecord
+    distortion: DistortionRecord
+    significance: tuple[GroupTestRecord, ...] = ()
+    fiducials: Mapping[str, FiducialRecord]
+    lens_known: LensReachRecord | None = None
+    converted: ConvertedFrom | None = None
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether there is an interior orientation, and not just fiducials."""
+        return math.isfinite(self.principal_distance_mm.sigma)
+
+    @property
+    def interior(self) -> Mapping[str, Quantity]:
+        """c, x0, y0 and the distortion's parameters by their names."""
+        point = self.principal_point_mm
+        return {"c": self.principal_distance_mm, "x0": point.x, "y0": point.y, **self.distortion.parameters}
+
+    def lens(self) -> Lens:
+        """The lens, without its covariance."""
+        distortion, known = self.distortion.settings(), self.interior
+        values = [known[name].value if name in known else 0.0 for name in parameter_names(distortion.family)]
+        interior = np.array([known[name].value for name in INTERIOR_NAMES])
+        return Lens(distortion, interior, np.array(values, dtype=float))
+
+
+@dataclass(frozen=True, slots=True)
+class ScannerRecord:
+    """How far a scanner puts a point off its place, mm, as products of Legendre polynomials over an extent."""
+
+    center_mm: tuple[float, float]
+    half_mm: tuple[float, float]
+    terms: Mapping[str, Quantity]
+    significance: tuple[GroupTestRecord, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a term that there is not."""
+        unknown = [name for name in self.terms if not is_term(name)]
+        if unknown:
+            raise ValueError(f"has the term {unknown[0]!r}, which no bend has")
+
+    def bend(self) -> tuple[Bend, Array]:
+        """The bend with the values (k,) of its terms."""
+        values = np.array([term.value for term in self.terms.values()], dtype=float)
+        return Bend(tuple(self.terms), self.center_mm, self.half_mm), values
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardRecord:
+    """How far a board's middle stands off its plane, object units; points: how many it has."""
+
+    points: int
+    terms: Mapping[str, Quantity] = field(metadata={REST: True})
+    significance: tuple[GroupTestRecord, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmRecord:
+    """A film transformation; its parameters by their keys in the file."""
+
+    kind: str
+    mirrored: bool = False
+    parameters: Mapping[str, Quantity] = field(default_factory=dict, metadata={REST: True})
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a kind that there is not, or one of its parameters missing."""
+        for name in film_parameter_names(self.kind):
+            if not self.parameters.keys() & {name, f"{name}_deg"}:
+                raise ValueError(f"has no key {name!r}")
+
+    def film(self, middle_mm: Array) -> Film:
+        """middle_mm (2,): a place about in the middle of the image, in the comparator."""
+        known = self.parameters
+        values = [
+            known[name].value if name in known else math.radians(known[f"{name}_deg"].value)
+            for name in film_parameter_names(self.kind)
+        ]
+        return Film(self.kind, np.array(values, dtype=float), middle_mm, self.mirrored)
+
+
+@dataclass(frozen=True, slots=True)
+class ExteriorRecord:
+    """An exterior orientation, object units and degrees."""
+
+    X0: Quantity
+    Y0: Quantity
+    Z0: Quantity
+    omega_deg: Quantity
+    phi_deg: Quantity
+    kappa_deg: Quantity
+
+    @property
+    def elements(self) -> Mapping[str, Quantity]:
+        return {name: getattr(self, name) for name in self.__slots__}
+
+    @property
+    def is_oriented(self) -> bool:
+        return all(math.isfinite(each.sigma) for each in self.elements.values())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImageRecord:
+    """An image: its camera, its scanner ("" without one), the frame that it is a part of."""
+
+    camera: str = ""
+    scanner: str = ""
+    part_of: str | None = None
+    transformation: FilmRecord
+    exterior: ExteriorRecord
+
+
+@dataclass(frozen=True, slots=True)
+class PointRecord:
+    """An object point, in the unit of the object coordinates."""
+
+    X: Quantity
+    Y: Quantity
+    Z: Quantity
+
+    @property
+    def axes(self) -> tuple[Quantity, Quantity, Quantity]:
+        return self.X, self.Y, self.Z
+
+    @property
+    def xyz(self) -> Array:
+        return np.array([each.value for each in self.axes])
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualRecord:
+    """An observation: its residual in the scan and in the camera, and what tests it. w: of the axis that fits worse."""
+
+    image: str
+    point: str
+    kind: str
+    vx_um: float
+    vy_um: float
+    redundancy_x: float
+    redundancy_y: float
+    w: float
+    w_x: float
+    w_y: float
+    weight: float
+    sx_um: float
+    sy_um: float
+    x_mm: float
+    y_mm: float
+    camera_x_mm: float
+    camera_y_mm: float
+    camera_vx_um: float
+    camera_vy_um: float
+    tau_x: float | None = None
+    tau_y: float | None = None
+    statistic: float | None = None
+    smallest_error_x_um: float | None = None
+    smallest_error_y_um: float | None = None
+    effect_sigmas: float | None = None
+
+    @property
+    def v_um(self) -> tuple[float, float]:
+        return self.vx_um, self.vy_um
+
+
+@dataclass(frozen=True, slots=True)
+class DistanceRecord:
+    """A given distance, in the unit of the object coordinates; see `FurtherResidual`."""
+
+    start: str = field(metadata={KEY: "from"})
+    end: str = field(metadata={KEY: "to"})
+    distance: float
+    sigma: float
+    v: float
+    redundancy: float
+    w: float
+    detectable: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.start} to {self.end}"
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedQuantity:
+    """A quantity of an earlier calibration (mm) or a coordinate of an antenna (object unit), as observed."""
+
+    name: str
+    value: float
+    sigma: float
+    v: float
+    redundancy: float
+    w: float
+    detectable: float
+
+
+@dataclass(frozen=True, slots=True)
+class ContradictionDirection:
+    """Where the images put a quantity less where it was observed, with the standard deviation of that."""
+
+    name: ParameterText
+    difference: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class ContradictionRecord:
+    """An earlier calibration as a whole: whether the images contradict it, and in what, the most telling first."""
+
+    F: float
+    freedom: int
+    p: float
+    direction: tuple[ContradictionDirection, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class NullDirectionRecord:
+    """What the observations cannot see: what moves together, why, and what would remove it."""
+
+    parameters: tuple[ParameterText, ...]
+    cause: str
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True)
+class CorrelationRecord:
+    """Quantities that the observations hardly separate."""
+
+    parameters: tuple[ParameterText, ...]
+    rho: float
+    cause: str
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True)
+class SuspectRecord:
+    """A suspect observation (see `Suspect`); its error in mm, object units or degrees."""
+
+    name: str
+    group: str
+    owner: str
+    point: str
+    coordinates: tuple[str, ...]
+    statistic: float
+    size: int
+    critical: float
+    w: float
+    tau: float
+    critical_tau: float
+    error: tuple[float, ...]
+    alike: tuple[str, ...]
+    removed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class OuterRecord:
+    """What the worst undetected error does to a camera parameter."""
+
+    parameter: ParameterText
+    effect: float
+    sigmas: float
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class TestedGiven:
+    """A given coordinate, tested, in mm, object units or degrees."""
+
+    name: str
+    group: str
+    v: float
+    sigma: float
+    redundancy: float
+    w: float
+    tau: float
+    smallest_error: float
+    effect_sigmas: float
+
+
+@dataclass(frozen=True, slots=True)
+class ReliabilityRecord:
+    """What the observations check, and what an undetected error would do (see `Reliability`)."""
+
+    alpha: float
+    power: float
+    family: float
+    critical_tau: float
+    outer: tuple[OuterRecord, ...]
+    unchecked: tuple[str, ...]
+    given: tuple[TestedGiven, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PartRecord:
+    """A scan of a frame in parts: the standard deviation of its film transformation at its corners."""
+
+    corner_sigma_um: float
+
+
+@dataclass(frozen=True, slots=True)
+class JoinRecord:
+    """Where two scans of a frame show one place, and how far they differ there."""
+
+    point: str
+    images: tuple[str, ...]
+    x_mm: float
+    y_mm: float
+    dx_um: float
+    dy_um: float
+
+
+@dataclass(frozen=True, slots=True)
+class PartMarkRecord:
+    """A mark of a frame in parts, in its camera frame."""
+
+    image: str
+    point: str
+    kind: str
+    x_mm: float
+    y_mm: float
+    sx_mm: float
+    sy_mm: float
+    rho: float
+
+
+@dataclass(frozen=True, slots=True)
+class JoinedFrameRecord:
+    """A frame that was scanned in parts."""
+
+    parts: Mapping[str, PartRecord]
+    joins: tuple[JoinRecord, ...]
+    marks: tuple[PartMarkRecord, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sigma0Record:
+    """What sigma0 was estimated from (see `VarianceFactor`)."""
+
+    redundancy: Finite
+    a_priori: bool
+    left_out: tuple[GivenGroup, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdjustmentRecord:
+    """An adjustment as it is kept: the result with everything that it came from.
+
+    made_from: fingerprints of all that was adjusted, by its kind. observations, conditions: a prior is one of each, a
+    measured point two. left_out: by image why it was left out. covariance: what of it adjustment.npz holds.
+    """
+
+    reseau: str
+    made_from: Mapping[str, str] = field(default_factory=dict)
+    converged: bool
+    termination: str
+    iterations: int
+    observations: int
+    conditions: int
+    unknowns: int
+    redundancy: int
+    vpv: float = math.nan
+    sigma0: float
+    sigma0_from: Sigma0Record | None = None
+    covariance: str = ""
+    singular: tuple[NullDirectionRecord, ...]
+    correlations: tuple[CorrelationRecord, ...]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    variance_factors: Mapping[str, float]
+    variance_sigmas: Mapping[str, float]
+    explanations: tuple[Explanation, ...] = ()
+    suspects: tuple[SuspectRecord, ...]
+    reliability: ReliabilityRecord | None
+    cameras: Mapping[str, CameraRecord]
+    scanners: Mapping[str, ScannerRecord] = field(default_factory=dict)
+    boards: Mapping[str, BoardRecord] = field(default_factory=dict)
+    images: Mapping[str, ImageRecord]
+    frames: Mapping[str, JoinedFrameRecord] = field(default_factory=dict)
+    points: Mapping[str, PointRecord]
+    residuals: tuple[ResidualRecord, ...]
+    refraction: bool = False
+    earth_curvature: bool = False
+    distances: tuple[DistanceRecord, ...]
+    calibrations: tuple[ObservedQuantity, ...]
+    calibration_tests: tuple[ContradictionRecord, ...] = ()
+    antennas: tuple[ObservedQuantity, ...]
+    groups: Mapping[str, Group]
+    history: tuple[Iteration, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for names that nothing in the file has."""
+        for name, image in self.images.items():
+            if image.camera not in (*self.cameras, ""):
+                raise ValueError(f"images[{name!r}].camera is {image.camera!r}, which cameras do not hold")
+        for number, row in enumerate(self.residuals):
+            if row.image not in self.images:
+                raise ValueError(f"residuals[{number}].image is {row.image!r}, which images do not hold")
+
+    @property
+    def variance_factor(self) -> Sigma0Record:
+        """What sigma0 was estimated from; files of earlier versions do not say it."""
+        return self.sigma0_from or Sigma0Record(self.redundancy, self.redundancy <= 0, ())
+
+    @property
+    def has_sigma0(self) -> bool:
+        """Whether sigma0 was estimated, and standard deviations are not a priori ones."""
+        return not self.variance_factor.a_priori
+
+    def camera_of(self, image: str) -> str:
+        """The name of an image's camera; the only one where the file does not say."""
+        return self.images[image].camera or next(iter(self.cameras))
+
+    def images_of(self, camera: str) -> list[str]:
+        return [image for image in self.images if self.camera_of(image) == camera]
+
+    def films(self, images: Iterable[str]) -> dict[str, Film]:
+        """The film transformations of some images, in their order."""
+        places = defaultdict[str, list[tuple[float, float]]](list)
+        for row in self.residuals:
+            places[row.image].append((row.x_mm, row.y_mm))
+        middles = {image: (np.min(places[image], axis=0) + np.max(places[image], axis=0)) / 2.0 for image in images}
+        return {image: self.images[image].transformation.film(middle) for image, middle in middles.items()}
+
+    def estimated_lenses(self) -> Iterator[tuple[str, LensReachRecord]]:
+        """How far out the lenses are known of which a parameter was estimated, where their frame's size is known."""
+        for name, camera in self.cameras.items():
+            reach = camera.lens_known
+            is_estimated = any(each.sigma > 0.0 for each in camera.distortion.parameters.values())
+            if reach is not None and math.isfinite(reach.corner_mm) and is_estimated:
+                yield name, reach
+
+    def observed_mm(self, camera: str) -> Array:
+        """(n, 2) where a camera has observations, in its frame."""
+        rows = (row for row in self.residuals if self.camera_of(row.image) == camera)
+        places = np.array([(row.camera_x_mm, row.camera_y_mm) for row in rows], dtype=float).reshape(-1, 2)
+        return np.asarray(places[np.isfinite(places).all(axis=1)])

@@ -1,0 +1,127 @@
+"""`choose.json`: the models that were compared, their tests, the one chosen and why."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+
+from adjust.model_selection.candidates import Candidate
+from adjust.model_selection.cross_validation import CrossValidation
+from adjust.model_selection.model_choice import Choice
+from adjust.model_selection.models import Model
+from pipeline.results.record_json import read_record
+
+
+@dataclass(frozen=True)
+class ModelRecord:
+    """A film transformation, a distortion family with its estimated parameters, the terms of scanners' bends."""
+
+    transformation: str
+    family: str
+    parameters: tuple[str, ...]
+    bends: Mapping[str, tuple[str, ...]]
+
+    @classmethod
+    def of(cls, model: Model) -> "ModelRecord":
+        return cls(model.transformation, model.family, model.parameters, dict(model.bends))
+
+
+@dataclass(frozen=True)
+class ParameterCorrelation:
+    """Two parameters that the data hardly separate."""
+
+    parameters: tuple[str, str]
+    correlation: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class CandidateRecord:
+    """A model as it was adjusted; with a problem (why it has no solution) it has no figures."""
+
+    name: str
+    transformation: str
+    family: str
+    parameters: tuple[str, ...]
+    bends: Mapping[str, tuple[str, ...]]
+    problem: str = ""
+    observations: int | None = None
+    unknowns: int | None = None
+    redundancy: int | None = None
+    vpv: float | None = None
+    sigma0: float | None = None
+    aic: float | None = None
+    aicc: float | None = None
+    cross_validation: CrossValidation | None = field(default_factory=lambda: None)
+    correlated: tuple[ParameterCorrelation, ...] | None = None
+    warnings: tuple[str, ...] | None = None
+
+    @classmethod
+    def of(cls, candidate: Candidate) -> "CandidateRecord":
+        model = candidate.model
+        known = cls(
+            name=model.name,
+            transformation=model.transformation,
+            family=model.family,
+            parameters=model.parameters,
+            bends=dict(model.bends),
+            problem=candidate.problem,
+        )
+        if candidate.problem:
+            return known
+        return replace(
+            known,
+            observations=candidate.observations,
+            unknowns=candidate.unknowns,
+            redundancy=candidate.redundancy,
+            vpv=candidate.vpv,
+            sigma0=candidate.sigma0,
+            aic=candidate.aic,
+            aicc=candidate.aicc,
+            cross_validation=candidate.cross_validation,
+            correlated=tuple(ParameterCorrelation((a, b), rho) for a, b, rho in candidate.correlated),
+            warnings=candidate.warnings,
+        )
+
+
+@dataclass(frozen=True)
+class ModelTest:
+    """The F-test of a model against a richer one, by their names."""
+
+    simpler: str
+    richer: str
+    F: float
+    degrees: tuple[int, int]
+    p: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChoiceRecord:
+    """The choice as it is kept; given: the project's own model; made_from: fingerprints of all that was adjusted."""
+
+    reseau: str = ""
+    made_from: Mapping[str, str] = field(default_factory=dict)
+    chosen: ModelRecord | None
+    given: ModelRecord
+    verdict: str
+    reasons: tuple[str, ...]
+    candidates: tuple[CandidateRecord, ...]
+    tests: tuple[ModelTest, ...]
+
+
+def choice_record(choice: Choice, made_from: Mapping[str, str]) -> ChoiceRecord:
+    """The record of a choice."""
+    return ChoiceRecord(
+        reseau=version("reseau"),
+        made_from=made_from,
+        chosen=ModelRecord.of(choice.chosen.model) if choice.chosen else None,
+        given=ModelRecord.of(choice.given),
+        verdict=choice.verdict,
+        reasons=choice.reasons,
+        candidates=tuple(map(CandidateRecord.of, choice.candidates)),
+        tests=tuple(ModelTest(t.simpler.name, t.richer.name, t.f, t.degrees, t.p) for t in choice.tests),
+    )
+
+
+def read_choice(path: Path) -> ChoiceRecord:
+    """Read `choose.json`. Raises FileNotFoundError, and InputError for what is no such file."""
+    return read_record(ChoiceRecord, path, "Run `reseau choose` again; it writes this file.")

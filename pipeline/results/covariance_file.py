@@ -1,0 +1,169 @@
+"""`adjustment.npz`: the covariance of all quantities of an adjustment, or, of a large network, its parts."""
+
+import io
+import zipfile
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.problem.parameter import Parameter, parameter_of, parameters_from_texts
+from adjust.solution.result import Adjustment
+from pipeline.errors import InputError
+from pipeline.provenance import of_file
+from pipeline.text.text_file import MOST_MB, read_bytes
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+AGAIN = "Run `reseau adjust` again; it writes both files."
+AFFORDABLE = 3000  # quantities whose covariance is written as one matrix
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """The a-posteriori covariance of all unknowns: parameters (n), values (n,), matrix (n, n); mm, object units, rad.
+
+    adjustment: the fingerprint of the adjustment.json that it belongs to; "" where the file does not say it.
+    """
+
+    parameters: tuple[Parameter, ...]
+    values: Array
+    matrix: Array
+    adjustment: str = ""
+
+    def of(self, parameters: Iterable[Parameter | str]) -> Array:
+        """The covariance (k, k) of some unknowns, by keys or by their texts in the file; one that is not listed was
+        fixed, its row is zero."""
+        at = np.array([self._positions.get(parameter_of(each), -1) for each in parameters], dtype=int)
+        block: Array = self.matrix[np.ix_(at, at)]
+        block[at < 0, :] = 0.0
+        block[:, at < 0] = 0.0
+        return block
+
+    @cached_property
+    def _positions(self) -> dict[Parameter, int]:
+        return {each: i for i, each in enumerate(self.parameters)}
+
+
+def covariance_path(path: Path) -> Path:
+    """Where the covariance of `adjustment.json` stands."""
+    return path.with_suffix(".npz")
+
+
+def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
+    """The a-posteriori covariance by the names of the file's arrays; mm, object units, rad.
+
+    names (n), values (n), matrix (n, n): of all quantities, or, where these are more than AFFORDABLE, of cameras and
+    images, and where these are more, of cameras. The points, and then the images, stand each by itself, without their
+    covariances with others: point_names (p, 3), point_values (p, 3), point_matrices (p, 3, 3), image_names (i, k) and
+    so on, with empty names and zeros behind an image that has less than k quantities.
+    """
+    parts = _parts(adjustment)
+    whole = _named(adjustment, parts.whole)
+    arrays = whole | {"matrix": adjustment.sigma0**2 * adjustment.cofactor.of(parts.whole)}
+    for kind, groups in parts.groups.items():
+        padded = np.full((len(groups), max(map(len, groups))), -1, dtype=np.intp)
+        for row, group in zip(padded, groups, strict=True):
+            row[: len(group)] = group
+        matrices = np.zeros((*padded.shape, padded.shape[1]))
+        lengths = (padded >= 0).sum(axis=1)
+        for length in np.unique(lengths):
+            cofactors = adjustment.cofactor.of_each(padded[lengths == length, :length])
+            matrices[lengths == length, :length, :length] = adjustment.sigma0**2 * cofactors
+        named = _named(adjustment, padded) | {"matrices": matrices}
+        arrays |= {f"{kind}_{name}": array for name, array in named.items()}
+    return arrays
+
+
+def covariance_note(adjustment: Adjustment) -> str:
+    """What of the covariance is in the file, in words."""
+    count, alone = len(adjustment.parameters), " and every ".join(_parts(adjustment).groups)
+    if not alone:
+        return "adjustment.npz holds the covariance of all quantities."
+    whole = "cameras" if "image" in alone else "cameras and images"
+    return (
+        f"adjustment.npz holds the covariance of the {whole} together and of every {alone} by itself: the matrix of "
+        f"all {count} quantities would be too large."
+    )
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Positions of the quantities: those of the whole matrix, and by kind the groups of those that are not in it."""
+
+    whole: Indices
+    groups: dict[str, list[Indices]]
+
+
+def _parts(adjustment: Adjustment) -> _Parts:
+    parameters = adjustment.parameters
+    whole = np.arange(len(parameters))
+    groups: dict[str, list[Indices]] = {}
+    # The quantities of a point or an image stand together, and begin with X or X0.
+    for kind, kinds, first in (("point", ("point",), "X"), ("image", ("exterior", "film"), "X0")):
+        members = np.array([parameters[i].kind in kinds for i in whole], dtype=bool)
+        if len(whole) <= AFFORDABLE or not members.any():
+            continue
+        positions = whole[members]
+        begins = [j for j, i in enumerate(positions) if parameters[i].quantity == first]
+        groups[kind] = np.split(positions, begins[1:])
+        whole = whole[~members]
+    return _Parts(whole, groups)
+
+
+def _named(adjustment: Adjustment, positions: Indices) -> dict[str, NDArray[np.generic]]:
+    """Names and values at some positions; empty and zero at -1."""
+    names = np.array([*adjustment.names, ""], dtype=np.str_)
+    return {"names": names[positions], "values": np.append(adjustment.values, 0.0)[positions]}
+
+
+def read_covariance(path: Path) -> Covariance:
+    """The covariance beside the `adjustment.json` at `path`. Raises InputError where it is missing or broken."""
+    file = covariance_path(path)
+    try:
+        data = read_bytes(file)
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{file}: there is no such file; it belongs to {path.name}. {AGAIN}") from None
+    names, values, matrix = (_array(data, name, file) for name in ("names", "values", "matrix"))
+    if names.dtype.kind != "U" or values.dtype.kind != "f" or matrix.dtype.kind != "f":
+        kinds = ", ".join(f"{array.dtype}" for array in (names, values, matrix))
+        raise InputError(f"{file}: names, values and matrix are to be text and real numbers, not {kinds}. {AGAIN}")
+    if names.ndim != 1 or values.shape != names.shape or matrix.shape != (*names.shape, *names.shape):
+        raise InputError(f"{file}: {names.size} names do not fit a matrix of shape {matrix.shape}. {AGAIN}")
+    texts = tuple(str(name) for name in names)
+    twice = next((name for name, count in Counter(texts).items() if count > 1), None)
+    if twice is not None:
+        raise InputError(f"{file}: {twice!r} is named twice. {AGAIN}")
+    adjustment = str(_array(data, "fingerprint", file)) if b"fingerprint.npy" in data else ""
+    try:
+        parameters = parameters_from_texts(texts)
+    except ValueError as error:
+        raise InputError(f"{file}: {error}. {AGAIN}") from None
+    return Covariance(parameters, values.astype(np.float64), matrix.astype(np.float64), adjustment)
+
+
+def read_own_covariance(path: Path) -> Covariance:
+    """The same, refused where it says that it is of another adjustment than that at `path`."""
+    covariance = read_covariance(path)
+    if covariance.adjustment not in ("", of_file(path)):
+        raise InputError(
+            f"{covariance_path(path)}: belongs to another adjustment than {path}. Bring both files of one adjustment "
+            "together, or run `reseau adjust` again."
+        )
+    return covariance
+
+
+def _array(data: bytes, name: str, file: Path) -> NDArray[Any]:
+    """One array of an npz file, unpacked up to the size that is read of any file."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open(f"{name}.npy") as member:
+            unpacked = io.BytesIO(member.read(MOST_MB * 1_000_000))
+        return np.asarray(np.lib.format.read_array(unpacked, allow_pickle=False))
+    except Exception as error:  # whatever zipfile, zlib and numpy's reader of headers raise at a damaged file
+        raise InputError(f"{file}: is not a covariance file ({name}: {error}). {AGAIN}") from None

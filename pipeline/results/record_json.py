@@ -1,0 +1,267 @@
+"""Records as JSON: dataclasses and named tuples, written and read by one mechanism for every result file.
+
+A record's fields are the file's keys, in their order. What the annotations say is what a reader takes; further keys are
+welcome. `float` is a number, or null for one that has no meaning (NaN), `Finite` a number always. A field of None by
+default is written only where it has a value. Metadata of a field: KEY, where it is called otherwise in the file; REST,
+for a mapping whose entries stand among the other keys.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
+from itertools import islice
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from pipeline.errors import InputError
+from pipeline.text.atomic import write_atomically
+from pipeline.text.text_file import read_json, shown
+
+Record = TypeVar("Record")
+Read = Callable[[Any], Any]
+Field = tuple[str, str, Any]  # name, key, default
+
+FINITE, KEY, REST = "finite", "key", "rest"
+Finite = Annotated[float, FINITE]
+
+_AT_A_TIME = 10_000  # words of JSON
+_NAMES: Mapping[type, str] = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
+
+
+class WrongForm(Exception):
+    """A value that a record does not take: its place within the record, and what is wrong."""
+
+    def __init__(self, problem: str, place: str = "") -> None:
+        super().__init__(problem)
+        self.problem, self.place = problem, place
+
+    def within(self, place: str) -> "WrongForm":
+        return WrongForm(self.problem, place + self.place)
+
+
+def json_text(record: object, ensure_ascii: bool = False) -> Iterator[str]:
+    """A record as JSON, some of it at a time: as one text a large result takes several times as much memory."""
+    encoder = json.JSONEncoder(indent=1, ensure_ascii=ensure_ascii, allow_nan=False, default=_content)
+    parts = encoder.iterencode(_plain(record))
+    while some := "".join(islice(parts, _AT_A_TIME)):
+        yield some
+    yield "\n"
+
+
+def write_record(record: object, path: Path) -> None:
+    """Write a record to a file. Raises WriteError where that cannot be done."""
+    write_atomically(path, "".join(json_text(record)))
+
+
+def plain_json(record: object) -> Any:
+    """A record as mappings, lists, texts and numbers."""
+    return json.loads("".join(json_text(record)))
+
+
+def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
+    """The record that a file holds. remedy: what to do where it holds none.
+
+    Raises FileNotFoundError and IsADirectoryError, and InputError for a file that is no JSON, or has a wrong value: the
+    message says where, and what would be right.
+    """
+    content = read_json(path)
+    try:
+        return parsed(kind, content)
+    except WrongForm as wrong:
+        place = wrong.place.removeprefix(".") or "the file"
+        raise InputError(f"{path}: {place} {wrong.problem}. {remedy}") from None
+
+
+def parsed(kind: type[Record], content: Any) -> Record:
+    """The record of the content of a JSON file. Raises WrongForm where it has another form."""
+    key: Any = kind
+    reader: Callable[[Any], Record] = _reader(key)
+    return reader(content)
+
+
+def _content(record: object) -> dict[str, Any]:
+    """A record's keys with their values, records within it left as they are."""
+    content: dict[str, Any] = {}
+    kind: Any = type(record)
+    for name, key, default in _fields(kind):
+        value = getattr(record, name)
+        if value is None and default is None:
+            continue
+        if key == REST:
+            content |= _plain(value)
+        else:
+            content[key] = _plain(value)
+    return content
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON has it, null for numbers that are not finite; dataclasses are left to the encoder."""
+    if isinstance(value, str | int | None):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if hasattr(value, "_fields"):
+        return _content(value)
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+@cache
+def _fields(kind: type) -> tuple[Field, ...]:
+    if not is_dataclass(kind):  # a named tuple
+        defaults: Mapping[str, Any] = kind._field_defaults  # type: ignore[attr-defined]
+        return tuple((name, name, defaults.get(name, MISSING)) for name in kind._fields)  # type: ignore[attr-defined]
+    made = []
+    for each in fields(kind):
+        default = each.default if each.default_factory is MISSING else each.default_factory
+        made.append((each.name, REST if REST in each.metadata else each.metadata.get(KEY, each.name), default))
+    return tuple(made)
+
+
+@cache
+def _reader(kind: Any) -> Read:
+    """What reads a value of a kind; it raises WrongForm."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _annotated(arguments[0], arguments[1])
+    if origin in (Union, UnionType):
+        inner = next(each for each in arguments if each is not NoneType)
+        return _number if inner is float else _optional(_reader(inner))  # None is a number that is not there
+    if origin is Literal:
+        return _word(arguments)
+    if origin is tuple:
+        return _list(_reader(arguments[0]), None if arguments[1] is ... else len(arguments))
+    if kind is Any:
+        return lambda value: value
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return _mapping(_reader(arguments[1]))
+    return _of_plain(kind) if kind in _NAMES else _of_record(kind)
+
+
+def _of_plain(kind: type, is_finite: bool = False) -> Read:
+    if kind is float:
+        return _finite if is_finite else _number
+
+    def read(value: Any) -> Any:
+        if type(value) is not kind:
+            raise _wrong(value, _NAMES[kind])
+        return value
+
+    return read
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else _finite(value, " or null")
+
+
+def _finite(value: Any, others: str = "") -> float:
+    if type(value) is not float and type(value) is not int:
+        raise _wrong(value, f"a number{others}")
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        number = math.inf
+    if not math.isfinite(number):
+        raise _wrong(value, "a finite number")
+    return number
+
+
+def _annotated(kind: Any, note: Any) -> Read:
+    """FINITE, or a function that raises ValueError at what it cannot take."""
+    if note == FINITE:
+        return _of_plain(kind, is_finite=True)
+    read = _reader(kind)
+
+    def checked(value: Any) -> Any:
+        try:
+            note(read(value))
+        except ValueError as error:
+            raise WrongForm(f"is not what it should be: {error}") from None
+        return value
+
+    return checked
+
+
+def _optional(read: Read) -> Read:
+    def of(value: Any) -> Any:
+        try:
+            return None if value is None else read(value)
+        except WrongForm as wrong:
+            raise wrong if wrong.place else WrongForm(f"{wrong.problem} or null") from None
+
+    return of
+
+
+def _word(words: tuple[str, ...]) -> Read:
+    def read(value: Any) -> Any:
+        if value not in words:
+            raise _wrong(value, " or ".join(map(repr, words)))
+        return value
+
+    return read
+
+
+def _list(read: Read, length: int | None) -> Read:
+    def of(value: Any) -> tuple[Any, ...]:
+        if not isinstance(value, list) or (length is not None and len(value) != length):
+            raise _wrong(value, "a list" if length is None else f"a list of {length}")
+        made, number = [], 0
+        try:
+            for number, item in enumerate(value):  # noqa: B007
+                made.append(read(item))
+        except WrongForm as wrong:
+            raise wrong.within(f"[{number}]") from None
+        return tuple(made)
+
+    return of
+
+
+def _mapping(read: Read) -> Read:
+    def of(value: Any) -> dict[str, Any]:
+        if not isinstance(value, dict):
+            raise _wrong(value, "a table")
+        made, key = {}, ""
+        try:
+            for key, item in value.items():
+                made[key] = read(item)
+        except WrongForm as wrong:
+            raise wrong.within(f"[{key!r}]") from None
+        return made
+
+    return of
+
+
+def _of_record(kind: type) -> Read:
+    hints, known = get_type_hints(kind, include_extras=True), _fields(kind)
+    readers = [(name, key, _reader(hints[name])) for name, key, _ in known]
+    keys = {key for _, key, _ in known}
+    needed = {key for _, key, default in known if default is MISSING and key != REST}
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, dict):
+            raise _wrong(value, "a table")
+        if not needed <= value.keys():
+            raise WrongForm(f"has no key {next(key for _, key, _ in known if key in needed - value.keys())!r}")
+        made, key = {}, ""
+        try:
+            for name, key, of in readers:
+                if key in value:
+                    made[name] = of(value[key])
+                elif key == REST:
+                    made[name] = of({each: item for each, item in value.items() if each not in keys})
+        except WrongForm as wrong:
+            raise wrong.within("" if key == REST else f".{key}") from None
+        try:
+            return kind(**made)
+        except ValueError as error:  # what does not go together
+            raise WrongForm(str(error)) from None
+
+    return read
+
+
+def _wrong(value: Any, expected: str) -> WrongForm:
+    return WrongForm(f"is {shown(value)}; it should be {expected}")
