@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.initial_values.resection import Pose
+from adjust.initial_values.pose import Pose
 from adjust.target_identification.naming import Names, name_marks
 
 Array = NDArray[np.float64]

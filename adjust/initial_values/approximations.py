@@ -11,14 +11,12 @@ from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.rotation import angles_from_rotation, angles_near
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.dlt import KnownField, taper
 from adjust.initial_values.fiducial_fit import fit_transformation
-from adjust.initial_values.frames import Frames, frames_of
+from adjust.initial_values.frames import Frames, camera_frames
 from adjust.initial_values.joined_frames import Film, joined_frames, whole_frames
 from adjust.initial_values.orientation import orient
-from adjust.initial_values.principal_distance import find_principal_distance
-from adjust.initial_values.resection import Pose
-from adjust.initial_values.wide_angle import find_wide_distance
+from adjust.initial_values.pose import KnownField, Pose
+from adjust.initial_values.principal_distance import find_principal_distance, find_wide_distance, taper
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Image, Network
 from adjust.problem.reduction import Reduction
@@ -53,11 +51,11 @@ def initial_values(network: Network) -> Approximations:
 
 def _initial_values(network: Network) -> Approximations:
     if network.has_parts:
-        return _of_parts(network)
+        return _joined_values(network)
     films = _film_transformations(network)
     transformation = {name: parameters for name, (parameters, _) in films.items()}
     mirrored = frozenset(name for name, (_, is_mirrored) in films.items() if is_mirrored)
-    frames = frames_of(network, transformation, mirrored)
+    frames = camera_frames(network, transformation, mirrored)
     used = [camera for camera in network.cameras if camera.name not in network.idle_cameras]
     interior = {camera.name: _interior(camera, frames) for camera in used}
     sights = {name: sight for camera in used for name, sight in _sights(camera, frames, interior[camera.name]).items()}
@@ -71,7 +69,7 @@ def _initial_values(network: Network) -> Approximations:
     )
 
 
-def _of_parts(network: Network) -> Approximations:
+def _joined_values(network: Network) -> Approximations:
     """Where frames were scanned in parts: those of the whole frames, and how the parts lie in them."""
     films, joins = dict[str, Film](), dict[tuple[str, str], Array]()
     for frame in joined_frames(network):

@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.dlt import KnownField, orient_together
 from adjust.initial_values.intersection import intersect
-from adjust.initial_values.resection import Pose, resect, three_point_poses
+from adjust.initial_values.pose import KnownField, Pose
+from adjust.initial_values.resection import resect_images
 
 Array = NDArray[np.float64]
 
 SURE_RESECTION = 6  # points that make a resection trustworthy; with fewer it waits until nothing better comes
-IMPLAUSIBLE = 0.05  # residuals, in principal distances, of a resection whose points cannot be what they are said to be
 WELL_DETERMINED = 1e-3  # determination (see intersect) from which an intersected point may orient further images
 
 
@@ -34,57 +33,31 @@ def extend(block: Block) -> None:
     while True:
         block.points = intersected(block, WELL_DETERMINED)
         waiting = [name for name in sorted(block.sights) if name not in block.poses]
+        new: dict[str, Pose] = {}
         for fewest in (SURE_RESECTION, 4, 3):
-            new = resected_together(block, waiting) if fewest == SURE_RESECTION else {}
-            others = (name for name in waiting if name not in new)
-            new |= {name: pose for name in others if (pose := _pose_of(block, name, fewest)) is not None}
-            if new:
-                break
+            new = new or _resected(block, waiting, fewest)
         if not new:
             return
         block.poses.update(new)
 
 
-def _pose_of(block: Block, image: str, fewest: int) -> Pose | None:
-    """Resection from firm points where there are enough, else from all that have coordinates by now."""
-    sight = block.sights[image]
+def _resected(block: Block, images: Sequence[str], fewest: int) -> dict[str, Pose]:
+    """The poses of those images whose points give one: of firm points where there are enough, else of all that have
+    coordinates by now."""
+    poses: dict[str, Pose] = {}
     for coordinates in (block.firm, {**block.rough, **block.points}):
-        xyz, xy_mm = known_field(sight, coordinates)
-        if len(xyz) >= fewest and (pose := resected(sight, xyz, xy_mm)) is not None:
-            return pose
-    return None
+        fields = {name: known_field(block.sights[name], coordinates) for name in images if name not in poses}
+        enough = {name: field for name, field in fields.items() if len(field.xyz) >= fewest}
+        found = resect_images(enough.values(), [block.sights[name].principal_distance_mm for name in enough])
+        poses |= {name: pose for name, pose in zip(enough, found, strict=True) if pose is not None}
+    return poses
 
 
-def resected(sight: Sight, xyz: Array, xy_mm: Array) -> Pose | None:
-    """The pose by resection, seeded alike for every image so that the order of things does not matter."""
-    c = sight.principal_distance_mm
-    if len(xyz) == 3:
-        poses = three_point_poses(xyz, xy_mm, c)
-        return poses[0] if len(poses) == 1 else None
-    resection = resect(xyz, xy_mm, c, np.random.default_rng(0), sight.sigma_mm)
-    return None if resection is None or resection.sigma_mm > IMPLAUSIBLE * c else resection.pose
-
-
-def resected_together(block: Block, images: Sequence[str]) -> dict[str, Pose]:
-    """The poses of those images whose points agree on one: the firm ones where these are enough."""
-    fields = {}
-    coordinates = {**block.rough, **block.points}
-    for name in images:
-        sight = block.sights[name]
-        xyz, xy_mm = known_field(sight, block.firm)
-        if len(xyz) < SURE_RESECTION:
-            xyz, xy_mm = known_field(sight, coordinates)
-        if len(xyz) >= SURE_RESECTION:
-            fields[name] = KnownField(xyz, xy_mm, sight.sigma_mm)
-    together = orient_together(list(fields.values()), [block.sights[name].principal_distance_mm for name in fields])
-    return {name: pose for name, pose in zip(fields, together, strict=True) if pose is not None}
-
-
-def known_field(sight: Sight, coordinates: Mapping[str, Array]) -> tuple[Array, Array]:
-    """The points (n, 3) of an image whose three coordinates are known, and where it sees them (n, 2)."""
+def known_field(sight: Sight, coordinates: Mapping[str, Array]) -> KnownField:
+    """The points of an image whose three coordinates are known."""
     xyz = np.array([coordinates[name] for name in sight.points]).reshape(-1, 3)
     usable = ~np.isnan(xyz).any(axis=1)
-    return xyz[usable], sight.xy_mm[usable]
+    return KnownField(xyz[usable], sight.xy_mm[usable], sight.sigma_mm)
 
 
 def intersected(block: Block, weakest: float) -> dict[str, Array]:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import rotation_from_vector
+from adjust.initial_values.pose import REJECTION, KnownField, Pose, robust_sigmas, trimmed_count
 from adjust.initial_values.pose_refinement import refined_distance, refined_poses, squared_residuals
-from adjust.initial_values.resection import REJECTION, Pose, half_of, robust_sigmas
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -35,16 +35,7 @@ ANOTHER = 1e-3  # difference of rotations, in any element, from which on two pos
 ALIKE = 4.0  # times the squares of a pose that a rival, refined, leaves where nothing tells which of the two it is
 
 
-@dataclass(frozen=True, eq=False)
-class KnownField:
-    """What one image shows of known points: xyz (n, 3), xy_mm (n, 2) about the principal point, their sigma in mm."""
-
-    xyz: Array
-    xy_mm: Array
-    sigma_mm: float
-
-
-def orient_together(seen: Sequence[KnownField], principal_distances_mm: Sequence[float]) -> list[Pose | None]:
+def closed_form_poses(seen: Sequence[KnownField], principal_distances_mm: Sequence[float]) -> list[Pose | None]:
     """The poses of the images whose points agree on one; None for the others.
 
     They agree where no residual is gross and all are as large as the standard deviations say, or as those of most
@@ -81,20 +72,6 @@ def principal_distance_together(seen: Sequence[KnownField]) -> tuple[float, floa
     batch, sigma_mm = batch.some(batch.counts >= FEWEST_TRIMMED).trimmed()
     agreeing = sigma_mm <= WORSE * np.maximum(batch.sigma_mm, np.median(sigma_mm))
     return batch.some(agreeing).distance_together() if 2 * agreeing.sum() > len(some) else None
-
-
-def taper(field: KnownField) -> float | None:
-    """By what part the scale changes across the image of a flat field, by its homography; None where it is not flat."""
-    centred = field.xyz - field.xyz.mean(axis=0)
-    _, extents, axes = np.linalg.svd(centred, full_matrices=False)
-    if extents[1] <= LINE * extents[0] or extents[2] > PLANE * extents[0]:
-        return None
-    places = np.column_stack([centred @ axes[:2].T / extents[0], np.ones(len(centred))])
-    xy = field.xy_mm / np.abs(field.xy_mm).max()
-    nothing = np.zeros_like(places)
-    rows = [np.hstack([places, nothing, -xy[:, :1] * places]), np.hstack([nothing, places, -xy[:, 1:] * places])]
-    depth = places @ np.linalg.svd(np.vstack(rows))[2][-1][6:]
-    return float(np.ptp(depth) / abs(depth.mean()))
 
 
 def _batches(seen: Sequence[KnownField], images: Sequence[int]) -> Iterator[Indices]:
@@ -197,7 +174,7 @@ class _Fields:
             np.put_along_axis(
                 rank, np.argsort(squared, axis=1, kind="stable"), np.arange(squared.shape[1])[None], axis=1
             )
-            weights = (rank < half_of(self.counts)[:, None]).astype(np.float64)
+            weights = (rank < trimmed_count(self.counts)[:, None]).astype(np.float64)
             if np.array_equal(weights, here.weights):
                 break
             here = replace(self, weights=weights)

@@ -60,7 +60,11 @@ def _determinant_where_marks_agree(comparator_mm: Array, camera_mm: Array) -> fl
     """Of the affine transformation that they agree on, negative in a mirrored scan; None where they agree on none, are
     too few to show it, or lie about on one line."""
     affine = film_kind("affine", False)
-    if len(comparator_mm) <= marks_of(affine) or _about_on_a_line(comparator_mm) or _about_on_a_line(camera_mm):
+    if (
+        len(comparator_mm) <= marks_of(affine)
+        or _are_nearly_collinear(comparator_mm)
+        or _are_nearly_collinear(camera_mm)
+    ):
         return None
     parameters = _fit(affine, comparator_mm, camera_mm)
     if not _agree(_squared(affine, parameters, comparator_mm, camera_mm)):
@@ -69,7 +73,7 @@ def _determinant_where_marks_agree(comparator_mm: Array, camera_mm: Array) -> fl
     return float(np.linalg.det(np.array(along) - origin))
 
 
-def _about_on_a_line(xy_mm: Array) -> bool:
+def _are_nearly_collinear(xy_mm: Array) -> bool:
     most, least = np.linalg.svd(xy_mm - xy_mm.mean(axis=0), compute_uv=False)
     return bool(least < LEAST_ASPECT * most)
 

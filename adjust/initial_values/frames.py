@@ -64,7 +64,7 @@ class Frames:
         }
 
 
-def frames_of(network: Network, transformation: Mapping[str, Array], mirrored: frozenset[str]) -> Frames:
+def camera_frames(network: Network, transformation: Mapping[str, Array], mirrored: frozenset[str]) -> Frames:
     """The object points of all images through their film transformations, parameters by image name."""
     observations, count = network.observations, len(network.images)
     names, number = observations.numbered_points

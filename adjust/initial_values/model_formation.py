@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.absolute_orientation import Similarity, absolute_orientation, levelled
 from adjust.initial_values.block import Block, extend
+from adjust.initial_values.pose import Pose, image_distances
 from adjust.initial_values.relative_orientation import relative_poses
-from adjust.initial_values.resection import Pose, image_distances
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,10 @@ from adjust.errors import AdjustmentError, UnorientedError
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.block import Block, extend, intersected, known_field, resected
+from adjust.initial_values.block import Block, extend, intersected, known_field
 from adjust.initial_values.model_formation import orient_free_model, typical_residual
-from adjust.initial_values.resection import Pose, image_distances
+from adjust.initial_values.pose import Pose, image_distances
+from adjust.initial_values.resection import resect_images
 from adjust.initial_values.vertical_block import orient_vertical_block
 from adjust.problem.network import Exterior, Network
 from adjust.problem.observations import Distance
@@ -31,7 +32,7 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
     block = Block(sights, _coordinates(network, firm=True), _coordinates(network, firm=False))
     for image in network.images:
         if image.exterior is not None and image.name in sights:
-            block.poses[image.name] = _checked(image.exterior, block, image.name)
+            block.poses[image.name] = _given_or_resected(image.exterior, block, image.name)
     extend(block)
     if sights and not block.poses:
         block.poses.update(_oriented_by_images(block))
@@ -48,14 +49,14 @@ def _oriented_by_images(block: Block) -> dict[str, Pose]:
     """Poses where too few points are known to begin with: as if all frames looked straight down, or, where that leaves
     residuals as tilted frames do, of a model in space, if this leaves less."""
     vertical = orient_vertical_block(block.sights, block.firm)
-    left = _left_by(block, vertical)
+    left = _relative_residual(block, vertical)
     if left < TILTED:
         return vertical
     model = orient_free_model(block.sights, block.firm)
-    return model if _left_by(block, model) < left or not vertical else vertical
+    return model if _relative_residual(block, model) < left or not vertical else vertical
 
 
-def _left_by(block: Block, poses: Mapping[str, Pose]) -> float:
+def _relative_residual(block: Block, poses: Mapping[str, Pose]) -> float:
     """The typical residual of images in these poses, in principal distances; infinite where there are none."""
     if not poses:
         return np.inf
@@ -75,18 +76,16 @@ def _value(prior: Prior | None, firm: bool) -> float:
     return np.nan if prior is None or (firm and np.isinf(prior.sigma)) else prior.value
 
 
-def _checked(exterior: Exterior, block: Block, image: str) -> Pose:
+def _given_or_resected(exterior: Exterior, block: Block, image: str) -> Pose:
     """The given orientation, or a resection where known points contradict it and it is not held fixed."""
     given = Pose(rotation_from_angles(exterior.values[3:]), exterior.center)
-    xyz, xy_mm = known_field(block.sights[image], block.firm)
-    if (exterior.sigmas == 0).any() or len(xyz) < 4:
+    field, c = known_field(block.sights[image], block.firm), block.sights[image].principal_distance_mm
+    if (exterior.sigmas == 0).any() or len(field.xyz) < 4:
         return given
-    found = resected(block.sights[image], xyz, xy_mm)
+    found = resect_images([field], [c])[0]
     if found is None:
         return given
-    c = block.sights[image].principal_distance_mm
-    left_given = np.median(image_distances(given, xyz, xy_mm, c))
-    left_found = np.median(image_distances(found, xyz, xy_mm, c))
+    left_given, left_found = (np.median(image_distances(pose, field.xyz, field.xy_mm, c)) for pose in (given, found))
     return found if left_given > CLEARLY_WORSE * max(left_found, block.sights[image].sigma_mm) else given
 
 
@@ -129,7 +128,7 @@ def _why_not_intersected(point: str, images: Sequence[str]) -> str:
 
 def _why_not_oriented(block: Block, image: str) -> str:
     sight = block.sights[image]
-    xyz, _ = known_field(sight, {**block.rough, **block.points})
+    xyz = known_field(sight, {**block.rough, **block.points}).xyz
     remedy = f"measure more known points, or give the orientation of image {image}."
     if not block.poses and len(xyz) < 3:
         return (

@@ -1,19 +1,31 @@
-"""An approximate principal distance from images of known points, where the camera brings none."""
+"""An approximate principal distance from images of known points, where the camera brings none.
+
+Of a pinhole a single image of a plane may leave it open; of a lens that is none while its parameters are 0, a fisheye,
+not even a single image of a plane fits with a wrong one.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.initial_values.dlt import KnownField, principal_distance_together
+from adjust.functional_model.lens import Distortion, Lens
+from adjust.functional_model.projection import rays
+from adjust.initial_values.dlt import LINE, PLANE, principal_distance_together
+from adjust.initial_values.pose import KnownField
 from adjust.initial_values.resection import Resection, refine, resect
 
 Array = NDArray[np.float64]
 
 GRID = np.geomspace(0.35, 16.0, 14)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
+FEWEST = 4  # points of an image
 COARSE_IMAGES = 5
 FINE_IMAGES = 12
 LARGEST_RELATIVE_SIGMA = 0.15
+ANGLES_DEG = np.arange(88.0, 8.0, -4.0)  # off the axis at which the outermost point of all images is tried
+WIDE_IMAGES = 5
+FEWEST_WIDE = 6  # points of an image
+HALVES = 4  # of the step between angles, for the last search
 
 
 def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
@@ -24,7 +36,7 @@ def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
     flat that the principal distance has a standard deviation above 15 %: a flat field parallel to the image, where a
     change of it is a change of the height.
     """
-    fields = sorted((f for f in fields if len(f.xyz) >= 4), key=lambda f: -len(f.xyz))[:FINE_IMAGES]
+    fields = _largest_fields(fields, FEWEST, FINE_IMAGES)
     if not fields:
         return None
     together = principal_distance_together(fields)
@@ -40,6 +52,11 @@ def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
             return None
         found = _minimum(fields, resections, found, width)
     return found if _relative_sigma(fields, _resections(fields, found), found) < LARGEST_RELATIVE_SIGMA else None
+
+
+def _largest_fields(fields: Sequence[KnownField], fewest: int, most: int) -> list[KnownField]:
+    """Those with most points, up to a number of them; none with too few points."""
+    return sorted((each for each in fields if len(each.xyz) >= fewest), key=lambda each: -len(each.xyz))[:most]
 
 
 def _resections(fields: Sequence[KnownField], c: float) -> dict[int, Resection]:
@@ -82,3 +99,57 @@ def _relative_sigma(fields: Sequence[KnownField], resections: dict[int, Resectio
     redundancy = sum(2 * int(r.inliers.sum()) - 6 for r in resections.values()) - 1
     noise = max(middle / max(redundancy, 1), max(f.sigma_mm for f in fields) ** 2)
     return float(np.sqrt(2 * noise / curvature)) if curvature > 0 else np.inf
+
+
+def taper(field: KnownField) -> float | None:
+    """By what part the scale changes across the image of a flat field, by its homography; None where it is not flat."""
+    centred = field.xyz - field.xyz.mean(axis=0)
+    _, extents, axes = np.linalg.svd(centred, full_matrices=False)
+    if extents[1] <= LINE * extents[0] or extents[2] > PLANE * extents[0]:
+        return None
+    places = np.column_stack([centred @ axes[:2].T / extents[0], np.ones(len(centred))])
+    xy = field.xy_mm / np.abs(field.xy_mm).max()
+    nothing = np.zeros_like(places)
+    rows = [np.hstack([places, nothing, -xy[:, :1] * places]), np.hstack([nothing, places, -xy[:, 1:] * places])]
+    depth = places @ np.linalg.svd(np.vstack(rows))[2][-1][6:]
+    return float(np.ptp(depth) / abs(depth.mean()))
+
+
+def find_wide_distance(fields: Sequence[KnownField], distortion: Distortion) -> float | None:
+    """The principal distance in mm with which resections leave the least; None where no image tells it.
+
+    fields: places about the principal point; distortion: as it is given.
+    """
+    fields = _largest_fields(fields, FEWEST_WIDE, WIDE_IMAGES)
+    if not fields:
+        return None
+    radius_mm = max(float(np.linalg.norm(each.xy_mm, axis=1).max()) for each in fields)
+
+    def misfit(angle_deg: float) -> float:
+        lens = Lens(distortion, np.array([radius_mm / np.radians(angle_deg), 0.0, 0.0]), distortion.values)
+        return sum(_misfit_mm2(each, i, lens) for i, each in enumerate(fields))
+
+    left = [misfit(angle) for angle in ANGLES_DEG]
+    best, step = float(ANGLES_DEG[int(np.argmin(left))]), float(ANGLES_DEG[0] - ANGLES_DEG[1])
+    least = min(left)
+    for _ in range(HALVES):
+        step /= 2.0
+        for angle in (best - step, best + step):
+            here = misfit(angle)
+            if here < least:
+                best, least = angle, here
+    return radius_mm / float(np.radians(best)) if np.isfinite(least) else None
+
+
+def _misfit_mm2(field: KnownField, number: int, lens: Lens) -> float:
+    """The median square by which an image's points miss where they were observed; inf where no pose is found."""
+    ideal_mm, found = lens.ideal_from_observed(field.xy_mm)
+    if found.sum() < FEWEST_WIDE or not found.all():
+        return np.inf
+    resection = resect(field.xyz, ideal_mm, float(lens.interior[0]), np.random.default_rng(number), field.sigma_mm)
+    if resection is None:
+        return np.inf
+    ray, _ = rays(resection.pose.rotation, field.xyz - resection.pose.center)
+    seen_mm, imaged = lens.camera_from_ray(ray)
+    squares = np.where(imaged, ((seen_mm - field.xy_mm) ** 2).sum(axis=1), np.inf)
+    return float(np.median(squares))

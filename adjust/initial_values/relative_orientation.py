@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.initial_values.resection import Pose
+from adjust.initial_values.pose import Pose
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -96,10 +96,10 @@ def _pose(essential: Array, first: Array, second: Array) -> Pose:
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     rotations = [u @ w @ vt * np.sign(np.linalg.det(u @ vt)) for w in (turn, turn.T)]
     poses = [Pose(rotation, sign * rotation.T @ u[:, 2]) for rotation in rotations for sign in (1.0, -1.0)]
-    return max(poses, key=lambda pose: _in_front(pose, first, second))
+    return max(poses, key=lambda pose: _pairs_in_front(pose, first, second))
 
 
-def _in_front(pose: Pose, first: Array, second: Array) -> int:
+def _pairs_in_front(pose: Pose, first: Array, second: Array) -> int:
     """How many pairs of rays meet at positive distances from both cameras."""
     turned = second @ pose.rotation
     cosine = (first * turned).sum(axis=1)

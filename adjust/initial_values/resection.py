@@ -1,34 +1,34 @@
 """Resection in space: the exterior orientation of one image from its known points, gross errors tolerated."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.initial_values.dlt import closed_form_poses
 from adjust.initial_values.p3p import triple_poses
-from adjust.initial_values.pose_refinement import BEHIND, refined_poses, squared_residuals
+from adjust.initial_values.pose import (
+    REJECTION,
+    KnownField,
+    Pose,
+    residual_distances,
+    robust_sigmas,
+    trimmed_count,
+)
+from adjust.initial_values.pose_refinement import refined_poses, squared_residuals
 
 Array = NDArray[np.float64]
-Count = TypeVar("Count", int, NDArray[np.intp])
 
+IMPLAUSIBLE = 0.05  # residuals, in principal distances, of a pose whose points cannot be the ones they are named
 MAX_TRIPLES = 120  # enough for one free of gross errors among them when every third point is wrong
 MAX_SCORED_POINTS = 200
 REFINED_CANDIDATES = 16  # poses kept for the refinement: the two minima of a flat field must both be among them
 EXACT = 1e-12  # squared residual of three points that are met
 SAME_PLACE = 1e-4  # poses nearer than this, in extents of the points, are one
 LINE = 1e-5  # width over length of points that lie on a line, about which a camera may turn
-REJECTION = 13.8  # 0.1 % point of the squared residual's chi-square (2) distribution, in sigma²
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Where a camera stood: rotation (3, 3) object to camera, center (3,) in object units."""
-
-    rotation: Array
-    center: Array
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,34 @@ class Resection:
     distances_mm: Array
     inliers: NDArray[np.bool_]
     sigma_mm: float
+
+
+def resect_images(fields: Iterable[KnownField], principal_distances_mm: Sequence[float]) -> list[Pose | None]:
+    """The poses of images from their known points; None where these give none, or several.
+
+    Parameters
+    ----------
+    fields : iterable of KnownField
+        Three points of an image at least.
+    principal_distances_mm : sequence of float
+        Of the images.
+
+    Notes
+    -----
+    Candidates and choice: homographies and direct linear transformations of all images at once, refined, where the
+    points agree on one (`dlt`); of the others the least trimmed squares over poses from triples (P3P), one by one; of
+    three points their only pose. Seeded alike for every image, so that their order does not matter.
+    """
+    fields = list(fields)
+    poses = closed_form_poses(fields, principal_distances_mm)
+    for i, (field, c) in enumerate(zip(fields, principal_distances_mm, strict=True)):
+        if poses[i] is None and len(field.xyz) == 3:
+            candidates = three_point_poses(field.xyz, field.xy_mm, c)
+            poses[i] = candidates[0] if len(candidates) == 1 else None
+        elif poses[i] is None:
+            resection = resect(field.xyz, field.xy_mm, c, np.random.default_rng(0), field.sigma_mm)
+            poses[i] = None if resection is None or resection.sigma_mm > IMPLAUSIBLE * c else resection.pose
+    return poses
 
 
 def resect(
@@ -60,13 +88,13 @@ def resect(
     if not len(rotations):
         return None
     scored = rng.permutation(len(xyz))[:MAX_SCORED_POINTS] if len(xyz) > MAX_SCORED_POINTS else np.arange(len(xyz))
-    rotations, shifts = _best_of(rotations, shifts, field.points[scored], field.tangents[scored])
+    rotations, shifts = _best_pose(rotations, shifts, field.points[scored], field.tangents[scored])
     squared = squared_residuals(rotations, shifts, field.points, field.tangents)
     sigma = max(float(robust_sigmas(squared, np.array([len(xyz)]))[0]), floor_mm / field.c)
     inliers = squared[0] < REJECTION * sigma**2
-    if _on_a_line(field.points[inliers]):
+    if _are_collinear(field.points[inliers]):
         return None
-    return _fitted(rotations, shifts, field, inliers, sigma * field.c)
+    return _refined_resection(rotations, shifts, field, inliers, sigma * field.c)
 
 
 def refine(resection: Resection, xyz: Array, xy_mm: Array, principal_distance_mm: float) -> Resection:
@@ -74,7 +102,7 @@ def refine(resection: Resection, xyz: Array, xy_mm: Array, principal_distance_mm
     field = _Field.of(xyz, xy_mm, principal_distance_mm)
     rotations = resection.pose.rotation[None]
     shifts = -rotations @ ((resection.pose.center - field.origin) / field.size)
-    return _fitted(rotations, shifts, field, resection.inliers, resection.sigma_mm)
+    return _refined_resection(rotations, shifts, field, resection.inliers, resection.sigma_mm)
 
 
 def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
@@ -89,17 +117,6 @@ def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) ->
         if all(np.linalg.norm(pose.center - other.center) > SAME_PLACE * field.size for other in poses):
             poses.append(pose)
     return poses
-
-
-def image_distances(pose: Pose, xyz: Array, xy_mm: Array, principal_distance_mm: float) -> Array:
-    """Distances (n,) in mm from observed to projected points; inf behind the camera."""
-    shift = -pose.rotation @ pose.center
-    squared = squared_residuals(pose.rotation[None], shift[None], xyz, xy_mm / principal_distance_mm)[0]
-    return _distances(squared, principal_distance_mm)
-
-
-def _distances(squared: Array, principal_distance_mm: float) -> Array:
-    return np.where(squared < BEHIND, principal_distance_mm * np.sqrt(squared), np.inf)
 
 
 @dataclass(frozen=True)
@@ -133,57 +150,41 @@ def _triples(tangents: Array, rng: np.random.Generator) -> NDArray[np.intp]:
     return np.asarray(triples[large][:MAX_TRIPLES])
 
 
-def _best_of(rotations: Array, shifts: Array, points: Array, tangents: Array) -> tuple[Array, Array]:
+def _best_pose(rotations: Array, shifts: Array, points: Array, tangents: Array) -> tuple[Array, Array]:
     """The pose (1, 3, 3), (1, 3) of the least trimmed squares, the most promising ones refined first."""
     order = np.argsort(_trimmed_cost(rotations, shifts, points, tangents), kind="stable")[:REFINED_CANDIDATES]
     rotations, shifts = rotations[order], shifts[order]
     for _ in range(2):
-        kept = _smallesthalf_of(squared_residuals(rotations, shifts, points, tangents))
+        kept = _half_weights(squared_residuals(rotations, shifts, points, tangents))
         rotations, shifts = refined_poses(rotations, shifts, points, tangents, kept)
     best = int(np.argmin(_trimmed_cost(rotations, shifts, points, tangents)))
     return rotations[[best]], shifts[[best]]
 
 
-def half_of(n: Count) -> Count:
-    """The number of residuals that least trimmed squares keeps, for poses of three points."""
-    return (n + 4) // 2
-
-
-def _smallesthalf_of(squared: Array) -> Array:
+def _half_weights(squared: Array) -> Array:
     """Weights (k, n): 1 for the smallest residuals of each pose."""
     weights = np.zeros_like(squared)
-    h = half_of(squared.shape[1])
+    h = trimmed_count(squared.shape[1])
     np.put_along_axis(weights, np.argsort(squared, axis=1, kind="stable")[:, :h], 1.0, axis=1)
     return weights
 
 
 def _trimmed_cost(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
-    half = half_of(len(points))
+    half = trimmed_count(len(points))
     squared = squared_residuals(rotations, shifts, points, tangents)
     return np.asarray(np.partition(squared, half - 1, axis=1)[:, :half].sum(axis=1))
 
 
-def robust_sigmas(squared: Array, counts: NDArray[np.intp]) -> Array:
-    """Standard deviations (k,) of a coordinate from the smallest half of chi-square (2) distributed squares (k, n).
-
-    Of these, counts (k,) are there, the others are infinite.
-    """
-    half = half_of(counts)
-    left_out = 1 - half / counts
-    with np.errstate(divide="ignore", invalid="ignore"):
-        truncation = 1 + np.where(left_out > 0, left_out * np.log(left_out) / (1 - left_out), 0.0)
-    sums = np.take_along_axis(np.cumsum(np.sort(squared, axis=1), axis=1), half[:, None] - 1, axis=1)[:, 0]
-    return np.asarray(np.sqrt(sums / np.maximum(2 * half - 6, 1) / truncation))
-
-
-def _on_a_line(points: Array) -> bool:
+def _are_collinear(points: Array) -> bool:
     length, width = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2]
     return bool(width < LINE * length)
 
 
-def _fitted(rotations: Array, shifts: Array, field: _Field, inliers: NDArray[np.bool_], sigma_mm: float) -> Resection:
+def _refined_resection(
+    rotations: Array, shifts: Array, field: _Field, inliers: NDArray[np.bool_], sigma_mm: float
+) -> Resection:
     """The one pose (1, 3, 3), (1, 3) fitted to its inliers, back in object units."""
     rotations, shifts = refined_poses(rotations, shifts, field.points, field.tangents, inliers[None].astype(np.float64))
     squared = squared_residuals(rotations, shifts, field.points, field.tangents)[0]
     pose = field.pose(rotations[0], shifts[0])
-    return Resection(pose, _distances(squared, field.c), inliers, sigma_mm)
+    return Resection(pose, residual_distances(squared, field.c), inliers, sigma_mm)

@@ -9,7 +9,7 @@ from scipy import sparse
 
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.resection import Pose
+from adjust.initial_values.pose import Pose
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

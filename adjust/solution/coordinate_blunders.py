@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Lens, Prior
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.frames import frames_of
+from adjust.initial_values.frames import camera_frames
 from adjust.initial_values.intersection import intersect
-from adjust.initial_values.resection import Pose, image_distances
+from adjust.initial_values.pose import Pose, image_distances
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
@@ -112,7 +112,7 @@ def _sights(problem: Problem) -> dict[str, Sight]:
     """By image name, of those that show object points: freed of the distortion as far as it is known beforehand."""
     network, unknowns = problem.network, problem.unknowns
     transformation = {name: unknowns.start[at] for name, at in unknowns.transformation.items()}
-    frames = frames_of(network, transformation, problem.mirrored)
+    frames = camera_frames(network, transformation, problem.mirrored)
     sights = {}
     for name, at in unknowns.camera.items():
         interior, known = np.split(unknowns.start[at], [3])

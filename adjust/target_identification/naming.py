@@ -17,7 +17,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.initial_values.resection import Pose, resect
+from adjust.initial_values.pose import Pose
+from adjust.initial_values.resection import resect
 from adjust.target_identification.naming_growth import OF_POSE, Grown, View, grow, log10_of_chance
 from adjust.target_identification.naming_hypotheses import (
     Cluster,

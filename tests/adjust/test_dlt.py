@@ -1,6 +1,7 @@
 """Images oriented together in closed form, against cv2.projectPoints; what does not agree is left to resection."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +11,11 @@ from projected import simulated as simulated_network
 from test_approximations import without_interior
 from test_resection import C_MM, FIELDS, ORIGIN, simulated
 
-from adjust.functional_model.sight import Sight
-from adjust.initial_values import block, principal_distance
+from adjust.initial_values import principal_distance, resection
 from adjust.initial_values.approximations import approximate
-from adjust.initial_values.block import resected
-from adjust.initial_values.dlt import KnownField, orient_together, principal_distance_together
-from adjust.initial_values.resection import Pose
+from adjust.initial_values.dlt import closed_form_poses, principal_distance_together
+from adjust.initial_values.pose import KnownField, Pose
+from adjust.initial_values.resection import Resection, resect
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ def fields(counts: list[int], relief: float, tilt_rad: float, noise_mm: float) -
 @pytest.mark.parametrize("tilt_rad", [0.05, 0.7], ids=["vertical", "oblique"])
 def test_exact_points_give_the_poses_of_images_of_any_size(relief: float, tilt_rad: float) -> None:
     given, poses = fields([40, 6, 300, 12, 7, 40], relief, tilt_rad, 0.0)
-    for found, pose in zip(orient_together(given, [C_MM] * len(given)), poses, strict=True):
+    for found, pose in zip(closed_form_poses(given, [C_MM] * len(given)), poses, strict=True):
         assert found is not None
         assert np.linalg.norm(found.center - pose.center) < 1e-3
         np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-6)
@@ -46,10 +46,10 @@ def test_exact_points_give_the_poses_of_images_of_any_size(relief: float, tilt_r
 @pytest.mark.parametrize("relief", [0.0, 0.3])
 def test_images_are_oriented_by_those_of_their_points_that_agree(relief: float) -> None:
     given, poses = fields([40] * 12, relief, 0.7, SIGMA_MM)
-    clean = orient_together(given, [C_MM] * len(given))
+    clean = closed_form_poses(given, [C_MM] * len(given))
     given[3].xy_mm[:8] += np.random.default_rng(1).uniform(-20.0, 20.0, (8, 2))
     given[7].xy_mm[[0, 1]] = given[7].xy_mm[[1, 0]]  # exchanged
-    for found, without, pose in zip(orient_together(given, [C_MM] * len(given)), clean, poses, strict=True):
+    for found, without, pose in zip(closed_form_poses(given, [C_MM] * len(given)), clean, poses, strict=True):
         assert found is not None
         assert without is not None
         assert np.linalg.norm(found.center - without.center) < 1.0
@@ -59,7 +59,7 @@ def test_images_are_oriented_by_those_of_their_points_that_agree(relief: float) 
 def test_an_image_most_of_whose_points_are_wrong_is_left() -> None:
     given, _ = fields([40] * 12, 0.0, 0.7, SIGMA_MM)
     given[3].xy_mm[:25] = given[3].xy_mm[:25][::-1].copy()
-    found = orient_together(given, [C_MM] * len(given))
+    found = closed_form_poses(given, [C_MM] * len(given))
     assert [i for i, pose in enumerate(found) if pose is None] == [3]
 
 
@@ -68,7 +68,7 @@ def test_a_plane_from_far_away_leaves_two_poses_and_none_is_given() -> None:
     xyz, xy, _ = simulated(12, 0.0, 0.3, rng, SIGMA_MM)
     about = xyz - ORIGIN
     given = [KnownField(0.002 * about + ORIGIN, 0.002 * xy + rng.normal(0.0, SIGMA_MM, xy.shape), SIGMA_MM)]
-    assert orient_together(given, [C_MM]) == [None]
+    assert closed_form_poses(given, [C_MM]) == [None]
 
 
 @pytest.mark.parametrize("gross", [0, 5])
@@ -94,13 +94,13 @@ def test_a_plane_parallel_to_the_images_does_not_tell_the_principal_distance() -
 
 
 def test_the_search_is_for_images_that_do_not_agree_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    searched: list[str] = []
+    searched: list[int] = []
 
-    def search(sight: Sight, xyz: Array, xy_mm: Array) -> Pose | None:
-        searched.extend(sight.points[:1])
-        return resected(sight, xyz, xy_mm)
+    def search(xyz: Array, *others: Any) -> Resection | None:
+        searched.append(len(xyz))
+        return resect(xyz, *others)
 
-    monkeypatch.setattr(block, "resected", search)
+    monkeypatch.setattr(resection, "resect", search)
     truth = simulated_network(BOARD, STATIONS, kind="none")
     approximate(truth.network)
     assert searched == []
@@ -108,4 +108,4 @@ def test_the_search_is_for_images_that_do_not_agree_alone(monkeypatch: pytest.Mo
     network = replace(truth.network, observations=truth.network.observations.only(few))
     network.observations.xy_mm[5] += 3.0
     approximate(network)
-    assert len(searched) == 1
+    assert searched == [12]

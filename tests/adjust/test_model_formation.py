@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from adjust.initial_values.absolute_orientation import absolute_orientation
 from adjust.initial_values.intersection import intersect
+from adjust.initial_values.pose import Pose
 from adjust.initial_values.relative_orientation import relative_poses
-from adjust.initial_values.resection import Pose
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.initial_values.resection import Pose, image_distances, resect, three_point_poses
+from adjust.initial_values.pose import Pose, image_distances
+from adjust.initial_values.resection import resect, three_point_poses
 
 Array = NDArray[np.float64]
 
