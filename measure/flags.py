@@ -287,8 +287,8 @@ JPEG_GRID = _limit(
 JPEG_STEP = _limit(0.01, "a coefficient without a step being given one, where there is a grid", "that step is counted")
 
 # Targets and natural points.
-MUCH_DUST = _limit(
-    0.05, "much dust on a disk, by what it looks like beside the others", "the disk is unlike the others"
+DISK_UNLIKE_THE_OTHERS = _limit(
+    0.01, "a right disk looking so unlike the others of its scan", "the disk is weak: dust may hide in it"
 )
 TARGET_OFF_PLACE = _limit(1e-3, "a right target lying farther off its place", "the target is weak")
 TARGET_ELSEWHERE = _limit(  # in a thousand fields of a thousand targets one is

@@ -13,6 +13,7 @@ import tifffile
 from stored_picture import HEIGHT, WIDTH, picture
 
 from measure.errors import MeasurementError
+from measure.scans.jpeg import stream_damage
 from measure.scans.opening import open_scan
 from measure.scans.parallel import map_in_threads
 
@@ -209,6 +210,17 @@ def test_a_jpeg_that_decodes_to_nothing_is_unknown(tmp_path: Path) -> None:
     (tmp_path / "s.jpg").write_bytes(data[:2] + data[tables : tables + 30] + b"\xff\xd9")
     with pytest.raises(MeasurementError, match="damaged or truncated"):
         open_scan(tmp_path / "s.jpg")
+
+
+def test_bytes_that_a_jpeg_lost_are_noticed_and_none_in_a_whole_one() -> None:
+    rng = np.random.default_rng(3)
+    grey = np.clip(cv2.GaussianBlur(rng.normal(128, 900, (200, 260)), (0, 0), 3), 0, 255).astype(np.uint8)
+    whole = cv2.imencode(".jpg", grey)[1].tobytes()
+    assert stream_damage(whole) == ""
+    noticed = 0
+    for first in rng.integers(whole.index(b"\xff\xda") + 20, len(whole) - 60, 20).tolist():
+        noticed += bool(stream_damage(whole[:first] + whole[first + 30 :]))
+    assert noticed >= 14
 
 
 @pytest.mark.parametrize(
