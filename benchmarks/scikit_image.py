@@ -14,7 +14,7 @@ import numpy as np
 from drawn import scan_of
 from numpy.typing import NDArray
 from skimage.feature import blob_log, corner_subpix
-from skimage.filters import threshold_local
+from skimage.filters import threshold_local, window
 from skimage.measure import EllipseModel, find_contours, label, ransac, regionprops
 from skimage.morphology import opening
 from skimage.registration import phase_cross_correlation
@@ -83,7 +83,8 @@ def phase_correlation(count: int) -> str:
         )
         if here is not None and there is not None:
             ours.append(there.center_px - here.center_px - shift)
-        moved, _error, _phase = phase_cross_correlation(pictures[1], pictures[0], upsample_factor=100)
+        tapered = [(each - each.mean()) * window("hann", each.shape) for each in pictures]
+        moved, _error, _phase = phase_cross_correlation(*tapered[::-1], upsample_factor=100, normalization=None)
         theirs.append(np.asarray(moved)[::-1] - shift)
     return f"{_rms(theirs)} px | matching in both {_rms(ours)} px"
 

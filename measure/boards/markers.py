@@ -18,7 +18,7 @@ Bytes = NDArray[np.uint8]
 Markers = Mapping[int, Array]  # the corners (4, 2) of each on its board, by number
 Key = TypeVar("Key")
 _OFF_SQUARES = 0.25  # of a square, that a corner lies off where the markers beside it put it
-_FEWEST_CORNERS = 4
+_FEWEST_CORNERS = 4  # that a homography takes
 
 
 @dataclass(frozen=True, eq=False)

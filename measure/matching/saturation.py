@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 Sides = NDArray[np.int8]
 
 _BITS = (8, 10, 12, 14, 16)  # of scanners' converters; their numbers are stored as they are, or moved up
-_LOG_DENSITY = -0.5 * np.log(2 * np.pi)
+_LOG_DENSITY = -0.5 * np.log(2 * np.pi)  # of the normal distribution at its middle
 _TAIL = 2.0  # standard deviations below the greatest value
 _LEAST_STEPS = 1.5  # of the scan's grey values in a standard deviation: in less noise an even ground is a pile as well
 _FEWEST = 20  # pixels: fewer bend no fit

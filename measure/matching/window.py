@@ -7,6 +7,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from skimage.filters import threshold_otsu
 
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
@@ -19,7 +20,6 @@ Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_LEVELS = 256  # of grey between which the edge's two sides are told apart
 _BESIDE_PX = 6.0  # about the drawing: the mark's own ground
 _FAR = 5.0  # standard deviations of the mark's side, the mark being part of it: so far off is no ground of this mark
 _EDGE_PX = 4.0  # an edge's blur: of 1.4 px it leaves a five hundredth of the edge so far off
@@ -126,19 +126,12 @@ def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark
     drawn = picture(mark, pixel_from_mark, window.shape[1], window.shape[0], 1.0)
     away_px = cv2.distanceTransform((drawn <= _DRAWN).astype(np.uint8), cv2.DIST_L2, 5)
     near, shown = away_px <= _BESIDE_PX, drawn > _SHOWN * drawn.max()
-    lighter = window > _otsu_level(window[near])
+    lighter = window > threshold_otsu(window[near])
     here = lighter if lighter[near & (away_px > 0)].mean() > 0.5 else ~lighter
     own, beyond = window[near & here], window[near & ~here]
     if not len(beyond) or here[shown].mean() <= 0.5 or abs(own.mean() - beyond.mean()) < _FAR * own.std():
         return np.zeros(window.shape, dtype=bool)
     return np.asarray(cv2.distanceTransform(here.astype(np.uint8), cv2.DIST_L2, 5) <= _EDGE_PX)
-
-
-def _otsu_level(grey: NDArray[np.floating]) -> float:
-    """The grey value that parts the pixels into two kinds most unlike one another (Otsu, 1979)."""
-    low, high = float(grey.min()), float(grey.max())
-    level = np.asarray((grey - low) / max(high - low, 1e-12) * (_LEVELS - 1), np.uint8)
-    return low + (cv2.threshold(level, 0, 1, cv2.THRESH_BINARY | cv2.THRESH_OTSU)[0] + 1) / (_LEVELS - 1) * (high - low)
 
 
 def _common_step(grey: Array) -> float:

@@ -21,10 +21,10 @@ from measure.flags import JPEG_GRID, JPEG_STEP
 
 Array = NDArray[np.float64]
 
-BLOCK_PX = 8
+BLOCK_PX = 8  # a side of a block (ITU-T T.81)
 _PERIODS = 5  # coefficients (u, v) with 0 < u + v below it: up to two periods in a block, as blurred edges have them
 _STEPS_DN = np.arange(2, 51)  # a step of 1 takes nothing away; 50 is that of quality 15
-_BIN_DN = 0.25
+_BIN_DN = 0.25  # of coefficients: a tenth of the coarser steps
 _LARGEST_DN = 150.0  # of a coefficient that is looked at: three times the largest step
 _LOST_PX = 0.25  # times the square of step over contrast: rms of what residuals do not show (benchmarks/marks.py)
 _TONE_LOST = 3.5  # times step over contrast, of what is not known of any curve (benchmarks/tone_said.py)

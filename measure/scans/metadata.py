@@ -30,10 +30,10 @@ MOST_PER_BYTE = 1000  # bytes of a picture for each of its file: deflate cannot 
 ALWAYS_BYTES = 128 << 20  # of a picture: a drawn one without any grain may be stored in next to nothing
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)  # of TIFF
 WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6  # PhotometricInterpretation
-_EXIF = 34665
+_EXIF = 34665  # the tag of an Exif block (Exif 2.3)
 MOST_CHANNELS = 4  # of a pixel: colours and transparency
 _COARSEST_UM = 250.0  # about 100 dpi; 72 and 96 dpi are what programs write that know nothing
-_FINEST_UM = 1.0
+_FINEST_UM = 1.0  # a pixel: no film scanner is as fine
 
 _METRE_UM = {"inch": 25400.0, "centimetre": 10000.0, "millimetre": 1000.0, "micrometre": 1.0, "metre": 1e6}
 TIFF_UNIT = {2: "inch", 3: "centimetre", 4: "millimetre", 5: "micrometre"}  # 4 and 5 are no standard, but are written

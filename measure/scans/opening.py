@@ -33,7 +33,7 @@ Array = NDArray[np.float32]
 _HEADERS_BYTES = 1 << 18  # of a JPEG or PNG file, before its picture: profiles and Exif blocks take less
 _END_BYTES = 1 << 16  # in which nearly every JPEG or PNG file that is whole has its end marker
 _BAND_PX = 1 << 18  # of the window that are read at a time
-_FULL_SCALE_DN = 65535.0
+_FULL_SCALE_DN = 65535.0  # of a thumbnail of 16 bits
 _GREY_BAND_PX = 1 << 20  # of the scan that is held in grey at a time, about
 
 

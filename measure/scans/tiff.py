@@ -37,7 +37,7 @@ from measure.tone.declared import ColourTags
 
 Extent = tuple[int, int]
 
-_MOST_DIRECTORIES, _MOST_ENTRIES = 1000, 4096
+_MOST_DIRECTORIES, _MOST_ENTRIES = 1000, 4096  # of a file and of a directory: more are damage
 _WHOLE = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}  # unsigned integers, by their types
 _TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _ONE, _SOME = True, False
@@ -67,11 +67,11 @@ _TAGS = {  # what is read with a picture, and whether it is one number
 }
 _CHILDREN = (330, 34665, 34853, 40965)  # places of directories: SubIFDs, Exif, GPS, Interoperability
 _STORED = ((273, 279), (324, 325), (513, 514))  # places and numbers of bytes of what no tag holds itself
-_TRANSFER_FUNCTION, _ICC_PROFILE = 301, 34675
+_TRANSFER_FUNCTION, _ICC_PROFILE = 301, 34675  # tags of the tone curve (TIFF 6.0; ICC.1:2022, B.4)
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
 
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the first bytes of TIFF and BigTIFF files
-_UNCOMPRESSED = 1
+_UNCOMPRESSED = 1  # of Compression (TIFF 6.0)
 _LOOKED_AT_BYTES = 1 << 16  # after the last that a file accounts for
 _JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
 _REDUCED_IMAGE, _TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType

@@ -23,7 +23,7 @@ from measure.scans.metadata import (
 )
 from measure.scans.remote import Address
 
-_PLAIN = 1
+_PLAIN = 1  # of Compression: no compression (TIFF 6.0)
 _INTO_MEMORY = (5, 8, 32773, 32946, 34926, 50000)  # LZW, deflate, PackBits, zstd: these give bytes
 _MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time; larger tiles and strips are not copied
 

@@ -24,8 +24,8 @@ Mask = NDArray[np.bool_]
 # its third, fifth and seventh degree; of what that of the third is about another middle than the image's; of the other
 # polynomials of the second to the fifth, of which the targets choose.
 _PLAIN, _RADIAL, _OFF_MIDDLE, _BENDING = 0.1, (0.03, 0.01, 0.003), 0.0015, (1e-5, 1e-4, 1e-3, 1e-2)
-_DEGREES = 5
-_ROUNDS, _SETTLED = 60, 1e-3
+_DEGREES = 5  # of the polynomials: the highest that a lens and a bent film need
+_ROUNDS, _SETTLED = 60, 1e-3  # of weights at most; a change of them that ends the rounds
 _MEDIAN = 2.0 * float(np.log(2.0))  # of chi-square (2)
 _NEIGHBOURS = 8  # that tell where the image bends more than the regression
 _LEAST_PX2 = 0.01**2  # the variance that no prediction falls short of

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from measure.flags import LARGE_ERROR, NO_REASON, Cause, Code, Reason
+from measure.flags import DISK_UNLIKE_THE_OTHERS, LARGE_ERROR, NO_REASON, Cause, Code, Reason
 from measure.marks.shapes import Disk, MarkShape
 from measure.matching.match import MatchOptions, mark_window, match
 from measure.matching.models import GREY
@@ -24,7 +24,7 @@ from measure.targets.disk_fit_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORS
 Array = NDArray[np.float64]
 
 UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
-_LONGEST_MARGIN_PX = 10.0
+_LONGEST_MARGIN_PX = 10.0  # of ground about a disk: more only disturbs
 _NARROWEST_MARGIN_PX = 1.5  # however near a neighbour is: with less, no pixel is ground
 _LEAST_SHIFT_PX = 2.0  # from the start: a small disk may have been found so far off
 _FORM_SIGMA = 0.2  # of size and shear: as well as the start is known
@@ -33,7 +33,7 @@ _MARGIN_BLURS = 4.0  # in a soft scan so many standard deviations of its blur, a
 _LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
 SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
 _SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from a lone disk
-_WEAK_DAMAGE, _MOST_DAMAGE = 0.2, 0.35
+_WEAK_DAMAGE, _MOST_DAMAGE = 0.2, 0.35  # shares of the pixels about it that do not fit a disk
 _MOST_BLUR = 0.7  # of the shorter half axis
 _SURE, _MOST_FAINTER = 3.0, 0.5  # standard deviations by which a contrast may be greater, and what that may add to it
 _LARGE_PX = 0.3  # the error that a small target must not have
@@ -274,7 +274,8 @@ def _doubt(disk: FittedDisk, off: Array, squares: float) -> Reason:
         size, *form, contrast, variance = off
         return Reason(
             f"unlike the other targets: {np.exp(size):.2f} times their size, {np.exp(contrast):.2f} times their "
-            f"contrast, its form {100 * np.hypot(*form):.0f} % off, its blur by {variance:.1f} px²; dust may hide in it",
+            f"contrast, its form {100 * np.hypot(*form):.0f} % off, its blur by {variance:.1f} px²; dust may hide in "
+            "it",
             Code.DUST,
         )
     sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from skimage.feature import peak_local_max
 
 from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.rendering import extent_px, picture
@@ -97,8 +98,7 @@ def _spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) 
     score = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED, mask=compared)
     score = np.nan_to_num(score, posinf=0.0, neginf=0.0)
     signed = {"light": score, "dark": -score}.get(polarity, np.abs(score))
-    peaks = np.argwhere((signed >= cv2.dilate(signed, np.ones((3, 3), np.uint8))) & (signed > _LEAST_CORRELATION))
-    peaks = peaks[np.argsort(-signed[peaks[:, 0], peaks[:, 1]], kind="stable")]
+    peaks = peak_local_max(signed, threshold_abs=_LEAST_CORRELATION, exclude_border=False)
     places = (peaks[:, ::-1] + half) * factor + (factor - 1) / 2 + corner
     within = np.hypot(*(places - prediction.center_px).T) <= prediction.search_px + factor
     return list(places[within][:_MOST_SPOTS])

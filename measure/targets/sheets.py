@@ -18,7 +18,7 @@ _RADIAL_FROM, _SECOND_RADIAL_FROM = 10, 30  # points, from which on the lens's r
 _LARGEST_RADIAL = 0.6  # at the picture's corner, relative
 _SETTLING = 5  # rounds, in which a view takes in what the lens moved
 _FAR = 4.0  # medians of the distances, beyond which a point does not tell where the sheet lies
-_LEAST_FAR_PX = 1.0
+_LEAST_FAR_PX = 1.0  # no point nearer than it is far
 _USUAL_FOCAL = 2.0  # half diagonals, where no view is oblique enough to tell it
 Indices = NDArray[np.int64]
 

@@ -36,7 +36,7 @@ Place = tuple[int, int]  # a frame, and a feature of it
 Track = dict[int, int]  # the feature in every frame
 
 _FEATURES = 25  # a scan, for every point wanted; one in five or so has a partner in all frames
-_LEAST_FEATURES = 3000
+_LEAST_FEATURES = 3000  # a scan: few are wanted of a small project, and its pairs need enough to be verified
 _AGREE_PX = 2.0  # in the reduced scan: what a feature's place and a lens leave
 _CELLS = 8  # a side of a frame, over which points are spread
 

@@ -13,8 +13,8 @@ from measure.tone.curve import Tone, power, sampled_curve, srgb
 Array = NDArray[np.float64]
 
 _ICC_HEADER, _CURVES = 128, (b"kTRC", b"gTRC")  # of a grey profile, and of green (ICC.1:2022, 7.2 and 9.2)
-_SAMPLES = np.linspace(0.0, 1.0, 1025)
-_EXIF_SRGB = 1
+_SAMPLES = np.linspace(0.0, 1.0, 1025)  # codes at which a parametric curve is tabulated
+_EXIF_SRGB = 1  # of ColorSpace (Exif 2.3)
 
 
 @dataclass(frozen=True, eq=False)
