@@ -23,7 +23,7 @@ Indices = NDArray[np.intp]
 
 _GROUP_PIXELS = 1 << 16  # of the windows of disks that are fitted together: with their derivatives they take 10 MiB
 _FIRST_BLUR_PX, _BLUR_PX = 1.0, (0.5, 8.0)  # standard deviations, pixels' own width included
-_STEPS_ROBUST, _LAST_ROBUST = (False, False, True), (False, True)  # steps, robust or not, in some and in all pixels
+_FIRST_STEPS_ROBUST = False, False, True  # in some of the pixels; one robust step in all of them comes after
 _HOPELESS = 1.5  # times the misfit that is allowed: after the first steps it may still shrink so far
 _LONGEST_STEP = 0.3  # of the radius: beyond it the picture is not linear
 _DAMPING = 1e-4  # of the step: a disk that hardly shows has unknowns that depend on one another
@@ -39,21 +39,25 @@ _FARTHEST, _MOST_GROWN = 0.5, float(np.log(1.5))  # radii from the outline's mid
 
 def disks_among(block: Block, patches: Patches) -> Patches:
     """Those patches that a disk explains, the strongest first, as fitted: a place within a tenth of a pixel or so."""
-    promising = _fitted_disks(block, patches, _strides(patches), _STEPS_ROBUST, _HOPELESS)
-    return _fitted_disks(block, promising, np.ones_like(_strides(promising)), _LAST_ROBUST, 1.0).strongest_first()
+    first = np.full(len(patches.radii), _FIRST_BLUR_PX)
+    promising, blurs = _fitted_disks(block, patches, first, _strides(patches), _FIRST_STEPS_ROBUST, _HOPELESS)
+    whole = np.ones(len(blurs), np.intp)
+    return _fitted_disks(block, promising, blurs, whole, (True,), 1.0)[0].strongest_first()
 
 
 def _fitted_disks(
-    block: Block, patches: Patches, strides: Indices, steps_robust: Sequence[bool], most_misfit: float
-) -> Patches:
-    """The disks among patches by some steps of a fit with every (n,) so many columns and rows."""
-    found = [Patches.collect(())]
+    block: Block, patches: Patches, blurs: Array, strides: Indices, steps_robust: Sequence[bool], most_misfit: float
+) -> tuple[Patches, Array]:
+    """The disks among patches, and their blurs (n,), by some steps of a fit in pixels so many strides (n,) apart."""
+    found, blurs_found = [Patches.collect(())], [np.zeros(0)]
     for own in _groups(patches, strides):
-        fit = _Fit(block, patches.part(own), strides[own])
+        fit = _Fit(block, patches.part(own), blurs[own], strides[own])
         for is_robust in steps_robust:
             fit.step(is_robust)
-        found.append(fit.disks(patches.part(own), most_misfit))
-    return concatenate(*found)
+        is_disk = fit.is_disk(patches.part(own), most_misfit)
+        found.append(fit.patches().part(is_disk))
+        blurs_found.append(fit.blur[is_disk])
+    return concatenate(*found), np.concatenate(blurs_found)
 
 
 def _groups(patches: Patches, strides: Indices) -> Iterator[Indices]:
@@ -89,7 +93,7 @@ class _Fit:
     (n, 4): gain, offset, slopes. Windows have side * side pixels: col, row (n, pixels) from their middles, grey (n,
     pixels), and used (n, pixels), those in the ellipse and its margin."""
 
-    def __init__(self, block: Block, patches: Patches, strides: Indices) -> None:
+    def __init__(self, block: Block, patches: Patches, blurs: Array, strides: Indices) -> None:
         half, stride = int(_half_sides(patches, strides).max()), strides[:, None]
         middles = np.rint(patches.centers).astype(np.intp)
         corners, self.side = middles - half * stride, 2 * half + 1
@@ -100,14 +104,14 @@ class _Fit:
         self.col, self.row = (np.asarray(one - half * stride, np.float32) for one in (col, row))
         self.middles, self.radius = middles, patches.radii
         self.centers, self.shapes = patches.centers - middles, patches.shapes
-        self.blur = np.full(len(middles), _FIRST_BLUR_PX)
-        near = _Edges.about(self).distance >= -_margins_px(patches)[:, None]
+        self.blur = blurs
+        near = _Edges.from_fit(self).distance >= -_margins_px(patches)[:, None]
         self.used = near & (inside[:, 0, None] & inside[:, 1, :, None]).reshape(near.shape)
         self.linearise()
 
     def linearise(self) -> None:
         """Design (n, unknowns, pixels), its greys by a plain fit, and residuals (n, pixels) with their scale (n,)."""
-        self.design = _Edges.about(self).design(self)
+        self.design = _Edges.from_fit(self).design(self)
         self.greys = gauss_newton_step(self.design[:, 6:], self.grey, self.used.astype(np.float32), _DAMPING)
         self.residuals = self.grey - (self.greys[:, None].astype(np.float32) @ self.design[:, 6:])[:, 0]
         self.design[:, :6] *= self.greys[:, :1, None].astype(np.float32)
@@ -138,13 +142,17 @@ class _Fit:
         allowed = np.where(correlation > SMOOTH, WORST_SMOOTH_MISFIT, WORST_MISFIT)
         return np.asarray(self.scale / np.maximum(allowed * np.abs(self.greys[:, 0]), 1e-6), float)
 
-    def disks(self, patches: Patches, most_misfit: float) -> Patches:
-        """Those that disks explain so well, still about what they started from."""
-        found = Patches(self.middles + self.centers, self.shapes, self.greys[:, 0])
-        moved = np.hypot(*(found.centers - patches.centers).T) / patches.radii
-        grown = np.abs(np.log(np.maximum(found.radii, 1e-6) / patches.radii))
-        same = found.contrasts * patches.contrasts > 0
-        return found.part((self.misfit() < most_misfit) & (moved < _FARTHEST) & (grown < _MOST_GROWN) & same)
+    def patches(self) -> Patches:
+        """In the scan."""
+        return Patches(self.middles + self.centers, self.shapes, self.greys[:, 0])
+
+    def is_disk(self, starts: Patches, most_misfit: float) -> Mask:
+        """(n,) whether a disk explains them so well, and is still about what it started from."""
+        found = self.patches()
+        moved = np.hypot(*(found.centers - starts.centers).T) / starts.radii
+        grown = np.abs(np.log(np.maximum(found.radii, 1e-6) / starts.radii))
+        same = found.contrasts * starts.contrasts > 0
+        return np.asarray((self.misfit() < most_misfit) & (moved < _FARTHEST) & (grown < _MOST_GROWN) & same)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +167,7 @@ class _Edges:
     distance: Image
 
     @classmethod
-    def about(cls, fit: _Fit) -> "_Edges":
+    def from_fit(cls, fit: _Fit) -> "_Edges":
         inverse = np.linalg.inv(fit.shapes).astype(np.float32)
         center = fit.centers.astype(np.float32)
         unit = inverse @ np.stack([fit.col - center[:, :1], fit.row - center[:, 1:]], axis=1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
+from scipy.special import chdtrc, fdtrc
 
 from measure.flags import DISK_UNLIKE_THE_OTHERS, LARGE_ERROR, NO_REASON, Cause, Code, Reason
 from measure.marks.shapes import Disk, MarkShape
@@ -14,7 +14,7 @@ from measure.matching.models import GREY
 from measure.matching.window import read_window
 from measure.noise.grain import BESIDE_PX
 from measure.noise.noise_model import may_be_noise
-from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
+from measure.noise.robust_estimation import MEDIAN_EFFICIENCY, SIGMA_OF_DEVIATION
 from measure.results import Covariance, MarkFit, SecondPlace
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
@@ -39,6 +39,7 @@ _SURE, _MOST_FAINTER = 3.0, 0.5  # standard deviations by which a contrast may b
 _LARGE_PX = 0.3  # the error that a small target must not have
 _FEWEST = 8  # that tell how much targets differ
 _DUST_PX = 4.0  # the shorter half axis up to which dust may pass for a disk or hide its edge: it is seldom larger
+_SPREADS = 2.0  # of five figures that differ by what the disks show: so known are all, of disks drawn without dust
 _OUTLYING = 3.0  # standard deviations from the median, beyond which a disk has no part in the mean appearance
 _LEAST_SPREAD = 1e-4  # no frame's targets are alike to better than 1 %, nor is the linearisation of their noise
 
@@ -260,17 +261,17 @@ def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[Reas
     off, spread = _robust_deviations(appearances, np.einsum("nii->ni", noise))
     squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(noise + np.diag(spread)), off)
     return [
-        _doubt(disk, own, float(square)) if disk.is_soft or disk.half_axes_px[1] < _DUST_PX else NO_REASON
+        _doubt(disk, own, float(square), len(disks)) if disk.is_soft or disk.half_axes_px[1] < _DUST_PX else NO_REASON
         for disk, own, square in zip(disks, off, squares, strict=True)
     ]
 
 
-def _doubt(disk: FittedDisk, off: Array, squares: float) -> Reason:
-    """Of a disk that dust may look like; off (5,): its appearance less that of the others; squares: the same in its
-    standard deviations, squared. Slopes of its paint are two more figures, independent of these."""
+def _doubt(disk: FittedDisk, off: Array, squares: float, count: int) -> Reason:
+    """Of a disk that dust may look like; off (5,): its appearance less that of the others, squares: the same in its
+    standard deviations, squared; count: of all. Slopes of its paint are two more figures, independent of these."""
     slopes = 0.0 if disk.sloping is None else disk.sloping.sigmas**2
-    freedom = len(off) + (0 if disk.sloping is None else 2)
-    if chdtrc(freedom, squares + slopes) < DISK_UNLIKE_THE_OTHERS:
+    figures = len(off) + (0 if disk.sloping is None else 2)
+    if fdtrc(figures, _SPREADS * MEDIAN_EFFICIENCY * count, (squares + slopes) / figures) < DISK_UNLIKE_THE_OTHERS:
         size, *form, contrast, variance = off
         return Reason(
             f"unlike the other targets: {np.exp(size):.2f} times their size, {np.exp(contrast):.2f} times their "

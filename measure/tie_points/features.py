@@ -1,6 +1,6 @@
 """Scans in which tie points are sought, their natural features (SIFT), and which of them two scans share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from measure.geometry import linear_scale
 from measure.scans.opening import open_scan
 from measure.scans.scan import Scan
-from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX
+from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Piece
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -121,6 +121,26 @@ def find_features(scan: Scan, usable: Callable[[Array], Mask], mirrored: bool, c
     found = replace(found, places_px=places * factor + (factor - 1) / 2, size_px=size_px, reduction=factor)
     found = found.chosen(np.flatnonzero(usable(found.places_px)))
     return found.chosen(_spread(found, np.array(size_px), count))
+
+
+def find_frame_features(frame: TieFrame, mirrored: bool, count: int) -> Features:
+    """As `find_features` gives them. Raises MeasurementError where the scan cannot be read."""
+    with frame.open() as scan:
+        size_px = scan.width_px, scan.height_px
+        return find_features(scan, lambda places: frame.usable(places, size_px), mirrored, count)
+
+
+def read_pieces(frame: TieFrame, patches: Sequence[tuple[Array, int]]) -> list[Piece]:
+    """The pictures about places in one scan, by their maps (2, 3) from the patch and its radius, read from the top.
+    Raises MeasurementError where the scan cannot be read."""
+    pieces: dict[int, Piece] = {}
+    with frame.open() as scan:
+        for k in sorted(range(len(patches)), key=lambda k: float(patches[k][0][1, 2])):
+            matrix, radius_px = patches[k]
+            half = int(np.ceil(radius_px * np.linalg.norm(matrix[:, :2], 2))) + SPARE_PX
+            col0, row0 = (int(value) - half for value in np.round(matrix[:, 2]))
+            pieces[k] = Piece(scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0), matrix)
+    return [pieces[k] for k in range(len(patches))]
 
 
 def shared_features(first: Features, second: Features) -> Indices:

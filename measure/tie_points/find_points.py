@@ -20,8 +20,8 @@ from measure.flags import NO_REASON, POINT_REFUSED, Code, Reason, Status
 from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.parallel import map_or_replace
-from measure.tie_points.features import Features, TieFrame
-from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Bending, Matched, Piece, bending_variance, match_pieces
+from measure.tie_points.features import Features, TieFrame, read_pieces
+from measure.tie_points.multi_image import RADIUS_PX, Bending, Matched, Piece, bending_variance, match_pieces
 from measure.tie_points.tracks import (
     Shared,
     TieCandidate,
@@ -35,8 +35,7 @@ from measure.tie_points.verification import FEWEST_PAIRS, epipolar_outliers, nei
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Window = tuple[NDArray[np.float32], tuple[int, int]]
-Windows = dict[int, Window | Reason]  # by frame; or why there is none
+Pieces = dict[int, Piece | Reason]  # by frame; or why there is none
 
 _RADII_PX = (RADIUS_PX, 21, 30)  # of patches: where the texture is too weak for one, of twice its area
 _WIDEST_PX = 2.0 * _RADII_PX[-1]
@@ -115,9 +114,9 @@ def measure_points(
         while left and sharp.sum() < wanted:
             missing = max(wanted - int(sharp.sum()), wanted // _LEAST_BATCH)
             chosen, left = _apart(left, [point.candidate for point in matched if point.matched], missing)
-            windows = _windows(frames, chosen, workers)
-            with_windows = list(zip(chosen, windows, strict=True))
-            matched += map_or_replace(workers, partial(_point, fewest), with_windows, _lost_point, _CHUNK)
+            pieces_by_frame = _all_pieces(frames, chosen, workers)
+            with_pieces = list(zip(chosen, pieces_by_frame, strict=True))
+            matched += map_or_replace(workers, partial(_point, fewest), with_pieces, _lost_point, _CHUNK)
             points = _straightened(matched)
             _judge(frames, points)
             sharp = np.array([sum(map(point.is_sharp, point.standing)) >= fewest for point in points], dtype=bool)
@@ -168,50 +167,42 @@ class _Taken:
         return False
 
 
-def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate], workers: Executor | None) -> list[Windows]:
-    """The windows of every candidate by frame; each scan is opened once, by one worker."""
-    windows: list[Windows] = [{} for _ in candidates]
+def _all_pieces(
+    frames: Sequence[TieFrame], candidates: Sequence[TieCandidate], workers: Executor | None
+) -> list[Pieces]:
+    """The pieces of every candidate by frame; each scan is opened once, by one worker."""
+    pieces_by_frame: list[Pieces] = [{} for _ in candidates]
     shown = [[k for k, candidate in enumerate(candidates) if i in candidate.maps] for i in range(len(frames))]
     task = [
         (frame, [(candidates[k].maps[i], candidates[k].radius_px) for k in own])
         for i, (frame, own) in enumerate(zip(frames, shown, strict=True))
     ]
-    for i, found in enumerate(map_or_replace(workers, _read_windows, task, lambda _, why: unreachable(why))):
+    for i, found in enumerate(map_or_replace(workers, _read_pieces, task, lambda _, why: unreachable(why))):
         for number, k in enumerate(shown[i]):
-            windows[k][i] = found if isinstance(found, Reason) else found[number]
-    return windows
+            pieces_by_frame[k][i] = found if isinstance(found, Reason) else found[number]
+    return pieces_by_frame
 
 
-def _read_windows(task: tuple[TieFrame, Sequence[tuple[Array, int]]]) -> list[Window] | Reason:
-    """About places in one scan, by their maps and radii, read from top to bottom."""
-    frame, patches = task
-    windows: dict[int, Window] = {}
+def _read_pieces(task: tuple[TieFrame, Sequence[tuple[Array, int]]]) -> list[Piece] | Reason:
     try:
-        with frame.open() as scan:
-            for k in sorted(range(len(patches)), key=lambda k: patches[k][0][1, 2]):
-                matrix, radius_px = patches[k]
-                half = int(np.ceil(radius_px * np.linalg.norm(matrix[:, :2], 2))) + SPARE_PX
-                col0, row0 = (int(value) - half for value in np.round(matrix[:, 2]))
-                windows[k] = (scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0))
+        return read_pieces(*task)
     except MeasurementError as error:
         return unreachable(str(error))
-    return [windows[k] for k in range(len(patches))]
 
 
-def _lost_point(task: tuple[TieCandidate, Windows], why: str) -> TiePoint:
+def _lost_point(task: tuple[TieCandidate, Pieces], why: str) -> TiePoint:
     return TiePoint(task[0], {}, {i: unreachable(why) for i in task[0].maps})
 
 
-def _point(fewest: int, task: tuple[TieCandidate, Windows]) -> TiePoint:
+def _point(fewest: int, task: tuple[TieCandidate, Pieces]) -> TiePoint:
     """The candidate measured; a frame that cannot be matched is left out where enough others remain."""
-    candidate, windows = task
-    failed = {i: window for i, window in windows.items() if isinstance(window, Reason)}
-    shown = {i: window for i, window in windows.items() if not isinstance(window, Reason)}
+    candidate, pieces_by_frame = task
+    failed = {i: piece for i, piece in pieces_by_frame.items() if isinstance(piece, Reason)}
+    shown = {i: piece for i, piece in pieces_by_frame.items() if not isinstance(piece, Reason)}
     members, unmatched = sorted(candidate.maps), dict[int, Reason]()
     while True:
         if not failed:
-            pieces = [Piece(*shown[i], candidate.maps[i]) for i in members]
-            reference = members.index(candidate.reference)
+            pieces, reference = [shown[i] for i in members], members.index(candidate.reference)
             matched = dict(zip(members, match_pieces(pieces, reference, candidate.radius_px), strict=True))
             failed = {i: piece.reason for i, piece in matched.items() if piece.reason}
             if not failed:

@@ -19,8 +19,15 @@ from measure.errors import MeasurementError
 from measure.flags import NO_REASON, POINT_REFUSED, Cause, Code, Reason, Status
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.parallel import map_or_replace
-from measure.tie_points.features import Features, TieFrame, find_features, interleave_groups, shared_features
-from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
+from measure.tie_points.features import (
+    Features,
+    TieFrame,
+    find_frame_features,
+    interleave_groups,
+    read_pieces,
+    shared_features,
+)
+from measure.tie_points.multi_image import RADIUS_PX, Matched, Piece, match_pieces
 from measure.tie_points.verification import neighbour_outliers
 
 Array = NDArray[np.float64]
@@ -87,9 +94,7 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
 
 def _features(part: TieFrame) -> Features | Reason:
     try:
-        with part.open() as scan:
-            size = scan.width_px, scan.height_px
-            return find_features(scan, lambda places: part.usable(places, size), False, _FEATURES)
+        return find_frame_features(part, False, _FEATURES)
     except MeasurementError as error:
         return _out_of_reach(str(error))
 
@@ -140,7 +145,7 @@ def _measure_pair(
     """Both places of every join, so many at most, and why other places are none."""
     places = _places(both[1], features, second_from_first, wanted)
     try:
-        pieces = list(zip(*(_pieces(part, of) for part, of in zip(both, places, strict=True)), strict=True))
+        pieces = list(zip(*(read_pieces(part, own) for part, own in zip(both, places, strict=True)), strict=True))
     except MeasurementError as error:
         return [], Counter([str(error)])
     matched = list(map_or_replace(workers, _match, pieces, lambda *_: (), _CHUNK))
@@ -155,9 +160,9 @@ def _measure_pair(
 
 def _places(
     other: TieFrame, features: tuple[Features, Features], second_from_first: Array, wanted: int
-) -> tuple[list[Array], ...]:
-    """Maps (2, 3) from patches to both scans, the best textured of every part of the overlap first, none touching
-    another."""
+) -> tuple[list[tuple[Array, int]], ...]:
+    """Maps (2, 3) from patches to both scans, and radii: the best textured of every part of the overlap first, none
+    touching another."""
     first, second = features
     there = first.places_px @ second_from_first[:, :2].T + second_from_first[:, 2]
     common = np.flatnonzero(other.usable(there, second.size_px))
@@ -174,20 +179,9 @@ def _places(
             break
     linear = second_from_first[:, :2]
     return (
-        [np.column_stack([np.eye(2), here[k]]) for k in chosen],
-        [np.column_stack([linear, there[common[k]]]) for k in chosen],
+        [(np.column_stack([np.eye(2), here[k]]), RADIUS_PX) for k in chosen],
+        [(np.column_stack([linear, there[common[k]]]), RADIUS_PX) for k in chosen],
     )
-
-
-def _pieces(part: TieFrame, maps: Sequence[Array]) -> list[Piece]:
-    """The windows about the places, read from the top of the scan down."""
-    pieces: dict[int, Piece] = {}
-    with part.open() as scan:
-        for k in sorted(range(len(maps)), key=lambda k: float(maps[k][1, 2])):
-            half = int(np.ceil(RADIUS_PX * np.linalg.norm(maps[k][:, :2], 2))) + SPARE_PX
-            col0, row0 = (int(value) - half for value in np.round(maps[k][:, 2]))
-            pieces[k] = Piece(scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0), maps[k])
-    return [pieces[k] for k in range(len(maps))]
 
 
 def _match(pieces: _Pair) -> _MatchedPair:

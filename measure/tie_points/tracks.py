@@ -19,7 +19,7 @@ from measure.errors import MeasurementError
 from measure.flags import Code, Reason
 from measure.noise.robust_estimation import least_distances
 from measure.scans.parallel import map_or_replace
-from measure.tie_points.features import Features, TieFrame, find_features, interleave_groups, shared_features
+from measure.tie_points.features import Features, TieFrame, find_frame_features, interleave_groups, shared_features
 from measure.tie_points.multi_image import RADIUS_PX
 from measure.tie_points.verification import epipolar_inliers
 
@@ -105,11 +105,8 @@ def find_all_features(frames: Sequence[TieFrame], wanted: int, workers: Executor
 
 
 def _features(wanted: int, frame: TieFrame) -> Features | Reason:
-    count = max(_FEATURES * wanted, _LEAST_FEATURES)
     try:
-        with frame.open() as scan:
-            size = (scan.width_px, scan.height_px)
-            return find_features(scan, lambda places: frame.usable(places, size), frame.mirrored, count)
+        return find_frame_features(frame, frame.mirrored, max(_FEATURES * wanted, _LEAST_FEATURES))
     except MeasurementError as error:
         return unreachable(str(error))
 
