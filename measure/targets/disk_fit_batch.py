@@ -24,7 +24,7 @@ Indices = NDArray[np.intp]
 _GROUP_PIXELS = 1 << 16  # of the windows of disks that are fitted together: with their derivatives they take 10 MiB
 _FIRST_BLUR_PX, _BLUR_PX = 1.0, (0.5, 8.0)  # standard deviations, pixels' own width included
 _FIRST_STEPS_ROBUST = False, False, True  # in some of the pixels; one robust step in all of them comes after
-_HOPELESS = 1.5  # times the misfit that is allowed: after the first steps it may still shrink so far
+_HOPELESS = 1.5  # times the misfit that is allowed: an outline is right to a few percent
 _LONGEST_STEP = 0.3  # of the radius: beyond it the picture is not linear
 _DAMPING = 1e-4  # of the step: a disk that hardly shows has unknowns that depend on one another
 _UNKNOWNS = 10  # place (2), size, stretch, shear, blur, gain, offset, slopes (2)
@@ -50,7 +50,11 @@ def _fitted_disks(
 ) -> tuple[Patches, Array]:
     """The disks among patches, and their blurs (n,), by some steps of a fit in pixels so many strides (n,) apart."""
     found, blurs_found = [Patches.collect(())], [np.zeros(0)]
-    for own in _groups(patches, strides):
+    for group in _groups(patches, strides):
+        # Most of what is no disk is so by its outline already.
+        own = group[_Fit(block, patches.part(group), blurs[group], strides[group]).misfit() < _HOPELESS]
+        if not len(own):
+            continue
         fit = _Fit(block, patches.part(own), blurs[own], strides[own])
         for is_robust in steps_robust:
             fit.step(is_robust)
