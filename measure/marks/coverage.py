@@ -22,17 +22,19 @@ CELLS = 4  # cells along a pixel's side: more than any blur of a scan tells apar
 _ROUND = 0.002  # cells: how far off its circle an outline may be
 
 
-def coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: int) -> Array:
-    """(height, width) shares, 0 to 1, of the pixels' areas that the mark covers.
+def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: int, cells: int) -> Single:
+    """Draw a mark without blur.
 
-    pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to (col, row) in this window. A part's share is exact;
+    Parameters
+    ----------
+    pixel_from_mark : (2, 3) affine matrix from (x_mm, y_mm, 1) to (col, row) in a window of width x height px.
+    cells : so many a pixel is divided into along either side.
+
+    Returns
+    -------
+    (height * cells, width * cells) shares, 0 to 1, of the cells' areas that the mark covers. A part's share is exact;
     where parts overlap they count once, to about 0.001 of a pixel.
     """
-    return _pixel_means(cell_coverage(shape, pixel_from_mark, width, height, CELLS), CELLS)
-
-
-def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: int, cells: int) -> Single:
-    """The coverage of the cells that a window's pixels are divided into, (height * cells, width * cells)."""
     cell_from_mark = np.array(pixel_from_mark, dtype=float)
     cell_from_mark[:, 2] += 0.5
     cell_from_mark *= cells  # corners of cells are whole numbers
@@ -40,15 +42,6 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
     for pieces in _outline_pieces(shape, cell_from_mark):
         _add(covered, pieces)
     return covered
-
-
-def _pixel_means(cell_values: NDArray[np.floating], cells: int) -> Array:
-    """Means over the cells of each pixel of an image (rows, columns)."""
-    rows, cols = cell_values.shape
-    size = (cols // cells, rows // cells)
-    import cv2  # not every command that reads a camera's drawing needs it
-
-    return np.asarray(cv2.resize(cell_values, size, interpolation=cv2.INTER_AREA), dtype=float)
 
 
 def outline_mm(part: Part) -> Array:

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from skimage.feature import peak_local_max
 
+from measure.detection.peaks import local_maxima
 from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.rendering import extent_px, picture
 from measure.marks.shapes import MarkShape, cross, thinnest_mm
@@ -98,8 +98,8 @@ def _spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) 
     score = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED, mask=compared)
     score = np.nan_to_num(score, posinf=0.0, neginf=0.0)
     signed = {"light": score, "dark": -score}.get(polarity, np.abs(score))
-    peaks = peak_local_max(signed, threshold_abs=_LEAST_CORRELATION, exclude_border=False)
-    places = (peaks[:, ::-1] + half) * factor + (factor - 1) / 2 + corner
+    peaks, _ = local_maxima(signed, signed.size, _LEAST_CORRELATION, 1)
+    places = (peaks + half) * factor + (factor - 1) / 2 + corner
     within = np.hypot(*(places - prediction.center_px).T) <= prediction.search_px + factor
     return list(places[within][:_MOST_SPOTS])
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from brute_marks import Array, brute_picture, placed
 
-from measure.marks.coverage import coverage
+from measure.marks.coverage import CELLS, cell_coverage
 from measure.marks.rendering import picture, render
 from measure.marks.shapes import Disk, MarkShape, MarkTemplate, Part, cross, dot, polygon, ring_cross, ring_dot
 
@@ -18,6 +18,12 @@ MARKS = {
     "ring-dot": ring_dot(1.0, 0.15, 0.3),
     "notch": polygon([(-1, -1), (1.2, -0.8), (0.1, 0.2), (0.3, 1.5)]),
 }
+
+
+def coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: int) -> Array:
+    """(height, width) shares of the pixels, the means of their cells."""
+    cells = cell_coverage(shape, pixel_from_mark, width, height, CELLS)
+    return np.asarray(cells.reshape(height, CELLS, width, CELLS).mean(axis=(1, 3)), float)
 
 
 @pytest.mark.parametrize("name", MARKS)
