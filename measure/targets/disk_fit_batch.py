@@ -40,25 +40,35 @@ _FARTHEST, _MOST_GROWN = 0.5, float(np.log(1.5))  # radii from the outline's mid
 def disks_among(block: Block, patches: Patches) -> Patches:
     """Those patches that a disk explains, the strongest first, as fitted: a place within a tenth of a pixel or so."""
     first = np.full(len(patches.radii), _FIRST_BLUR_PX)
-    promising, blurs = _fitted_disks(block, patches, first, _strides(patches), _FIRST_STEPS_ROBUST, _HOPELESS)
+    promising, blurs = _fitted_disks(
+        block, patches, first, _strides(patches), _FIRST_STEPS_ROBUST, (_HOPELESS, _HOPELESS)
+    )
     whole = np.ones(len(blurs), np.intp)
-    return _fitted_disks(block, promising, blurs, whole, (True,), 1.0)[0].strongest_first()
+    return _fitted_disks(block, promising, blurs, whole, (True,), (np.inf, 1.0))[0].strongest_first()
 
 
 def _fitted_disks(
-    block: Block, patches: Patches, blurs: Array, strides: Indices, steps_robust: Sequence[bool], most_misfit: float
+    block: Block,
+    patches: Patches,
+    blurs: Array,
+    strides: Indices,
+    steps_robust: Sequence[bool],
+    most_misfits: tuple[float, float],
 ) -> tuple[Patches, Array]:
-    """The disks among patches, and their blurs (n,), by some steps of a fit in pixels so many strides (n,) apart."""
+    """The disks among patches, and their blurs (n,), by some steps of a fit in pixels strides (n,) apart.
+    most_misfits: before and after these."""
     found, blurs_found = [Patches.collect(())], [np.zeros(0)]
     for group in _groups(patches, strides):
-        # Most of what is no disk is so by its outline already.
-        own = group[_Fit(block, patches.part(group), blurs[group], strides[group]).misfit() < _HOPELESS]
-        if not len(own):
-            continue
-        fit = _Fit(block, patches.part(own), blurs[own], strides[own])
+        own, fit = group, _Fit(block, patches.part(group), blurs[group], strides[group])
+        is_promising = fit.misfit() < most_misfits[0]
+        if not is_promising.all():  # most of what is no disk is so by its outline already
+            own = group[is_promising]
+            if not len(own):
+                continue
+            fit = _Fit(block, patches.part(own), blurs[own], strides[own])
         for is_robust in steps_robust:
             fit.step(is_robust)
-        is_disk = fit.is_disk(patches.part(own), most_misfit)
+        is_disk = fit.is_disk(patches.part(own), most_misfits[1])
         found.append(fit.patches().part(is_disk))
         blurs_found.append(fit.blur[is_disk])
     return concatenate(*found), np.concatenate(blurs_found)
@@ -111,12 +121,13 @@ class _Fit:
         self.blur = blurs
         near = _Edges.from_fit(self).distance >= -_margins_px(patches)[:, None]
         self.used = near & (inside[:, 0, None] & inside[:, 1, :, None]).reshape(near.shape)
-        self.linearise()
+        design = _Edges.from_fit(self).design(self)
+        self.greys = gauss_newton_step(design[:, 6:], self.grey, self.used.astype(np.float32), _DAMPING)
+        self.linearise(design)
 
-    def linearise(self) -> None:
-        """Design (n, unknowns, pixels), its greys by a plain fit, and residuals (n, pixels) with their scale (n,)."""
-        self.design = _Edges.from_fit(self).design(self)
-        self.greys = gauss_newton_step(self.design[:, 6:], self.grey, self.used.astype(np.float32), _DAMPING)
+    def linearise(self, design: Image) -> None:
+        """Design (n, unknowns, pixels) at the present state, and residuals (n, pixels) with their scale (n,)."""
+        self.design = design
         self.residuals = self.grey - (self.greys[:, None].astype(np.float32) @ self.design[:, 6:])[:, 0]
         self.design[:, :6] *= self.greys[:, :1, None].astype(np.float32)
         self.scale = _masked_scales(self.residuals, self.used)
@@ -134,7 +145,8 @@ class _Fit:
         forms = np.array([[1 + size + stretch, shear], [shear, 1 + size - stretch]]).transpose(2, 0, 1)
         self.shapes = self.shapes @ forms
         self.blur = np.clip(self.blur + np.clip(change[:, 5], -0.5 * self.blur, self.blur), *_BLUR_PX)
-        self.linearise()
+        self.greys = self.greys + change[:, 6:]
+        self.linearise(_Edges.from_fit(self).design(self))
 
     def misfit(self) -> Array:
         """(n,) what disks leave unexplained, over what is allowed; a picture of something else leaves what is alike in
