@@ -96,8 +96,8 @@ def _spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) 
     small = small - small.mean()  # the correlation's sums are of single precision
     compared = _compared_part(prediction.pixel_from_disk / factor, half, shape)
     score = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED, mask=compared)
-    score = np.nan_to_num(score, posinf=0.0, neginf=0.0)
-    signed = {"light": score, "dark": -score}.get(polarity, np.abs(score))
+    score = np.asarray(np.nan_to_num(score, posinf=0.0, neginf=0.0), np.float32)
+    signed: NDArray[np.float32] = {"light": score, "dark": -score}.get(polarity, np.abs(score))
     peaks, _ = local_maxima(signed, signed.size, _LEAST_CORRELATION, 1)
     places = (peaks + half) * factor + (factor - 1) / 2 + corner
     within = np.hypot(*(places - prediction.center_px).T) <= prediction.search_px + factor
