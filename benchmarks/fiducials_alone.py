@@ -203,7 +203,7 @@ class Solved:
             moved = np.linalg.solve(images + prior, pull.sum(axis=1)[..., 0][..., None] + (prior @ given[..., None]))
             of_films = own @ by_film.swapaxes(-1, -2) @ right[..., None] - through @ moved[:, None]
             places = places + moved.reshape(places.shape)
-            films = films + (kind.by_centred(films, center, half) @ of_films)[..., 0]
+            films = films + (kind.centred_jacobian(films, center, half) @ of_films)[..., 0]
         vpv = (right**2).sum(axis=(1, 2))
         datum = ((batch.given - places) ** 2).sum(axis=(1, 2)) / batch.stated_mm**2
         free = np.eye(size) - np.linalg.inv(images + prior) @ prior
@@ -219,7 +219,7 @@ class Solved:
         scaled = np.where(left_out, common, 1.0)[:, None, None] * prior
         covariance = common[:, None, None] * np.linalg.inv(images + scaled)
         of_films = common[:, None, None, None] * own + through @ covariance[:, None] @ through.swapaxes(-1, -2)
-        by = kind.by_centred(films, center, half)
+        by = kind.centred_jacobian(films, center, half)
         of_films = by @ of_films @ by.swapaxes(-1, -2)
         across = -by[:, 0] @ through[:, 0] @ covariance
         joint = np.block([[covariance, across.swapaxes(1, 2)], [across, of_films[:, 0]]])
@@ -247,11 +247,11 @@ def corrected(batch: Batch, films: Array, places: Array) -> tuple[Array, Array]:
         design = kind.design(fitted[:, None], source, np.zeros(2), np.array(HALF_MM))
         design = np.broadcast_to(design, (*source.shape, design.shape[-1])).reshape(len(films), size, -1)
         inverse_design = np.linalg.pinv(design)
-        fitted = fitted + (kind.by_centred(fitted, center, half) @ inverse_design @ left[..., None])[..., 0]
+        fitted = fitted + (kind.centred_jacobian(fitted, center, half) @ inverse_design @ left[..., None])[..., 0]
     projector = np.eye(size) - design @ inverse_design
     back = np.linalg.inv(np.broadcast_to(kind.gradient(films[:, None], source), (*source.shape, 2)))
     by_film = kind.design(films[:, None], source, np.zeros(2), np.array(HALF_MM))
-    by_film = back @ by_film @ np.linalg.inv(kind.by_centred(films, center, half))[:, None]
+    by_film = back @ by_film @ np.linalg.inv(kind.centred_jacobian(films, center, half))[:, None]
     turned = np.broadcast_to(kind.gradient(fitted[:, None], source), (*source.shape, 2))
     by_source = np.einsum("tinj,tnjk->tink", projector.reshape(len(films), size, size // 2, 2), turned)
     by_places = np.einsum("tinj,tnjk->tink", by_source, back).reshape(len(films), size, size)

@@ -24,7 +24,7 @@ AFFINITY = ("+b1", "+b2")
 ADDED_NAMES = (*RADIAL, *DECENTERING[0], *DECENTERING[1], *AFFINITY)
 
 
-def corrected_further(correct: Correct, count: int) -> Correct:
+def correction_with_terms(correct: Correct, count: int) -> Correct:
     """The correction of a family of so many parameters, with the terms added to it."""
 
     def corrected(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
@@ -32,24 +32,24 @@ def corrected_further(correct: Correct, count: int) -> Correct:
         added = _added(settings.half_mm[0], xy - principal_point, parameters[count:])
         return Correction(
             own.value + added.value,
-            own.by_xy + added.by_xy,
+            own.xy_jacobian + added.xy_jacobian,
             own.by_principal_point + added.by_principal_point,
-            np.concatenate([own.by_parameters, added.by_parameters], axis=2),
+            np.concatenate([own.parameter_jacobian, added.parameter_jacobian], axis=2),
         )
 
     return corrected
 
 
-def imaged_without(image: Image, count: int) -> Image:
+def image_without_terms(image: Image, count: int) -> Image:
     """The image of a ray by a family of so many parameters, which the added terms have no part in."""
 
     def imaged(settings: Settings, c: float, ray: Array, parameters: Array) -> Imaged:
         own = image(settings, c, ray, parameters[:count])
 
-        def by_parameter(k: int) -> Array:
-            return own.by_parameter(k) if k < count else np.broadcast_to(0.0, own.value.shape)
+        def parameter_derivative(k: int) -> Array:
+            return own.parameter_derivative(k) if k < count else np.broadcast_to(0.0, own.value.shape)
 
-        return Imaged(own.value, own.by_ray, own.by_distance, by_parameter)
+        return Imaged(own.value, own.ray_jacobian, own.by_distance, parameter_derivative)
 
     return imaged
 
@@ -68,8 +68,8 @@ def _added(unit_mm: float, reduced: Array, parameters: Array) -> Correction:
     by_scaled = sum(
         (each * parameter for (_, each), parameter in zip(terms, parameters, strict=True)), np.zeros((1, 2, 2))
     )
-    by_xy = by_scaled / unit_mm
-    return Correction(value, by_xy, -by_xy, columns([each for each, _ in terms]))
+    xy_jacobian = by_scaled / unit_mm
+    return Correction(value, xy_jacobian, -xy_jacobian, columns([each for each, _ in terms]))
 
 
 def _radial(x: Array, y: Array, power: int) -> tuple[Array, Array]:
@@ -81,20 +81,20 @@ def _decentering(x: Array, y: Array, axis: int, power: int) -> tuple[Array, Arra
     """(s + 2x², 2xy) or (2xy, s + 2y²), times s^power, and its derivative."""
     mixed = 2.0 * x * y
     if axis == 0:
-        term, by_xy = vectors(3.0 * x**2 + y**2, mixed), matrices((6.0 * x, 2.0 * y), (2.0 * y, 2.0 * x))
+        term, xy_jacobian = vectors(3.0 * x**2 + y**2, mixed), matrices((6.0 * x, 2.0 * y), (2.0 * y, 2.0 * x))
     else:
-        term, by_xy = vectors(mixed, x**2 + 3.0 * y**2), matrices((2.0 * y, 2.0 * x), (2.0 * x, 6.0 * y))
-    return _times_power(term, by_xy, x, y, power)
+        term, xy_jacobian = vectors(mixed, x**2 + 3.0 * y**2), matrices((2.0 * y, 2.0 * x), (2.0 * x, 6.0 * y))
+    return _times_power(term, xy_jacobian, x, y, power)
 
 
-def _times_power(term: Array, by_xy: Array, x: Array, y: Array, power: int) -> tuple[Array, Array]:
+def _times_power(term: Array, xy_jacobian: Array, x: Array, y: Array, power: int) -> tuple[Array, Array]:
     """A term times s^power, and its derivative."""
     if power == 0:
-        return term, by_xy
+        return term, xy_jacobian
     s = x**2 + y**2
     slope = 2.0 * power * s ** (power - 1)
     outer = term[:, :, None] * vectors(x, y)[:, None, :] * slope[:, None, None]
-    return term * (s**power)[:, None], by_xy * (s**power)[:, None, None] + outer
+    return term * (s**power)[:, None], xy_jacobian * (s**power)[:, None, None] + outer
 
 
 def _identity(x: Array) -> Array:

@@ -1,7 +1,7 @@
 """What every distortion family gives: a correction of the observed point or the image of a ray, with derivatives.
 
 Three kinds of formulas make all families: a correction of the observed point (the image side), the same of the ideal
-point (the object side, `of_ideal_point`), and what is done to the ray itself, without units (`of_ray`).
+point (the object side, `ideal_point_family`), and what is done to the ray itself, without units (`ray_family`).
 """
 
 from collections.abc import Callable
@@ -37,9 +37,9 @@ class Correction:
     """
 
     value: Array
-    by_xy: Array
+    xy_jacobian: Array
     by_principal_point: Array
-    by_parameters: Array
+    parameter_jacobian: Array
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Imaged:
     """
 
     value: Array
-    by_ray: Array
+    ray_jacobian: Array
     by_distance: Array
-    by_parameter: Callable[[int], Array]
+    parameter_derivative: Callable[[int], Array]
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class DistortedRay:
     """Rays (n, 2) as a lens bends them, and their derivatives as in `Imaged`."""
 
     value: Array
-    by_ray: Array
-    by_parameter: Callable[[int], Array]
+    ray_jacobian: Array
+    parameter_derivative: Callable[[int], Array]
 
 
 Correct = Callable[[Settings, Array, Array, Array], Correction]  # of settings, points, principal point, parameters
@@ -81,20 +81,20 @@ def straight(ray: Array) -> DistortedRay:
     return DistortedRay(ray, np.broadcast_to(np.eye(2), (len(ray), 2, 2)), lambda _: np.broadcast_to(0.0, ray.shape))
 
 
-def of_ray(bent: Callable[[Array, Array], DistortedRay]) -> Image:
+def ray_family(bent: Callable[[Array, Array], DistortedRay]) -> Image:
     """The image of a ray that is bent before it is imaged at c."""
 
     def image(_: Settings, c: float, ray: Array, parameters: Array) -> Imaged:
         at = bent(ray, parameters)
-        return Imaged(c * at.value, c * at.by_ray, at.value, lambda k: c * at.by_parameter(k))
+        return Imaged(c * at.value, c * at.ray_jacobian, at.value, lambda k: c * at.parameter_derivative(k))
 
     return image
 
 
-undistorted = of_ray(lambda ray, _: straight(ray))  # of the families that correct the observed point, and of none
+undistorted = ray_family(lambda ray, _: straight(ray))  # of the families that correct the observed point, and of none
 
 
-def of_ideal_point(correct: Correct) -> Image:
+def ideal_point_family(correct: Correct) -> Image:
     """The image of a ray whose ideal point gets what a formula of points about the principal point says there.
 
     It is added, where the same formula of the observed point is subtracted.
@@ -103,9 +103,9 @@ def of_ideal_point(correct: Correct) -> Image:
     def image(settings: Settings, c: float, ray: Array, parameters: Array) -> Imaged:
         ideal_mm = c * ray
         added = correct(settings, ideal_mm, np.zeros(2), parameters)
-        by_ideal = np.eye(2) + added.by_xy
+        by_ideal = np.eye(2) + added.xy_jacobian
         return Imaged(
-            ideal_mm + added.value, c * by_ideal, applied(by_ideal, ray), lambda k: added.by_parameters[..., k]
+            ideal_mm + added.value, c * by_ideal, applied(by_ideal, ray), lambda k: added.parameter_jacobian[..., k]
         )
 
     return image

@@ -12,16 +12,16 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.added_terms import ADDED_NAMES, corrected_further, imaged_without
+from adjust.functional_model.added_terms import ADDED_NAMES, correction_with_terms, image_without_terms
 from adjust.functional_model.correction import (
     Correct,
     Image,
+    ideal_point_family,
     no_correction,
-    of_ideal_point,
-    of_ray,
+    ray_family,
     undistorted,
 )
-from adjust.functional_model.fourier_sets import by_order, fourier, fourier_names
+from adjust.functional_model.fourier_sets import fourier, fourier_names, order_groups
 from adjust.functional_model.juhl import JUHL_GROUPS, JUHL_NAMES, JUHL_UNITS, juhl
 from adjust.functional_model.opencv_family import (
     FISHEYE_GROUPS,
@@ -50,7 +50,7 @@ from adjust.functional_model.physical import (
     brown,
     torlegard,
 )
-from adjust.functional_model.polynomial_sets import EBNER, GRUEN, PolynomialSet, by_degree, correct, legendre
+from adjust.functional_model.polynomial_sets import EBNER, GRUEN, PolynomialSet, correct, degree_groups, legendre
 
 Array = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ class Family:
 
 
 def _polynomials(of: PolynomialSet) -> Family:
-    return Family(of.names, correct=partial(correct, of), needs="half_mm", groups=by_degree(of))
+    return Family(of.names, correct=partial(correct, of), needs="half_mm", groups=degree_groups(of))
 
 
 def _legendre(order: int) -> Family:
@@ -96,7 +96,7 @@ def _legendre(order: int) -> Family:
 
 
 def _fourier(order: int) -> Family:
-    return Family(fourier_names(order), correct=partial(fourier, order), needs="half_mm", groups=by_order(order))
+    return Family(fourier_names(order), correct=partial(fourier, order), needs="half_mm", groups=order_groups(order))
 
 
 _BROWN_LADDER = ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 k3 p1 p2")
@@ -115,14 +115,14 @@ _FAMILIES = {
     ),
     "aicon": Family(
         AICON_NAMES,
-        image=of_ideal_point(aicon),
+        image=ideal_point_family(aicon),
         units=BROWN_UNITS,
         groups=AICON_GROUPS,
         ladder=("a1", "a1 a2", "a1 b1 b2", "a1 a2 b1 b2", "a1 a2 a3 b1 b2"),
     ),
     "opencv": Family(
         OPENCV_NAMES,
-        image=of_ray(opencv),
+        image=ray_family(opencv),
         units=OPENCV_UNITS,
         y_down=OPENCV_Y_DOWN,
         groups=OPENCV_GROUPS,
@@ -132,7 +132,7 @@ _FAMILIES = {
     ),
     "opencv_fisheye": Family(
         FISHEYE_NAMES,
-        image=of_ray(opencv_fisheye),
+        image=ray_family(opencv_fisheye),
         units=("–",) * len(FISHEYE_NAMES),
         y_down=("b2",),
         groups=FISHEYE_GROUPS,
@@ -159,8 +159,8 @@ def _extended(of: Family) -> Family:
         of,
         parameters=(*of.parameters, *ADDED_NAMES),
         units=(*units, *("mm",) * len(ADDED_NAMES)),
-        image=imaged_without(of.image, count),
-        correct=corrected_further(of.correct, count),
+        image=image_without_terms(of.image, count),
+        correct=correction_with_terms(of.correct, count),
         needs="half_mm" if not of.needs else of.needs,
         apart=lambda parameters: np.concatenate([of.apart(parameters[:count]), parameters[count:]]),
     )

@@ -2,7 +2,7 @@
 
 Parameters (..., k) go with coordinates (..., 2). The columns of a polynomial about a far origin are all but dependent,
 so that the adjustment moves centred parameters: those of the same formula in (x - center) / half, with the middle and
-half the extent of what was observed in an image. `design` is the derivative by these, and `by_centred` leads back.
+half the extent of what was observed in an image. `design` is the derivative by these, `centred_jacobian` leads back.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class FilmKind(Protocol):
     def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
         """Their derivative (..., 2, k) by the centred parameters; center (..., 2), half (...)."""
 
-    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
         """Derivative (..., k, k) of the parameters by the centred ones."""
 
     def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
@@ -48,7 +48,7 @@ class FilmKind(Protocol):
         """
 
 
-def marks_of(kind: FilmKind) -> int:
+def least_marks(kind: FilmKind) -> int:
     """How many marks, of two coordinates each, determine the parameters of a formula."""
     return (len(kind.names) + 1) // 2
 
@@ -68,7 +68,7 @@ class Identity:
     def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
         return np.zeros((*xy.shape, 0))
 
-    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
         return np.zeros((*np.shape(half), 0, 0))
 
     def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
@@ -94,7 +94,7 @@ class Congruent:
         design[..., 2] = applied(self._turn_by_angle(parameters), xy - center)
         return design
 
-    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
         result = np.broadcast_to(np.eye(3), (*np.shape(half), 3, 3)).copy()
         result[..., :2, 2] = -applied(self._turn_by_angle(parameters), center)
         return result
@@ -122,12 +122,12 @@ class Conformal:
     names: tuple[str, ...]
 
     def apply(self, parameters: Array, xy: Array) -> Array:
-        return self._of_powers(parameters, self._powers(xy))
+        return self._combination(parameters, self._powers(xy))
 
     def gradient(self, parameters: Array, xy: Array) -> Array:
         powers = self._powers(xy)
         factors = np.arange(1, self.order + 1)[:, None]
-        by_x = self._of_powers(parameters[..., 2:], powers[..., :-1, :] * factors)
+        by_x = self._combination(parameters[..., 2:], powers[..., :-1, :] * factors)
         m = -1.0 if self.mirrored else 1.0
         by_y = np.stack([-m * by_x[..., 1], m * by_x[..., 0]], axis=-1)
         return np.stack([by_x, by_y], axis=-1)
@@ -139,7 +139,7 @@ class Conformal:
         design[..., 1, 0::2], design[..., 1, 1::2] = powers[..., 1], powers[..., 0]
         return design
 
-    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
         m = -1.0 if self.mirrored else 1.0
         origin = -(center[..., 0] + 1j * m * center[..., 1])
         result = np.zeros((*np.shape(half), 2 * self.order + 2, 2 * self.order + 2))
@@ -162,7 +162,7 @@ class Conformal:
             powers.append(np.stack([real * x - imaginary * y, real * y + imaginary * x], axis=-1))
         return np.stack(powers, axis=-2)
 
-    def _of_powers(self, parameters: Array, powers: Array) -> Array:
+    def _combination(self, parameters: Array, powers: Array) -> Array:
         a, b = parameters[..., 0::2], parameters[..., 1::2]
         real, imaginary = powers[..., 0], powers[..., 1]
         return np.stack([(a * real - b * imaginary).sum(-1), (a * imaginary + b * real).sum(-1)], axis=-1)
@@ -179,10 +179,10 @@ class Polynomial:
         return tuple(f"{axis}{k}" for axis in "ab" for k in range(1, len(self.exponents) + 1))
 
     def apply(self, parameters: Array, xy: Array) -> Array:
-        return self._of_terms(parameters, self._terms(xy))
+        return self._combination(parameters, self._terms(xy))
 
     def gradient(self, parameters: Array, xy: Array) -> Array:
-        return np.stack([self._of_terms(parameters, self._terms(xy, by)) for by in (0, 1)], axis=-1)
+        return np.stack([self._combination(parameters, self._terms(xy, by)) for by in (0, 1)], axis=-1)
 
     def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
         terms = self._terms((xy - center) / half[..., None])
@@ -191,7 +191,7 @@ class Polynomial:
         design[..., 0, :count] = design[..., 1, count:] = terms
         return design
 
-    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
         count = len(self.exponents)
         result = np.zeros((*np.shape(half), 2 * count, 2 * count))
         for j, (p, q) in enumerate(self.exponents):
@@ -223,7 +223,7 @@ class Polynomial:
             terms.append(factor * powers[lowered[0]][..., 0] * powers[lowered[1]][..., 1])
         return np.stack(terms, axis=-1)
 
-    def _of_terms(self, parameters: Array, terms: Array) -> Array:
+    def _combination(self, parameters: Array, terms: Array) -> Array:
         count = len(self.exponents)
         first, second = parameters[..., :count], parameters[..., count:]
         return np.stack([(first * terms).sum(-1), (second * terms).sum(-1)], axis=-1)
@@ -254,7 +254,7 @@ class Projective:
         centred = self._denominator(parameters, xy) / self._denominator(parameters, center)
         return design / centred[..., None, None]
 
-    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
         """With d(center) the factor between both numerators, of which d(0) = 1 takes the derivative along."""
         factor = self._denominator(parameters, center)[..., None]
         result = np.zeros((*np.shape(half), 8, 8))
@@ -270,8 +270,8 @@ class Projective:
     def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
         bent = camera_xy[..., :, None] * parameters[..., None, 6:]
         solution, regular = _solved(self._linear(parameters) - bent, camera_xy - parameters[..., [0, 3]])
-        beside = self._denominator(parameters, solution) * self._denominator(parameters, center) > 0.0
-        return solution, np.asarray(regular & beside)  # beyond the horizon the image is upside down
+        same_side = self._denominator(parameters, solution) * self._denominator(parameters, center) > 0.0
+        return solution, np.asarray(regular & same_side)  # beyond the horizon the image is upside down
 
     def _linear(self, parameters: Array) -> Array:
         return np.stack([parameters[..., 1:3], parameters[..., 4:6]], axis=-2)

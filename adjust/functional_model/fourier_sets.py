@@ -26,7 +26,7 @@ def fourier_names(order: int) -> tuple[str, ...]:
     return tuple(f"{letter}{index}" for letter in "abcd" for index in indices)
 
 
-def by_order(order: int) -> tuple[tuple[str, tuple[str, ...]], ...]:
+def order_groups(order: int) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """The parameters of every order, the larger of m and n."""
     orders = np.tile(np.abs(_frequencies(order)).max(axis=1), 4)
     names = np.array(fourier_names(order))
@@ -41,10 +41,10 @@ def fourier(order: int, settings: Settings, xy: Array, principal_point: Array, p
     basis = np.concatenate([cos, sin], axis=1)
     slope = np.concatenate([-sin[..., None] * waves, cos[..., None] * waves], axis=1)  # (n, terms, 2)
     pair = parameters.reshape(2, -1)
-    by_xy = np.einsum("ak,nkj->naj", pair, slope)
+    xy_jacobian = np.einsum("ak,nkj->naj", pair, slope)
     zero = np.zeros_like(basis)
-    by_parameters = np.stack([np.hstack([basis, zero]), np.hstack([zero, basis])], axis=1)
-    return Correction(basis @ pair.T, by_xy, -by_xy, by_parameters)
+    parameter_jacobian = np.stack([np.hstack([basis, zero]), np.hstack([zero, basis])], axis=1)
+    return Correction(basis @ pair.T, xy_jacobian, -xy_jacobian, parameter_jacobian)
 
 
 def _frequencies(order: int) -> NDArray[np.int_]:

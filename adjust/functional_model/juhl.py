@@ -40,7 +40,7 @@ def juhl(settings: Settings, xy: Array, _: Array, parameters: Array) -> Correcti
     )
     # In polar coordinates: d/dxy = d/dradius along' - d/dangle across' / radius; the angle turns along to -across.
     gradient = tangential_by_radius[:, None] * along - tangential_over_radius_by_angle[:, None] * across
-    by_xy = (
+    xy_jacobian = (
         across[:, :, None] * gradient[:, None, :]
         - (tangential / radius)[:, None, None] * along[:, :, None] * across[:, None, :]
         + radial_by_radius[:, None, None] * along[:, :, None] * along[:, None, :]
@@ -48,7 +48,7 @@ def juhl(settings: Settings, xy: Array, _: Array, parameters: Array) -> Correcti
     )
     affine = np.array([[0.0, 0.0], [-sh, -af]])
     zero = np.zeros_like(x)
-    by_parameters = np.concatenate(
+    parameter_jacobian = np.concatenate(
         [
             across[:, :, None] * (power[:, None] * harmonics)[:, None, :],
             along[:, :, None] * radial_terms[:, None, :],
@@ -60,7 +60,7 @@ def juhl(settings: Settings, xy: Array, _: Array, parameters: Array) -> Correcti
     count = len(xy)
     return Correction(
         value=-added / UM_PER_MM,
-        by_xy=-(by_xy + affine) / (UM_PER_MM * MM_PER_DM),
+        xy_jacobian=-(xy_jacobian + affine) / (UM_PER_MM * MM_PER_DM),
         by_principal_point=np.zeros((count, 2, 2)),
-        by_parameters=-by_parameters / UM_PER_MM,
+        parameter_jacobian=-parameter_jacobian / UM_PER_MM,
     )

@@ -86,29 +86,31 @@ class ImageEquations:
     correction: Correction
 
     @property
-    def by_xy(self) -> Array:
-        return np.asarray(np.eye(2) - self.correction.by_xy)
+    def xy_jacobian(self) -> Array:
+        return np.asarray(np.eye(2) - self.correction.xy_jacobian)
 
     @property
-    def by_ray(self) -> Array:
-        return -self.imaged.by_ray
+    def ray_jacobian(self) -> Array:
+        return -self.imaged.ray_jacobian
 
     @property
-    def by_interior(self) -> Array:
-        return columns([self.by_quantity(k) for k in range(3)])
+    def interior_jacobian(self) -> Array:
+        return columns([self.quantity_derivative(k) for k in range(3)])
 
     @property
-    def by_parameters(self) -> Array:
-        count = self.correction.by_parameters.shape[2]
-        return columns([self.by_quantity(3 + k) for k in range(count)]) if count else zeros(len(self.value), 2, 0)
+    def parameter_jacobian(self) -> Array:
+        count = self.correction.parameter_jacobian.shape[2]
+        return (
+            columns([self.quantity_derivative(3 + k) for k in range(count)]) if count else zeros(len(self.value), 2, 0)
+        )
 
-    def by_quantity(self, k: int) -> Array:
+    def quantity_derivative(self, k: int) -> Array:
         """Derivative (n, 2) by c, x0', y0' or a parameter of the family, in this order."""
         if k == 0:
             return -self.imaged.by_distance
         if k < 3:
             return np.asarray(-np.eye(2)[:, k - 1] - self.correction.by_principal_point[..., k - 1])
-        return np.asarray(-self.imaged.by_parameter(k - 3) - self.correction.by_parameters[..., k - 3])
+        return np.asarray(-self.imaged.parameter_derivative(k - 3) - self.correction.parameter_jacobian[..., k - 3])
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ class Lens:
         """Whether the parameters leave every point where it is."""
         return family(self.distortion.family).is_pinhole_at_zero and not self.parameters.any()
 
-    def with_values(self, values: Array) -> "Lens":
+    def replaced_values(self, values: Array) -> "Lens":
         """The lens with other values (3 + k,) of its quantities."""
         return replace(self, interior=values[:3].copy(), parameters=values[3:].copy())
 
@@ -197,13 +199,13 @@ class Lens:
         found = np.zeros(len(imaged.value), dtype=bool)
         with np.errstate(over="ignore", invalid="ignore"):
             xy_mm = ideal_mm = principal_point + imaged.value
-            unfolded = _unfolded(determinant(imaged.by_ray))
+            unfolded = _unfolded(determinant(imaged.ray_jacobian))
             if correct is no_correction:
                 return ideal_mm, unfolded & np.isfinite(ideal_mm).all(axis=1)
             tolerance_mm = 4 * NEWTON_TOLERANCE * (abs(c) + np.abs(ideal_mm).max(axis=1))
             for _ in range(NEWTON_STEPS):
                 correction = correct(self.distortion, xy_mm, principal_point, self.parameters)
-                step, regular = _newton_step(np.eye(2) - correction.by_xy, xy_mm - ideal_mm - correction.value)
+                step, regular = _newton_step(np.eye(2) - correction.xy_jacobian, xy_mm - ideal_mm - correction.value)
                 xy_mm = xy_mm - step
                 found = regular & unfolded & (np.abs(step).max(axis=1) <= tolerance_mm)
                 if found.all():
@@ -219,7 +221,7 @@ class Lens:
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(NEWTON_STEPS):
                 at = self.equations(xy_mm, ray)
-                step, regular = _newton_step(-at.by_ray, -at.value)
+                step, regular = _newton_step(-at.ray_jacobian, -at.value)
                 ray = ray - step
                 found = regular & (np.abs(step).max(axis=1) <= 4 * NEWTON_TOLERANCE * (1.0 + np.abs(ray).max(axis=1)))
                 if found.all():
@@ -238,7 +240,7 @@ class Lens:
             return ~found
         with np.errstate(over="ignore", invalid="ignore"):
             at = self.equations(xy_mm, ray)
-            sides = determinant(at.by_xy), determinant(at.imaged.by_ray)
+            sides = determinant(at.xy_jacobian), determinant(at.imaged.ray_jacobian)
         return ~(found & _unfolded(sides[0]) & _unfolded(sides[1]))
 
     def displacement(self, from_principal_point_mm: Array) -> Displacement:
@@ -254,8 +256,8 @@ class Lens:
         ideal_mm[~imaged] = principal_point
         ray = (ideal_mm - principal_point) / c
         at = self.equations(xy_mm, ray)
-        by_unknowns = np.concatenate([at.by_interior[:, :, :1], at.by_parameters], axis=2)
-        derivatives = c * np.linalg.solve(at.by_ray, by_unknowns)
+        by_unknowns = np.concatenate([at.interior_jacobian[:, :, :1], at.parameter_jacobian], axis=2)
+        derivatives = c * np.linalg.solve(at.ray_jacobian, by_unknowns)
         derivatives[:, :, 0] -= ray
         derivatives[~imaged] = 0.0
         return Displacement(np.where(imaged[:, None], 1e3 * (xy_mm - ideal_mm), np.nan), 1e3 * derivatives, imaged)

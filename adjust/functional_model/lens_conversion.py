@@ -78,16 +78,16 @@ def convert_lens(
     ValueError
         For a parameter that there is not.
     """
-    rays = _Rays.of(source, corners_mm)
+    rays = _Rays.from_lens(source, corners_mm)
     if estimated is not None:
-        return rays.fitted(into, tuple(estimated), held)
+        return rays.fit(into, tuple(estimated), held)
     usual, with_affinity = _usual(into.family)
-    found = rays.fitted(into, usual)
+    found = rays.fit(into, usual)
     if not found.is_same and with_affinity != usual:
-        richer = rays.fitted(into, with_affinity)
+        richer = rays.fit(into, with_affinity)
         found = richer if richer.rms_mm < found.rms_mm / 2.0 else found
     needed = rays.needed(found, [source.quantities.index(each) for each in uncertain])
-    return found if needed == found.estimated else rays.fitted(into, needed)
+    return found if needed == found.estimated else rays.fit(into, needed)
 
 
 def frame_grid_mm(corners_mm: Array) -> Array:
@@ -99,10 +99,10 @@ def frame_grid_mm(corners_mm: Array) -> Array:
 
 def _usual(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The parameters that a family is mostly used with, and with these its affinity and shear."""
-    of = family(name)
-    usual = tuple(of.ladder[-1].split()) if of.ladder else of.parameters
-    affinity = dict(of.groups).get("affinity", ())
-    return usual, tuple(each for each in of.parameters if each in usual or each in affinity)
+    own_family = family(name)
+    usual = tuple(own_family.ladder[-1].split()) if own_family.ladder else own_family.parameters
+    affinity = dict(own_family.groups).get("affinity", ())
+    return usual, tuple(each for each in own_family.parameters if each in usual or each in affinity)
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class _Rays:
     by_lens: Array
 
     @classmethod
-    def of(cls, source: Lens, corners_mm: Array) -> "_Rays":
+    def from_lens(cls, source: Lens, corners_mm: Array) -> "_Rays":
         grid_mm = frame_grid_mm(corners_mm)
         rays, found = source.ray_from_observed(grid_mm)
         if found.sum() < found.size / 4:
@@ -125,10 +125,10 @@ class _Rays:
                 "size."
             )
         at = source.equations(grid_mm[found], rays[found])
-        by_lens = np.concatenate([at.by_interior, at.by_parameters], axis=2)
-        return cls(source, rays[found], grid_mm[found], -np.linalg.solve(at.by_xy, by_lens))
+        by_lens = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
+        return cls(source, rays[found], grid_mm[found], -np.linalg.solve(at.xy_jacobian, by_lens))
 
-    def fitted(self, into: Distortion, estimated: tuple[str, ...], held: Sequence[str] = ()) -> ConvertedLens:
+    def fit(self, into: Distortion, estimated: tuple[str, ...], held: Sequence[str] = ()) -> ConvertedLens:
         names = parameter_names(into.family)
         unknown = sorted(set(estimated) - set(names))
         if unknown:
@@ -140,13 +140,13 @@ class _Rays:
         columns = [k for k, each in enumerate(lens.quantities) if each in sought]
         values = lens.values
         for _ in range(_STEPS):
-            misfit, design = self._linearised(lens.with_values(values), columns)
+            misfit, design = self._linearised(lens.replaced_values(values), columns)
             step = _least_squares(design, misfit.reshape(-1, 1))[:, 0]
             values[columns] -= step
             if not (np.isfinite(values).all() and values[0] > 0.0):
                 break
             if np.abs(design * step).max() <= _STEP * values[0]:
-                return self._ended(lens.with_values(values), columns, estimated)
+                return self._ended(lens.replaced_values(values), columns, estimated)
         raise AdjustmentError(
             f"the lens cannot be brought to the family {into.family}: the fit finds no end. Name fewer of its "
             "parameters, or a family of the same kind."
@@ -155,8 +155,8 @@ class _Rays:
     def _linearised(self, lens: Lens, columns: list[int]) -> tuple[Array, Array]:
         """How far (n, 2) the other lens misses the observed places, and the derivatives (2 n, k) of that."""
         at = lens.equations(self.observed_mm, self.rays)
-        by = np.stack([at.by_quantity(k) for k in columns], axis=2)
-        misfit, design = (np.asarray(np.linalg.solve(at.by_xy, each)) for each in (at.value[..., None], by))
+        by = np.stack([at.quantity_derivative(k) for k in columns], axis=2)
+        misfit, design = (np.asarray(np.linalg.solve(at.xy_jacobian, each)) for each in (at.value[..., None], by))
         return misfit[..., 0], design.reshape(-1, len(columns))
 
     def _ended(self, lens: Lens, columns: list[int], estimated: tuple[str, ...]) -> ConvertedLens:
@@ -174,7 +174,7 @@ class _Rays:
         """Its parameters without those that do nothing at their values, nor where these columns of the source move."""
         lens = found.lens
         at = lens.equations(self.observed_mm, self.rays)
-        per_unit = np.abs(at.by_parameters).max(axis=(0, 1))
+        per_unit = np.abs(at.parameter_jacobian).max(axis=(0, 1))
         by_source = np.abs(found.by_source[len(INTERIOR_NAMES) :, uncertain] * per_unit[:, None])
         moved = (by_source > _RELATED * np.abs(self.by_lens[..., uncertain]).max(axis=(0, 1))).any(axis=1)
         does = moved | (per_unit * np.abs(lens.parameters) > SAME * lens.interior[0])

@@ -53,8 +53,8 @@ class SightVectors:
 def sight_vectors(setting: LineOfSight, station: Array, xyz: Array) -> SightVectors:
     """Points (n, 3) as they appear from stations (3,) or (n, 3)."""
     stations = np.broadcast_to(station, xyz.shape)
-    seen = _over_the_sphere(setting.unit_m, stations, xyz) if setting.curvature else _straight(stations, xyz)
-    return _refracted(setting.unit_m, stations, xyz, seen) if setting.refraction else seen
+    apparent = _over_the_sphere(setting.unit_m, stations, xyz) if setting.curvature else _straight(stations, xyz)
+    return _refracted(setting.unit_m, stations, xyz, apparent) if setting.refraction else apparent
 
 
 def _straight(stations: Array, xyz: Array) -> SightVectors:
@@ -90,17 +90,17 @@ def _sinc_slope(angle: Array) -> Array:
     return np.where(small, -1.0 / 3.0 + angle**2 / 30.0, (np.cos(a) - np.sinc(a / np.pi)) / a**2)
 
 
-def _refracted(unit_m: float, stations: Array, xyz: Array, seen: SightVectors) -> SightVectors:
+def _refracted(unit_m: float, stations: Array, xyz: Array, apparent: SightVectors) -> SightVectors:
     """Points are seen higher by the coefficient times the square of their distance."""
     air = bending(unit_m * stations[:, 2], unit_m * xyz[:, 2])
     coefficient = unit_m * air.coefficient
-    square = (seen.vector**2).sum(axis=1)
-    vector, by_station, by_point = seen.vector.copy(), seen.by_station.copy(), seen.by_point.copy()
+    square = (apparent.vector**2).sum(axis=1)
+    vector, by_station, by_point = apparent.vector.copy(), apparent.by_station.copy(), apparent.by_point.copy()
     vector[:, 2] += coefficient * square
     for derivative, by_height, of_vector in (
-        (by_station, air.by_station, seen.by_station),
-        (by_point, air.by_point, seen.by_point),
+        (by_station, air.by_station, apparent.by_station),
+        (by_point, air.by_point, apparent.by_point),
     ):
-        derivative[:, 2] += 2.0 * coefficient[:, None] * np.einsum("ni,nij->nj", seen.vector, of_vector)
+        derivative[:, 2] += 2.0 * coefficient[:, None] * np.einsum("ni,nij->nj", apparent.vector, of_vector)
         derivative[:, 2, 2] += unit_m**2 * by_height * square
     return SightVectors(vector, by_station, by_point)

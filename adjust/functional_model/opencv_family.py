@@ -42,14 +42,16 @@ def opencv(ray: Array, parameters: Array) -> DistortedRay:
     is_tilted = tau_x != 0.0 or tau_y != 0.0
     tilted = _tilt(straight_lens.value, tau_x, tau_y) if is_tilted else straight(straight_lens.value)
 
-    def by_parameter(k: int) -> Array:
+    def parameter_derivative(k: int) -> Array:
         if OPENCV_NAMES[k] in ("tau_x", "tau_y"):
-            return _tilt(straight_lens.value, tau_x, tau_y).by_parameter(k - OPENCV_NAMES.index("tau_x"))
-        column = straight_lens.by_parameter(k)
-        return applied(tilted.by_ray, column) if is_tilted else column
+            return _tilt(straight_lens.value, tau_x, tau_y).parameter_derivative(k - OPENCV_NAMES.index("tau_x"))
+        column = straight_lens.parameter_derivative(k)
+        return applied(tilted.ray_jacobian, column) if is_tilted else column
 
-    by_ray = product(tilted.by_ray, straight_lens.by_ray) if is_tilted else straight_lens.by_ray
-    return _in_camera(DistortedRay(tilted.value, by_ray, by_parameter), b1, b2, OPENCV_NAMES.index("b1"))
+    ray_jacobian = product(tilted.ray_jacobian, straight_lens.ray_jacobian) if is_tilted else straight_lens.ray_jacobian
+    return _camera_axes(
+        DistortedRay(tilted.value, ray_jacobian, parameter_derivative), b1, b2, OPENCV_NAMES.index("b1")
+    )
 
 
 def opencv_fisheye(ray: Array, parameters: Array) -> DistortedRay:
@@ -74,38 +76,38 @@ def opencv_fisheye(ray: Array, parameters: Array) -> DistortedRay:
     series_by_theta2 = k[0] + theta2 * (2 * k[1] + theta2 * (3 * k[2] + theta2 * 4 * k[3]))
     radial = bent * series
     radial_by_r2 = bent_by_r2 * series + bent * series_by_theta2 * theta2_by_r2
-    by_ray = matrices(
+    ray_jacobian = matrices(
         (radial + 2 * x * x * radial_by_r2, 2 * x * y * radial_by_r2),
         (2 * x * y * radial_by_r2, radial + 2 * y * y * radial_by_r2),
     )
 
-    def by_parameter(number: int) -> Array:
+    def parameter_derivative(number: int) -> Array:
         factor = bent * theta2 ** (number + 1)
         return vectors(x * factor, y * factor)
 
-    lens = DistortedRay(vectors(x * radial, y * radial), by_ray, by_parameter)
-    return _in_camera(lens, b1, b2, FISHEYE_NAMES.index("b1"))
+    lens = DistortedRay(vectors(x * radial, y * radial), ray_jacobian, parameter_derivative)
+    return _camera_axes(lens, b1, b2, FISHEYE_NAMES.index("b1"))
 
 
-def _in_camera(lens: DistortedRay, b1: float, b2: float, first: int) -> DistortedRay:
+def _camera_axes(lens: DistortedRay, b1: float, b2: float, first: int) -> DistortedRay:
     """What OpenCV's axes show of rays in them, stretched and sheared, in the camera's axes; first: the number of b1
     among the parameters, b2 is the next."""
     scale = np.array([1.0 + b1, -1.0]) + 0.0 * b2  # as complex as they are
 
-    def seen(straight: Array) -> Array:
+    def camera_axes(straight: Array) -> Array:
         """Of vectors (2, ...) with the axes first."""
         sheared = (straight.T * scale).T
         if b2 != 0.0:
             sheared[0] += b2 * straight[1]
         return np.asarray(sheared)
 
-    def by_parameter(k: int) -> Array:
+    def parameter_derivative(k: int) -> Array:
         if k >= first:
             return vectors(lens.value[:, k - first], np.zeros_like(lens.value[:, 0]))
-        return seen(lens.by_parameter(k).T).T
+        return camera_axes(lens.parameter_derivative(k).T).T
 
-    by_ray = np.moveaxis(seen(np.moveaxis(lens.by_ray, 0, -1)), -1, 0)
-    return DistortedRay(seen(lens.value.T).T, by_ray * DOWN, by_parameter)
+    ray_jacobian = np.moveaxis(camera_axes(np.moveaxis(lens.ray_jacobian, 0, -1)), -1, 0)
+    return DistortedRay(camera_axes(lens.value.T).T, ray_jacobian * DOWN, parameter_derivative)
 
 
 def expanded(parameters: Array) -> Array:
@@ -133,12 +135,12 @@ def _lens(ray: Array, parameters: Array) -> DistortedRay:
     yd = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2
     xd_by_r2 = x * radial_by_r2 + p2 + s1 + 2 * s2 * r2
     yd_by_r2 = y * radial_by_r2 + p1 + s3 + 2 * s4 * r2
-    by_ray = matrices(
+    ray_jacobian = matrices(
         (radial + 2 * p1 * y + 4 * p2 * x + 2 * x * xd_by_r2, 2 * p1 * x + 2 * y * xd_by_r2),
         (2 * p2 * y + 2 * x * yd_by_r2, radial + 4 * p1 * y + 2 * p2 * x + 2 * y * yd_by_r2),
     )
 
-    def by_parameter(k: int) -> Array:
+    def parameter_derivative(k: int) -> Array:
         zero, powers = np.zeros_like(x), (r2, r2 * r2, r2 * r2 * r2)
         match OPENCV_NAMES[k]:
             case "p1":
@@ -155,7 +157,7 @@ def _lens(ray: Array, parameters: Array) -> DistortedRay:
                 factor = -radial * powers[int(name[1]) - 4] / below
         return vectors(x * factor, y * factor)
 
-    return DistortedRay(vectors(xd, yd), by_ray, by_parameter)
+    return DistortedRay(vectors(xd, yd), ray_jacobian, parameter_derivative)
 
 
 def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
@@ -177,7 +179,7 @@ def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
         [size * (row[i] - at * rotation[2, i]) for i in (0, 1)] for row, at in zip(rotation, over, strict=False)
     ]
 
-    def by_angle(k: int) -> Array:
+    def angle_derivative(k: int) -> Array:
         change = moved[k]
         *shift, deeper = _turned(change, point)
         return vectors(
@@ -185,7 +187,7 @@ def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
         )
 
     value = [rotation[2, 2] * at - rotation[axis, 2] for axis, at in enumerate(over)]
-    return DistortedRay(vectors(*value), matrices(*by_point), by_angle)
+    return DistortedRay(vectors(*value), matrices(*by_point), angle_derivative)
 
 
 def _turned(matrix: Array, point: Array) -> list[Array]:

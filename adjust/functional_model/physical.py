@@ -32,7 +32,7 @@ def torlegard(settings: Settings, xy: Array, principal_point: Array, parameters:
 
 def brown(_: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
     """Brown's terms of the observed point: Torlegård's with r0 = 0, and an affinity b1, b2 of x'."""
-    return _with_affinity(xy, principal_point, parameters, 0.0)
+    return _affine_correction(xy, principal_point, parameters, 0.0)
 
 
 def australis(_: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
@@ -40,8 +40,8 @@ def australis(_: Settings, xy: Array, principal_point: Array, parameters: Array)
 
     Source: C. S. Fraser, Digital camera self-calibration, ISPRS Journal 52 (1997), the model of Australis and iWitness.
     """
-    at = _with_affinity(xy, principal_point, -parameters, 0.0)
-    return replace(at, by_parameters=-at.by_parameters)
+    at = _affine_correction(xy, principal_point, -parameters, 0.0)
+    return replace(at, parameter_jacobian=-at.parameter_jacobian)
 
 
 def aicon(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
@@ -51,10 +51,10 @@ def aicon(settings: Settings, xy: Array, principal_point: Array, parameters: Arr
     interior orientation; AICON's .ior files (A1 to A3, R0, B1, B2, C1, C2) as JAICOV's `IORFileReader` reads them, and
     the distortion models in its `bundle.derivation`, which add all terms to x0 - c U/W.
     """
-    return _with_affinity(xy, principal_point, parameters, settings.r0_mm)
+    return _affine_correction(xy, principal_point, parameters, settings.r0_mm)
 
 
-def _with_affinity(xy: Array, principal_point: Array, parameters: Array, r0_mm: float) -> Correction:
+def _affine_correction(xy: Array, principal_point: Array, parameters: Array, r0_mm: float) -> Correction:
     """Three radial and two decentering terms, and an affinity of x' with two."""
     stretch, shear = parameters[5:]
     whole = np.concatenate([parameters[:5], np.zeros(2)])
@@ -65,9 +65,9 @@ def _with_affinity(xy: Array, principal_point: Array, parameters: Array, r0_mm: 
     affinity = np.array([[stretch, shear], [0.0, 0.0]])
     return Correction(
         value=common.value + reduced @ affinity.T,
-        by_xy=common.by_xy + affinity,
+        xy_jacobian=common.xy_jacobian + affinity,
         by_principal_point=common.by_principal_point - affinity,
-        by_parameters=np.concatenate([common.by_parameters[..., :5], by_affinity], axis=2),
+        parameter_jacobian=np.concatenate([common.parameter_jacobian[..., :5], by_affinity], axis=2),
     )
 
 
@@ -98,7 +98,7 @@ def _radial_and_decentering(
     decentering = [by_p1 * dec[:, None], by_p2 * dec[:, None], plain * r2[:, None], plain * r2[:, None] ** 2]
     return Correction(
         value=reduced * rad[:, None] + plain * dec[:, None],
-        by_xy=by_reduced + by_decentering,
+        xy_jacobian=by_reduced + by_decentering,
         by_principal_point=-by_reduced if literal else -by_reduced - by_decentering,
-        by_parameters=matrices(*zip(*(column.T for column in (*radial, *decentering)), strict=True)),
+        parameter_jacobian=matrices(*zip(*(column.T for column in (*radial, *decentering)), strict=True)),
     )

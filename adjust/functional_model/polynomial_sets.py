@@ -53,7 +53,7 @@ def legendre(order: int) -> PolynomialSet:
 def legendre_terms(terms: dict[str, Term], degree: int) -> PolynomialSet:
     """Some terms by their names, of products of Legendre polynomials up to a degree in x and in y."""
     polynomials = [tuple(series.leg2poly([0.0] * each + [1.0]).tolist()) for each in range(degree + 1)]
-    return _set(polynomials, 5 / 6, terms)
+    return _polynomial_set(polynomials, 5 / 6, terms)
 
 
 def _single_terms(degree: int) -> list[tuple[int, int, int]]:
@@ -68,11 +68,11 @@ def _single_terms(degree: int) -> list[tuple[int, int, int]]:
     ]
 
 
-def _set(polynomials: Sequence[tuple[float, ...]], tilt: float, terms: dict[str, Term]) -> PolynomialSet:
+def _polynomial_set(polynomials: Sequence[tuple[float, ...]], tilt: float, terms: dict[str, Term]) -> PolynomialSet:
     return PolynomialSet(tuple(polynomials), tilt, tuple(terms), tuple(terms.values()))
 
 
-EBNER = _set(
+EBNER = _polynomial_set(
     ((1.0,), (0.0, 1.0), (-2 / 3, 0.0, 1.0)),
     2.0,
     {
@@ -81,7 +81,7 @@ EBNER = _set(
     },
 )  # fmt: skip
 # Grün's a and b are the coefficients of dx and dy; their first index is 1 + the degree in y, the second in x.
-GRUEN = _set(
+GRUEN = _polynomial_set(
     ((1.0,), (0.0, 1.0), (-1 / 2, 0.0, 1.0), (0.0, -17 / 20, 0.0, 1.0), (9 / 70, 0.0, -31 / 28, 0.0, 1.0)),
     10 / 7,
     {"a12": STRETCH, "a21": SHEAR, "a22": TILT_Y, "b22": TILT_X}
@@ -89,7 +89,7 @@ GRUEN = _set(
 )
 
 
-def by_degree(of: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
+def degree_groups(of: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """The parameters of every degree in x and y together."""
     combined = {STRETCH: 1, SHEAR: 1, TILT_X: 2, TILT_Y: 2}
     degrees = [combined[term] if isinstance(term, str) else sum(term[1:]) for term in of.terms]
@@ -111,11 +111,11 @@ def summed(of: PolynomialSet, half: Array, xy: Array, center: Array, parameters:
     (x, x_slope), (y, y_slope) = (_polynomials(of, scaled[:, axis]) for axis in (0, 1))
     count = len(of.polynomials) ** 2
     products = (x[:, :, None] * y[:, None, :]).reshape(len(xy), count)
-    by_parameters = (products @ coefficients.reshape(-1, count).T).reshape(len(xy), 2, len(of.terms))
+    parameter_jacobian = (products @ coefficients.reshape(-1, count).T).reshape(len(xy), 2, len(of.terms))
     products_of = np.einsum("akij,k->aij", coefficients, parameters)
     by_scaled = [np.einsum("aij,ni,nj->na", products_of, *pair) for pair in ((x_slope, y), (x, y_slope))]
-    by_xy = np.stack(by_scaled, axis=2) / half
-    return Correction(by_parameters @ parameters, by_xy, -by_xy, by_parameters)
+    xy_jacobian = np.stack(by_scaled, axis=2) / half
+    return Correction(parameter_jacobian @ parameters, xy_jacobian, -xy_jacobian, parameter_jacobian)
 
 
 @lru_cache

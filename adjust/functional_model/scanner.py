@@ -28,7 +28,7 @@ from adjust.functional_model.polynomial_sets import (
     legendre_terms,
     summed,
 )
-from adjust.functional_model.transformation import order_of
+from adjust.functional_model.transformation import polynomial_order
 from adjust.linear_algebra.small_matrices import determinant, solved
 
 Array = NDArray[np.float64]
@@ -44,16 +44,16 @@ TOLERANCE_MM = 1e-11
 def smooth_terms(films: Iterable[str]) -> tuple[str, ...]:
     """The terms of degree 2 and 3 that no film transformation of some takes; of degree 1 what similarities leave."""
     products = [(axis, degree - n, n) for degree in SMOOTH for axis in (0, 1) for n in range(degree + 1)]
-    return _left_by(films, (*COMBINED, *(_name(*each) for each in products)))
+    return _remaining_terms(films, (*COMBINED, *(_name(*each) for each in products)))
 
 
 def carriage_terms(films: Iterable[str]) -> tuple[str, ...]:
     """Those of degree 4 to 6 along x or y alone."""
     products = [(axis, *pair) for degree in ALONG for pair in ((degree, 0), (0, degree)) for axis in (0, 1)]
-    return _left_by(films, tuple(_name(*each) for each in products))
+    return _remaining_terms(films, tuple(_name(*each) for each in products))
 
 
-def _left_by(films: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
+def _remaining_terms(films: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
     kinds = set(films) - {"none"}
     return tuple(name for name in names if all(is_left(kind, name) for kind in kinds))
 
@@ -71,7 +71,7 @@ def is_left(kind: str, name: str) -> bool:
         return (m, n) != (1, 1) and (axis, m, n) not in ((0, 2, 0), (1, 0, 2))
     if kind == "bilinear":
         return (m, n) != (1, 1)
-    return m + n > order_of(kind)
+    return m + n > polynomial_order(kind)
 
 
 def _name(axis: int, m: int, n: int) -> str:
@@ -82,7 +82,7 @@ def _product(name: str) -> tuple[int, int, int]:
     return "ab".index(name[0]), int(name[1]), int(name[2])
 
 
-def degree_of(name: str) -> int:
+def term_degree(name: str) -> int:
     """The degree in x and y together of a term."""
     return {"stretch": 1, "shear": 1, "tilt_x": 2, "tilt_y": 2}[name] if name in COMBINED else sum(_product(name)[1:])
 
@@ -106,7 +106,7 @@ class Bend:
 
     def displacement(self, parameters: Array, scan_mm: Array) -> Correction:
         """How far (n, 2) the scanner puts points beside their places, at the coordinates (n, 2) that it gives them."""
-        return summed(self._set, np.array(self.half_mm), scan_mm, np.array(self.center_mm), parameters)
+        return summed(self._polynomial_set, np.array(self.half_mm), scan_mm, np.array(self.center_mm), parameters)
 
     def apply(self, parameters: Array, scan_mm: Array) -> Array:
         """The places (n, 2) of points whose coordinates in the scan (n, 2) are given, mm."""
@@ -116,7 +116,7 @@ class Bend:
         """Their derivatives (n, 2, 2) by the coordinates in the scan."""
         if not self.terms:
             return np.broadcast_to(np.eye(2), (*scan_mm.shape, 2))
-        return np.asarray(np.eye(2) - self.displacement(parameters, scan_mm).by_xy)
+        return np.asarray(np.eye(2) - self.displacement(parameters, scan_mm).xy_jacobian)
 
     def inverse(self, parameters: Array, xy_mm: Array) -> tuple[Array, Mask]:
         """The coordinates in the scan (n, 2) of places (n, 2), and which were found: where the bend folds none are."""
@@ -127,7 +127,7 @@ class Bend:
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(STEPS):
                 at = self.displacement(parameters, scan_mm)
-                gradient = np.eye(2) - at.by_xy
+                gradient = np.eye(2) - at.xy_jacobian
                 side = determinant(gradient)
                 regular = np.isfinite(side) & (side > 0.0)
                 step = solved(gradient, scan_mm - at.value - xy_mm, regular, side)
@@ -138,7 +138,7 @@ class Bend:
         return scan_mm, found
 
     @cached_property
-    def _set(self) -> PolynomialSet:
+    def _polynomial_set(self) -> PolynomialSet:
         terms: dict[str, Term] = {name: COMBINED.get(name) or _product(name) for name in self.terms}
         degrees = [2 if isinstance(term, str) else max(term[1:]) for term in terms.values()]
         return legendre_terms(terms, max(degrees))

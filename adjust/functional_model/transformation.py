@@ -29,7 +29,7 @@ from adjust.functional_model.film_kinds import (
     Mask,
     Polynomial,
     Projective,
-    marks_of,
+    least_marks,
 )
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ def film_parameter_names(spelling: str) -> tuple[str, ...]:
 
 def marks_needed(spelling: str) -> int:
     """How many fiducial marks determine a transformation by themselves."""
-    return marks_of(film_kind(spelling))
+    return least_marks(film_kind(spelling))
 
 
 @lru_cache
@@ -108,7 +108,7 @@ def simpler(spelling: str) -> str | None:
     return None
 
 
-def order_of(spelling: str) -> int:
+def polynomial_order(spelling: str) -> int:
     """The order of a conformal or general polynomial; 1 of those that are linear or nearly so."""
     return _name_and_order(spelling)[1] if spelling.startswith(("conformal", "polynomial")) else 1
 
@@ -146,7 +146,7 @@ class Film:
         """Comparator coordinates (n, 2) of camera coordinates (n, 2), mm; which lie where nothing folds over."""
         return self._kind.inverse(self.parameters, xy_mm, self.center_mm)
 
-    def moved(self, parameter: int, by: float) -> "Film":
+    def changed(self, parameter: int, by: float) -> "Film":
         """The same with one parameter, by number, changed."""
         parameters = self.parameters.copy()
         parameters[parameter] += by

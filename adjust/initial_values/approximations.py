@@ -153,7 +153,7 @@ def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> 
     xyz = np.array([_known_place(network, name) for name in names])[number[frames.rows]]
     is_known = ~np.isnan(xyz).any(axis=1)
     fields = []
-    for i in sorted(frames.of_camera(camera.name), key=lambda i: network.images[i].name):
+    for i in sorted(frames.camera_images(camera.name), key=lambda i: network.images[i].name):
         part, known = frames.part(i), is_known[frames.part(i)]
         fields.append(KnownField(xyz[part][known], frames.xy_mm[part][known] - principal_point_mm, frames.sigma_mm[i]))
     return fields
@@ -170,7 +170,7 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
     """Freed of the distortion as it is known beforehand. Raises AdjustmentError where that folds an image over."""
     known = camera.distortion.parameters
     lens = Lens(camera.distortion, interior, camera.distortion.values)
-    images = frames.of_camera(camera.name)
+    images = frames.camera_images(camera.name)
     folds = lens.folded_over(frames.xy_mm[frames.places(images)])
     first = np.cumsum([0, *np.diff(frames.starts)[images]])
     for i, start, stop in zip(images, first[:-1], first[1:], strict=True):

@@ -35,17 +35,19 @@ ANOTHER = 1e-3  # difference of rotations, in any element, from which on two pos
 ALIKE = 4.0  # times the squares of a pose that a rival, refined, leaves where nothing tells which of the two it is
 
 
-def closed_form_poses(seen: Sequence[KnownField], principal_distances_mm: Sequence[float]) -> list[Pose | None]:
+def closed_form_poses(known_fields: Sequence[KnownField], principal_distances_mm: Sequence[float]) -> list[Pose | None]:
     """The poses of the images whose points agree on one; None for the others.
 
     They agree where no residual is gross and all are as large as the standard deviations say, or as those of most
     images are: a lens that is not known yet leaves some everywhere.
     """
-    poses: list[Pose | None] = [None] * len(seen)
-    c, sigmas = np.array(principal_distances_mm), np.full(len(seen), np.nan)
+    poses: list[Pose | None] = [None] * len(known_fields)
+    c, sigmas = np.array(principal_distances_mm), np.full(len(known_fields), np.nan)
     for fewest, trimmed in ((FEWEST, False), (FEWEST_TRIMMED, True)):
-        left = [i for i, pose in enumerate(poses) if pose is None and len(seen[i].xyz) >= fewest]
-        several = [(some, _Fields.of([seen[i] for i in some])) for some in _batches(seen, left)]
+        left = [i for i, pose in enumerate(poses) if pose is None and len(known_fields[i].xyz) >= fewest]
+        several = [
+            (some, _Fields.from_fields([known_fields[i] for i in some])) for some in _batches(known_fields, left)
+        ]
         several = [(some, batch.trimmed()[0] if trimmed else batch) for some, batch in several]
         oriented = [batch.oriented(*batch.approximate(c[some]), c[some]) for some, batch in several]
         for (some, _), found in zip(several, oriented, strict=True):
@@ -57,15 +59,15 @@ def closed_form_poses(seen: Sequence[KnownField], principal_distances_mm: Sequen
     return poses
 
 
-def principal_distance_together(seen: Sequence[KnownField]) -> tuple[float, float] | None:
+def principal_distance_together(known_fields: Sequence[KnownField]) -> tuple[float, float] | None:
     """The principal distance in mm of all images together, and the standard deviation of its logarithm; None where not
     all images agree on it.
 
     Of flat fields from the orthogonality of their homographies' axes (Zhang 2000), with a principal point that is
     known and pixels that are square; then by least squares with all poses.
     """
-    some = [field for field in seen if len(field.xyz) >= FEWEST]
-    batch = _Fields.of(some) if some else None
+    some = [field for field in known_fields if len(field.xyz) >= FEWEST]
+    batch = _Fields.from_fields(some) if some else None
     together = None if batch is None else batch.distance_together()
     if batch is None or together is not None or 2 * (batch.counts >= FEWEST_TRIMMED).sum() <= len(some):
         return together
@@ -74,9 +76,9 @@ def principal_distance_together(seen: Sequence[KnownField]) -> tuple[float, floa
     return batch.some(agreeing).distance_together() if 2 * agreeing.sum() > len(some) else None
 
 
-def _batches(seen: Sequence[KnownField], images: Sequence[int]) -> Iterator[Indices]:
+def _batches(known_fields: Sequence[KnownField], images: Sequence[int]) -> Iterator[Indices]:
     """Of some images those of about as many points, some at a time."""
-    counts = np.array([len(field.xyz) for field in seen], dtype=np.intp)
+    counts = np.array([len(field.xyz) for field in known_fields], dtype=np.intp)
     order = np.array(sorted(images, key=lambda i: -counts[i]), dtype=np.intp)
     while len(order):
         largest = int(counts[order[0]])
@@ -130,7 +132,7 @@ class _Fields:
     sigma_mm: Array
 
     @classmethod
-    def of(cls, fields: Sequence[KnownField]) -> "_Fields":
+    def from_fields(cls, fields: Sequence[KnownField]) -> "_Fields":
         counts = np.array([len(field.xyz) for field in fields], dtype=np.intp)
         xyz, xy_mm = np.zeros((len(fields), counts.max(), 3)), np.zeros((len(fields), counts.max(), 2))
         for k, field in enumerate(fields):

@@ -6,7 +6,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.film_kinds import Congruent, FilmKind, Identity, Projective, marks_of
+from adjust.functional_model.film_kinds import Congruent, FilmKind, Identity, Projective, least_marks
 from adjust.functional_model.transformation import film_kind, marks_needed, simpler
 from adjust.linear_algebra.small_matrices import applied
 from adjust.problem.network import Transformation
@@ -61,7 +61,7 @@ def _determinant_where_marks_agree(comparator_mm: Array, camera_mm: Array) -> fl
     too few to show it, or lie about on one line."""
     affine = film_kind("affine", False)
     if (
-        len(comparator_mm) <= marks_of(affine)
+        len(comparator_mm) <= least_marks(affine)
         or _are_nearly_collinear(comparator_mm)
         or _are_nearly_collinear(camera_mm)
     ):
@@ -80,7 +80,7 @@ def _are_nearly_collinear(xy_mm: Array) -> bool:
 
 def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple[Array, float]:
     """Parameters, and the trimmed sum of squared distances that chose them."""
-    n, fewest = len(comparator_mm), marks_of(kind)
+    n, fewest = len(comparator_mm), least_marks(kind)
     half = (n + fewest + 1) // 2
     best = _fit(kind, comparator_mm, camera_mm)
     squared = _squared(kind, best, comparator_mm, camera_mm)
@@ -134,7 +134,7 @@ def _fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> Array:
     nothing = np.zeros(count)
     design = kind.design(nothing, comparator_mm, center, half[..., None])
     centred = _solved(design, moved)
-    parameters = applied(kind.by_centred(nothing, center[..., 0, :], half), centred)
+    parameters = applied(kind.centred_jacobian(nothing, center[..., 0, :], half), centred)
     parameters[..., [kind.names.index("a1"), kind.names.index("b1")]] += target[..., 0, :]
     return parameters
 

@@ -32,7 +32,7 @@ class Frames:
     def part(self, image: int) -> slice:
         return slice(int(self.starts[image]), int(self.starts[image + 1]))
 
-    def of_camera(self, camera: str) -> list[int]:
+    def camera_images(self, camera: str) -> list[int]:
         """The images of a camera that show object points, by number."""
         images = enumerate(self.network.images)
         return [i for i, image in images if image.camera == camera and self.starts[i] < self.starts[i + 1]]
@@ -46,7 +46,7 @@ class Frames:
 
         A coordinate that the distortion cannot have produced stays as it is.
         """
-        images, names = self.of_camera(camera), self.network.observations.point
+        images, names = self.camera_images(camera), self.network.observations.point
         if not images:
             return {}
         at = self.places(images)

@@ -37,12 +37,12 @@ class JoinedFrame:
 def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:
     """The film transformations of the parts of one frame. Raises AdjustmentError where parts have too little in common,
     or the frame has too few fiducial marks."""
-    seen = {part.name: _marks(network, part) for part in parts}
-    first_from = _placed(parts[0].part_of, seen)
+    marks_by_part = {part.name: _marks(network, part) for part in parts}
+    first_from = _placed(parts[0].part_of, marks_by_part)
     place: dict[Mark, Array] = {}
     for name, film in first_from.items():
-        moved = film_kind("similarity", film[1]).apply(film[0], np.array(list(seen[name].values())))
-        place |= {mark: xy for mark, xy in zip(seen[name], moved, strict=True) if mark not in place}
+        moved = film_kind("similarity", film[1]).apply(film[0], np.array(list(marks_by_part[name].values())))
+        place |= {mark: xy for mark, xy in zip(marks_by_part[name], moved, strict=True) if mark not in place}
     given = network.camera_by_name[parts[0].camera].fiducials
     marks = sorted(point for kind, point in place if kind == "fiducial")
     camera_mm = np.array([[given[mark].x_mm.value, given[mark].y_mm.value] for mark in marks]).reshape(-1, 2)
@@ -52,7 +52,7 @@ def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:
     whole = film_kind(kind, mirrored)
     films = {}
     for part in parts:
-        xy_mm = np.array(list(seen[part.name].values()))
+        xy_mm = np.array(list(marks_by_part[part.name].values()))
         lattice = (xy_mm.min(axis=0) + xy_mm.max(axis=0)) / 2 + np.ptp(xy_mm, axis=0) / 2 * LATTICE
         turned, is_mirrored = first_from[part.name]
         in_first = film_kind("similarity", is_mirrored).apply(turned, lattice)
@@ -72,21 +72,23 @@ def _marks(network: Network, part: Image) -> dict[Mark, Array]:
     }
 
 
-def _placed(frame: str, seen: Mapping[str, Mapping[Mark, Array]]) -> dict[str, Film]:
+def _placed(frame: str, marks_by_part: Mapping[str, Mapping[Mark, Array]]) -> dict[str, Film]:
     """Similarities from every part's comparator to that of the first; the part that has most in common comes next."""
-    names = list(seen)
+    names = list(marks_by_part)
     films: dict[str, Film] = {names[0]: (np.array([0.0, 0.0, 1.0, 0.0]), False)}
-    place = dict(seen[names[0]])
+    place = dict(marks_by_part[names[0]])
     while len(films) < len(names):
         left = [name for name in names if name not in films]
-        name = max(left, key=lambda name: len(place.keys() & seen[name].keys()))
-        common = sorted(place.keys() & seen[name].keys())
+        name = max(left, key=lambda name: len(place.keys() & marks_by_part[name].keys()))
+        common = sorted(place.keys() & marks_by_part[name].keys())
         if len(common) < FEWEST_COMMON:
             raise AdjustmentError(_why_not_joined(frame, name, list(films), len(common)))
-        own, there = (np.array([where[mark] for mark in common]) for where in (seen[name], place))
+        own, there = (np.array([where[mark] for mark in common]) for where in (marks_by_part[name], place))
         films[name] = fit_transformation("similarity", own, there)
-        moved = film_kind("similarity", films[name][1]).apply(films[name][0], np.array(list(seen[name].values())))
-        place |= {mark: xy for mark, xy in zip(seen[name], moved, strict=True) if mark not in place}
+        moved = film_kind("similarity", films[name][1]).apply(
+            films[name][0], np.array(list(marks_by_part[name].values()))
+        )
+        place |= {mark: xy for mark, xy in zip(marks_by_part[name], moved, strict=True) if mark not in place}
     return films
 
 

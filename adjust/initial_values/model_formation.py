@@ -40,7 +40,9 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
         similarity = levelled(model[with_height], xyz[with_height, 2], stations)
     else:
         similarity = absolute_orientation(model, xyz, stations)
-    return {} if similarity is None else {image: _moved(pose, similarity) for image, pose in best.poses.items()}
+    return (
+        {} if similarity is None else {image: _transformed_pose(pose, similarity) for image, pose in best.poses.items()}
+    )
 
 
 def _pairs(sights: Mapping[str, Sight]) -> list[tuple[str, str]]:
@@ -86,5 +88,5 @@ def typical_residual(model: Block) -> float:
     return float(np.median(np.concatenate(distances)))
 
 
-def _moved(pose: Pose, similarity: Similarity) -> Pose:
+def _transformed_pose(pose: Pose, similarity: Similarity) -> Pose:
     return Pose(pose.rotation @ similarity.rotation.T, similarity.apply(pose.center[None])[0])

@@ -108,9 +108,9 @@ def _all_points(block: Block) -> dict[str, Array]:
     points = {**block.rough, **intersected(block, 0.0)}
     unknown = {name for name, xyz in points.items() if np.isnan(xyz).any()}
     for name in sorted(unknown):
-        seen_in = [image for image in sorted(block.sights) if name in block.sights[image].points]
-        if seen_in:
-            raise AdjustmentError(_why_not_intersected(name, seen_in))
+        showing = [image for image in sorted(block.sights) if name in block.sights[image].points]
+        if showing:
+            raise AdjustmentError(_why_not_intersected(name, showing))
     return {name: xyz for name, xyz in points.items() if name not in unknown}
 
 

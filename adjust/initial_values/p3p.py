@@ -23,9 +23,9 @@ def triple_poses(points: Array, tangents: Array) -> tuple[Array, Array, NDArray[
         ratio_u = numerator / (2 * (cos_g[:, None] - ratio_v * cos_a[:, None]))
         first = np.sqrt(b2[:, None] / (1 + ratio_v**2 - 2 * ratio_v * cos_b[:, None]))
         distances = np.stack([first, ratio_u * first, ratio_v * first], axis=2)  # (m, 4, 3)
-        seen = distances[..., None] * rays[:, None]
-        rotations = _triad(seen) @ np.swapaxes(_triad(points), 1, 2)[:, None]
-        shifts = seen.mean(axis=2) - np.einsum("mkij,mj->mki", rotations, points.mean(axis=1))
+        in_camera = distances[..., None] * rays[:, None]
+        rotations = _triad(in_camera) @ np.swapaxes(_triad(points), 1, 2)[:, None]
+        shifts = in_camera.mean(axis=2) - np.einsum("mkij,mj->mki", rotations, points.mean(axis=1))
     usable = (distances > 0).all(axis=2) & np.isfinite(rotations).all(axis=(2, 3)) & np.isfinite(shifts).all(axis=2)
     return rotations[usable], shifts[usable], np.nonzero(usable)[0]
 

@@ -32,7 +32,7 @@ def refined_poses(
         diagonal = np.einsum("kii->ki", normal)
         diagonal += damping[:, None] * diagonal + 1e-14  # the constant keeps a pose without a solution harmless
         step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
-        new_rotations, new_shifts = _moved(rotations, shifts, step)
+        new_rotations, new_shifts = _stepped(rotations, shifts, step)
         new_cost = (weights * squared_residuals(new_rotations, new_shifts, points, tangents)).sum(axis=1)
         better = new_cost < cost
         settled = np.abs(cost - new_cost) <= SETTLED * cost
@@ -66,7 +66,7 @@ def refined_distance(
         reduced = normal[:, 6:, 6:].sum(axis=0) - left[:, :2] + np.diag(prior)
         change = np.linalg.solve(reduced, right[:, 6:].sum(axis=0) - left[:, 2] - prior * [0.0, bend])
         change = np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
-        rotations, shifts = _moved(rotations, shifts, through[..., 2] - through[..., :2] @ change)
+        rotations, shifts = _stepped(rotations, shifts, through[..., 2] - through[..., :2] @ change)
         c, bend = c * float(np.exp(change[0])), bend + float(change[1])
         if abs(change[0]) < np.sqrt(SETTLED):
             break
@@ -79,20 +79,20 @@ def refined_distance(
 
 def squared_residuals(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
     """Squared residuals (k, n) in units of the principal distance."""
-    u, v, w = _in_camera(rotations, shifts, points)
+    u, v, w = _camera_coordinates(rotations, shifts, points)
     x, y = tangents[..., 0], tangents[..., 1]
-    seen = w < 0.0
-    depth = np.where(seen, w, -1.0)
+    in_front = w < 0.0
+    depth = np.where(in_front, w, -1.0)
     squared = (u / depth + x) ** 2 + (v / depth + y) ** 2
-    return np.asarray(np.where(seen & (squared < BEHIND), squared, BEHIND))
+    return np.asarray(np.where(in_front & (squared < BEHIND), squared, BEHIND))
 
 
-def _moved(rotations: Array, shifts: Array, step: Array) -> tuple[Array, Array]:
+def _stepped(rotations: Array, shifts: Array, step: Array) -> tuple[Array, Array]:
     turn = rotation_from_vector(step[:, :3])
     return turn @ rotations, np.einsum("kij,kj->ki", turn, shifts) + step[:, 3:]
 
 
-def _in_camera(rotations: Array, shifts: Array, points: Array) -> Array:
+def _camera_coordinates(rotations: Array, shifts: Array, points: Array) -> Array:
     """U, V, W (3, k, n) of points (n, 3), or (k, n, 3), in the axes of k cameras."""
     return np.asarray((rotations @ points.swapaxes(-1, -2) + shifts[..., None]).swapaxes(0, 1))
 
@@ -102,7 +102,7 @@ def _normal_equations(
 ) -> tuple[Array, Array]:
     """J'WJ (k, 6, 6) and J'Wr (k, 6) for a small turn of the camera and a shift in its frame; by_bend (k, n, 2): and
     two more, for the logarithm of the principal distance and for what these tangents are multiplied with."""
-    u, v, w = _in_camera(rotations, shifts, points)
+    u, v, w = _camera_coordinates(rotations, shifts, points)
     inverse = -1.0 / np.minimum(w, -1e-9)
     p, q = u * inverse, v * inverse
     x, y, n = tangents[..., 0], tangents[..., 1], w.shape[1]

@@ -150,6 +150,6 @@ def _misfit_mm2(field: KnownField, number: int, lens: Lens) -> float:
     if resection is None:
         return np.inf
     ray, _ = rays(resection.pose.rotation, field.xyz - resection.pose.center)
-    seen_mm, imaged = lens.camera_from_ray(ray)
-    squares = np.where(imaged, ((seen_mm - field.xy_mm) ** 2).sum(axis=1), np.inf)
+    imaged_mm, imaged = lens.camera_from_ray(ray)
+    squares = np.where(imaged, ((imaged_mm - field.xy_mm) ** 2).sum(axis=1), np.inf)
     return float(np.median(squares))

@@ -82,7 +82,7 @@ def resect(
     Poses from triples of points are ranked by the sum of the smallest half of the squared residuals (least trimmed
     squares: Rousseeuw and Van Driessen 2006) and refined on that half. floor_mm: residuals this small are never gross.
     """
-    field = _Field.of(xyz, xy_mm, principal_distance_mm)
+    field = _Field.from_points(xyz, xy_mm, principal_distance_mm)
     triples = _triples(field.tangents, rng)
     rotations, shifts, _ = triple_poses(field.points[triples], field.tangents[triples])
     if not len(rotations):
@@ -99,7 +99,7 @@ def resect(
 
 def refine(resection: Resection, xyz: Array, xy_mm: Array, principal_distance_mm: float) -> Resection:
     """The same image on the same inliers with another principal distance, by least squares."""
-    field = _Field.of(xyz, xy_mm, principal_distance_mm)
+    field = _Field.from_points(xyz, xy_mm, principal_distance_mm)
     rotations = resection.pose.rotation[None]
     shifts = -rotations @ ((resection.pose.center - field.origin) / field.size)
     return _refined_resection(rotations, shifts, field, resection.inliers, resection.sigma_mm)
@@ -107,7 +107,7 @@ def refine(resection: Resection, xyz: Array, xy_mm: Array, principal_distance_mm
 
 def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
     """All poses (up to four) from which three points appear where they are observed. xyz (3, 3), xy_mm (3, 2)."""
-    field = _Field.of(xyz, xy_mm, principal_distance_mm)
+    field = _Field.from_points(xyz, xy_mm, principal_distance_mm)
     rotations, shifts, _ = triple_poses(field.points[None], field.tangents[None])
     rotations, shifts = refined_poses(rotations, shifts, field.points, field.tangents, np.ones((len(rotations), 3)))
     exact = squared_residuals(rotations, shifts, field.points, field.tangents).max(axis=1) < EXACT
@@ -130,7 +130,7 @@ class _Field:
     c: float
 
     @classmethod
-    def of(cls, xyz: Array, xy_mm: Array, c: float) -> "_Field":
+    def from_points(cls, xyz: Array, xy_mm: Array, c: float) -> "_Field":
         origin, size = xyz.mean(axis=0), max(float(np.linalg.norm(np.ptp(xyz, axis=0))), np.finfo(float).tiny)
         return cls((xyz - origin) / size, xy_mm / c, origin, size, c)
 

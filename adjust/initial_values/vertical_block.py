@@ -71,7 +71,7 @@ def _connected(sights: Mapping[str, Sight], known: Mapping[str, Array]) -> list[
     left, groups = set(sights), []
     while left:
         group = {min(left)}
-        while grown := {i for i in left - group if any(_shared(sights, i, j) >= FEWEST_SHARED for j in group)}:
+        while grown := {i for i in left - group if any(_common_points(sights, i, j) >= FEWEST_SHARED for j in group)}:
             group |= grown
         left -= group
         controlled = min(len(planimetric & {name for i in group for name in sights[i].points}), 2)
@@ -80,12 +80,12 @@ def _connected(sights: Mapping[str, Sight], known: Mapping[str, Array]) -> list[
 
 
 def _heights_only(sights: Mapping[str, Sight], images: list[str], known: Mapping[str, Array]) -> bool:
-    seen = sorted({name for image in images for name in sights[image].points})
-    nan = np.isnan([known[name] for name in seen])
+    names = sorted({name for image in images for name in sights[image].points})
+    nan = np.isnan([known[name] for name in names])
     return bool((nan[:, 0] & nan[:, 1] & ~nan[:, 2]).mean() >= 0.5)
 
 
-def _shared(sights: Mapping[str, Sight], first: str, second: str) -> int:
+def _common_points(sights: Mapping[str, Sight], first: str, second: str) -> int:
     return len(set(sights[first].points) & set(sights[second].points))
 
 

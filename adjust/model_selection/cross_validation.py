@@ -55,7 +55,7 @@ def folds(network: Network, options: Options) -> tuple[frozenset[str], ...]:
     )
     held = {name for distance in network.distances for name in (distance.start, distance.end)}
     held |= {object_coordinate(text).id for text in options.datum_coordinates} | set(options.datum_points)
-    known = {point.id for point in network.points if point.id in shown and _given(network, point.id).any()}
+    known = {point.id for point in network.points if point.id in shown and _given_axes(network, point.id).any()}
     if len(known) < FEWEST_KNOWN:
         held |= known
     free = sorted(set(shown) - held)
@@ -74,7 +74,7 @@ def cross_validate(
     network = adjustment.network
     errors, rows = np.empty((0, 2)), np.empty(0, dtype=np.intp)
     for points in left_out:
-        fitted = _fitted_without(adjustment, points, options)
+        fitted = _refitted_models(adjustment, points, options)
         if fitted is None:
             return None
         found = _errors(fitted, adjustment, points)
@@ -87,13 +87,13 @@ def cross_validate(
     return CrossValidation(rms_um, float(np.sqrt(normalised.mean() / 2)), len(rows))
 
 
-def approximations_of(adjustment: Adjustment) -> Approximations:
+def adjusted_values(adjustment: Adjustment) -> Approximations:
     """The values of an adjustment as a start of another one."""
-    values = _by_owner(adjustment.parameters, adjustment.values)
+    values = _values_by_owner(adjustment.parameters, adjustment.values)
     return _as_approximations(adjustment.network, values, adjustment.mirrored)
 
 
-def _by_owner(parameters: Sequence[Parameter], values: Array) -> dict[Owner, Array]:
+def _values_by_owner(parameters: Sequence[Parameter], values: Array) -> dict[Owner, Array]:
     """The values of every camera, image, point and so on."""
     collected: dict[Owner, list[float]] = {}
     for each, value in zip(parameters, values.tolist(), strict=True):
@@ -113,7 +113,7 @@ def _as_approximations(network: Network, values: dict[Owner, Array], mirrored: f
     )
 
 
-def _fitted_without(
+def _refitted_models(
     adjustment: Adjustment, points: frozenset[str], options: Options
 ) -> Mapping[str, ImageModel] | None:
     """The images as the other points determine them, without the tests that take longest; None where these do not."""
@@ -132,7 +132,7 @@ def _fitted_without(
     if reduced.unoriented - network.unoriented:
         return None
     reduction = Reduction.of(reduced)
-    start = reduction.approximations(approximations_of(adjustment))
+    start = reduction.approximations(adjusted_values(adjustment))
     try:
         validate(reduced)
         problem = number(reduction.network(reduced), start, options.method == "elements")
@@ -142,13 +142,13 @@ def _fitted_without(
     if not last.converged:
         return None
     whole = reduction.unreduced_values(problem.unknowns, last.end.state.values, reduced)
-    values = _by_owner(problem.unknowns.parameters, whole)
+    values = _values_by_owner(problem.unknowns.parameters, whole)
     fitted = _as_approximations(reduced, values, adjustment.mirrored)
     oriented = [image for image in reduced.images if image.name not in reduced.unoriented]
     return {
         image.name: replace(
             (model := approximate_image(reduced, fitted, image.name)),
-            lens=model.lens.with_values(values["interior", image.camera, ""]),
+            lens=model.lens.replaced_values(values["interior", image.camera, ""]),
             bend_parameters=values.get(("scanner", image.scanner, ""), np.empty(0)),
         )
         for image in oriented
@@ -160,7 +160,7 @@ def _errors(models: Mapping[str, ImageModel], adjustment: Adjustment, points: fr
     network = adjustment.network
     rays = _rays(adjustment, points)
     centers, directions = np.empty((len(rays.rows), 3)), np.empty((len(rays.rows), 3))
-    for image, at in rays.by_image(network).items():
+    for image, at in rays.rays_per_image(network).items():
         centers[at] = models[image].station
         directions[at] = _directions(models[image], network.observations.xy_mm[rays.rows[at]])
     unknown = np.asarray(np.isnan(rays.known).any(axis=1))
@@ -174,7 +174,7 @@ def _errors(models: Mapping[str, ImageModel], adjustment: Adjustment, points: fr
             located = np.where(unknown[:, None], found, rays.known)
         there = np.asarray(np.isfinite(located).all(axis=1))
         predicted = ~source & ~(given & half) & there[rays.point]
-        for image, at in rays.by_image(network).items():
+        for image, at in rays.rays_per_image(network).items():
             chosen = at[predicted[at]]
             xy_mm, visible = models[image].comparator_from_object(located[rays.point[chosen]])
             errors.append((xy_mm - network.observations.xy_mm[rays.rows[chosen]])[visible])
@@ -194,7 +194,7 @@ class _Rays:
     odd: Mask
     known: Array
 
-    def by_image(self, network: Network) -> dict[str, Indices]:
+    def rays_per_image(self, network: Network) -> dict[str, Indices]:
         """The rays of every image."""
         images = np.array([network.observations.image[row] for row in self.rows])
         return {str(image): np.flatnonzero(images == image) for image in np.unique(images)}
@@ -216,14 +216,15 @@ def _rays(adjustment: Adjustment, points: frozenset[str]) -> _Rays:
         rows=np.array([row for _, _, row in ordered], dtype=np.intp),
         point=number,
         odd=(np.arange(len(number)) - first) % 2 == 1,
-        known=np.array([_known(network, name) for name in names]).reshape(-1, 3) + lifted(adjustment, names),
+        known=np.array([_known_coordinates(network, name) for name in names]).reshape(-1, 3)
+        + lifted(adjustment, names),
     )
 
 
-def _known(network: Network, point: str) -> Array:
+def _known_coordinates(network: Network, point: str) -> Array:
     """(3,) the coordinates that are given, nan where none is."""
     each = network.point_by_id[point]
-    priors = zip((each.X, each.Y, each.Z), _given(network, point), strict=True)
+    priors = zip((each.X, each.Y, each.Z), _given_axes(network, point), strict=True)
     return np.array([prior.value if prior is not None and given else np.nan for prior, given in priors])
 
 
@@ -234,7 +235,7 @@ def _directions(model: ImageModel, xy_mm: Array) -> Array:
     return np.asarray(in_camera @ model.rotation)
 
 
-def _given(network: Network, point: str) -> Mask:
+def _given_axes(network: Network, point: str) -> Mask:
     """(3,) which coordinates of a point are given, exactly or with a standard deviation."""
     each = network.point_by_id[point]
     return np.array([prior is not None and bool(np.isfinite(prior.sigma)) for prior in (each.X, each.Y, each.Z)])

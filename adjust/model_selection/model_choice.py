@@ -16,8 +16,8 @@ from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
 from adjust.model_selection.candidates import Candidate, Nested, nested_tests, simplest_sufficient
 from adjust.model_selection.choice_reasons import reasons, verdict
-from adjust.model_selection.cross_validation import approximations_of, cross_validate, folds
-from adjust.model_selection.models import Bends, Model, given_model, left_by, lenses, transformations
+from adjust.model_selection.cross_validation import adjusted_values, cross_validate, folds
+from adjust.model_selection.models import Bends, Model, given_model, lenses, remaining_bends, transformations
 from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Network
 from adjust.problem.parameter import description
@@ -61,7 +61,7 @@ def choose(
     half_mm = half_mm or {}
     given = given_model(own.network)
     held = replace(options, robust=False, variance_components=False, snooping=False)
-    fits = _Fits(weighed(own), held, half_mm, progress, {given.transformation: own})
+    fits = _Fits(weighted_network(own), held, half_mm, progress, {given.transformation: own})
     chosen, untold = _chosen(fits, given, with_sets=all(camera.name in half_mm for camera in own.network.cameras))
     candidates = tuple(fits.done.values())
     return Choice(
@@ -82,26 +82,26 @@ def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | N
     untold: tuple[str, ...] = ()
     for _ in range(ROUNDS):
         models = [replace(each, bends=bends) for each in lenses(fits.network, film, with_sets)]
-        chosen = simplest_sufficient([fits.of(model) for model in models])
+        chosen = simplest_sufficient([fits.candidate(model) for model in models])
         if chosen is None:
             return None, untold
-        needed, untold = fits.bends_of(replace(chosen.model, bends=()))
-        possible = dict.fromkeys(((), needed, left_by(film, given.bends)))
-        bent = simplest_sufficient([fits.of(replace(chosen.model, bends=each)) for each in possible])
+        needed, untold = fits.needed_bends(replace(chosen.model, bends=()))
+        possible = dict.fromkeys(((), needed, remaining_bends(film, given.bends)))
+        bent = simplest_sufficient([fits.candidate(replace(chosen.model, bends=each)) for each in possible])
         if bent is None:
             return None, untold
         films = [
-            replace(bent.model, transformation=each, bends=left_by(each, bent.model.bends))
+            replace(bent.model, transformation=each, bends=remaining_bends(each, bent.model.bends))
             for each in transformations(fits.network)
         ]
-        chosen = simplest_sufficient([fits.of(model) for model in films])
+        chosen = simplest_sufficient([fits.candidate(model) for model in films])
         if chosen is None or (chosen.model.transformation, chosen.model.bends) == (film, bends):
             break
         film, bends = chosen.model.transformation, chosen.model.bends
     return chosen, untold
 
 
-def weighed(own: Adjustment) -> Network:
+def weighted_network(own: Adjustment) -> Network:
     """The network with the weights that its image points ended with in an adjustment; without those that have none."""
     observations = own.network.observations
     weights = own.weights if len(own.weights) else np.ones(len(observations))
@@ -122,13 +122,13 @@ class _Fits:
     starts: dict[str, Adjustment]
     done: dict[Model, Candidate] = field(default_factory=dict)
 
-    def of(self, model: Model) -> Candidate:
+    def candidate(self, model: Model) -> Candidate:
         if model not in self.done:
             self.progress(model.name, len(self.done))
-            self.done[model] = self._adjusted(model)
+            self.done[model] = self._candidate(model)
         return self.done[model]
 
-    def bends_of(self, model: Model) -> tuple[Bends, tuple[str, ...]]:
+    def needed_bends(self, model: Model) -> tuple[Bends, tuple[str, ...]]:
         """The terms of scanners' bends that tests ask for beside a model that has none; and what is to be said of terms
         that are not told."""
         near = self.starts[model.transformation]
@@ -136,12 +136,12 @@ class _Fits:
         if not any(image.scanner for image in network.images):
             return (), ()
         try:
-            choice = choose_bends(network, lambda bent: adjust(bent, approximations_of(near), self.options))
+            choice = choose_bends(network, lambda bent: adjust(bent, adjusted_values(near), self.options))
         except AdjustmentError as error:
             return (), (f"A bend of the scanner was not looked for: {error}",)
         return given_model(choice.network).bends, choice.remarks
 
-    def _adjusted(self, model: Model) -> Candidate:
+    def _candidate(self, model: Model) -> Candidate:
         near = self.starts.get(model.transformation)
         try:
             result = self._from(model, None if near is None or not near.converged else near)
@@ -170,7 +170,7 @@ class _Fits:
         """Adjusted from the values of a model near to it, or where that leads nowhere from the images themselves."""
         if near is not None:
             try:
-                result = adjust(self._network(model, near), approximations_of(near), self.options)
+                result = adjust(self._network(model, near), adjusted_values(near), self.options)
             except AdjustmentError:
                 result = None
             if result is not None and (result.converged or result.singular):
@@ -182,7 +182,7 @@ class _Fits:
         """The network with a model, parameters that the near one has too starting at its values."""
         same = near is not None and near.network.cameras[0].distortion.family == model.family
         values = dict(zip(near.parameters, near.values.tolist(), strict=True)) if near is not None and same else {}
-        return model.of(self.network, values, self.half_mm)
+        return model.build_network(self.network, values, self.half_mm)
 
 
 def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:

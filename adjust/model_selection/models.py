@@ -10,7 +10,7 @@ from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import is_left
 from adjust.functional_model.transformation import marks_needed
-from adjust.model_selection.scanner_choice import with_terms
+from adjust.model_selection.scanner_choice import network_with_terms
 from adjust.problem.network import Network, Transformation
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
@@ -58,7 +58,7 @@ class Model:
         same = same and all(set(terms) <= set(bends.get(scanner, ())) for scanner, terms in other.bends)
         return other != self and other.transformation in films and same
 
-    def of(
+    def build_network(
         self, network: Network, values: Mapping[Parameter, float], half_mm: Mapping[str, tuple[float, float]]
     ) -> Network:
         """The network with this model, its parameters free. values: where they start."""
@@ -77,12 +77,12 @@ class Model:
             image if image.transformation == "none" else replace(image, transformation=self.transformation)
             for image in network.images
         )
-        calibrations = tuple(_without_distortion(each, network) for each in network.calibrations)
+        calibrations = tuple(_calibration_without_distortion(each, network) for each in network.calibrations)
         changed = replace(network, cameras=tuple(cameras), images=images, calibrations=calibrations)
-        return with_terms(changed, dict(self.bends))
+        return network_with_terms(changed, dict(self.bends))
 
 
-def _without_distortion(calibration: Calibration, network: Network) -> Calibration:
+def _calibration_without_distortion(calibration: Calibration, network: Network) -> Calibration:
     """What an earlier calibration says of everything but distortion, which is another in every candidate."""
     cameras = network.cameras
     distortion = {Parameter.interior(camera.name, name) for camera in cameras for name in camera.distortion.parameters}
@@ -104,7 +104,7 @@ def given_model(network: Network) -> Model:
     return Model(films[0] if films else "none", distortion.family if names else "none", names, bends)
 
 
-def left_by(film: Transformation, bends: Bends) -> Bends:
+def remaining_bends(film: Transformation, bends: Bends) -> Bends:
     """The terms of bends that a film transformation does not take."""
     left = ((scanner, tuple(term for term in terms if is_left(film, term))) for scanner, terms in bends)
     return tuple((scanner, terms) for scanner, terms in left if terms)

@@ -36,19 +36,19 @@ class ScannerChoice:
     remarks: tuple[str, ...]
 
 
-def with_bends(network: Network, terms: Sequence[str] | None = None, sigma_mm: float = np.inf) -> Network:
+def bent_network(network: Network, terms: Sequence[str] | None = None, sigma_mm: float = np.inf) -> Network:
     """The network with a bend of every scanner that its images name, over the extent of their observations.
 
     terms: of the bend; None: all of degree 2 and 3, and of degree 1, that no film transformation takes. sigma_mm: of
     every term, which is given as 0.
     """
     smooth = smooth_terms(_films(network))
-    return with_terms(
+    return network_with_terms(
         network, {name: smooth if terms is None else tuple(terms) for name in _scanners(network)}, sigma_mm
     )
 
 
-def with_terms(network: Network, terms: Mapping[str, Sequence[str]], sigma_mm: float = np.inf) -> Network:
+def network_with_terms(network: Network, terms: Mapping[str, Sequence[str]], sigma_mm: float = np.inf) -> Network:
     """The network with these terms of the bends of the scanners that its images name, each given as 0; terms: by
     scanner, none of one that is not among them."""
     scanners = []
@@ -67,25 +67,27 @@ def choose_bends(
 ) -> ScannerChoice:
     """The network with those terms of every scanner's bend that the observations ask for.
 
-    adjusted: how a network is adjusted; once, with all candidates. sigma_mm: as in `with_bends`.
+    adjusted: how a network is adjusted; once, with all candidates. sigma_mm: as in `bent_network`.
     """
     smooth, films = smooth_terms(_films(network)), _films(network)
     candidates = (*smooth, *carriage_terms(films))
-    trial = adjusted(with_terms(network, dict.fromkeys(_scanners(network), candidates), WEAK_MM))
+    trial = adjusted(network_with_terms(network, dict.fromkeys(_scanners(network), candidates), WEAK_MM))
     if not trial.converged:
-        return ScannerChoice(with_terms(network, {}), (_no_trial(trial),))
+        return ScannerChoice(network_with_terms(network, {}), (_no_trial(trial),))
     chosen: dict[str, tuple[str, ...]] = {}
     remarks: list[str] = []
     for scanner in trial.network.scanners:
         equations = _equations(trial, scanner)
         chosen[scanner.name] = _needed(equations, smooth)
-        untold = [term for term in equations.untold(chosen[scanner.name]) if term in smooth]
+        undetermined_terms = [term for term in equations.undetermined_terms(chosen[scanner.name]) if term in smooth]
         images = [image.name for image in network.images if image.scanner == scanner.name]
         center = np.array([scanner.center_mm])
         poses = scan_poses(adjusted_image(trial, name).camera_by_comparator(center)[0] for name in images)
-        with_lens = _equations(trial, scanner, _free_distortion(trial)).untold(chosen[scanner.name])
-        remarks += undetermined_term_sentences(scanner.name, untold, set(untold) - set(with_lens), poses)
-    return ScannerChoice(with_terms(network, chosen, sigma_mm), tuple(remarks))
+        with_lens = _equations(trial, scanner, _free_distortion(trial)).undetermined_terms(chosen[scanner.name])
+        remarks += undetermined_term_sentences(
+            scanner.name, undetermined_terms, set(undetermined_terms) - set(with_lens), poses
+        )
+    return ScannerChoice(network_with_terms(network, chosen, sigma_mm), tuple(remarks))
 
 
 def _films(network: Network) -> set[str]:
@@ -111,20 +113,20 @@ class _Equations:
     vpv: float
     redundancy: int
 
-    def untold(self, taken: Sequence[str]) -> list[str]:
+    def undetermined_terms(self, taken: Sequence[str]) -> list[str]:
         """The terms that cannot be told, beside some that are taken, from the other unknowns."""
         left, _ = self._reduced(taken)
-        return [term for term, told in zip(self.terms, left, strict=True) if term not in taken and not told]
+        return [term for term, determined in zip(self.terms, left, strict=True) if term not in taken and not determined]
 
     def next(self, taken: Sequence[str], among: Collection[str]) -> tuple[str, float] | None:
         """Of some terms that which explains most beside those taken, and the probability of so much by chance."""
-        told, explained = self._reduced(taken)
-        open_ = np.array([each in among and each not in taken for each in self.terms]) & told
+        determined, explained = self._reduced(taken)
+        open_ = np.array([each in among and each not in taken for each in self.terms]) & determined
         if not open_.any():
             return None
         best = int(np.argmax(np.where(open_, explained, -np.inf)))
         redundancy = self.redundancy - len(taken) - 1
-        left = self.vpv - self._explained_by(taken) - float(explained[best])
+        left = self.vpv - self._explained_square_sum(taken) - float(explained[best])
         if redundancy > 0 and left > 0.0:
             return self.terms[best], float(fdtrc(1, redundancy, explained[best] / left * redundancy))
         return self.terms[best], float(chdtrc(1, explained[best]))
@@ -135,10 +137,10 @@ class _Equations:
         solved = np.linalg.solve(self.normal[np.ix_(at, at)], np.column_stack([self.normal[at], self.right[at]]))
         normal = np.diag(self.normal) - (self.normal[:, at] * solved[:, :-1].T).sum(axis=1)
         right = self.right - self.normal[:, at] @ solved[:, -1]
-        told = normal > self.known / HARDLY**2
-        return told, np.where(told, right**2 / np.where(told, normal, 1.0), 0.0)
+        determined = normal > self.known / HARDLY**2
+        return determined, np.where(determined, right**2 / np.where(determined, normal, 1.0), 0.0)
 
-    def _explained_by(self, taken: Sequence[str]) -> float:
+    def _explained_square_sum(self, taken: Sequence[str]) -> float:
         at = [self.terms.index(each) for each in taken]
         return float(self.right[at] @ np.linalg.solve(self.normal[np.ix_(at, at)], self.right[at]))
 
@@ -164,7 +166,7 @@ def _equations(trial: Adjustment, scanner: Scanner, held: Sequence[Parameter] = 
     weights = np.linalg.inv(observations.covariance_mm2[rows])
     if len(trial.weights):
         weights = weights * trial.weights[rows][:, None, None]
-    design = scanner.bend.displacement(np.zeros(len(terms)), observations.xy_mm[rows]).by_parameters
+    design = scanner.bend.displacement(np.zeros(len(terms)), observations.xy_mm[rows]).parameter_jacobian
     known = np.einsum("nik,nij,njk->k", design, weights, design)
     without = trial.vpv + float(values @ normal @ values)
     return _Equations(

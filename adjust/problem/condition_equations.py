@@ -161,7 +161,7 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         lens = _lens(problem, state, seen.camera)
         images, rows = problem.image_numbers[seen.rows], seen.rows
         at = lens.equations_with_image(at_distorted.camera_xy[rows], seen.imaged)
-        by_in_camera = _by_in_camera(at.by_ray, seen)
+        by_in_camera = _by_in_camera(at.ray_jacobian, seen)
         by_vector = product(by_in_camera, seen.rotation)
         by_attitude = cross(seen.in_camera[:, None, :], by_in_camera)
         if problem.keeps_angles.any():
@@ -169,9 +169,9 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         by_station = -by_vector if straight else product(by_vector, seen.sight.by_station)
         by_point = by_vector if straight else product(by_vector, seen.sight.by_point)
         if len(at.value) == len(xy_mm):
-            by_camera_xy = at.by_xy
+            by_camera_xy = at.xy_jacobian
         else:
-            by_camera_xy[rows] = at.by_xy
+            by_camera_xy[rows] = at.xy_jacobian
         by_exterior = by_station, by_attitude
         _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
         _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
@@ -179,15 +179,17 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
             by_unknowns, rows, parts.board, [applied(by_point, problem.lifted_by[rows, k]) for k in parts.board.members]
         )
         own = [k for k in parts.camera.members if k < len(lens.quantities)]  # others have other families
-        _fill(by_unknowns, rows, parts.camera, [at.by_quantity(k) for k in own])
+        _fill(by_unknowns, rows, parts.camera, [at.quantity_derivative(k) for k in own])
     for part, of_film, of_distorted in (
-        (parts.film, film.by_parameters, at_distorted.by_parameters),
+        (parts.film, film.parameter_jacobian, at_distorted.parameter_jacobian),
         (parts.scanner, film.by_scanner, at_distorted.by_scanner),
     ):
         if len(part.members):
-            by_parameters = of_film + product(by_camera_xy - np.eye(2), of_distorted)
-            _fill(by_unknowns, slice(None), part, [by_parameters[..., k] for k in part.members])
-    return Derivatives(film.by_xy if problem.by_elements else product(by_camera_xy, film.by_xy), by_unknowns)
+            parameter_jacobian = of_film + product(by_camera_xy - np.eye(2), of_distorted)
+            _fill(by_unknowns, slice(None), part, [parameter_jacobian[..., k] for k in part.members])
+    return Derivatives(
+        film.xy_jacobian if problem.by_elements else product(by_camera_xy, film.xy_jacobian), by_unknowns
+    )
 
 
 def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Sequence[Array]) -> None:
@@ -196,9 +198,9 @@ def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Sequence[Arra
         by_unknowns[..., column][rows] = derivative
 
 
-def _by_in_camera(by_ray: Array, seen: SeenTargets) -> Array:
+def _by_in_camera(ray_jacobian: Array, seen: SeenTargets) -> Array:
     """Derivative (n, 2, 3) by U, V, W of what has a derivative (n, 2, 2) by the ray -U/W, -V/W."""
-    by_in_plane = by_ray / -seen.in_camera[:, 2, None, None]
+    by_in_plane = ray_jacobian / -seen.in_camera[:, 2, None, None]
     return columns([by_in_plane[..., 0], by_in_plane[..., 1], applied(by_in_plane, seen.ray)])
 
 
@@ -209,8 +211,8 @@ class _FilmDerivatives:
     """
 
     camera_xy: Array
-    by_xy: Array
-    by_parameters: Array
+    xy_jacobian: Array
+    parameter_jacobian: Array
     by_scanner: Array
 
 
@@ -219,13 +221,13 @@ def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDeri
     if not problem.scans:
         return film
     width = max(len(scans.positions) for scans in problem.scans)
-    by_xy, by_scanner = film.by_xy.copy(), zeros(len(xy_mm), 2, width)
+    xy_jacobian, by_scanner = film.xy_jacobian.copy(), zeros(len(xy_mm), 2, width)
     for scans in problem.scans:
         rows = scans.rows
         at = scans.bend.displacement(state.values[scans.positions], xy_mm[rows])
-        by_xy[rows] = product(film.by_xy[rows], np.eye(2) - at.by_xy)
-        by_scanner[rows, :, : len(scans.positions)] = -product(film.by_xy[rows], at.by_parameters)
-    return replace(film, by_xy=by_xy, by_scanner=by_scanner)
+        xy_jacobian[rows] = product(film.xy_jacobian[rows], np.eye(2) - at.xy_jacobian)
+        by_scanner[rows, :, : len(scans.positions)] = -product(film.xy_jacobian[rows], at.parameter_jacobian)
+    return replace(film, xy_jacobian=xy_jacobian, by_scanner=by_scanner)
 
 
 def _by_film(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
@@ -233,11 +235,11 @@ def _by_film(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
     of_films = [_of_films(films, state, xy_mm) for films in problem.films]
     if len(of_films) == 1:
         return of_films[0]
-    count, width = len(xy_mm), max(each.by_parameters.shape[2] for each in of_films)
+    count, width = len(xy_mm), max(each.parameter_jacobian.shape[2] for each in of_films)
     result = _FilmDerivatives(zeros(count, 2), zeros(count, 2, 2), zeros(count, 2, width), zeros(count, 2, 0))
     for films, each in zip(problem.films, of_films, strict=True):
-        result.camera_xy[films.rows], result.by_xy[films.rows] = each.camera_xy, each.by_xy
-        result.by_parameters[films.rows, :, : each.by_parameters.shape[2]] = each.by_parameters
+        result.camera_xy[films.rows], result.xy_jacobian[films.rows] = each.camera_xy, each.xy_jacobian
+        result.parameter_jacobian[films.rows, :, : each.parameter_jacobian.shape[2]] = each.parameter_jacobian
     return result
 
 

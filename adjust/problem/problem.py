@@ -142,8 +142,8 @@ class Problem:
         Rotation vectors stand in the places of the angles, centred film parameters in those of the film parameters.
         """
         values = state.values + step
-        for positions, by_centred in self.films_by_centred(state):
-            values[positions] = state.values[positions] + (by_centred @ step[positions][..., None])[..., 0]
+        for positions, centred_jacobian in self.films_by_centred(state):
+            values[positions] = state.values[positions] + (centred_jacobian @ step[positions][..., None])[..., 0]
         rotations = rotation_from_vector(step[self.exterior[:, 3:]]) @ state.rotations
         kept, told = self.exterior[self.keeps_angles, 3:], self.exterior[~self.keeps_angles, 3:]
         rotations[self.keeps_angles] = rotation_from_angles(values[kept])
@@ -158,7 +158,10 @@ class Problem:
     def films_by_centred(self, state: State) -> list[tuple[Indices, Array]]:
         """Positions (m, k) of film parameters, and their derivatives (m, k, k) by what moves them, the centred ones."""
         return [
-            (films.positions, films.kind.by_centred(state.values[films.positions], films.center_mm, films.half_mm))
+            (
+                films.positions,
+                films.kind.centred_jacobian(state.values[films.positions], films.center_mm, films.half_mm),
+            )
             for films in self.films
         ]
 

@@ -77,7 +77,7 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
         design = kind.design(parameters, source, center, half).reshape(2 * count, -1)
         inverse = np.linalg.pinv(design)
         step = inverse @ (given_mm - kind.apply(parameters, source)).ravel()
-        parameters = np.asarray(parameters + kind.by_centred(parameters, center, half) @ step, dtype=np.float64)
+        parameters = np.asarray(parameters + kind.centred_jacobian(parameters, center, half) @ step, dtype=np.float64)
         if np.abs(design @ step).max() < STILL_MM:
             break
     projector = np.eye(len(design)) - design @ inverse
@@ -90,7 +90,7 @@ def _comparator_by_unknowns(film: Film, xy_mm: Array) -> Array:
     kind, half = film_kind(film.transformation, film.mirrored), np.array(0.5 * np.ptp(xy_mm, axis=0).max())
     center = xy_mm.mean(axis=0)
     by_film = kind.design(film.parameters, xy_mm, center, half).reshape(2 * len(xy_mm), -1)
-    by_film = by_film @ np.linalg.inv(kind.by_centred(film.parameters, center, half))
+    by_film = by_film @ np.linalg.inv(kind.centred_jacobian(film.parameters, center, half))
     back = _by_coordinates(np.eye(2 * len(xy_mm)), np.asarray(np.linalg.inv(film.gradient(xy_mm)), dtype=np.float64))
     return np.hstack([back, -back @ by_film])
 

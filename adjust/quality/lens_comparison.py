@@ -171,18 +171,18 @@ class _View:
     def _jacobian(self, shared: tuple[str, ...]) -> Array:
         """(2 (m + f), n): of the value by all that the calibration knows, turns and scale of its frame left out."""
         own, fields = self.own, 2 * len(self.ray)
-        by = np.concatenate([self.equations.by_interior, self.equations.by_parameters], axis=2)
+        by = np.concatenate([self.equations.interior_jacobian, self.equations.parameter_jacobian], axis=2)
         rows = np.zeros((fields + 2 * len(shared), len(own.covariance)))
-        rows[:fields, : by.shape[2]] = self._by_ray(by).reshape(fields, -1)
+        rows[:fields, : by.shape[2]] = self._field_change(by).reshape(fields, -1)
         names = list(own.fiducials)
         for k, id in enumerate(shared):
             column = by.shape[2] + 2 * names.index(id)
             rows[fields + 2 * k, column] = rows[fields + 2 * k + 1, column + 1] = 1e3
         return rows
 
-    def _by_ray(self, by: Array) -> Array:
+    def _field_change(self, by: Array) -> Array:
         """The change of the field (m, 2, n) in um that goes with a change of the equations (m, 2, n)."""
-        return np.asarray(-self.c_um * self.turn.T @ np.linalg.solve(self.equations.by_ray, by))
+        return np.asarray(-self.c_um * self.turn.T @ np.linalg.solve(self.equations.ray_jacobian, by))
 
     @property
     def root(self) -> Array:
@@ -198,8 +198,8 @@ class _View:
         ones, zeros = np.ones(len(points)), np.zeros(len(points))
         x, y = points.T
         moves = np.array([(ones, zeros), (zeros, ones), (-y, x), (x, y)]).transpose(2, 1, 0)
-        seen = self._by_ray(self.equations.by_xy @ moves[: len(self.ray)])
-        frame = np.concatenate([seen, -1e3 * moves[len(self.ray) :]])
+        field_moves = self._field_change(self.equations.xy_jacobian @ moves[: len(self.ray)])
+        frame = np.concatenate([field_moves, -1e3 * moves[len(self.ray) :]])
         u, v = self.ray.T
         one = np.ones_like(u)
         turns = [(u * v, one + v * v), (one + u * u, u * v), (-v, u)]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.lens import INTERIOR_NAMES
-from adjust.functional_model.scanner import degree_of, is_left
+from adjust.functional_model.scanner import is_left, term_degree
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import Cofactor
 from adjust.problem.parameter import Parameter
@@ -58,7 +58,7 @@ def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
     poses: in which the scanner's frames lie. confused_with: what does the same, "lens" or "marks"; empty where the
     term does nothing that the marks show.
     """
-    is_odd, one_pose = degree_of(term) % 2 == 1, len(poses) == 1
+    is_odd, one_pose = term_degree(term) % 2 == 1, len(poses) == 1
     given = "x' and y' of the fiducial marks (F5, F6), or to the term itself"
     otherwise = "leave it out"
     if confused_with and one_pose and not is_odd:

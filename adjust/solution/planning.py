@@ -71,12 +71,12 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     options = options or Options()
     validate_plan(network)
     reduction = Reduction.of(network)
-    problem = _at_computed_observations(number(reduction.network(network), reduction.approximations(values)))
+    problem = _computed_problem(number(reduction.network(network), reduction.approximations(values)))
     result = adjust_problem(problem, options)
     singular = result.singular
     null = np.zeros((len(problem.unknowns), 0))
     if singular:
-        held, null = _held(with_datum(problem, options))
+        held, null = _regularised(with_datum(problem, options))
         result = adjust_problem(problem, options, held)
     own = reduction.inverse.network(result.network)
     adjusted = reduction.unreduced_values(problem.unknowns, result.values, own)
@@ -85,7 +85,7 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     return Plan(expected, sigma0, singular, null)
 
 
-def _at_computed_observations(problem: Problem) -> Problem:
+def _computed_problem(problem: Problem) -> Problem:
     xy_mm = computed_observations(problem, problem.start())
     if xy_mm is None:
         raise AdjustmentError(_blind(problem))
@@ -96,7 +96,7 @@ def _at_computed_observations(problem: Problem) -> Problem:
     return replace(problem, network=network, unknowns=replace(unknowns, given=given))
 
 
-def _held(problem: Problem) -> tuple[list[int], Array]:
+def _regularised(problem: Problem) -> tuple[list[int], Array]:
     """Positions of unknowns that make a singular problem regular when held, and its null vectors (n, d).
 
     Held are the pivots of the null vectors, one for each: minimal constraints for whatever is free.
@@ -127,8 +127,8 @@ def _factor(numbering: Numbering) -> Factor:
 
 
 def _blind(problem: Problem) -> str:
-    told, _ = next(iter(blind_marks(problem, problem.start()).values()))
+    reason, _ = next(iter(blind_marks(problem, problem.start()).values()))
     return (
-        f"The network cannot be planned: {told}. Turn the camera towards the field, or leave the point out of that "
+        f"The network cannot be planned: {reason}. Turn the camera towards the field, or leave the point out of that "
         "image."
     )

@@ -79,8 +79,8 @@ def name_marks(
     n, m = len(xyz), len(xy_mm)
     if min(n, m) < LEAST_POINTS:
         return f"{m} marks and {n} points are too few: {LEAST_POINTS} that agree are needed"
-    unit = _Unit.of(xyz)
-    own = unit.of_points(xyz)
+    unit = _Unit.from_points(xyz)
+    own = unit.scaled(xyz)
     tried = clusters(own, normals, m / n)
     assumed = _assumed(xy_mm, frame_mm, principal_distance_mm, sigma_mm)
     search, found = _first([_Search(own, normals, marks, tried) for marks in assumed])
@@ -110,7 +110,7 @@ def name_coded(
     """
     if len(codes) < LEAST_CODES:
         return f"{len(codes)} coded targets were recognised, and {LEAST_CODES} are needed"
-    unit = _Unit.of(xyz)
+    unit = _Unit.from_points(xyz)
     assumed = _assumed(xy_mm, frame_mm, principal_distance_mm, sigma_mm)
     grown = [(marks, one) for marks in assumed if (one := _grown_from_codes(unit, xyz, normals, marks, codes))]
     if not grown:
@@ -139,7 +139,7 @@ def _grown_from_codes(
         return None
     shift = -resection.pose.rotation @ ((resection.pose.center - unit.origin) / unit.size)
     view, agree = View(resection.pose.rotation, shift), resection.inliers
-    grown = grow(view, points[agree], coded[agree], unit.of_points(xyz), normals, marks)
+    grown = grow(view, points[agree], coded[agree], unit.scaled(xyz), normals, marks)
     right = sum(grown.mark.get(point) == mark for mark, point in codes.items())
     area = float(np.prod(marks.greatest - marks.least))
     chance = min(np.pi * (2.0 * grown.gate) ** 2 / area, 1.0)
@@ -151,9 +151,9 @@ def _assumed(
 ) -> list[Marks]:
     """The marks in units of the principal distance, or of each that is tried where it is not known."""
     if principal_distance_mm is not None:
-        return [Marks.of(xy_mm, *frame_mm, sigma_mm, principal_distance_mm, KNOWN_SIGMA)]
+        return [Marks.from_mm(xy_mm, *frame_mm, sigma_mm, principal_distance_mm, KNOWN_SIGMA)]
     diagonal = float(np.linalg.norm(frame_mm[1] - frame_mm[0]))
-    return [Marks.of(xy_mm, *frame_mm, sigma_mm, share * diagonal, UNKNOWN_SIGMA) for share in UNKNOWN]
+    return [Marks.from_mm(xy_mm, *frame_mm, sigma_mm, share * diagonal, UNKNOWN_SIGMA) for share in UNKNOWN]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,10 +164,10 @@ class _Unit:
     size: float
 
     @classmethod
-    def of(cls, xyz: Array) -> "_Unit":
+    def from_points(cls, xyz: Array) -> "_Unit":
         return cls(xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0))))
 
-    def of_points(self, xyz: Array) -> Array:
+    def scaled(self, xyz: Array) -> Array:
         return np.asarray((xyz - self.origin) / self.size)
 
     def names(self, found: Grown, c: float) -> Names:
@@ -185,7 +185,7 @@ class _Search:
     marks: Marks
     clusters: Sequence[Cluster]
 
-    def begun_with(self, cluster: Cluster) -> tuple[Grown | None, int]:
+    def grow_cluster(self, cluster: Cluster) -> tuple[Grown | None, int]:
         """The likeliest naming that one cluster leads to, if it leads to any, and how many poses were tried."""
         triples = mark_triples(cluster, self.marks)
         poses = promising(self.xyz, self.normals, self.marks, cluster.triple[None], triples)
@@ -204,9 +204,9 @@ class _Search:
         named = [cluster for cluster in self.clusters if all(int(point) in found.mark for point in cluster.triple)]
         others = []
         for cluster in named[:OTHER_CLUSTERS]:
-            seen = np.array([[found.mark[int(point)] for point in cluster.triple]])
+            named_marks = np.array([[found.mark[int(point)] for point in cluster.triple]])
             points = point_triples(cluster, self.xyz)
-            poses = promising(self.xyz, self.normals, self.marks, points, seen)
+            poses = promising(self.xyz, self.normals, self.marks, points, named_marks)
             for grown in self._grown(poses):
                 same = sum(found.mark.get(point) == mark for point, mark in grown.mark.items())
                 if same < 0.5 * len(grown.mark):
@@ -241,7 +241,7 @@ def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
     for cluster in searches[0].clusters:
         believed = []
         for search in searches:
-            found, count = search.begun_with(cluster)
+            found, count = search.grow_cluster(cluster)
             tried += count
             if found is not None and found.log10_chance < most:
                 believed.append((search, found))

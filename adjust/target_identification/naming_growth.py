@@ -54,7 +54,7 @@ class View:
         by_radial = (1.0 + self.scale) * p * r2[:, None]
         return np.concatenate([by_pose, by_scale[:, :, None], by_radial[:, :, None]], axis=2)
 
-    def moved(self, step: Array) -> "View":
+    def stepped(self, step: Array) -> "View":
         turn = rotation_from_vector(step[:3])
         return View(turn @ self.rotation, turn @ self.shift + step[3:6], self.scale + step[6], self.radial + step[7])
 
@@ -90,19 +90,19 @@ def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array
     for _ in range(_ROUNDS):
         if len(points) <= OF_POSE:
             return Grown(view)
-        view, sigma, covariance = _fitted(view, xyz[points], marks.places[named], marks)
+        view, sigma, covariance = _fit_view(view, xyz[points], marks.places[named], marks)
         before = points, named
         points, named = _near(view, xyz, normals, marks, sigma, covariance)
         if np.array_equal(points, before[0]) and np.array_equal(named, before[1]):
             break
-    return _judged(view, xyz, normals, marks, sigma, dict(zip(points.tolist(), named.tolist(), strict=True)))
+    return _significance(view, xyz, normals, marks, sigma, dict(zip(points.tolist(), named.tolist(), strict=True)))
 
 
 def _near(
     view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, covariance: Array
 ) -> tuple[Indices, Indices]:
     """Points, and the marks that they are: next to one another, in a gate that chance seldom reaches."""
-    shown = np.flatnonzero(_shown(view, xyz, normals, marks))
+    shown = np.flatnonzero(_shown_points(view, xyz, normals, marks))
     places, by = view.images(xyz[shown]), view.derivatives(xyz[shown])
     predicted = np.einsum("nij,jk,nik->ni", by, covariance, by).sum(axis=1)
     gate = _GATE_SIGMAS * np.sqrt(sigma**2 + predicted)
@@ -119,11 +119,11 @@ def _near(
     return shown[kept], nearest[kept].astype(np.intp)
 
 
-def _shown(view: View, xyz: Array, normals: Array, marks: Marks) -> NDArray[np.bool_]:
+def _shown_points(view: View, xyz: Array, normals: Array, marks: Marks) -> NDArray[np.bool_]:
     return np.asarray(marks.inside(view.images(xyz)) & view.facing(xyz, normals))
 
 
-def _fitted(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, float, Array]:
+def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, float, Array]:
     """Least squares, wrong names tolerated: the view, the marks' standard deviation, the parameters' covariance."""
     priors = np.diag([0.0] * 6 + [marks.c_sigma**-2, _PRIOR_RADIAL**-2])
     sigma = marks.sigma
@@ -142,7 +142,7 @@ def _fitted(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, 
         right -= priors @ np.array([0.0] * 6 + [view.scale, view.radial])
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30))
         step = scale * np.linalg.lstsq(normal * np.outer(scale, scale), scale * right, rcond=1e-13)[0]
-        view = view.moved(step)
+        view = view.stepped(step)
         if np.abs(by @ step).max() < 0.01 * sigma:
             break
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30))
@@ -150,11 +150,11 @@ def _fitted(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, 
     return view, sigma, covariance
 
 
-def _judged(view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, mark: dict[int, int]) -> Grown:
+def _significance(view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, mark: dict[int, int]) -> Grown:
     """How likely chance would do as well: any three points as any three marks give a pose, and the others would have
     to agree, each with the probability that a mark lies in its gate by chance."""
     gate = _GATE_SIGMAS * sigma
-    shown = np.flatnonzero(_shown(view, xyz, normals, marks))
+    shown = np.flatnonzero(_shown_points(view, xyz, normals, marks))
     expected = len(shown)
     agreeing = min(len(mark), expected)
     if agreeing <= OF_POSE:

@@ -104,11 +104,11 @@ def _ranks(xyz: Array, normals: Array, near: Indices) -> Array:
             continue
         flat = xyz @ np.linalg.svd(direction[None])[2][1:].T
         own = np.linalg.norm(flat[near] - flat[:, None], axis=2)
-        ranks.append(np.stack([_count_within(flat, own[:, k]) for k in range(near.shape[1])], axis=1))
+        ranks.append(np.stack([_neighbour_counts(flat, own[:, k]) for k in range(near.shape[1])], axis=1))
     return np.quantile(ranks, _RANK_SHARE, axis=0) if ranks else np.full(near.shape, float(n - 1))
 
 
-def _count_within(flat: Array, reach: Array) -> Indices:
+def _neighbour_counts(flat: Array, reach: Array) -> Indices:
     return np.asarray(cKDTree(flat).query_ball_point(flat, reach, return_length=True), dtype=np.intp)
 
 
@@ -149,35 +149,35 @@ def point_triples(cluster: Cluster, xyz: Array) -> Indices:
 def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: Indices) -> Poses:
     """The poses that explain best what lies about three points (k or 1, 3) if they are three marks (k or 1, 3)."""
     count = max(len(points), len(named))
-    about = _about(xyz, points, _ABOUT)
+    about = _nearest_points(xyz, points, _ABOUT)
     kept: list[tuple[Array, Array, Indices, Array]] = []
     tried = 0
     for start in range(0, count, _CHUNK):
         rows = np.arange(start, min(start + _CHUNK, count))
-        own, seen = _rows(points, rows), _rows(named, rows)
-        rotations, shifts, of = triple_poses(xyz[own], marks.places[seen])
+        own, own_marks = _rows(points, rows), _rows(named, rows)
+        rotations, shifts, of = triple_poses(xyz[own], marks.places[own_marks])
         tried += len(of)
         facing = _facing(rotations, shifts, xyz, normals, own[of])
         rotations, shifts, of = rotations[facing], shifts[facing], of[facing]
-        anchors = marks.places[seen[of]].mean(axis=1)
+        anchors = marks.places[own_marks[of]].mean(axis=1)
         evidence, _, _ = _tested(rotations, shifts, xyz[_rows(about, rows)[of]], anchors, marks, _REACH)
         best = np.argsort(-evidence, kind="stable")[:_KEPT]
         kept.append((rotations[best], shifts[best], rows[of[best]], evidence[best]))
     rotations, shifts, of, evidence = (np.concatenate(part) for part in zip(*kept, strict=True))
     best = np.argsort(-evidence, kind="stable")[:_KEPT]
     rotations, shifts, of = rotations[best], shifts[best], of[best]
-    own, seen = _rows(points, of), _rows(named, of)
-    anchors = marks.places[seen].mean(axis=1)
+    own, own_marks = _rows(points, of), _rows(named, of)
+    anchors = marks.places[own_marks].mean(axis=1)
     for count_about, reach in ((_ABOUT, _REACH), (_FARTHER, _LATER_REACH)):
-        ring = _rows(_about(xyz, points, count_about), of)
+        ring = _rows(_nearest_points(xyz, points, count_about), of)
         _, nearest, hit = _tested(rotations, shifts, xyz[ring], anchors, marks, reach)
-        fitted = np.concatenate([own, ring], axis=1), np.concatenate([seen, nearest], axis=1)
+        fitted = np.concatenate([own, ring], axis=1), np.concatenate([own_marks, nearest], axis=1)
         weights = np.concatenate([np.ones(own.shape), hit], axis=1)
         rotations, shifts = refined_poses(rotations, shifts, xyz[fitted[0]], marks.places[fitted[1]], weights)
-    ring = _rows(_about(xyz, points, _FARTHER), of)
+    ring = _rows(_nearest_points(xyz, points, _FARTHER), of)
     evidence, nearest, hit = _tested(rotations, shifts, xyz[ring], anchors, marks, _LATER_REACH)
     best = np.argsort(-evidence, kind="stable")[:_RETURNED]
-    agreeing = [(np.append(own[i], ring[i, hit[i]]), np.append(seen[i], nearest[i, hit[i]])) for i in best]
+    agreeing = [(np.append(own[i], ring[i, hit[i]]), np.append(own_marks[i], nearest[i, hit[i]])) for i in best]
     return Poses(rotations[best], shifts[best], agreeing, tried)
 
 
@@ -186,7 +186,7 @@ def _rows(table: Indices, rows: Indices) -> Indices:
     return table[rows] if len(table) > 1 else np.broadcast_to(table, (len(rows), table.shape[1]))
 
 
-def _about(xyz: Array, points: Indices, count: int) -> Indices:
+def _nearest_points(xyz: Array, points: Indices, count: int) -> Indices:
     """(k, count) the points next to the heads of clusters, the clusters' own points left out."""
     count = min(count, len(xyz) - 3)
     near = np.asarray(cKDTree(xyz).query(xyz[points].mean(axis=1), k=np.arange(1, count + 4))[1])

@@ -32,14 +32,14 @@ class Marks:
     density_of_cell: Array
 
     @classmethod
-    def of(
+    def from_mm(
         cls, xy_mm: Array, least_mm: Array, greatest_mm: Array, sigma_mm: float, c: float, c_sigma: float
     ) -> "Marks":
         """Marks (m, 2) in mm, of which there is at least one, in a frame between two corners."""
         places, least, greatest = xy_mm / c, np.asarray(least_mm) / c, np.asarray(greatest_mm) / c
         tree = cKDTree(places)
         nearest = np.asarray(tree.query(_centres(least, greatest, _CELLS))[1], dtype=np.intp)
-        density = density_about(tree, _centres(least, greatest, _COARSE_CELLS))
+        density = mark_density(tree, _centres(least, greatest, _COARSE_CELLS))
         mean = len(places) / float(np.prod(greatest - least))
         return cls(
             places, least, greatest, sigma_mm / c, c, c_sigma, tree, nearest, np.maximum(density, mean)
@@ -65,7 +65,7 @@ class Marks:
         return np.asarray(cell[..., 1] * cells + cell[..., 0], dtype=np.intp)
 
 
-def density_about(tree: cKDTree, places: Array) -> Array:
+def mark_density(tree: cKDTree, places: Array) -> Array:
     """(n,) how dense marks are about places (n, 2), by how far the nearest few reach."""
     crowd = min(_CROWD, tree.n)
     reach = np.asarray(tree.query(places, k=[crowd])[0])[:, 0]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
-from adjust.model_selection.scanner_choice import choose_bends, with_bends
+from adjust.model_selection.scanner_choice import bent_network, choose_bends
 from adjust.problem.network import Network
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
@@ -36,7 +36,7 @@ def with_scanners(
         choice = choose_bends(network, adjusted, sigma_mm)
         return choice.network, choice.remarks
     if settings.scanner == "bend":
-        return with_bends(network, None, sigma_mm), ()
+        return bent_network(network, None, sigma_mm), ()
     possible = (*smooth_terms(films), *carriage_terms(films))
     for term in settings.scanner:
         if term not in possible:
@@ -44,7 +44,7 @@ def with_scanners(
                 f"{project.path}: [adjust] scanner names {term!r}, which the {' or '.join(sorted(films))} "
                 f"transformation of the films takes; it leaves {', '.join(possible) or 'no term'}."
             )
-    return with_bends(network, settings.scanner, sigma_mm), ()
+    return bent_network(network, settings.scanner, sigma_mm), ()
 
 
 def with_scanner_names(project: Project, network: Network) -> Network:

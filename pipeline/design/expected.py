@@ -226,8 +226,8 @@ def _ray_by_unknowns(lens: Lens, from_principal_point_mm: Array) -> Array:
     xy_mm = lens.interior[1:] + from_principal_point_mm
     ray, _ = lens.ray_from_observed(xy_mm)
     at = lens.equations(xy_mm, ray)
-    by_unknowns = np.concatenate([at.by_interior, at.by_parameters], axis=2)
-    return -np.asarray(np.linalg.solve(at.by_xy, by_unknowns))
+    by_unknowns = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
+    return -np.asarray(np.linalg.solve(at.xy_jacobian, by_unknowns))
 
 
 def expect(setup: Setup) -> Expected:

@@ -15,7 +15,7 @@ from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.transformation import Film
 from adjust.initial_values.resection import MAX_TRIPLES
 from adjust.target_identification.naming import Names, name_coded, name_marks
-from adjust.target_identification.unnamed_marks import chance_of_a_mark, density_about, log10_of_agreement
+from adjust.target_identification.unnamed_marks import chance_of_a_mark, log10_of_agreement, mark_density
 from measure.targets.block_search import Candidate
 from measure.targets.measure_targets import TargetPrediction
 from pipeline.files.camera_file import CameraFile
@@ -94,7 +94,7 @@ def log10_of_chance(places_px: Array, found_px: Array, gate_px: float, tried: in
     n = len(places_px)
     if n <= _OF_POSE or not len(found_px):
         return 0.0
-    chance = chance_of_a_mark(density_about(cKDTree(found_px), places_px), gate_px).mean()
+    chance = chance_of_a_mark(mark_density(cKDTree(found_px), places_px), gate_px).mean()
     agreeing = len(assign(places_px, found_px, gate_px))
     tests = tried * _POSES * min(comb(agreeing, _OF_POSE), MAX_TRIPLES)
     return log10_of_agreement(agreeing - _OF_POSE, n - _OF_POSE, float(chance)) + float(np.log10(max(tests, 1)))

@@ -125,4 +125,4 @@ def _moved(of: Lens, number: int, step: float) -> Lens:
     """c is the first of the unknowns."""
     values = of.values
     values[number + 2 if number else 0] += step
-    return of.with_values(values)
+    return of.replaced_values(values)

@@ -71,7 +71,7 @@ def bend_field(name: str, scanner: ScannerRecord, covariance: Covariance, xy_mm:
     bend, values = scanner.bend()
     at = bend.displacement(values, xy_mm)
     of_terms = covariance.of(Parameter.scanner(name, term) for term in scanner.terms)
-    by_terms = UM_PER_MM * at.by_parameters
+    by_terms = UM_PER_MM * at.parameter_jacobian
     return BendField(xy_mm, UM_PER_MM * at.value, np.einsum("nik,kl,njl->nij", by_terms, of_terms, by_terms))
 
 

@@ -98,7 +98,7 @@ class _Part:
         by_parameters = np.empty((len(xy_mm), 2, len(film.parameters)))
         for k, value in enumerate(film.parameters.tolist()):
             step = _STEP * max(abs(value), _STEP)
-            ends = [film.moved(k, way * step).camera_from_comparator(xy_mm) for way in (1.0, -1.0)]
+            ends = [film.changed(k, way * step).camera_from_comparator(xy_mm) for way in (1.0, -1.0)]
             by_parameters[:, :, k] = (ends[0] - ends[1]) / (2.0 * step)
         return np.asarray(by_parameters @ self.film_covariance @ by_parameters.swapaxes(1, 2))
 

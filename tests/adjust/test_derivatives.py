@@ -50,7 +50,9 @@ def test_image_equations_by_complex_steps(family: str, decentering: Decentering)
         rng.uniform(-0.7, 0.7, (6, 2)),
     ]
     at = Lens(distortion, *parts[:2]).equations(*parts[2:])
-    for part_number, derivative in enumerate((at.by_interior, at.by_parameters, at.by_xy, at.by_ray)):
+    for part_number, derivative in enumerate(
+        (at.interior_jacobian, at.parameter_jacobian, at.xy_jacobian, at.ray_jacobian)
+    ):
         for column in range(derivative.shape[2]):
             moved = [part.astype(complex) for part in parts]
             moved[part_number][..., column] += 1j * STEP

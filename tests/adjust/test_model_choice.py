@@ -12,7 +12,7 @@ from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
 from adjust.model_selection.candidates import Candidate, f_test, nested_tests, simplest_sufficient
 from adjust.model_selection.cross_validation import CrossValidation, cross_validate, folds
-from adjust.model_selection.model_choice import Choice, choose, weighed
+from adjust.model_selection.model_choice import Choice, choose, weighted_network
 from adjust.model_selection.models import Model, lenses
 from adjust.problem.network import Network, ObjectPoint, Transformation
 from adjust.quality.reweighting import WeightFunction
@@ -196,7 +196,7 @@ def test_all_candidates_get_the_weights_of_the_networks_own_adjustment(robust: W
     spoiled = replace(network, observations=replace(network.observations, xy_mm=xy))
     start = approximate(spoiled)
     own = adjust(spoiled, start, Options(robust=robust, variance_components=True))
-    again = adjust(weighed(own), start)
+    again = adjust(weighted_network(own), start)
     assert own.weights[5] < 0.5
     assert len(again.network.observations) == (48 if robust == "huber" else 47)
     assert again.vpv == pytest.approx(own.vpv, rel=1e-6)
@@ -244,7 +244,7 @@ def test_predictions_of_known_points_err_by_noise_and_by_what_predicts() -> None
     """Of 40 points in 5 folds the camera and stations add little to the noise of 4 um that the images have."""
     network = network_of(4, "k3", "none")
     model = Model("none", "torlegard", ("k3",))
-    fitted = model.of(network, {}, {})
+    fitted = model.build_network(network, {}, {})
     result = adjust(fitted, approximate(fitted))
     found = cross_validate(result, folds(fitted, Options()), Options())
     assert found is not None

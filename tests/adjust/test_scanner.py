@@ -54,7 +54,7 @@ def test_derivatives_by_complex_steps() -> None:
         np.testing.assert_allclose(bend.gradient(parameters, PLACES_MM)[..., axis], stepped, rtol=0, atol=1e-15)
     for k in range(len(EVERY)):
         stepped = bend.apply(parameters + 1j * STEP * np.eye(len(EVERY))[k], PLACES_MM).imag / STEP
-        np.testing.assert_allclose(-at.by_parameters[..., k], stepped, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(-at.parameter_jacobian[..., k], stepped, rtol=0, atol=1e-14)
 
 
 def test_a_bend_there_and_back() -> None:

@@ -9,7 +9,7 @@ from bent_scans import MIDDLE_MM, RESEAU_MM, films, in_a_bent_scanner
 from simulated import STATIONS, Truth, field_points, simulated
 
 from adjust.initial_values.approximations import approximate
-from adjust.model_selection.scanner_choice import choose_bends, with_bends
+from adjust.model_selection.scanner_choice import bent_network, choose_bends
 from adjust.problem.network import Approximations, Network
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
@@ -90,8 +90,8 @@ def test_two_photographs_are_enough_for_terms_that_they_tell() -> None:
 
 def test_a_bend_of_given_terms_over_the_extent_of_the_scans() -> None:
     network = films(QUARTERS, {}, {})
-    (scanner,) = with_bends(network, ("a20", "b02"), 0.01).scanners
+    (scanner,) = bent_network(network, ("a20", "b02"), 0.01).scanners
     assert {name: prior.sigma for name, prior in scanner.terms.items()} == {"a20": 0.01, "b02": 0.01}
     xy_mm = network.observations.xy_mm
     np.testing.assert_allclose(np.array(scanner.center_mm) - scanner.half_mm, xy_mm.min(axis=0))
-    assert len(with_bends(network).scanners[0].terms) == 14
+    assert len(bent_network(network).scanners[0].terms) == 14

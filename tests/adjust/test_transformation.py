@@ -61,7 +61,7 @@ def test_centred_parameters_are_those_of_the_formula_about_the_middle(kind: Tran
     half = np.asarray(110.0)
     places = MIDDLE_MM + rng.uniform(-110.0, 110.0, (60, 2))
     centred = formula.design(parameters, places, MIDDLE_MM, half)
-    back = formula.by_centred(parameters, MIDDLE_MM, half)
+    back = formula.centred_jacobian(parameters, MIDDLE_MM, half)
     raw = formula.design(parameters, places, np.zeros(2), ONE)
     np.testing.assert_allclose(raw @ back, centred, rtol=0, atol=1e-10)
     if parameters.size and kind != "projective":
