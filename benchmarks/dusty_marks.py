@@ -25,7 +25,7 @@ from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from measure.targets.disks import PLAIN_MARGIN_PX
-from measure.targets.measure_targets import TargetPrediction, measure_disks
+from measure.targets.identification import TargetPrediction, measure_disks
 from synthetic_images.optics import reach_px, seen_coverage
 
 Array = NDArray[np.float64]

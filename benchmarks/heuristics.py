@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from true_marks import KIND
 
 import measure.fiducials.measure_frame as frame_measurement
-import measure.targets.measure_targets as targets
+import measure.targets.identification as targets
 from adjust.linear_algebra import fronts
 from adjust.solution.adjustment import adjust
 from benchmarks.dusty_marks import frame_of_disks

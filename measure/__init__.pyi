@@ -25,7 +25,7 @@ from .results import MarkMeasurement as MarkMeasurement
 from .results import Pose as Pose
 from .scans.opening import open_scan as open_scan
 from .scans.scan import Scan as Scan
-from .targets.measure_targets import TargetOptions as TargetOptions
-from .targets.measure_targets import TargetPrediction as TargetPrediction
-from .targets.measure_targets import measure_crosses as measure_crosses
-from .targets.measure_targets import measure_disks as measure_disks
+from .targets.identification import TargetOptions as TargetOptions
+from .targets.identification import TargetPrediction as TargetPrediction
+from .targets.identification import measure_crosses as measure_crosses
+from .targets.identification import measure_disks as measure_disks

@@ -134,7 +134,12 @@ class BoardMeasurement:
 
 
 def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
-    """Measure a chessboard, grid of dots or squares, ArUco or ChArUco board. A board that is not there is no error."""
+    """Measure a chessboard, grid of dots or squares, ArUco or ChArUco board.
+
+    Returns
+    -------
+    One mark for each point of the board, found or not. A board that is not there is no error, but a reason.
+    """
     if isinstance(spec, CircleGridSpec):
         grid = measure_circle_grid(scan, spec)
         kind = f"grids of {spec.columns} x {spec.rows} dots"

@@ -130,7 +130,7 @@ def _rectangle_mask(
     return np.asarray(np.all((places >= least) & (places <= greatest), axis=-1))
 
 
-def frame_pixels_about(
+def frame_pixel_mask(
     mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float
 ) -> NDArray[np.bool_]:
     """(height, width): which pixels show the exposed frame beside a mark that is cut into its border, farther than

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.flags import Cause
-from measure.marks.rendering import extent_px, frame_pixels_about, known_mask
+from measure.marks.rendering import extent_px, frame_pixel_mask, known_mask
 from measure.marks.shapes import Mark, MarkTemplate
 from measure.matching.covariance import (
     Landscape,
@@ -146,7 +146,7 @@ def _surroundings(given: _Given, part: _Part, fit: PictureFit) -> _Surroundings:
     where = given.mark, place, width, height, EDGE_BLURS * fit.model.total_blur_px
     free = given.blank & known_mask(*where)
     free[part.rows, part.cols] &= ~fit.area
-    return _Surroundings(given.grey, free, given.usable & frame_pixels_about(*where))
+    return _Surroundings(given.grey, free, given.usable & frame_pixel_mask(*where))
 
 
 def _start_fit(

@@ -67,7 +67,17 @@ class Comparison:
 
 
 def compared(targets: TargetPlaces, observed_px: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Comparison:
-    """Targets seen at (n, 2) px with covariances (n, 2, 2), in an image of this width and height."""
+    """Compare each target of an image with what the others say of its place.
+
+    Parameters
+    ----------
+    observed_px, covariance_px2 : (n, 2) and (n, 2, 2), as measured.
+    size_px : width and height of the image.
+
+    Notes
+    -----
+    A linear regression with priors in Student's t distribution (Lange, Little and Taylor 1989), cross-validated.
+    """
     offsets = observed_px - targets.places_px
     fits = [_regression(_design(targets, size_px, bending), offsets, targets, covariance_px2) for bending in _BENDING]
     best = min(fits, key=lambda fit: float(np.median(np.linalg.norm(fit.off_px, axis=1))))
@@ -206,8 +216,12 @@ class ImagePoints:
 
 
 def compared_together(images: Sequence[ImagePoints], xyz: Array) -> list[Comparison]:
-    """Each image's targets against its others and the other images; xyz (m, 3): the points, along a plane and above it
-    if they lie on one: each coordinate has a spread of its own."""
+    """Compare each image's targets with its others and with the other images.
+
+    Parameters
+    ----------
+    xyz : (m, 3) the points, along a plane and above it if they lie on one: each coordinate has a spread of its own.
+    """
     known = _Known.start(len(images), xyz)
     for _ in range(_POINT_ROUNDS - 1):
         known = _gathered(_Readings.read(images, known), known)

@@ -46,7 +46,12 @@ class CrossSearch:
 
 
 def cross_candidates(scan: Scan, search: CrossSearch) -> list[Candidate]:
-    """Patches of a cross's shape, the strongest first; the columns of pixel_from_disk are its half bars."""
+    """Detect crosses in a whole scan, in one pass over its blocks.
+
+    Returns
+    -------
+    Candidates, the strongest first; the columns of pixel_from_disk are a cross's half bars.
+    """
     return search_blocks(scan, _octaves(search, scan.full_scale_dn))
 
 

@@ -297,7 +297,12 @@ def _round_ones(found: Outlines, noise: Array, factor: int, sign: int) -> Patche
 
 
 def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
-    """What a disk explains, to a tenth of a pixel or so, the strongest first, none within another."""
+    """Detect disks in a whole scan, in one pass over its blocks.
+
+    Returns
+    -------
+    Candidates to a tenth of a pixel or so, the strongest first, none within another.
+    """
     smallest, largest = search.diameter_px[0] / _SIZE_TOLERANCE, search.diameter_px[1] * _SIZE_TOLERANCE
 
     def disks(block: Block, patches: Patches) -> Patches:

@@ -66,10 +66,16 @@ class RingCode:
 
 
 def read_code(scan: Scan, dot: Candidate, code: RingCode) -> int | None:
-    """The number in the ring about a dot; None where there is no ring, or one that is not of this code.
+    """Read the number in the ring about a dot.
 
+    Returns
+    -------
+    None where there is no ring, or one that is not of this code.
+
+    Notes
+    -----
     The ring is sampled along the dot's own ellipse, enlarged: what perspective does to both is the same but for some
-    percent. Set bits are those that look like the dot.
+    percent. Set bits are those that look like the dot (Schneider, IDENT/VISION 1991).
     """
     inner, outer = code.ring
     angles = 2.0 * np.pi * np.arange(code.bits * _SAMPLES) / (code.bits * _SAMPLES)

@@ -202,11 +202,17 @@ class Naming:
 
 
 def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | str:
-    """Name the dots that are points of the sheet; or why none has a name.
+    """Name the dots that are points of a sheet.
 
-    sheet (n, 2): the points' places on it, in any unit and of either hand; size_px: width and height of the picture.
-    Coded dots are as large as one another. A suggestion is taken if it explains most of the points that it puts into
-    the picture.
+    Parameters
+    ----------
+    sheet : (n, 2) the points' places on it, in any unit and of either hand.
+    dots : as found. Coded dots are as large as one another.
+    size_px : width and height of the picture.
+
+    Returns
+    -------
+    The names, of a suggestion that explains most of the points that it puts into the picture; or why there are none.
     """
     if len(dots.coded) < 2:
         return f"{len(dots.coded)} coded targets of the sheet were recognised, and two are needed"

@@ -150,7 +150,18 @@ class Matched:
 
 
 def match_pieces(pieces: Sequence[Piece], reference: int, radius_px: int = RADIUS_PX) -> tuple[Matched, ...]:
-    """Match the pieces of one point jointly, in a patch of that radius; the reference's point stays where it is."""
+    """Match the pieces of one point jointly.
+
+    Parameters
+    ----------
+    pieces : what each frame shows of the point.
+    reference : the number of the piece whose point stays where it is.
+    radius_px : of the patch.
+
+    Returns
+    -------
+    The pieces as matched, in their order; with reasons where they could not be.
+    """
     fit = _Fit(pieces, reference, radius_px)
     best: tuple[Matched, ...] = ()
     for smoothing_px in _SMOOTHING_PX:

@@ -14,7 +14,7 @@ from measure.flags import Code, Reason, Status
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.opening import open_scan
 from measure.scans.remote import fetch_location, scan_path
-from measure.targets.measure_targets import TargetPrediction
+from measure.targets.identification import TargetPrediction
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.target_field import Field, checked_places, measure_single_targets, target_field

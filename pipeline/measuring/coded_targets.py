@@ -13,7 +13,7 @@ from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate
 from measure.targets.consistency import along_plane, is_flat
 from measure.targets.disk_detection import DiskSearch, disk_candidates
-from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_disks
+from measure.targets.identification import TargetOptions, TargetPrediction, measure_disks
 from measure.targets.ring_codes import read_code
 from measure.targets.sheets import Dots, Naming, name_dots
 from pipeline.errors import InputError

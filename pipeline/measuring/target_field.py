@@ -15,7 +15,7 @@ from measure.targets.block_search import Candidate
 from measure.targets.consistency import TargetPlaces, compared
 from measure.targets.crosses import CrossSearch, cross_candidates
 from measure.targets.disk_detection import DiskSearch, disk_candidates
-from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
+from measure.targets.identification import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.results.comparator_file import pixel_from_comparator

@@ -17,7 +17,7 @@ from adjust.initial_values.resection import MAX_TRIPLES
 from adjust.target_identification.naming import Names, name_coded, name_marks
 from adjust.target_identification.unnamed_marks import chance_of_a_mark, log10_of_agreement, mark_density
 from measure.targets.block_search import Candidate
-from measure.targets.measure_targets import TargetPrediction
+from measure.targets.identification import TargetPrediction
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.target_field import (
     Field,

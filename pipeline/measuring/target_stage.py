@@ -14,7 +14,7 @@ from measure.boards.measure import measure_board
 from measure.flags import Code, Reason, Status
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan
-from measure.targets.measure_targets import TargetPrediction
+from measure.targets.identification import TargetPrediction
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings

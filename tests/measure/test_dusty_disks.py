@@ -7,7 +7,7 @@ from drawn import drawn, ellipse, scan_of, whitened
 from measure.flags import Status
 from measure.results import Covariance, SecondPlace
 from measure.targets.disks import FittedDisk, doubts
-from measure.targets.measure_targets import TargetPrediction, measure_disks
+from measure.targets.identification import TargetPrediction, measure_disks
 
 CONTRAST, GROUND = 15000.0, 25000.0
 

@@ -18,7 +18,7 @@ from measure.boards.specs import ChessboardSpec
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import MarkShape, polygon, turned_part
 from measure.results import MEASURE_REVISION, MarkMeasurement
-from measure.targets.measure_targets import TargetPrediction, measure_disks
+from measure.targets.identification import TargetPrediction, measure_disks
 
 TABLE = Path(__file__).with_name("revision.json")
 PLACE_PX, SIGMA = 1e-4, 0.01  # which processors may make of rounding; SIGMA is a share

@@ -10,7 +10,7 @@ from measure.flags import Status
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.crosses import CrossSearch, cross_candidates
-from measure.targets.measure_targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
+from measure.targets.identification import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 500.0, 12000.0

@@ -348,10 +348,22 @@ class _Row:
 def measure_disks(
     scan: Scan, predictions: Sequence[TargetPrediction], options: TargetOptions | None = None
 ) -> tuple[MarkMeasurement, ...]:
-    """Find, fit and identify disks: one mark for each prediction, whatever became of it.
+    """Find, fit and identify disks.
 
-    A disk is a prediction's target if it is the one disk of the right size near the place where the prediction and the
-    shift that all targets share put it. Points are named once; ValueError otherwise.
+    Parameters
+    ----------
+    predictions : where each target should be. A disk is a prediction's target if it is the one disk of the right size
+        near the place where the prediction and the shift that all targets share put it.
+    options : None: the defaults of `TargetOptions`.
+
+    Returns
+    -------
+    One mark for each prediction, whatever became of it.
+
+    Raises
+    ------
+    ValueError
+        Where a point is predicted twice.
     """
     return _measure_predicted(scan, predictions, options or TargetOptions(), UNIT_DISK)
 
@@ -359,7 +371,13 @@ def measure_disks(
 def measure_crosses(
     scan: Scan, predictions: Sequence[TargetPrediction], line: float, options: TargetOptions | None = None
 ) -> tuple[MarkMeasurement, ...]:
-    """The same for upright crosses: radius 1 is half an arm-to-arm length, line is the arms' width in that unit."""
+    """Find, fit and identify upright crosses, as `measure_disks` does disks.
+
+    Parameters
+    ----------
+    predictions : radius 1 of pixel_from_disk is half an arm-to-arm length.
+    line : the arms' width in that unit.
+    """
     return _measure_predicted(scan, predictions, options or TargetOptions(), MarkShape(cross(1.0, line)))
 
 
