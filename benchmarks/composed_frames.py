@@ -25,7 +25,7 @@ from benchmarks.search import OUTCOMES, POSE_OUTCOMES, judged, lines, print_tabl
 from benchmarks.search_frames import Case
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.marks.templates import cut, template_of
+from measure.marks.templates import cut, learn_template
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
@@ -111,7 +111,7 @@ def learned_layout(camera: Path, learned_dn: float, round_: int) -> FiducialLayo
         spare_px = 8 + 2 * float(np.abs(origins[side]).max())
         size_mm = PITCH_MM * (min(crops[side].shape) / fold(crops[side]) - spare_px)
         placed = [(scan, np.column_stack([FLIP / PITCH_MM, places[side] + origins[side]])) for scan, places in scans]
-        template = template_of([cut(scan, place, size_mm) for scan, place in placed], size_mm)
+        template = learn_template([cut(scan, place, size_mm) for scan, place in placed], size_mm)
         x, y = PITCH_MM * (REACH_PX * np.array(direction) + FLIP @ origins[side])
         marks.append(LayoutMark(side, (float(x), float(y)), (0.05, 0.05), template))
     return FiducialLayout(tuple(marks), (SIZE_PX * PITCH_MM,) * 2)

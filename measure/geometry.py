@@ -31,7 +31,7 @@ def pose_in_camera(seen: str, frame: str) -> str:
     return next(pose for pose in POSES if np.array_equal(up_from_camera(pose), np.rint(own)))
 
 
-def quarter_turned(image: Grid, turn: Array) -> Grid:
+def turn_by_quarters(image: Grid, turn: Array) -> Grid:
     """The image under a turn (2, 2) of its columns and rows by whole quarters, after a mirror if there is one."""
     whole = np.rint(turn)
     turned = image if whole[0, 0] else image.T

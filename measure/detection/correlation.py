@@ -66,14 +66,14 @@ class Surroundings:
     def pattern(self, template: Array, detail_px: float, image: Map) -> tuple[Map, Map]:
         """What a flattened picture is correlated with, of mean 0, and how much each of its pixels counts: one that is
         nan in the template does not."""
-        about = self._about(template, detail_px)
+        about = self._template_mask(template, detail_px)
         template = np.nan_to_num(template)
         chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), self.coarse * detail_px), np.float32)
         if self.whitened:
             chip = np.asarray(cv2.filter2D(chip, -1, _inverse_covariance(image)), np.float32)
         return about * (chip - np.average(chip, weights=about)), about
 
-    def _about(self, template: Array, detail_px: float) -> Map:
+    def _template_mask(self, template: Array, detail_px: float) -> Map:
         """1 on the drawing and beside it, 0 elsewhere."""
         rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
         drawn = np.nan_to_num(np.abs(template - np.nanmedian(rim)))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.geometry import linear_scale, quarter_turned
+from measure.geometry import linear_scale, turn_by_quarters
 from measure.marks.rendering import extent_px, known_picture
 from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
 from measure.scans.scan import Scan
@@ -83,7 +83,7 @@ def _templates(views: Sequence[MarkView], reduction: int, half_px: int) -> list[
             first[view.mark] = view.linear, _template(view, reduction, half_px)
         linear, template = first[view.mark]
         turn = view.linear @ np.linalg.inv(linear)
-        drawn[key] = quarter_turned(template, turn) if _is_quarter(turn) else _template(view, reduction, half_px)
+        drawn[key] = turn_by_quarters(template, turn) if _is_quarter(turn) else _template(view, reduction, half_px)
     return [drawn[view.mark, view.linear.tobytes()] for view in views]
 
 

@@ -66,14 +66,16 @@ def recurrence(reference: Window, others: Sequence[Window], size_mm: float) -> R
     row, col = tried[best]
     square = reference[row : row + _SIDE, col : col + _SIDE]
     places = [_highest(cv2.matchTemplate(window, square, cv2.TM_CCOEFF_NORMED)) for window in others]
-    moved = [_moved(window, col - there[1], row - there[0]) for window, there in zip(others, places, strict=True)]
+    moved = [
+        _shift_window(window, col - there[1], row - there[0]) for window, there in zip(others, places, strict=True)
+    ]
     center_row, center_col = _telling(np.stack([reference, *moved]), (row, col))
     middle = (reference.shape[0] - 1) / 2
     offset = np.array([center_col - middle, middle - center_row]) * size_mm / _SIDE
     return Recurrence(offset, float(excess[best]))
 
 
-def _moved(window: Window, right: int, down: int) -> Window:
+def _shift_window(window: Window, right: int, down: int) -> Window:
     """The window moved by whole samples; where nothing comes in, nothing is."""
     shift = np.array([[1.0, 0.0, right], [0.0, 1.0, down]], np.float32)
     return np.asarray(cv2.warpAffine(window, shift, window.shape[::-1], flags=cv2.INTER_NEAREST), np.float32)

@@ -24,9 +24,9 @@ from measure.scans.scan import Scan
 _COMPARED = 3  # best placements: the one that chance makes least is among them
 _QUICK = Effort(cache_bytes=48 << 20, half_px=16, all_orientations=False)
 _AT_LEAST = 3  # marks that are seen of a frame
-_LOOKS = 3  # at the best of these
+_TRIED = 3  # at the best of these
 _PLACES = 2  # that are looked at, each in the poses that answer there
-_LOOK = FiducialOptions(match=MatchOptions(damage_rounds=1))  # how a mark looks takes less than where it lies
+_QUICK_OPTIONS = FiducialOptions(match=MatchOptions(damage_rounds=1))  # how a mark looks takes less than where it lies
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Answer:
     placements: tuple[Placement, ...]
 
 
-def answer(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int = 0) -> Answer:
+def search_camera(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int = 0) -> Answer:
     """How the scan answers to the constellation under hypotheses about its pitch. tried: how many were before."""
     search, tried = FrameSearch(scan, layout, FiducialOptions(), effort=_QUICK), tried + len(hypotheses)
     found = search.search_room(hypotheses)[:_COMPARED]
@@ -46,19 +46,19 @@ def answer(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothe
     return Answer(min(expected, default=np.inf), tuple(found))
 
 
-def seen(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.0) -> Frame | None:
+def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.0) -> Frame | None:
     """The frame as its marks look at the first of the best placements where they agree, at one of two places in any of
     the poses that answer there, None where they do nowhere. times: how many pixels a side the scan has for one of what
     answered, a thumbnail of it."""
     places = list[Placement]()
-    for placement in answered.placements[:_LOOKS]:
+    for placement in answered.placements[:_TRIED]:
         if not any(placement.same_place(other) for other in places):
             places.append(placement)
         if len(places) > _PLACES:
             break
         enlarged = _enlarged(placement, times)
         if answered.expected <= CAMERA_BY_CHANCE or _may_be_there(scan, layout, enlarged):
-            frame = detect_frame(scan, layout, enlarged, _LOOK)
+            frame = detect_frame(scan, layout, enlarged, _QUICK_OPTIONS)
             if frame.accepted:
                 return frame
     return None
@@ -67,7 +67,7 @@ def seen(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.
 def _may_be_there(scan: Scan, layout: FiducialLayout, placement: Placement) -> bool:
     """Whether noise hardly makes three of the marks look like themselves as much as they do. A fit takes ten times as
     long as to see that."""
-    frame = Frame.from_placement(scan, layout, placement, _LOOK)
+    frame = Frame.from_placement(scan, layout, placement, _QUICK_OPTIONS)
     peaks = [localise(scan, frame.prediction(index, frame.first_search_px)) for index in range(len(layout.marks))]
     false_alarms = np.sort([1.0 if peak is None else peak[1] for peak in peaks])[:_AT_LEAST]
     return bool(comb(len(peaks), len(false_alarms)) * false_alarms.prod() <= CAMERA_BY_NOISE)

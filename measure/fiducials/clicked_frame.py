@@ -25,7 +25,7 @@ _COLLINEAR = 1e-3  # of their extent: marks nearer to a line than that do not te
 
 def is_shown(layout: FiducialLayout, options: FiducialOptions) -> bool:
     """Whether enough marks were pointed at to say where the frame is."""
-    return len(_shown(layout, options.clicks)[0]) >= LEAST_CLICKS
+    return len(_clicked_places(layout, options.clicks)[0]) >= LEAST_CLICKS
 
 
 def clicked_frame(
@@ -33,7 +33,7 @@ def clicked_frame(
 ) -> tuple[Frame, Pose]:
     """The frame measured from a similarity through the marks that were pointed at, and its pose, which they tell
     unless they lie on a line, or the project sets it."""
-    camera, clicked = _shown(layout, options.clicks)
+    camera, clicked = _clicked_places(layout, options.clicks)
     pixel_mm = np.array(pitch_um or (1.0, 1.0)) / 1000.0
     up_mm = clicked * pixel_mm * (1.0, -1.0)
     pose, up = _clicked_pose(camera, up_mm, POSES if options.pose == "auto" else (options.pose,))
@@ -46,41 +46,41 @@ def clicked_frame(
     placements = [Placement(pose, matrix, 0.0, len(camera), polarity, 1, pitch_mm) for polarity in polarities]
     frames = [measure_frame(scan, layout, placement, options) for placement in placements]
     frame = max(frames, key=lambda one: (one.measured_count, int(one.inliers.sum())))
-    tells = options.pose != "auto" or not on_a_line(camera)
+    tells = options.pose != "auto" or not are_collinear(camera)
     evidence = _TOLD if tells else ("the marks that were pointed at lie on a line, which has two sides.",)
     return frame, Pose(pose, tells, evidence)
 
 
 def contradicted_pose(layout: FiducialLayout, options: FiducialOptions, pitch_um: tuple[float, float] | None) -> Reason:
     """Why the clicks do not go with the scan orientation that is set; empty where they do, or cannot tell."""
-    camera, clicked = _shown(layout, options.clicks)
-    if options.pose == "auto" or on_a_line(camera):
+    camera, clicked = _clicked_places(layout, options.clicks)
+    if options.pose == "auto" or are_collinear(camera):
         return NO_REASON
     pose, _ = _clicked_pose(camera, clicked * np.array(pitch_um or (1.0, 1.0)) / 1000.0 * (1.0, -1.0), POSES)
     if pose == options.pose:
         return NO_REASON
-    told = (
+    sentence = (
         f"the marks that were pointed at show the scan orientation {pose}, and {options.pose} is set. A viewer that "
         "obeys the file's orientation tag shows other columns and rows than the file has. Point at them in the picture "
         "as it is stored, or set the right orientation"
     )
-    return Reason(told, Code.POSE)
+    return Reason(sentence, Code.POSE)
 
 
-def on_a_line(places: Array) -> bool:
+def are_collinear(places: Array) -> bool:
     """Whether places (n, 2) do not tell a mirrored frame from one that is not."""
     singular = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
     return bool(singular[1] <= _COLLINEAR * singular[0])
 
 
-def with_clicks(frame: FrameMeasurement, clicks: Sequence[Click]) -> FrameMeasurement:
+def place_clicked_marks(frame: FrameMeasurement, clicks: Sequence[Click]) -> FrameMeasurement:
     """Marks that were pointed at and could not be matched are where the person saw them, as well as one points."""
-    told = {click.point: click for click in clicks}
-    marks = (_placed(mark, told[mark.point]) if mark.point in told else mark for mark in frame.marks)
+    by_point = {click.point: click for click in clicks}
+    marks = (_place_clicked(mark, by_point[mark.point]) if mark.point in by_point else mark for mark in frame.marks)
     return replace(frame, marks=tuple(marks))
 
 
-def _shown(layout: FiducialLayout, clicks: Sequence[Click]) -> tuple[Array, Array]:
+def _clicked_places(layout: FiducialLayout, clicks: Sequence[Click]) -> tuple[Array, Array]:
     """(n, 2) camera mm of the marks that were pointed at, and (n, 2) where."""
     places = {mark.id: mark.xy_mm for mark in layout.marks}
     known = [click for click in clicks if click.point in places]
@@ -99,11 +99,11 @@ def _similarity(camera: Array, up_mm: Array, pose: str) -> tuple[Array, float]:
     """(2, 3), camera mm to the scan's mm (right, up) through a pose and a similarity, least squares, and what is left
     of the places, mm."""
     turned = camera @ up_from_camera(pose).T
-    own, seen = turned @ (1.0, 1j), up_mm @ (1.0, 1j)
+    own, observed = turned @ (1.0, 1j), up_mm @ (1.0, 1j)
     design = np.column_stack([own, np.ones(len(own))])
-    (scale, shift), *_ = np.linalg.lstsq(design, seen, rcond=None)
+    (scale, shift), *_ = np.linalg.lstsq(design, observed, rcond=None)
     linear = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ up_from_camera(pose)
-    left = float(np.abs(design @ (scale, shift) - seen).max())
+    left = float(np.abs(design @ (scale, shift) - observed).max())
     return np.column_stack([linear, [shift.real, shift.imag]]), left
 
 
@@ -113,11 +113,11 @@ def _turn_rad(up_from_mm: Array, pose: str) -> float:
     return float(np.arctan2(own[1, 0], own[0, 0]))
 
 
-def _placed(mark: MarkMeasurement, click: Click) -> MarkMeasurement:
+def _place_clicked(mark: MarkMeasurement, click: Click) -> MarkMeasurement:
     if mark.status.is_observation:
         return mark
     place = np.array([click.col_px, click.row_px])
     covariance = Covariance({Cause.CLICK: CLICK_SIGMA_PX**2 * np.eye(2)})
-    told = f"it is where a person pointed, for nothing could be matched there: {mark.reason}"
-    reason = Reason(told, Code.CLICKED, *mark.reason.codes)
+    sentence = f"it is where a person pointed, for nothing could be matched there: {mark.reason}"
+    reason = Reason(sentence, Code.CLICKED, *mark.reason.codes)
     return replace(mark, center_px=place, covariance=covariance, status=Status.WEAK, reason=reason)

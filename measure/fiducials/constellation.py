@@ -125,7 +125,7 @@ def mark_sign(mark: Mark, assumed: int) -> int:
     return {"light": 1, "dark": -1, "auto": assumed}[mark.polarity]
 
 
-def possible_signs(marks: Sequence[LayoutMark]) -> set[int]:
+def mark_signs(marks: Sequence[LayoutMark]) -> set[int]:
     """Which signs the marks can have."""
     return {mark_sign(mark.mark, assumed) for mark in marks for assumed in (1, -1)}
 

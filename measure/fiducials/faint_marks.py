@@ -81,7 +81,7 @@ def _extremes_dn(frame: Frame) -> Array:
     to be read."""
     inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
     expected = [frame.prediction(index, 0.0) for index in inside]
-    grey = [_grey_about(frame, each.mark, each.pixel_from_mark, _SURROUND).ravel() for each in expected]
+    grey = [_surrounding_grey(frame, each.mark, each.pixel_from_mark, _SURROUND).ravel() for each in expected]
     return np.asarray(np.percentile(np.concatenate(grey), _EXTREMES))
 
 
@@ -90,19 +90,19 @@ def _reached_dn(frame: Frame, agreeing: Mapping[int, MarkFit]) -> dict[int, floa
     reached: dict[int, list[float]] = {}
     for index, fit in list(agreeing.items())[:_TYPICAL]:
         is_light = fit.contrast_dn > 0
-        grey = _grey_about(frame, frame.layout.marks[index].mark, fit.pixel_from_mark)
+        grey = _surrounding_grey(frame, frame.layout.marks[index].mark, fit.pixel_from_mark)
         reached.setdefault(1 if is_light else -1, []).append(float(np.percentile(grey, _EXTREMES[int(is_light)])))
     return {polarity: float(np.median(tones)) for polarity, tones in reached.items()}
 
 
 def _ground(frame: Frame, expected: MarkPrediction, tones_dn: Sequence[float]) -> Ground:
     """About a mark's place; tones_dn: grey values that a mark can have."""
-    grey = _grey_about(frame, expected.mark, expected.pixel_from_mark)
+    grey = _surrounding_grey(frame, expected.mark, expected.pixel_from_mark)
     room_dn = max(*(expected.polarity * (tone_dn - float(np.median(grey))) for tone_dn in tones_dn), 0.0)
     return Ground(expected.polarity > 0, room_dn, float(grey.std()))
 
 
-def _grey_about(frame: Frame, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Array:
+def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Array:
     """The grey values about a mark's place, as far as it reaches or so many times as far."""
     center = pixel_from_mark[:, 2]
     least, greatest = (center + times * (corner - center) for corner in extent_px(mark, pixel_from_mark))

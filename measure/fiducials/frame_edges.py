@@ -31,7 +31,7 @@ def edge_tone_information(
     """None or one, of all pieces of edge that are seen as straight lines; pixel_from_camera (2, 3): of the frame."""
     linear = pixel_from_camera[:, :2]
     px_per_mm = linear_scale(linear)
-    told = []
+    tones = []
     pieces = list(_pieces(layout))
     for start_mm, along_mm, inwards_mm, length_mm in pieces[:: max(len(pieces) // _PIECES, 1)]:
         count = int(length_mm * px_per_mm / _SHARE_PX)
@@ -48,8 +48,8 @@ def edge_tone_information(
         )
         edge = edge_along(course, (0.0, length_mm * px_per_mm), _SEARCH_MM * px_per_mm, 0, count)
         if edge is not None and edge.tone is not None:
-            told.append(edge.tone)
-    return [pool_edge_tones(told, scan.tone)] if told else []
+            tones.append(edge.tone)
+    return [pool_edge_tones(tones, scan.tone)] if tones else []
 
 
 def _pieces(layout: FiducialLayout) -> Iterator[tuple[Array, Array, Array, float]]:
@@ -67,12 +67,14 @@ def _pieces(layout: FiducialLayout) -> Iterator[tuple[Array, Array, Array, float
         reach = _reach_mm(mark, 1 - side) + _BESIDE_MM
         for way in (1.0, -1.0):
             room = half[1 - side] - way * at[1 - side]  # to the corner
-            neighbours = [way * (np.array(other.xy_mm) - at)[1 - side] for other in _on_side(layout, mark, side)]
+            neighbours = [
+                way * (np.array(other.xy_mm) - at)[1 - side] for other in _same_side_marks(layout, mark, side)
+            ]
             room = min([room, *(gap - reach for gap in neighbours if gap > 0)]) - _BESIDE_MM
             yield on_edge + way * reach * run, way * run, inwards, min(room, _LONGEST_MM) - reach
 
 
-def _on_side(layout: FiducialLayout, mark: LayoutMark, side: int) -> list[LayoutMark]:
+def _same_side_marks(layout: FiducialLayout, mark: LayoutMark, side: int) -> list[LayoutMark]:
     """The other marks near the same edge."""
     half, sign = layout.frame_mm[side] / 2, np.sign(mark.xy_mm[side])
     return [one for one in layout.marks if one is not mark and half - sign * one.xy_mm[side] < 2 * _NEAR_MM]

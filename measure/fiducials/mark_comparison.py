@@ -19,7 +19,7 @@ from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.results import MarkFit
 
 Array = NDArray[np.float64]
-# The standard deviation of a figure from mark to mark, by the variance that so many marks show beyond their own.
+# The standard deviation of a figure from mark to mark, by the variance that so many marks show exceedance their own.
 _Spread = Callable[[float, int], float]
 
 _FEWEST_BLURS = 3  # other marks: of fewer nobody knows by how much they differ
@@ -50,7 +50,7 @@ class SharedBlur:
     sigma: float
     differs: bool
 
-    def is_borne_out_by(self, fit: MarkFit) -> bool:
+    def is_confirmed(self, fit: MarkFit) -> bool:
         """Whether a match that took it as an observation comes out with such a blur: noise moves the estimate from an
         observation by the root of what it takes from its variance."""
         moved = _log_total_px(fit.blur_px) - _log_total_px(self.blur_px)
@@ -67,7 +67,7 @@ def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
     return [
         None
         if expected is None or not (expected.differs or own_sigma > _TELLING)
-        else SharedBlur(_without_pixel(expected.value), expected.sigma, expected.differs)
+        else SharedBlur(_remove_pixel(expected.value), expected.sigma, expected.differs)
         for expected, own_sigma in zip(expected_blurs, sigma.tolist(), strict=True)
     ]
 
@@ -115,7 +115,7 @@ class Touch:
         """Of a coordinate, whichever way it was moved."""
         return self.probability * (self.moved_px**2 + self.sigma_px**2) / 2
 
-    def beyond(self, px: float) -> float:
+    def exceedance(self, px: float) -> float:
         """The probability that it was moved farther."""
         ends = (np.array([self.moved_px, -self.moved_px]) - px) / max(self.sigma_px, 1e-12)
         return self.probability * float(ndtr(ends).sum())
@@ -183,7 +183,7 @@ def _log_total_px(blur_px: float) -> float:
     return float(np.log(blur_px**2 + PIXEL_VARIANCE_PX2) / 2)
 
 
-def _without_pixel(log_seen_px: float) -> float:
+def _remove_pixel(log_seen_px: float) -> float:
     return float(np.sqrt(max(np.exp(2 * log_seen_px) - PIXEL_VARIANCE_PX2, 0.0)))
 
 
@@ -220,8 +220,8 @@ def _mean(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, f
     by how much more: by the moments of what they leave (DerSimonian and Laird, 1986)."""
     weights = 1 / sigma**2
     rest = values - weights @ values / weights.sum()
-    beyond = weights @ rest**2 - (len(values) - 1)
-    between = max(beyond / (weights.sum() - (weights**2).sum() / weights.sum()), 0.0)
+    exceedance = weights @ rest**2 - (len(values) - 1)
+    between = max(exceedance / (weights.sum() - (weights**2).sum() / weights.sum()), 0.0)
     apart = spread(float(between), len(values))
     weights = 1 / (sigma**2 + apart**2)
     return float(weights @ values / weights.sum()), float(1 / np.sqrt(weights.sum())), apart

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from measure.annotations.detect_text import networks
 from measure.annotations.fields import KnownLine, Line
 from measure.annotations.read import read_writing
-from measure.fiducials.clicked_frame import clicked_frame, contradicted_pose, is_shown, with_clicks
+from measure.fiducials.clicked_frame import clicked_frame, contradicted_pose, is_shown, place_clicked_marks
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import pitch_hypotheses
@@ -54,12 +54,12 @@ def measure_fiducials(
     if is_shown(layout, options):
         frame, pose = clicked_frame(scan, layout, pitch_um, options)
         lines = _read(scan, layout, frame) if options.writing == "all" else None
-        shown = with_clicks(
+        shown = place_clicked_marks(
             replace(present_frame(scan, layout, frame, pose, pitch_um, (), NO_REASON), writing=lines), options.clicks
         )
         contradiction = contradicted_pose(layout, options, pitch_um)
         return _refused(shown, contradiction) if contradiction else shown
-    return with_clicks(_searched(scan, layout, pitch_um, options), options.clicks)
+    return place_clicked_marks(_search_frame(scan, layout, pitch_um, options), options.clicks)
 
 
 def _refused(frame: FrameMeasurement, why: Reason) -> FrameMeasurement:
@@ -71,7 +71,7 @@ def _refused(frame: FrameMeasurement, why: Reason) -> FrameMeasurement:
     return replace(frame, marks=tuple(marks), problems=(why.reword(f"{why}."), *frame.problems))
 
 
-def _searched(
+def _search_frame(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
 ) -> FrameMeasurement:
     """The same where nobody shows where the frame is."""
@@ -164,19 +164,19 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
             shift = np.linalg.solve(
                 best.pixel_from_camera[:, :2], other.pixel_from_camera[:, 2] - best.pixel_from_camera[:, 2]
             )
-            told = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
-            beside = Reason(
-                f"the scan shows another frame {told} beside this one, with {other.supported} marks where this one has "
-                f"{best.supported}: give a scan of one frame, or name both in images.csv by the column window",
+            shift_mm = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
+            another = Reason(
+                f"the scan shows another frame {shift_mm} beside this one, with {other.supported} marks where this one "
+                f"has {best.supported}: give a scan of one frame, or name both in images.csv by the column window",
                 Code.OTHER_FRAME,
             )
             shifted = Reason(
-                f"the constellation fits nearly as well shifted by {told}, on {other.supported} marks against "
+                f"the constellation fits nearly as well shifted by {shift_mm}, on {other.supported} marks against "
                 f"{best.supported}: the marks' names are not certain",
                 Code.AMBIGUOUS,
             )
-            is_beside = (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any()
-            problems.append(beside if is_beside else shifted)
+            is_outside = (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any()
+            problems.append(another if is_outside else shifted)
     return problems[:3]
 
 
@@ -186,5 +186,5 @@ def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bo
         return False
     if search.false_placements(other) > FRAMES_BY_CHANCE:
         return False
-    seen = measure_frame(search.scan, search.layout, other, search.options)
-    return seen.is_sure and not frame.contains(seen)
+    frame_there = measure_frame(search.scan, search.layout, other, search.options)
+    return frame_there.is_sure and not frame.contains(frame_there)

@@ -1,7 +1,9 @@
 """What a found mark's picture says of which of the camera's marks it is, in whichever direction a pose shows it."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from measure.detection.mark_views import detail_px
-from measure.geometry import linear_scale, quarter_turned
+from measure.geometry import linear_scale, turn_by_quarters
 from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
 from measure.marks.shapes import Mark, MarkTemplate
 from measure.noise.robust_estimation import TukeyFit, robust_scale, tukey_fit
@@ -34,7 +36,7 @@ SPOILT = 0.01  # probability that writing, dust or a neighbour beside a mark fei
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class PosedMark:
     """A mark as a pose shows it at a site: turn (2, 2), from its x and y to right and up. None: bare ground."""
 
     mark: Mark | None
@@ -43,47 +45,25 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A mark's picture on the drawings' grid, (size, size) with its origin in the middle. told: where it tells the grey
-    values: a learned chip has the landscape of other scans beside its mark. reached: the chip, which tells nothing
+    """A mark's picture on the drawings' grid, (size, size) with its origin in the middle. known: where it tells the
+    grey values: a learned chip has the landscape of other scans beside its mark. covered: the chip, which tells nothing
     beyond its edge; of a drawn mark everything. noise: of the chip's own pixels, in shares of the contrast, inf where
     it is not known."""
 
     grey: Array
-    told: Mask
-    reached: Mask
+    known: Mask
+    covered: Mask
     noise: float = 0.0
 
-    def turned(self, turn: Array) -> "View":
-        return replace(
-            self,
-            grey=quarter_turned(self.grey, turn),
-            told=quarter_turned(self.told, turn),
-            reached=quarter_turned(self.reached, turn),
-        )
+    def replace_pictures(self, change: Callable[[Any], Any]) -> "View":
+        """With the same change, a turn say, of all three pictures."""
+        return replace(self, grey=change(self.grey), known=change(self.known), covered=change(self.covered))
 
-    def wider(self, spare: int) -> "View":
-        """On a larger grid. A drawing's edge goes on; beyond a chip's there is nothing."""
-        return replace(
-            self,
-            grey=np.pad(self.grey, spare, mode="edge"),
-            told=np.pad(self.told, spare, mode="edge"),
-            reached=np.pad(self.reached, spare, mode="edge"),
-        )
-
-    def moved(self, cells: tuple[int, int]) -> "View":
-        """Down and right by so many cells, which must be spare about a chip."""
-        return replace(
-            self,
-            grey=np.roll(self.grey, cells, (0, 1)),
-            told=np.roll(self.told, cells, (0, 1)),
-            reached=np.roll(self.reached, cells, (0, 1)),
-        )
-
-    def aligned(self, window: Array) -> "View":
+    def align(self, window: Array) -> "View":
         """Moved by the part of a cell that makes it most like a window (size, size), which it lies on to a cell."""
-        used, moved, shift = self.told & self.reached, self, np.zeros(2)
+        used, moved, shift = self.known & self.covered, self, np.zeros(2)
         for _ in range(_ALIGNMENTS):
-            factors = moved.fitted(window, used).factors
+            factors = moved.fit(window, used).factors
             if factors[1] == 0.0:
                 return self
             shift = np.clip(shift - factors[2:] / factors[1], -1.0, 1.0)
@@ -94,16 +74,16 @@ class View:
         """The sum of the squares by which two chips differ wherever both tell something, one moved as it is most like
         the other, beyond what their noise makes of a pixel. contrast: of the picture, in standard deviations of its
         noise: what is an outlier there counts as one."""
-        used = self.told & other.told & self.reached & other.reached
+        used = self.known & other.known & self.covered & other.covered
         if used.sum() < _FEWEST:
             return 0.0
-        moved = replace(self, told=used, reached=used).aligned(other.grey)
-        residuals = moved.fitted(other.grey, used).residuals
+        moved = replace(self, known=used, covered=used).align(other.grey)
+        residuals = moved.fit(other.grey, used).residuals
         noise = min(robust_scale(residuals), float(np.hypot(self.noise, other.noise)))
         alike = max(_OUTLIER * noise, _ALIKE)
         return float(((residuals**2 - alike**2) * contrast**2).clip(0.0, _OUTLIER**2).sum())
 
-    def fitted(self, window: Array, used: Mask) -> TukeyFit:
+    def fit(self, window: Array, used: Mask) -> TukeyFit:
         """The fit to a window in the pixels used, robust against writing and dust in it. Factors: offset, gain, by row
         and by column."""
         slopes = [np.asarray(np.gradient(self.grey, axis=axis))[used] for axis in (0, 1)]
@@ -113,11 +93,16 @@ class View:
 
     @property
     def is_chip(self) -> bool:
-        return not bool(self.reached.all())
+        return not bool(self.covered.all())
 
 
 _EVERYWHERE = np.ones((1, 1), dtype=bool)
 _BARE = View(np.zeros((1, 1)), _EVERYWHERE, _EVERYWHERE)
+
+
+def _turn_and_pad(picture: Any, turn: Array, spare: int) -> Any:
+    """Turned by quarters, on a larger grid. A drawing's edge goes on; beyond a template's there is nothing."""
+    return np.pad(turn_by_quarters(picture, turn), spare, mode="edge")
 
 
 class Drawings:
@@ -132,18 +117,21 @@ class Drawings:
         per_mm = linear_scale(scan_from_up) / self.reduction
         grid_from_up = per_mm * _FLIP
         self.scan_from_grid = scan_from_up @ np.linalg.inv(grid_from_up)
-        self._drawn = {mark: _drawn(mark, grid_from_up, blur_px / self.reduction) for mark in set(marks)}
+        self._views = {mark: _draw_view(mark, grid_from_up, blur_px / self.reduction) for mark in set(marks)}
 
-    def seen(self, shown: Sequence[Shown], spare: int) -> list[View]:
+    def views(self, shown: Sequence[PosedMark], spare: int) -> list[View]:
         """What each pose shows at a place, which is in the middle, on grids of one size, so many cells larger on every
         side than the largest picture."""
-        drawn = [_BARE if each.mark is None else self._drawn[each.mark] for each in shown]
+        drawn = [_BARE if each.mark is None else self._views[each.mark] for each in shown]
         half = max(len(each.grey) // 2 for each in drawn) + spare
         turns = [_FLIP @ each.turn @ _FLIP for each in shown]
-        return [each.turned(turn).wider(half - len(each.grey) // 2) for each, turn in zip(drawn, turns, strict=True)]
+        return [
+            each.replace_pictures(partial(_turn_and_pad, turn=turn, spare=half - len(each.grey) // 2))
+            for each, turn in zip(drawn, turns, strict=True)
+        ]
 
 
-class Site:
+class MarkSite:
     """A place where a mark was found, or where it should be and was not: then like is the fit of another mark.
 
     reach_px: how far off a chip may lie in another pose than the one it was found in. A drawn mark's origin is its
@@ -164,24 +152,24 @@ class Site:
         self.sign = np.sign(like.contrast_dn)
         self.noise_dn = like.noise_dn / drawings.reduction
 
-    def likelihoods(self, shown: Sequence[Shown]) -> Array:
+    def likelihoods(self, shown: Sequence[PosedMark]) -> Array:
         """The log-likelihood of the picture under what each pose shows here, up to a constant: 0 for the best, and no
         less than the probability that something else spoils the picture."""
         chips = any(isinstance(each.mark, MarkTemplate) for each in shown)
         spare = int(np.ceil(self.reach_px / self.drawings.reduction)) if chips else 0
-        views, view_of = _distinct(self.drawings.seen(shown, spare))
+        views, view_of = _distinct(self.drawings.views(shown, spare))
         if len(views) == 1:
             return np.zeros(len(shown))
         window = self._window(len(views[0].grey))
         views = [self._placed(window, view, spare) for view in views]
         area = _area([view.grey for view in views])
-        residuals = [self._residuals(window, view.grey, area & view.told) for view in views]
+        residuals = [self._residuals(window, view.grey, area & view.known) for view in views]
         # Where even the best picture leaves much, what is left is no noise, and tells the pictures apart less surely.
         scale = max(self.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
         misfits = np.full((len(views), *window.shape), _OUTLIER**2)  # what a chip does not tell it misses
         for misfit, view, residual in zip(misfits, views, residuals, strict=True):
-            misfit[area & view.told] = np.minimum(np.abs(residual) / scale, _OUTLIER) ** 2
-        excess = _excess(misfits, np.stack([area & view.reached for view in views]))
+            misfit[area & view.known] = np.minimum(np.abs(residual) / scale, _OUTLIER) ** 2
+        excess = _excess(misfits, np.stack([area & view.covered for view in views]))
         best = views[int(excess.argmin())]
         if best.is_chip:
             excess = np.minimum(excess, [self._most_excess(best, view, scale) for view in views])
@@ -198,14 +186,15 @@ class Site:
 
     def _placed(self, window: Array, view: View, spare: int) -> View:
         """A chip moved to where the window is most like it."""
-        if not view.is_chip or not view.told.any():
+        if not view.is_chip or not view.known.any():
             return view
         core = slice(spare, len(window) - spare)
-        grey, told = (np.asarray(each[core, core], np.float32) for each in (view.grey, view.told))
-        likeness = cv2.matchTemplate(np.asarray(window, np.float32), grey, cv2.TM_CCOEFF_NORMED, mask=told)
+        grey, known = (np.asarray(each[core, core], np.float32) for each in (view.grey, view.known))
+        likeness = cv2.matchTemplate(np.asarray(window, np.float32), grey, cv2.TM_CCOEFF_NORMED, mask=known)
         likeness = np.where(np.isfinite(likeness), self.sign * likeness, -1.0)
         row, col = np.unravel_index(int(likeness.argmax()), likeness.shape)
-        return view.moved((int(row) - spare, int(col) - spare)).aligned(window)
+        shift = int(row) - spare, int(col) - spare
+        return view.replace_pictures(partial(np.roll, shift=shift, axis=(0, 1))).align(window)
 
     def _window(self, size: int) -> Array:
         """(size, size) grey values of the scan on the drawings' grid, the site in the middle."""
@@ -237,17 +226,17 @@ class Site:
         return tukey_fit(np.stack(ground), grey, _ROUNDS, _LEAST_SCALE).residuals
 
 
-def _drawn(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
+def _draw_view(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
     """The mark's picture about its origin."""
     place = np.column_stack([grid_from_mark, np.zeros(2)])
     half = int(np.ceil(np.abs(extent_px(mark, place)).max() + 2 * _ABOUT_PX))
     place[:, 2] = half
     size = 2 * half + 1
-    told = reached = np.ones((size, size), dtype=bool)
+    known = covered = np.ones((size, size), dtype=bool)
     if isinstance(mark, MarkTemplate):
-        told = chip_mask(mark, place, size, size)
-        reached = chip_mask(replace(mark, steady=None), place, size, size)
-    return View(picture(mark, place, size, size, blur_px, ROUGH_CELLS), told, reached, _noise(mark))
+        known = chip_mask(mark, place, size, size)
+        covered = chip_mask(replace(mark, steady=None), place, size, size)
+    return View(picture(mark, place, size, size, blur_px, ROUGH_CELLS), known, covered, _noise(mark))
 
 
 def _noise(mark: Mark) -> float:

@@ -128,7 +128,7 @@ def _refit_with_blur(frame: Frame) -> Frame:
     faint = {index: fit for index, fit in drawn.items() if fit.covariance is None}
     fits = {index: fit for index, fit in drawn.items() if index not in faint and frame.is_clear(index)} | faint
     shared = dict(zip(fits, shared_blurs(list(fits.values())), strict=True))
-    options = {index: _with_blur(frame.options.match, blur) for index, blur in shared.items() if blur is not None}
+    options = {index: _set_blur(frame.options.match, blur) for index, blur in shared.items() if blur is not None}
     if not options and not faint:
         return frame
     matched = _refit(frame, {index: each for index, each in options.items() if index not in faint}, orient=False)
@@ -143,14 +143,14 @@ def _refit_with_blur(frame: Frame) -> Frame:
     return orient_frame(matched)
 
 
-def _with_blur(options: MatchOptions, blur: SharedBlur) -> MatchOptions:
+def _set_blur(options: MatchOptions, blur: SharedBlur) -> MatchOptions:
     return replace(options, blur_px=blur.blur_px, blur_sigma=blur.sigma)
 
 
 def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
     """Whether a fit of a faint mark counts: where it means the same mark, of the others' blur, and is the better known.
     A faint mark takes all that is finer than the mark for texture: in plain noise a fit knows its place far better."""
-    if blur is not None and not blur.is_borne_out_by(fit):
+    if blur is not None and not blur.is_confirmed(fit):
         return False
     off = fit.center_px - before.center_px
     return fit.sigma_px < before.sigma_px and may_be_noise(off, before.covariance_px2 + fit.covariance_px2)
@@ -204,7 +204,7 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape) -> 
             touch = touch_of_round(shape, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
     if shape.differs:
         frame = frame.add_reason(index, Reason(f"{other}: something may cover or touch it", *codes))
-    elif touch is not None and is_round(mark) and is_damaged and touch.beyond(WRONG_PX) > LARGE_ERROR:
+    elif touch is not None and is_round(mark) and is_damaged and touch.exceedance(WRONG_PX) > LARGE_ERROR:
         reason = f"{other} and damaged beside it: something may touch it and have moved it by more than {WRONG_PX} px"
         frame = frame.add_reason(index, Reason(reason, *codes))
     if touch is not None:

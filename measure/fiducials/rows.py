@@ -61,7 +61,7 @@ def present_frame(
     if Code.NO_FRAME in chance.codes:
         return replace(_predicted_frame(scan, layout, frame, chance), pose=pose, problems=tuple(problems))
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
-    marks = tuple(_of_assumed_name(row, mark, pose) for row, mark in zip(marks, layout.marks, strict=True))
+    marks = tuple(_weaken_assumed_name(row, mark, pose) for row, mark in zip(marks, layout.marks, strict=True))
     weak = chance or (_FAINT if frame.placement.surroundings.robust else NO_REASON)
     if weak:
         marks = tuple(
@@ -90,13 +90,13 @@ def _problems(scan: Scan, frame: Frame, pitch_um: tuple[float, float] | None) ->
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
     given = pitch_um or (1.0, 1.0)
     if abs(per_mm[0] * given[0] / (per_mm[1] * given[1]) - 1) > 2 * AFFINITY_SIGMA:
-        told = _stretch(scan, 1000 / per_mm[0], 1000 / per_mm[1], pitch_um)
-        problems.append(Reason(told, Code.PITCH))
+        problem = _stretch(scan, 1000 / per_mm[0], 1000 / per_mm[1], pitch_um)
+        problems.append(Reason(problem, Code.PITCH))
     used = int(frame.inliers.sum())
     if used <= 3:
         kind = "an affine transformation" if used == 3 else "a similarity"
-        told = f"{kind} on {used} fiducials has no redundancy: no check."
-        problems.append(Reason(told, Code.NO_CHECK))
+        problem = f"{kind} on {used} fiducials has no redundancy: no check."
+        problems.append(Reason(problem, Code.NO_CHECK))
     return problems
 
 
@@ -133,7 +133,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
         "significance": fit.significance,
         "redundancy": float(fit.redundancy),
         "neighbour_correlation": fit.neighbour_correlation,
-        **_by_edges(fit.edges),
+        **_edge_figures(fit.edges),
     }
     status, reason = frame.verdict(index)
     covariance = fit.place_covariance
@@ -144,7 +144,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
 
 
-def _of_assumed_name(row: MarkMeasurement, mark: LayoutMark, pose: Pose) -> MarkMeasurement:
+def _weaken_assumed_name(row: MarkMeasurement, mark: LayoutMark, pose: Pose) -> MarkMeasurement:
     """A drawn mark is the same place under every name. A learned one's origin is where somebody clicked: at another
     mark that looks like it, it lies elsewhere, but where the marks' symmetry leaves it the same."""
     if not isinstance(mark.mark, MarkTemplate) or mark.mark.learned_mm == 0 or pose.is_decided_but_for(mark.mark.alike):
@@ -152,7 +152,7 @@ def _of_assumed_name(row: MarkMeasurement, mark: LayoutMark, pose: Pose) -> Mark
     return replace(row, status=Status.WEAK, reason=_ASSUMED) if row.status is Status.MEASURED else row
 
 
-def _by_edges(edges: SecondPlace | None) -> dict[str, float]:
+def _edge_figures(edges: SecondPlace | None) -> dict[str, float]:
     """How far from the matched place the second method puts the mark, and in standard deviations of that."""
     if edges is None:
         return {}

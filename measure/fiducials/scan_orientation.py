@@ -18,7 +18,7 @@ from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame, first_search_px
 from measure.fiducials.interior_orientation import FrameFit, fit_frame
 from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions
-from measure.fiducials.orientation_pictures import Drawings, Shown, Site
+from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark
 from measure.geometry import pose_in_camera, up_from_camera
 from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
 from measure.results import MarkFit, Pose
@@ -50,18 +50,18 @@ class _Verdict:
     writing: float = 0.0
 
     @property
-    def of_pictures(self) -> float:
+    def pictures_total(self) -> float:
         return float(np.logaddexp(self.pictures.sum(), self.by_chance))
 
     @property
-    def seen(self) -> float:
-        """What is seen of it."""
-        return self.of_pictures + self.coordinates + self.writing
+    def likelihood(self) -> float:
+        """Of all that is observed."""
+        return self.pictures_total + self.coordinates + self.writing
 
     @property
     def total(self) -> float:
         """And what was to be expected before, which tells what is assumed, and never decides."""
-        return self.seen + (0.0 if self.pose.endswith("m") else _UNMIRRORED)
+        return self.likelihood + (0.0 if self.pose.endswith("m") else _UNMIRRORED)
 
 
 def decide_pose(
@@ -74,35 +74,35 @@ def decide_pose(
 ) -> Pose:
     """The pose, from a placement for each (at the place of the frame that was measured in one of them). lines: what is
     written about the frame, as far as it was read."""
-    seen = [fit for fit in frame.fits if fit is not None]
+    fits = [fit for fit in frame.fits if fit is not None]
     missed = frame.missed_px
     named = [
         each
-        for each in (_Named.of(placement, layout, seen, missed, options) for placement in placements)
+        for each in (_Named.from_placement(placement, layout, fits, missed, options) for placement in placements)
         if each is not None
     ]
     if not named:
-        return _decision([], layout, len(seen))
+        return _decision([], layout, len(fits))
     scan_from_up = frame.pixel_from_camera[:, :2] @ np.linalg.inv(up_from_camera(frame.placement.pose))
-    blur_px = float(np.median([fit.blur_px for fit in seen]))
+    blur_px = float(np.median([fit.blur_px for fit in fits]))
     drawings = Drawings([mark.mark for mark in layout.marks], scan_from_up, blur_px)
     reach_px = first_search_px(frame.placement, layout, options)
-    sites = [Site(scan, fit, fit.center_px, frame.weights, drawings, reach_px) for fit in seen]
+    sites = [MarkSite(scan, fit, fit.center_px, frame.weights, drawings, reach_px) for fit in fits]
     # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
-    usual = sorted(seen, key=lambda fit: abs(fit.contrast_dn))[len(seen) // 2]
-    sites += [Site(scan, usual, place, frame.weights, drawings, reach_px) for place in missed]
+    usual = sorted(fits, key=lambda fit: abs(fit.contrast_dn))[len(fits) // 2]
+    sites += [MarkSite(scan, usual, place, frame.weights, drawings, reach_px) for place in missed]
 
-    def of_site(index: int) -> Array:
-        return sites[index].likelihoods([each.shown(index, layout) for each in named])
+    def site_likelihoods(index: int) -> Array:
+        return sites[index].likelihoods([each.posed_mark(index, layout) for each in named])
 
-    pictures = np.array(map_in_threads(of_site, range(len(sites)))).reshape(len(sites), len(named))
-    by_chance = _by_chance(pictures) if any(_is_bare_chip(mark.mark) for mark in layout.marks) else -np.inf
+    pictures = np.array(map_in_threads(site_likelihoods, range(len(sites)))).reshape(len(sites), len(named))
+    by_chance = _chance_likelihood(pictures) if any(_is_bare_chip(mark.mark) for mark in layout.marks) else -np.inf
     verdicts = [each.verdict(pictures[:, index], by_chance) for index, each in enumerate(named)]
     if not lines or not frame.accepted:
-        return _decision(verdicts, layout, len(seen))
+        return _decision(verdicts, layout, len(fits))
     written = writing_likelihoods(lines, layout.writing, [verdict.pose for verdict in verdicts])
     verdicts = [replace(each, writing=own) for each, own in zip(verdicts, written.tolist(), strict=True)]
-    return _decision(verdicts, layout, len(seen), lines)
+    return _decision(verdicts, layout, len(fits), lines)
 
 
 def _is_bare_chip(mark: Mark) -> bool:
@@ -111,7 +111,7 @@ def _is_bare_chip(mark: Mark) -> bool:
     return isinstance(mark, MarkTemplate) and mark.steadiness is None
 
 
-def _by_chance(pictures: Array) -> float:
+def _chance_likelihood(pictures: Array) -> float:
     """The log-likelihood of pictures (sites, poses) in which something else than the marks looks most like one pose or
     another, like each as often: then as many sites agree on a pose as chance lets."""
     return float((np.logaddexp.reduce(pictures, axis=1) - np.log(pictures.shape[1])).sum())
@@ -127,39 +127,39 @@ class _Named:
     fit: FrameFit | None
 
     @classmethod
-    def of(
+    def from_placement(
         cls,
         placement: Placement,
         layout: FiducialLayout,
-        seen: Sequence[MarkFit],
+        fits: Sequence[MarkFit],
         missed: Sequence[Array],
         options: FiducialOptions,
     ) -> "_Named | None":
         """None where the pose names fewer than two of the marks found, having two, or gives two the same name."""
         pitch, camera = np.asarray(placement.pitch_mm), np.array([mark.xy_mm for mark in layout.marks])
         predicted = camera @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
-        centers = np.array([*(fit.center_px for fit in seen), *missed])
+        centers = np.array([*(fit.center_px for fit in fits), *missed])
         distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
         nearest = distance.argmin(axis=0)
         near = distance.min(axis=0) < _NAMED * options.gate_mm
         names = np.where(near, nearest, -1)
         if len(np.unique(names[near])) < near.sum():
             return None
-        near, centers = near[: len(seen)], centers[: len(seen)]
+        near, centers = near[: len(fits)], centers[: len(fits)]
         if near.sum() < 2:
             alone = cls(placement.pose, tuple(names.tolist()), None)
-            return alone if len(seen) < 2 else None
-        own = names[: len(seen)][near]
+            return alone if len(fits) < 2 else None
+        own = names[: len(fits)][near]
         given = np.array([_given_sigma_mm(layout.marks[name]) for name in own])
-        measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in seen])[near] * pitch.mean()
+        measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in fits])[near] * pitch.mean()
         sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
         up = centers[near] * pitch * (1.0, -1.0)
         fit = fit_frame(camera[own], up, sigma, up_from_camera(placement.pose))
         return cls(placement.pose, tuple(names.tolist()), fit)
 
-    def shown(self, site: int, layout: FiducialLayout) -> Shown:
+    def posed_mark(self, site: int, layout: FiducialLayout) -> PosedMark:
         name = self.names[site]
-        return Shown(None if name < 0 else layout.marks[name].mark, up_from_camera(self.pose))
+        return PosedMark(None if name < 0 else layout.marks[name].mark, up_from_camera(self.pose))
 
     def verdict(self, pictures: Array, by_chance: float) -> _Verdict:
         """The coordinates' likelihood is Student's: nobody knows the film's standard deviation well."""
@@ -181,8 +181,8 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
     upright, so that a roll's frames are named alike. found: marks, beside which the places of missed ones count too."""
     if not verdicts:
         return Pose("0", False, ("no pose names the marks that were found.",))
-    seen = max(verdict.seen for verdict in verdicts)
-    alike = [verdict for verdict in verdicts if seen - verdict.seen < DECIDED]
+    best_likelihood = max(verdict.likelihood for verdict in verdicts)
+    alike = [verdict for verdict in verdicts if best_likelihood - verdict.likelihood < DECIDED]
     best = max(alike, key=lambda verdict: verdict.total)
     others = sorted((v for v in verdicts if v not in alike), key=lambda verdict: -verdict.total)
     against = _against(best, others[0], layout, lines) if others else ()
@@ -200,24 +200,24 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
         assumed = upright or best.pose
         equal = [verdict.pose for verdict in near if verdict.pose != assumed]
         as_likely = f"as likely as {', '.join(equal)} and " if equal else ""
-        told = (
+        sentence = (
             f"the {found} marks found do not tell the poses {names} apart with certainty: {assumed} is assumed"
             f"{like_writing}, {as_likely}likelier than {alike[0].pose} by log-odds of only {lead:.1f}."
         )
     else:
         assumed = upright or alike[0].pose
-        told = (
+        sentence = (
             f"nothing in the {found} marks found tells the poses {names} apart: their pictures and given coordinates "
             f"are alike; {assumed} is assumed{like_writing}."
         )
     rivals = tuple(pose_in_camera(verdict.pose, assumed) for verdict in alike if verdict.pose != assumed)
-    return Pose(assumed, False, (told, *against), written, main, rivals=rivals)
+    return Pose(assumed, False, (sentence, *against), written, main, rivals=rivals)
 
 
 def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:
     """What speaks for the best pose against the likeliest of those that it rules out, a sentence each."""
     sentences = []
-    by_site, lead = best.pictures - rival.pictures, best.of_pictures - rival.of_pictures
+    by_site, lead = best.pictures - rival.pictures, best.pictures_total - rival.pictures_total
     if lead > TOLD:
         telling = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > TOLD]
         kinds = sorted({_difference(best.names[site], rival.names[site], layout) for site in telling})
@@ -233,11 +233,11 @@ def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Seq
             f"with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
         )
     if abs(best.writing - rival.writing) > TOLD:
-        sentences.append(_of_writing(best, rival, layout, lines))
+        sentences.append(_writing_sentence(best, rival, layout, lines))
     return tuple(sentences)
 
 
-def _of_writing(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> str:
+def _writing_sentence(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> str:
     """What the writing says of two poses, and the lines that say most of it."""
     lead = best.writing - rival.writing
     by_line = [
@@ -254,13 +254,13 @@ def _difference(one: int, other: int, layout: FiducialLayout) -> str:
     """What two marks of the camera are told apart by."""
     if one < 0 or other < 0:
         return "marks where the other pose has none"
-    (core, dots), (other_core, other_dots) = (_drawn(layout.marks[index].mark) for index in (one, other))
+    (core, dots), (other_core, other_dots) = (_figure(layout.marks[index].mark) for index in (one, other))
     if core != other_core:
         return "unlike marks"
     return "identification dots" if dots != other_dots else "the marks' directions"
 
 
-def _drawn(mark: Mark) -> tuple[object, int]:
+def _figure(mark: Mark) -> tuple[object, int]:
     """A mark's figure, whichever way it is turned, and how many dots stand beside it."""
     if not isinstance(mark, MarkShape):
         return mark, 0

@@ -18,7 +18,7 @@ from measure.detection.responses import (
     correlate_scan,
     correlate_windows,
 )
-from measure.fiducials.constellation import NARROW, Bounds, Placement, PlacementSearch, possible_signs
+from measure.fiducials.constellation import NARROW, Bounds, Placement, PlacementSearch, mark_signs
 from measure.fiducials.hypotheses import PitchHypothesis, centred_places_px, reach_mm, room_mm
 from measure.fiducials.options import FiducialOptions
 from measure.geometry import POSES, up_from_camera
@@ -47,7 +47,7 @@ class FrameSearch:
         self.scan, self.layout, self.options, self.surroundings = scan, layout, options, surroundings
         self.poses = POSES if options.pose == "auto" else (options.pose,)
         self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
-        self._signs = possible_signs(layout.marks)
+        self._signs = mark_signs(layout.marks)
         self._responses: tuple[Pair, Responses] | None = None
         self._searches: dict[Pair, PlacementSearch] = {}
         # Of dilations there are two for each of the views of one pose.

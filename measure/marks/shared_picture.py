@@ -57,9 +57,9 @@ class SharedPicture:
     def shares(self) -> Array:
         """(n,) how much of the image is each picture's own, of as fine a detail as a fit sees."""
         side = len(self.image)
-        told = self.weights.mean(axis=(1, 2))[:, None, None] * _transfers(side, 2 * self.variances_px2)
-        seen = _transfers(side, np.array([2 * SMOOTHED_PX2]))
-        return np.asarray((seen * told / told.sum(axis=0)).sum(axis=(1, 2)) / seen.sum())
+        information = self.weights.mean(axis=(1, 2))[:, None, None] * _transfers(side, 2 * self.variances_px2)
+        visible = _transfers(side, np.array([2 * SMOOTHED_PX2]))
+        return np.asarray((visible * information / information.sum(axis=0)).sum(axis=(1, 2)) / visible.sum())
 
     @property
     def slope_noise(self) -> float:
@@ -83,13 +83,13 @@ def first_picture(stack: Array) -> SharedPicture:
     )
 
 
-def adjusted(shared: SharedPicture, stack: Array, steady: Mask) -> SharedPicture:
+def adjust_picture(shared: SharedPicture, stack: Array, steady: Mask) -> SharedPicture:
     """The shared picture adjusted once more to pictures (n, side, side), moves and blurs by the steady pixels."""
-    smoothed = _seen(stack, np.full(len(stack), SMOOTHED_PX2))
+    smoothed = _blur_images(stack, np.full(len(stack), SMOOTHED_PX2))
     designs = _designs(shared.image, shared.variances_px2, steady)
     fits = [_fit(*each) for each in zip(smoothed, designs, shared.weights, strict=True)]
     alike, weights = np.array([fit.alike for fit in fits]), _weights(fits, shared.shares)
-    variances = _beyond_the_sharpest(shared.variances_px2, fits)
+    variances = _excess_variances(shared.variances_px2, fits)
     together = _Together(shared.image, variances, weights, steady)
     image, more = together.solved(np.array([fit.levelled for fit in fits]))
     moves = np.clip(-more[:, [_COL, _ROW]], -_LONGEST_PX, _LONGEST_PX)
@@ -114,7 +114,7 @@ def _transfers(side: int, variances_px2: Array) -> Array:
     return np.asarray(np.exp(-0.5 * variances_px2[:, None, None] * _squares(side)))
 
 
-def _seen(images: Array, variances_px2: Array) -> Array:
+def _blur_images(images: Array, variances_px2: Array) -> Array:
     """(n, side, side) one image, or n, under blurs (n,); mirrored at its borders, so that a blur is its own adjoint."""
     cosines = _transfers(images.shape[-1], variances_px2) * _cosines(images)
     return np.asarray(idctn(cosines, axes=(1, 2), norm="ortho"))
@@ -127,7 +127,7 @@ def _cosines(images: Array) -> Array:
 def _designs(image: Array, variances_px2: Array, steady: Mask) -> Array:
     """(n, 5, side, side) of each picture: the shared one as it shows it, one, and how that changes by column, row and
     variance of the blur, where pixels are steady."""
-    views = _seen(image, variances_px2 + SMOOTHED_PX2)
+    views = _blur_images(image, variances_px2 + SMOOTHED_PX2)
     by_row, by_col = np.gradient(views, axis=(1, 2))
     by_variance = idctn(-0.5 * _squares(len(image)) * _cosines(views), axes=(1, 2), norm="ortho")
     return np.stack([views, np.ones_like(views), *(part * steady for part in (by_col, by_row, by_variance))], axis=1)
@@ -151,15 +151,15 @@ class _Fit:
 def _fit(picture: Array, design: Array, weights: Array) -> _Fit:
     """Robust against dust and the landscape behind the mark. What a pixel changes by while the picture is moved and
     blurred is no damage: the next round shows it."""
-    columns, seen = design.reshape(len(design), -1), picture.ravel()
+    columns, grey = design.reshape(len(design), -1), picture.ravel()
     floor = NOISE_FLOOR * float(np.ptp(design[_GAIN]))
     weights = weights.ravel()
     for _ in range(_REWEIGHTINGS):
         weighed = columns * weights
         inverse = np.linalg.pinv(weighed @ columns.T, hermitian=True)
-        factors = inverse @ (weighed @ seen)
+        factors = inverse @ (weighed @ grey)
         gain = max(float(factors[_GAIN]), _LEAST_GAIN)
-        residuals = (seen - factors @ columns) / gain
+        residuals = (grey - factors @ columns) / gain
         scale = max(robust_scale(residuals), floor)
         changes = factors[_COL:] @ columns[_COL:] / gain
         alike = tukey_weights(residuals / np.hypot(scale, changes), 1.0)
@@ -182,7 +182,7 @@ def _weights(fits: Sequence[_Fit], shares: Array) -> Array:
     return (np.array([fit.alike for fit in fits]) + _LEAST_WEIGHT) / noise[:, None, None] ** 2
 
 
-def _beyond_the_sharpest(variances_px2: Array, fits: Sequence[_Fit]) -> Array:
+def _excess_variances(variances_px2: Array, fits: Sequence[_Fit]) -> Array:
     """(n,) variances as fits have them, less that of the sharpest picture: 0 where pictures are as sharp as it, as far
     as is known."""
     found = _bounded(variances_px2, np.array([fit.blur_px2 for fit in fits]))
@@ -192,8 +192,8 @@ def _beyond_the_sharpest(variances_px2: Array, fits: Sequence[_Fit]) -> Array:
 
 def _bounded(variances_px2: Array, change_px2: Array) -> Array:
     """Variances after a change that a linearisation allows."""
-    seen = variances_px2 + _SEEN_PX2
-    return np.clip(seen + change_px2, seen / _MOST_BLURRED**2, seen * _MOST_BLURRED**2) - _SEEN_PX2
+    total = variances_px2 + _SEEN_PX2
+    return np.clip(total + change_px2, total / _MOST_BLURRED**2, total * _MOST_BLURRED**2) - _SEEN_PX2
 
 
 class _Together:
@@ -207,11 +207,11 @@ class _Together:
         self.image, self.roots = image, np.sqrt(weights)
         self.designs = _designs(image, variances_px2, steady)
         self.transfers = _transfers(len(image), variances_px2 + SMOOTHED_PX2)
-        told = self.roots[:, None] * self.designs
-        told[variances_px2 == 0, _BLUR] = 0.0
-        self.lengths = np.sqrt((told**2).sum(axis=(2, 3)))
+        weighted = self.roots[:, None] * self.designs
+        weighted[variances_px2 == 0, _BLUR] = 0.0
+        self.lengths = np.sqrt((weighted**2).sum(axis=(2, 3)))
         self.lengths[self.lengths == 0] = np.inf
-        self.columns = told / self.lengths[:, :, None, None]
+        self.columns = weighted / self.lengths[:, :, None, None]
         self.held = float(np.sqrt(_HELD * np.median(weights.mean(axis=(1, 2)))))
         self.scale = 1 / np.sqrt(weights.sum(axis=0) + self.held**2)
 
@@ -220,7 +220,7 @@ class _Together:
         wanted = (self.roots * (levelled - self.designs[:, _GAIN])).ravel()
         rest = self.image.size + _BLUR
         shape = (wanted.size + rest, self.image.size + self.lengths.size)
-        operator = LinearOperator(shape, matvec=self._seen, rmatvec=self._told, dtype=float)
+        operator = LinearOperator(shape, matvec=self._forward, rmatvec=self._adjoint, dtype=float)
         wanted = np.concatenate([wanted, np.zeros(rest)])
         found = lsmr(operator, wanted, atol=_TOLERANCE, btol=_TOLERANCE, maxiter=_ITERATIONS)[0]
         image, factors = self._parted(found)
@@ -229,7 +229,7 @@ class _Together:
     def _parted(self, unknowns: Array) -> tuple[Array, Array]:
         return unknowns[: self.image.size].reshape(self.image.shape), unknowns[self.image.size :].reshape(-1, _BLUR + 1)
 
-    def _seen(self, unknowns: Array) -> Array:
+    def _forward(self, unknowns: Array) -> Array:
         """What changes of the unknowns change: in the pictures, in the image, and in the sums."""
         image, factors = self._parted(unknowns)
         change = self.scale * image
@@ -237,12 +237,12 @@ class _Together:
         pictures = self.roots * pictures + np.einsum("nk,nkij->nij", factors, self.columns)
         return np.concatenate([pictures.ravel(), self.held * change.ravel(), factors[:, :_BLUR].sum(axis=0)])
 
-    def _told(self, rows: Array) -> Array:
+    def _adjoint(self, rows: Array) -> Array:
         """The adjoint of it."""
         pictures, change, sums = np.split(rows, [self.roots.size, self.roots.size + self.image.size])
         pictures = pictures.reshape(self.roots.shape)
-        told = idctn((self.transfers * _cosines(self.roots * pictures)).sum(axis=0), norm="ortho")
-        image = self.scale * (told + self.held * change.reshape(self.image.shape))
+        back = idctn((self.transfers * _cosines(self.roots * pictures)).sum(axis=0), norm="ortho")
+        image = self.scale * (back + self.held * change.reshape(self.image.shape))
         factors = np.einsum("nkij,nij->nk", self.columns, pictures)
         factors[:, :_BLUR] += sums
         return np.concatenate([image.ravel(), factors.ravel()])

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.geometry import POSES, linear_scale, quarter_turned, up_from_camera
+from measure.geometry import POSES, linear_scale, turn_by_quarters, up_from_camera
 from measure.marks.shapes import MarkTemplate
-from measure.marks.shared_picture import NOISE_FLOOR, SharedPicture, adjusted, first_picture
+from measure.marks.shared_picture import NOISE_FLOOR, SharedPicture, adjust_picture, first_picture
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
 
@@ -61,13 +61,13 @@ def cut(scan: Scan, pixel_from_mark: Array, size_mm: float, weights: Sequence[fl
     return Chip(scan.name, grey, (col0, row0), matrix)
 
 
-def template_of(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
+def learn_template(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
     """The template that all pictures of one mark have in common. Raises ValueError without any picture."""
     if not chips:
         raise ValueError("a template needs a picture of its mark")
     pitch_um = float(np.median([chip.pitch_um for chip in chips]))
     side = 2 * int(np.ceil(size_mm * 500 / pitch_um)) + 1  # odd: the origin is the middle pixel
-    shared, steady = _aligned(chips, side, pitch_um)
+    shared, steady = _align_chips(chips, side, pitch_um)
     image = shared.image
     return MarkTemplate(
         image,
@@ -84,7 +84,7 @@ def template_of(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
     )
 
 
-def _aligned(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[SharedPicture, Mask]:
+def _align_chips(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[SharedPicture, Mask]:
     """The picture (side, side) that chips share, and which of its pixels are steady."""
     places = [np.array(chip.pixel_from_mark) for chip in chips]
 
@@ -94,7 +94,7 @@ def _aligned(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[SharedP
     shared, steady = first_picture(stack()), np.ones((side, side), dtype=bool)
     for _ in range(_PHASES if len(chips) > 1 else 0):
         for _ in range(_ROUNDS):
-            before, shared = shared, adjusted(shared, stack(), steady)
+            before, shared = shared, adjust_picture(shared, stack(), steady)
             for place, move in zip(places, shared.moves, strict=True):
                 place[:, 2] += place[:, :2] @ (move * (1.0, -1.0) * pitch_um / 1000)
             blurred = np.abs(shared.variances_px2 - before.variances_px2).max()
@@ -142,7 +142,7 @@ def _detail_px(image: Array) -> float:
 # one another, as it takes the middles of crosses.
 
 
-def with_common_origins(
+def share_origins(
     templates: Sequence[MarkTemplate], places_mm: Array, poses: Collection[str]
 ) -> tuple[list[MarkTemplate], Array]:
     """The templates of a camera's learned marks at places_mm (n, 2), each with those of the poses, which frames do not
@@ -166,7 +166,7 @@ def with_common_origins(
     if not alike:
         return list(templates), np.zeros((count, 2))
     moves = np.linalg.lstsq(np.concatenate(rows), np.concatenate(shifts), rcond=None)[0].reshape(count, 2)
-    moved = [_with_origin(template, move, tuple(alike)) for template, move in zip(templates, moves, strict=True)]
+    moved = [_move_origin(template, move, tuple(alike)) for template, move in zip(templates, moves, strict=True)]
     return moved, moves
 
 
@@ -180,7 +180,7 @@ def _partners(places_mm: Array, turn: Array, near_mm: float) -> list[int] | None
 def _aligned_origin(one: MarkTemplate, other: MarkTemplate, turn: Array) -> Array | None:
     """Where a mark's origin lies beside another's, mm (2,), once it is turned and laid where it is most like that; None
     where it is not like it."""
-    seen, shown = _about_origin(other), quarter_turned(_about_origin(one), _FLIP @ turn @ _FLIP)
+    seen, shown = _centre_origin(other), turn_by_quarters(_centre_origin(one), _FLIP @ turn @ _FLIP)
     side = min(len(seen), len(shown))
     margin = int(np.ceil(_CORE * side))
     within, core = _middle(seen, side), _middle(shown, side - 2 * margin)
@@ -198,7 +198,7 @@ def _aligned_origin(one: MarkTemplate, other: MarkTemplate, turn: Array) -> Arra
     return np.asarray(_FLIP @ shift_px * other.pitch_um / 1000) if likeness >= _ALIKE else None
 
 
-def _about_origin(template: MarkTemplate) -> Array:
+def _centre_origin(template: MarkTemplate) -> Array:
     """The largest square picture with the origin in its middle, to a part of a pixel."""
     size = np.array(template.image.shape[::-1])
     origin = np.array(template.origin_px)
@@ -213,6 +213,6 @@ def _middle(picture: Array, side: int) -> NDArray[np.float32]:
     return np.ascontiguousarray(picture[spare : spare + side, spare : spare + side], np.float32)
 
 
-def _with_origin(template: MarkTemplate, move_mm: Array, alike: tuple[str, ...]) -> MarkTemplate:
+def _move_origin(template: MarkTemplate, move_mm: Array, alike: tuple[str, ...]) -> MarkTemplate:
     col, row = np.array(template.origin_px) + _FLIP @ move_mm * 1000 / template.pitch_um
     return replace(template, origin_px=(float(col), float(row)), alike=alike)

@@ -33,7 +33,7 @@ _WORST_CONDITION = 1e6  # of a normal matrix: beyond it double precision leaves 
 _OWN = 0.9  # of what is known of rotation and scale: where the picture gives so much, little is the frame's
 
 
-_LEAST_TOLD = 0.1  # of the slopes' squares: less would tell nothing
+_LEAST_SQUARES = 0.1  # of the slopes' squares: less would tell nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,11 +270,11 @@ def honest_covariance(template: MarkTemplate, scan: str, fit: MarkFit) -> Covari
     share = template.shares.get(scan, 0.0)
     if share == 1.0:
         return Covariance.from_noise(_covariance_of_noise(template, fit))
-    widened = _without_slope_noise(template, fit)
+    widened = _slope_noise_factor(template, fit)
     return fit.place_covariance.through(widened / np.sqrt(1.0 - share))
 
 
-def _without_slope_noise(template: MarkTemplate, fit: MarkFit) -> Array:
+def _slope_noise_factor(template: MarkTemplate, fit: MarkFit) -> Array:
     """(2, 2) what an error of the place is to be multiplied by: the squares of all slopes that the fit saw over those
     of the mark's."""
     linear, blur_px2 = fit.pixel_from_mark[:, :2], SMOOTHED_PX2 + fit.blur_px**2
@@ -285,9 +285,9 @@ def _without_slope_noise(template: MarkTemplate, fit: MarkFit) -> Array:
     slopes = np.stack([shown.by_col.ravel(), shown.by_row.ravel()]).astype(float)
     noise = template.slope_noise_dn / max(float(np.ptp(template.image)), 1e-9) / px_per_sample
     noise *= SMOOTHED_PX2 / blur_px2  # more blur takes as much of the slopes of white noise
-    told, axes = np.linalg.eigh(slopes @ slopes.T)
-    marks = np.maximum(told - noise**2 * side**2, _LEAST_TOLD * told)
-    return np.asarray(axes * (told / marks) @ axes.T)
+    squares, axes = np.linalg.eigh(slopes @ slopes.T)
+    marks = np.maximum(squares - noise**2 * side**2, _LEAST_SQUARES * squares)
+    return np.asarray(axes * (squares / marks) @ axes.T)
 
 
 def _covariance_of_noise(template: MarkTemplate, fit: MarkFit) -> Array:

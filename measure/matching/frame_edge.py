@@ -309,10 +309,10 @@ def fit_frame_corner(
         if edge is None:
             return _missed(pixel_from_mark, _UNSEEN)
         edges.append(edge)
-    return _met(edges, unit, pixel_from_mark, scan.tone)
+    return _intersect_edges(edges, unit, pixel_from_mark, scan.tone)
 
 
-def _met(edges: Sequence[Edge], unit: Array, pixel_from_mark: Array, tone: Tone) -> MarkFit:
+def _intersect_edges(edges: Sequence[Edge], unit: Array, pixel_from_mark: Array, tone: Tone) -> MarkFit:
     """The corner: along the first edge x, y = a + b x, and along the second x = c + d y."""
     first, second = edges
     a, b, c, d = first.offset, first.slope, second.offset, second.slope

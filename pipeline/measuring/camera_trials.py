@@ -13,7 +13,7 @@ from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from measure.annotations.detect_text import networks
 from measure.annotations.read import read_writing
-from measure.fiducials.camera_recognition import Answer, answer, likeness, seen
+from measure.fiducials.camera_recognition import Answer, likeness, recognise_frame, search_camera
 from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.fiducials.options import FiducialOptions
@@ -125,7 +125,7 @@ class LayoutSearch:
 
     def seen(self, tried: Tried) -> Frame | None:
         """The frame as its marks look."""
-        return seen(self._scan, tried.layout, tried.answer, self._scan.width_px / tried.picture.width_px)
+        return recognise_frame(self._scan, tried.layout, tried.answer, self._scan.width_px / tried.picture.width_px)
 
     def _tried(
         self, layout: FiducialLayout, bold: FiducialLayout, picture: Scan, hypotheses: Hypotheses, before: int = 0
@@ -133,7 +133,7 @@ class LayoutSearch:
         for known in self._known:
             if known.picture is picture and known.hypotheses == hypotheses and same_marks(known.bold.marks, bold.marks):
                 return replace(known, layout=layout)
-        answered = answer(picture, bold, hypotheses, before)
+        answered = search_camera(picture, bold, hypotheses, before)
         self._known.append(Tried(layout, bold, picture, hypotheses, before, answered))
         return self._known[-1]
 

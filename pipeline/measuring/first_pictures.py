@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from measure.detection.recurrence import Recurrence, Window, about, recurrence
 from measure.errors import MeasurementError
-from measure.fiducials.clicked_frame import LEAST_CLICKS, on_a_line
+from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.measurement import measure_fiducials
 from measure.geometry import POSES, up_from_camera
 from measure.marks import shapes
-from measure.marks.templates import cut, template_of
+from measure.marks.templates import cut, learn_template
 from measure.scans.parallel import map_items
 from measure.scans.scan import Scan
 from pipeline.errors import InputError
@@ -79,7 +79,7 @@ def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Place
     """Raises InputError where clicks show the frame in another scan orientation than the project sets: a viewer that
     obeys the file's orientation tag shows other columns and rows than the file has. Where the project sets none, and
     the clicks were not made in `reseau review`, a file with such a tag leaves open which they are."""
-    if len(px) < LEAST_CLICKS or camera.clicks is None or on_a_line(np.array(list(px.values()))):
+    if len(px) < LEAST_CLICKS or camera.clicks is None or are_collinear(np.array(list(px.values()))):
         return
     given = _up_from_camera(_through_clicks(task.options, scan, px))
     clicked = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
@@ -217,7 +217,7 @@ def _start(
         if isinstance(one.mark, shapes.LearnedMark):
             chip = cut(scan, np.column_stack([placement[:, :2], px[one.id]]), one.mark.size_mm)
             x, y = inverse @ (px[one.id] - placement[:, 2])
-            one = replace(one, seen_mm=(float(x), float(y)), mark=template_of([chip], one.mark.size_mm))
+            one = replace(one, seen_mm=(float(x), float(y)), mark=learn_template([chip], one.mark.size_mm))
         fiducials.append(one)
     given = _up_from_camera(placement)
     pose = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))

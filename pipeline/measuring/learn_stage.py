@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from measure.marks.shapes import LearnedMark, Mark, MarkTemplate
-from measure.marks.templates import Chip, cut, template_of, with_common_origins
+from measure.marks.templates import Chip, cut, learn_template, share_origins
 from measure.results import MEASURE_REVISION, FrameMeasurement
 from measure.scans.parallel import map_items
 from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
@@ -188,7 +188,7 @@ def _averaged(
 
 
 def _template(job: tuple[list[Chip], float]) -> MarkTemplate:
-    return template_of(*job)
+    return learn_template(*job)
 
 
 def _with_common_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
@@ -199,7 +199,7 @@ def _with_common_origins(camera: CameraFile, poses: Collection[str]) -> CameraFi
         return camera
     places = np.array([one.seen_mm or one.xy_mm for one in learned])
     marks = [one.mark for one in learned if isinstance(one.mark, MarkTemplate)]
-    templates, moves = with_common_origins(marks, places, poses)
+    templates, moves = share_origins(marks, places, poses)
     seen = {
         one.id: replace(one, mark=template, seen_mm=(float(x), float(y)))
         for one, template, (x, y) in zip(learned, templates, places + moves, strict=True)

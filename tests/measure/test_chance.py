@@ -16,7 +16,7 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.hypotheses import PitchHypothesis, pitch_hypotheses
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.orientation_pictures import SPOILT, Shown, Site
+from measure.fiducials.orientation_pictures import SPOILT, MarkSite, PosedMark
 from measure.fiducials.rows import present_frame
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch
@@ -24,7 +24,7 @@ from measure.fiducials.significance import doubt_frame
 from measure.flags import Status
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, MarkShape, dot
-from measure.marks.templates import cut, template_of
+from measure.marks.templates import cut, learn_template
 from measure.results import Pose
 from measure.scans.scan import Scan
 
@@ -176,17 +176,17 @@ def test_pictures_of_one_scan_alone_decide_a_pose_only_beyond_chance(
     scan = scan_of(picture(DOTS, "0"))
     frame = frame_of(scan, DOTS)
     with_chips = [
-        replace(mark, mark=template_of([cut(scan, centred(mark.xy_mm), 2.0)], 2.0)) if chips else mark
+        replace(mark, mark=learn_template([cut(scan, centred(mark.xy_mm), 2.0)], 2.0)) if chips else mark
         for mark in DOTS.marks
     ]
     sites = iter(range(4))
 
-    def best(_: Site, shown: Sequence[Shown]) -> Array:
+    def best(_: MarkSite, shown: Sequence[PosedMark]) -> Array:
         likelihoods = np.full(len(shown), np.log(SPOILT))
         likelihoods[1 if next(sites) < agreeing else 2] = 0.0
         return likelihoods
 
-    monkeypatch.setattr(Site, "likelihoods", best)
+    monkeypatch.setattr(MarkSite, "likelihoods", best)
     placements = [placement(pose) for pose in POSES]
     pose = decide_pose(scan, replace(DOTS, marks=tuple(with_chips)), placements, frame, OPTIONS)
     assert pose.decided is decided, pose.evidence

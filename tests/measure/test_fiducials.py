@@ -27,7 +27,7 @@ from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
 from measure.geometry import POSES
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross
-from measure.marks.templates import cut, template_of
+from measure.marks.templates import cut, learn_template
 
 
 @pytest.mark.parametrize("pose", POSES)
@@ -62,7 +62,7 @@ def test_learned_marks_tell_the_pose_only_where_they_differ(
     with written_scan(frame_picture(drawn, matrix, seed=2), tmp_path, "another.tif") as scan:
         for mark, off in zip(drawn.marks, ((0.12, -0.1), (0.05, 0.0), (-0.06, 0.13), (0.0, 0.0)), strict=True):
             xy = (mark.xy_mm[0] + off[0], mark.xy_mm[1] + off[1])
-            template = template_of([cut(scan, np.column_stack([matrix[:, :2], matrix @ (*xy, 1.0)]), 3.2)], 3.2)
+            template = learn_template([cut(scan, np.column_stack([matrix[:, :2], matrix @ (*xy, 1.0)]), 3.2)], 3.2)
             learned.append(replace(mark, xy_mm=xy, mark=template))
     given = replace(drawn, marks=tuple(learned))
     result = measured(frame_picture(drawn, pixel_from_camera(pose)), given, tmp_path)

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from measure.detection.recurrence import recurrence
 from measure.marks.shapes import MarkShape, polygon
-from measure.marks.templates import Chip, template_of
+from measure.marks.templates import Chip, learn_template
 from measure.matching.covariance import honest_covariance
 from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
@@ -44,7 +44,7 @@ def pictures(
 
 def measured(chips: list[Chip], options: MatchOptions = SHIFT) -> tuple[Array, Array]:
     """Places (n, 2) and standard deviations (n, 2) with the template that the chips give."""
-    template = template_of(chips, SIZE_MM)
+    template = learn_template(chips, SIZE_MM)
     fits = [match(ScanWindow(chip.grey), template, chip.pixel_from_mark, options) for chip in chips]
     covariances = [honest_covariance(template, chip.scan, fit).px2 for chip, fit in zip(chips, fits, strict=True)]
     return np.array([fit.center_px for fit in fits]), np.sqrt(np.array(covariances)[:, [0, 1], [0, 1]])
@@ -90,14 +90,14 @@ def test_noise_in_the_template_is_not_taken_for_slopes_of_the_mark() -> None:
 def test_dust_on_one_picture_stays_out_of_the_template() -> None:
     clean, _ = pictures(5, 3)
     dusty, _ = pictures(5, 3, dust=True)
-    with_dust, without = (template_of(chips, SIZE_MM).image.ravel() for chips in (dusty, clean))
+    with_dust, without = (learn_template(chips, SIZE_MM).image.ravel() for chips in (dusty, clean))
     gain, offset = np.polyfit(with_dust, without, 1)  # of a template they do not matter
     assert np.abs(gain * with_dust + offset - without).max() < 4 * NOISE_DN
 
 
 def test_one_picture_alone_is_its_own_template_and_keeps_an_honest_sigma() -> None:
     chips, _ = pictures(1, 4)
-    template = template_of(chips, SIZE_MM)
+    template = learn_template(chips, SIZE_MM)
     assert dict(template.shares) == {"frame0": 1.0}
     fit = match(ScanWindow(chips[0].grey), template, chips[0].pixel_from_mark, SHIFT)
     np.testing.assert_allclose(fit.center_px, chips[0].pixel_from_mark[:, 2], atol=0.02)
@@ -107,7 +107,7 @@ def test_one_picture_alone_is_its_own_template_and_keeps_an_honest_sigma() -> No
 
 def test_no_picture_gives_no_template() -> None:
     with pytest.raises(ValueError, match="needs a picture"):
-        template_of([], 3.0)
+        learn_template([], 3.0)
 
 
 def test_what_recurs_is_found_among_what_changes() -> None:
@@ -129,7 +129,7 @@ def test_a_corner_of_the_border_beside_a_lighter_landscape_is_known_less_surely(
     """Learned beside a landscape of 150, seen beside one of 230, each rough in its own way, whose glow on the border
     does not grow with it: both edges seem to lie elsewhere, as the standard deviations have to say."""
     rng = np.random.default_rng(6)
-    template = template_of([corner(rng, 150.0, 30 + rng.uniform(-0.5, 0.5, 2)) for _ in range(3)], SIZE_MM)
+    template = learn_template([corner(rng, 150.0, 30 + rng.uniform(-0.5, 0.5, 2)) for _ in range(3)], SIZE_MM)
     errors = []
     for place in 30 + rng.uniform(-0.5, 0.5, (4, 2)):
         seen = corner(rng, 230.0, place)

@@ -67,11 +67,11 @@ def test_a_match_with_the_others_blur_rarely_contradicts_it_unless_its_own_is_an
     good = 1.1 * np.exp(weight * rng.normal(0, np.hypot(others_sigma, own_sigma), 2000))
     other = 1.1 * np.exp(weight * rng.normal(np.log(0.6), own_sigma, 2000))
     contradicted, found = (
-        sum(not told.is_borne_out_by(fit) for fit in fits(seen, [sigma] * len(seen))) for seen in (good, other)
+        sum(not told.is_confirmed(fit) for fit in fits(seen, [sigma] * len(seen))) for seen in (good, other)
     )
     assert 8 <= contradicted <= 34  # 1 in 100
     assert found > 1800
-    assert not told.is_borne_out_by(fits([1.1], [np.inf])[0])
+    assert not told.is_confirmed(fits([1.1], [np.inf])[0])
 
 
 def test_too_few_marks_tell_nothing() -> None:
@@ -122,7 +122,7 @@ def test_a_speck_is_no_larger_beside_a_large_mark(radius_px: float, pitch_um: fl
     for off in (-1.0, 0.0, 1.0):
         one = touch(1 + 0.007 * off, 0.007, radius_px, 1000 / pitch_um)
         assert one.variance_px2 < 1e-4
-        assert one.beyond(0.5) < 0.0015
+        assert one.exceedance(0.5) < 0.0015
 
 
 def test_how_likely_a_touched_dot_is_far_off_is_what_drawing_at_random_finds() -> None:
@@ -131,7 +131,7 @@ def test_how_likely_a_touched_dot_is_far_off_is_what_drawing_at_random_finds() -
     alike = np.abs(changes + rng.normal(0.0, sigma, len(changes)) + 0.054) < 0.002  # of those that look so small
     one = touch(np.exp(-0.054), sigma, radius_px)
     expected = float(np.mean(np.abs(2 * radius_px * changes[alike]) > 0.5))
-    assert one.beyond(0.5) / one.probability == pytest.approx(expected, abs=0.02)
+    assert one.exceedance(0.5) / one.probability == pytest.approx(expected, abs=0.02)
 
 
 def test_two_other_marks_tell_a_size_and_an_odd_one_does_not_spoil_the_others() -> None:

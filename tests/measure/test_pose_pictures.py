@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fiducials.orientation_pictures import Drawings, Shown, Site
+from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark
 from measure.marks.shapes import MarkTemplate
 from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
@@ -35,12 +35,12 @@ def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
         for index, linear in enumerate(turned):
             for slid_px in (0.0, 4.0):
                 site = among_landscape(template, linear, seed, slid_px)
-                told = site.likelihoods([Shown(template, FLIP @ each) for each in turned])
+                told = site.likelihoods([PosedMark(template, FLIP @ each) for each in turned])
                 assert told.argmax() == index
                 assert np.sort(told)[-2] < -4.0
 
 
-def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: int, slid_px: float) -> Site:
+def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: int, slid_px: float) -> MarkSite:
     rng = np.random.default_rng(seed)
     landscape = cv2.GaussianBlur(rng.normal(0.0, 1.0, (3 * SIDE, 3 * SIDE)), (0, 0), 4.0)
     grey = 150.0 + 45.0 * landscape / landscape.std()
@@ -50,4 +50,4 @@ def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: i
     scan = Scan(Path("scan"), WholePicture(grey.astype(np.uint8)[..., None]), NO_TAGS)
     place = np.column_stack([linear, [SIDE + 30.0, SIDE + 30.0]])
     fit = match(ScanWindow(grey), template, place, MatchOptions(freedom="shift", estimate_blur=False))
-    return Site(scan, fit, fit.center_px + slid_px, None, Drawings([template], FLIP, 0.0), 5.0)
+    return MarkSite(scan, fit, fit.center_px + slid_px, None, Drawings([template], FLIP, 0.0), 5.0)

@@ -6,7 +6,7 @@ from brute_marks import brute_picture
 
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import MarkShape, MarkTemplate, cross, polygon
-from measure.marks.templates import with_common_origins
+from measure.marks.templates import share_origins
 
 PLACES = np.array([(6.0, -6.0), (-6.0, -6.0), (-6.0, 6.0), (6.0, 6.0)])
 SIDE, PX_PER_MM = 61, 20.0
@@ -23,9 +23,7 @@ def clicked(shape: MarkShape, off_mm: np.ndarray, rng: np.random.Generator) -> M
 def test_origins_of_crosses_are_laid_in_their_middles() -> None:
     rng = np.random.default_rng(1)
     off = rng.normal(0, 0.1, (4, 2))
-    templates, moves = with_common_origins(
-        [clicked(MarkShape(cross(1.0, 0.2)), each, rng) for each in off], PLACES, POSES
-    )
+    templates, moves = share_origins([clicked(MarkShape(cross(1.0, 0.2)), each, rng) for each in off], PLACES, POSES)
     assert templates[0].alike == POSES[1:]
     np.testing.assert_allclose(moves, -off, atol=0.05 / PX_PER_MM)
     for template, move in zip(templates, moves, strict=True):
@@ -40,9 +38,7 @@ def test_marks_that_are_each_turned_with_their_place_keep_what_nothing_tells() -
     quarters = [up_from_camera(pose) for pose in ("0", "270", "180", "90")]  # from one corner to the next
     off = rng.normal(0, 0.1, (4, 2))
     shapes = [MarkShape(polygon(tuple(map(tuple, (outline @ turn.T).tolist())))) for turn in quarters]
-    templates, moves = with_common_origins(
-        [clicked(*each, rng) for each in zip(shapes, off, strict=True)], PLACES, POSES
-    )
+    templates, moves = share_origins([clicked(*each, rng) for each in zip(shapes, off, strict=True)], PLACES, POSES)
     assert templates[0].alike == ("90", "180", "270")
     left = off + moves  # of the origins from the tips: alike once each is turned back
     turned_back = np.array([turn.T @ each for turn, each in zip(quarters, left, strict=True)])
@@ -54,6 +50,6 @@ def test_marks_that_differ_stay_as_they_were(places: np.ndarray) -> None:
     rng = np.random.default_rng(3)
     shapes = [MarkShape(cross(1.0, 0.2)), *(MarkShape(polygon(((0.0, 0.0), (1.1, 0.2), (0.4, 0.8)))) for _ in range(3))]
     marks = [clicked(shape, np.zeros(2), rng) for shape in shapes]
-    templates, moves = with_common_origins(marks, places, POSES)
+    templates, moves = share_origins(marks, places, POSES)
     assert templates == marks
     assert not moves.any()

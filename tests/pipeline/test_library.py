@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from measure.fiducials.camera_recognition import Answer, answer
+from measure.fiducials.camera_recognition import Answer
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from pipeline.cli import run
@@ -269,7 +269,7 @@ def test_a_part_of_a_lattice_is_no_other_camera(
     (scan,) = (frame.parent / "scans").glob("*.tif")
     two = {name: LIBRARY[name] for name in ("hasselblad-reseau-60", "register-glass-262")}
     monkeypatch.setattr(
-        "pipeline.measuring.camera_trials.answer", lambda _, layout, *__: Answer(10.0 ** -len(layout.marks), ())
+        "pipeline.measuring.camera_trials.search_camera", lambda _, layout, *__: Answer(10.0 ** -len(layout.marks), ())
     )
     monkeypatch.setattr(
         camera_trials, "_trial", lambda *_: replace(trial(("lattice",), 0.5), found=found, expected=1e-25)
@@ -285,12 +285,12 @@ def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     (scan,) = (frame.parent / "scans").glob("*.tif")
     few = {name: LIBRARY[name] for name in (RENDERED, "hasselblad-reseau-60")}
     monkeypatch.setattr("pipeline.files.library.read_library", lambda: few)
-    answered = answer
+    answered = search_camera
 
     def small_only(scan: Scan, layout: FiducialLayout, *given: Any) -> Answer:
         return answered(scan, layout, *given) if len(layout.marks) == 4 else Answer(math.inf, ())
 
-    monkeypatch.setattr("pipeline.measuring.camera_trials.answer", small_only)
+    monkeypatch.setattr("pipeline.measuring.camera_trials.search_camera", small_only)
     assert run(["cameras", "--scan", str(scan), "--json"]) == 0
     trials = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["trials"]
     assert trials[0]["expected"] < 1e-4
