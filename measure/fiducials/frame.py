@@ -226,11 +226,6 @@ class Frame:
         return self.accepted and self.measured_count >= self._least
 
     @property
-    def is_whole(self) -> bool:
-        """Whether every mark that lies in the scan was plainly seen where the others put it."""
-        return self.accepted and int(self.inliers.sum()) == self.inside and self.all_clear
-
-    @property
     def is_complete(self) -> bool:
         """Whether it needs no other search: every mark plainly seen where the others put it."""
         return bool(self.accepted and len(self.inliers) >= _CHECKED and self.inliers.all() and self.all_clear)

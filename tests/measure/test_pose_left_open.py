@@ -47,7 +47,8 @@ def test_a_frame_seen_as_its_mirror_image_is_renamed_as_it_lies(tmp_path: Path) 
         mirrored = measure_frame(scan, LEANING, right.posed("0m", right_mm(LEANING)), OPTIONS)
         assert int(mirrored.inliers.sum()) < 4
         frame = rename_frame(scan, mirrored, "0")
-        assert frame.is_whole
+        assert frame.inliers.all()
+        assert frame.all_clear
         # It is not replaced by one with fewer marks.
         assert rename_frame(scan, frame, "0m") is frame
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from measure.fiducials.camera_recognition import Answer
+from measure.fiducials.camera_recognition import Answer, search_camera
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from pipeline.cli import run
