@@ -82,6 +82,12 @@ def test_every_module_stands_on_the_map_of_the_code_with_its_own_words() -> None
     assert page == script("make_code_map").mapped(page), "run python docs/make_code_map.py"
 
 
+def test_the_page_of_keys_is_current() -> None:
+    page = (DOCS / "keys.md").read_text(encoding="utf-8")
+    assert page == script("make_keys").text(), "run python docs/make_keys.py"
+    assert "| `film_sigma_um` | number, 0 or more | µm | 0 |" in page
+
+
 def test_what_the_map_of_the_code_says_to_enter_by_exists() -> None:
     """Above the list of a folder's modules: a name with a dot is one of theirs, or a file."""
     named, folder = set(), ""

@@ -18,7 +18,8 @@ from pipeline.adjusting.fiducial_check import check_fiducials
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.project_file import UNITS_MM, Project
+from pipeline.files.project_file import Project
+from pipeline.files.project_tables import UNITS_MM
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.wording import did_you_mean, listed
 

@@ -25,7 +25,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.convention import FORMATS, IMPORTED, LARGEST_MISFIT_PX, ExportOptions
 from pipeline.text.wording import counted
 
-TEMPLATES = ("project", "camera", "scene")
+TEMPLATES = ("project", "camera", "scene", "keys")
 
 
 def resample(
@@ -139,9 +139,14 @@ def render(scene: SceneFile, out_dir: OutDir) -> int:
 def template(
     kind: Annotated[str, typer.Argument(metavar="KIND", help=one_of(TEMPLATES), show_default=False)],
 ) -> int:
-    """Print a commented file to start from."""
+    """Print a commented file to start from; keys: a table of all keys of project.toml."""
     if kind not in TEMPLATES:
         raise InputError(f"there is no template {kind!r}; possible are {', '.join(TEMPLATES)}.")
+    if kind == "keys":
+        from pipeline.files.project_tables import keys_text
+
+        typer.echo(keys_text(), nl=False)
+        return DONE
     from importlib import resources
 
     typer.echo(resources.files("pipeline").joinpath("templates", f"{kind}.toml").read_text(encoding="utf-8"), nl=False)

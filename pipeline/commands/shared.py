@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.files.project_file import FINEST_PITCH_UM
 from pipeline.terminal import PlainConsole, plain
+from pipeline.text.text_file import FINEST_PITCH_UM
 
 if TYPE_CHECKING:
     from pipeline.files.project_file import Project

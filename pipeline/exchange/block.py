@@ -14,7 +14,8 @@ from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.project_file import UNITS_MM, Project
+from pipeline.files.project_file import Project
+from pipeline.files.project_tables import UNITS_MM
 from pipeline.publishing.made_from import adjusted_from, differing
 from pipeline.resampling.frame_chain import FrameChain, image_chain
 from pipeline.results.adjustment_file import read_adjustment

@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from typing import Annotated, Literal, cast, get_args
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from adjust.functional_model.scanner import is_term
 from adjust.functional_model.transformation import film_kind
@@ -11,6 +13,7 @@ from adjust.problem.network import Transformation
 from adjust.problem.tested import PRIOR_GROUPS
 from adjust.quality.reweighting import WeightFunction
 from adjust.solution.options import MEASURED_KINDS
+from pipeline.text.table_models import FLAG, NOT_NEGATIVE, POSITIVE, TABLE, Key, choice, read_model
 from pipeline.text.tables import Table
 
 Datum = Literal["control", "minimal", "free"]
@@ -19,53 +22,79 @@ ScannerSetting = Literal["none", "auto", "bend"] | tuple[str, ...]
 SCANNER_WORDS = ("none", "auto", "bend")
 
 
-@dataclass(frozen=True)
+def _datum_choice(wanted: Datum) -> Key:
+    """The coordinates or points that a datum names; none where the program is to choose."""
+
+    def read(table: Table, key: str) -> tuple[str, ...]:
+        datum = table.text("datum", "control")
+        if datum != wanted:
+            raise table.error(
+                key, f'goes with datum = "{wanted}", and the datum here is "{datum}". Change one of the two.'
+            )
+        names = table.texts(key)
+        if not names:
+            raise table.error(key, "is an empty list. Leave it out where the program is to choose.")
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise table.error(key, f"names {twice[0]!r} twice.")
+        return names
+
+    return Key("list of texts", read)
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
 class AdjustSettings:
-    """The table [adjust]: a-priori standard deviations in um at the film.
+    """The table [adjust]: film model, datum, weights and tests. Standard deviations in µm at the film."""
 
-    transformation None: affine for a camera with fiducials, none for one without. scanner: the terms of the scanners'
-    bends, "bend" for all of degree 2 and 3 that the films leave, "auto" for those that tests choose; scanner_sigma_um:
-    of every term, which is given as 0, inf free.
-    """
-
-    transformation: Transformation | None
-    datum: Datum
-    datum_coordinates: tuple[str, ...]
-    datum_points: tuple[str, ...]
-    sigma_target_um: float
-    sigma_fiducial_um: float
-    film_sigma_um: float
-    scanner: ScannerSetting
-    scanner_sigma_um: float
-    refraction: bool
-    earth_curvature: bool
-    robust: bool | WeightFunction
-    variance_components: bool | tuple[str, ...]
-    snooping: bool
-    method: Method
+    transformation: Annotated[Transformation | None, Key("text", lambda table, key: read_transformation(table))] = (
+        Field(
+            default=None,
+            description="Film deformation model; absent: affine, or none without fiducials.",
+        )
+    )
+    datum: Annotated[Datum, choice(*get_args(Datum))] = Field(
+        default="control", description="What fixes the object system."
+    )
+    datum_coordinates: Annotated[tuple[str, ...], _datum_choice("minimal")] = Field(
+        default=(), description="The coordinates that a minimal datum holds; absent: the program chooses."
+    )
+    datum_points: Annotated[tuple[str, ...], _datum_choice("free")] = Field(
+        default=(), description="The points over which a free network has inner constraints; absent: all."
+    )
+    sigma_target_um: Annotated[float, POSITIVE] = Field(
+        default=5.0, description="Of a target where comparator.csv has none."
+    )
+    sigma_fiducial_um: Annotated[float, POSITIVE] = Field(
+        default=5.0, description="Of a fiducial where comparator.csv has none."
+    )
+    film_sigma_um: Annotated[float, NOT_NEGATIVE] = Field(
+        default=0.0, description="Film and scanner: added in quadrature to every comparator sigma."
+    )
+    scanner: Annotated[
+        ScannerSetting, Key("word or list of terms", lambda table, key: read_scanner(table, SCANNER_WORDS))
+    ] = Field(default="none", description="Bend of the scanner: none, bend (degrees 2, 3), auto (by tests), or terms.")
+    scanner_sigma_um: Annotated[float, Key("standard deviation", lambda table, key: read_scanner_sigma(table))] = Field(
+        default=math.inf, description="Prior of every term of the bend, which is given as 0; absent: free."
+    )
+    refraction: Annotated[bool, FLAG] = Field(default=False, description="Correct for atmospheric refraction.")
+    earth_curvature: Annotated[bool, FLAG] = Field(default=False, description="Correct for the curvature of the earth.")
+    robust: Annotated[
+        bool | WeightFunction, Key("true, false or a weight function", lambda table, key: _robust(table))
+    ] = Field(default=False, description="Reweight gross errors; true: Huber's weights.")
+    variance_components: Annotated[
+        bool | tuple[str, ...], Key("true, false or list of groups", lambda table, key: _variance_components(table))
+    ] = Field(default=False, description="Estimate the variances of groups of observations.")
+    snooping: Annotated[bool, FLAG] = Field(
+        default=False, description="Take gross errors out one by one (data snooping)."
+    )
+    method: Annotated[Method, choice(*get_args(Method))] = Field(
+        default="combined", description="One combined adjustment, or by observed elements."
+    )
 
 
 def read_adjust(table: Table) -> AdjustSettings:
     """Read the table. Raises InputError naming the key that is wrong."""
-    datum = cast(Datum, table.text("datum", "control", get_args(Datum)))
-    settings = AdjustSettings(
-        transformation=read_transformation(table),
-        datum=datum,
-        datum_coordinates=_datum_choice(table, "datum_coordinates", datum, "minimal"),
-        datum_points=_datum_choice(table, "datum_points", datum, "free"),
-        sigma_target_um=table.number("sigma_target_um", 5.0, above=0.0),
-        sigma_fiducial_um=table.number("sigma_fiducial_um", 5.0, above=0.0),
-        film_sigma_um=table.number("film_sigma_um", 0.0, least=0.0),
-        scanner=read_scanner(table, SCANNER_WORDS),
-        scanner_sigma_um=read_scanner_sigma(table),
-        refraction=table.flag("refraction", False),
-        earth_curvature=table.flag("earth_curvature", False),
-        robust=_robust(table),
-        variance_components=_variance_components(table),
-        snooping=table.flag("snooping", False),
-        method=cast(Method, table.text("method", "combined", get_args(Method))),
-    )
-    table.done()
+    settings = read_model(table, AdjustSettings)
     if settings.robust and settings.snooping:
         raise table.error("snooping", "and robust both take out gross errors. Set one of the two to false.")
     return settings
@@ -114,21 +143,6 @@ def _variance_components(table: Table) -> bool | tuple[str, ...]:
     unknown = [name for name in names if name not in known]
     if unknown:
         raise table.error("variance_components", f"names {unknown[0]!r}; possible are {', '.join(known)}.")
-    return names
-
-
-def _datum_choice(table: Table, key: str, datum: Datum, wanted: Datum) -> tuple[str, ...]:
-    """The coordinates or points that a datum names; none where the program is to choose."""
-    if key not in table:
-        return ()
-    if datum != wanted:
-        raise table.error(key, f'goes with datum = "{wanted}", and the datum here is "{datum}". Change one of the two.')
-    names = table.texts(key)
-    if not names:
-        raise table.error(key, "is an empty list. Leave it out where the program is to choose.")
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise table.error(key, f"names {twice[0]!r} twice.")
     return names
 
 

@@ -1,19 +1,18 @@
 """project.toml: which camera, which scans, what to measure, how to adjust, where to write."""
 
-import math
+import dataclasses
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, cast, get_args
+from typing import TYPE_CHECKING
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from measure.fiducials.options import ANY_FILM, BelievedFilm, Reads
-from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.files.adjust_table import AdjustSettings, read_adjust
+from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.decisions_file import FILE as DECISIONS
 from pipeline.files.decisions_file import Decision, cut_short_line, decisions_bytes, learned_from, parse_decisions
@@ -21,24 +20,22 @@ from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.library import camera_path
 from pipeline.files.mark_table import Clicks
 from pipeline.files.points_file import GivenDistance, GivenPoints, read_distances, read_points
+from pipeline.files.project_tables import UNITS_MM, ProjectTable
 from pipeline.files.scan_files import FoundScans, as_named, find_scans, with_cuts
-from pipeline.files.target_table import TargetSettings, TieSettings, read_targets, read_ties
+from pipeline.files.target_table import TargetSettings, TieSettings
 from pipeline.provenance import of_content
 from pipeline.results.covariance_file import covariance_path
 from pipeline.text.names import path_below
+from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, read_toml
 
-FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
 if TYPE_CHECKING:
     from measure.scans.scan import Scan
 
-_COARSEST_PITCH_UM = 1e4  # above it nm were meant: film of a few pixels shows no mark
 DEFAULT_SCANNER = "1"  # the name of that of all images that name none
-TONES = ("linear", "srgb")  # beside auto and a power
-UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Project:
     """A project file as read; paths are resolved against the file's folder.
 
@@ -210,47 +207,40 @@ def read_project(path: Path) -> Project:
     Raises InputError with file, line and key: for what is wrong in the project file itself before any other file.
     """
     table = read_toml(path)
-    objects, measure = table.table("object"), table.table("measure")
-    camera = table.path_text("camera")
-    patterns = table.path_texts("scans") if "scans" in table else None
-    exclude = table.path_texts("exclude") if "exclude" in table else ()
-    named = {key: objects.path_of(key) for key in ("points", "images", "distances") if key in objects}
-    antenna = _antenna(objects)
+    given, objects = read_model(table, ProjectTable), table.table("object")
+    folder = path.parent
+    files = {key: getattr(given.object, key) for key in ("points", "images", "distances")}
+    named = {key: folder / name for key, name in files.items() if name is not None}
+    antenna = given.object.antenna_offset
+    if any(antenna) and "images" not in named:
+        raise objects.error("antenna_offset", 'goes with images = "...", the file of the observed stations. Give both.')
+    _check_named(table, objects, given.camera, named)
+    images = read_images(named["images"], antenna) if "images" in named else None
+    found = FoundScans({}, frozenset())
+    if given.scans is not None:
+        found = find_scans(table, given.scans, given.exclude)
     project = Project(
         path=path,
-        cameras={},
-        scans={},
-        comparator=table.path_of("comparator", "comparator.csv"),
-        pitch_um=_pitch(table),
-        output=table.path_of("output", "out"),
-        pose=measure.text("pose", "auto", ("auto", *POSES)),
-        tone=measure.number_or_text("tone", "auto", ("auto", *TONES), above=0.0),
-        targets=read_targets(table.table("targets")) if "targets" in table else None,
-        ties=read_ties(table.table("ties")) if "ties" in table else None,
-        given_points=None,
-        given_images=None,
-        given_distances=(),
-        unit_mm=UNITS_MM[objects.text("unit", "m", tuple(UNITS_MM))],
-        adjust=read_adjust(table.table("adjust")),
-        writing=cast(Reads, measure.text("writing", "pose", get_args(Reads))),
-        crs=objects.text("crs", ""),
-        board_bend_sigma=objects.sigma("board_bend", 0.0),
-        transparent=objects.flag("transparent", False),
-    )
-    for each in (table, measure, objects):
-        each.done()
-    _check_named(table, objects, camera, named)
-    images = read_images(named["images"], antenna) if "images" in named else None
-    found = FoundScans({}, frozenset()) if patterns is None else find_scans(table, patterns, exclude)
-    project = replace(
-        project,
-        cameras=_cameras(table, camera, images),
+        cameras=_cameras(table, given.camera, images),
         scans=with_cuts(found.files, images, named.get("images")),
         left_out=found.left_out,
+        comparator=folder / given.comparator,
+        pitch_um=given.pitch_um,
+        output=folder / given.output,
+        pose=given.measure.pose,
+        tone=given.measure.tone,
+        targets=given.targets,
+        ties=given.ties,
         given_points=read_points(named["points"]) if "points" in named else None,
         given_images=images,
         given_distances=read_distances(named["distances"]) if "distances" in named else (),
         images_path=named.get("images"),
+        unit_mm=UNITS_MM[given.object.unit],
+        adjust=given.adjust,
+        writing=given.measure.writing,
+        crs=given.object.crs,
+        board_bend_sigma=given.object.board_bend,
+        transparent=given.object.transparent,
     )
     project = with_decisions(project)
     if not project.scans and not project.comparator.exists():
@@ -292,13 +282,6 @@ def _shown(project: Project, camera: CameraFile, shown: Decision | None) -> Clic
         )
     px = {one.id: shown.px[one.id] for one in camera.learned}
     return Clicks(shown.image, px, shown.fingerprint, shown.who or "somebody")
-
-
-def _antenna(objects: Table) -> tuple[float, float, float]:
-    antenna = objects.triple("antenna_offset", (0.0, 0.0, 0.0))
-    if any(antenna) and "images" not in objects:
-        raise objects.error("antenna_offset", 'goes with images = "...", the file of the observed stations. Give both.')
-    return antenna
 
 
 def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, Path]) -> None:
@@ -355,16 +338,3 @@ def _cameras(table: Table, default: str, images: GivenImages | None) -> Mapping[
             )
         titles[camera.name] = name
     return cameras
-
-
-def _pitch(table: Table) -> tuple[float, float] | None:
-    if "pitch_um" not in table:
-        return None
-    pitch = table.number_or_pair("pitch_um")
-    if not all(0.0 < value < math.inf for value in pitch):
-        raise table.error("pitch_um", f"must be positive, not {list(pitch)}.")
-    if min(pitch) < FINEST_PITCH_UM:
-        raise table.error("pitch_um", f"{min(pitch):g} um is finer than any scanner. Give um: 20.0, not 0.02.")
-    if max(pitch) > _COARSEST_PITCH_UM:
-        raise table.error("pitch_um", f"{max(pitch):g} um is coarser than any scan. Give um: 20.0, not 20000.")
-    return pitch

@@ -1,12 +1,28 @@
 """The tables [targets] and [ties] of project.toml: what is to be measured apart from the fiducials."""
 
+import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from measure.marks.shapes import Polarity
+from pipeline.text.table_models import (
+    FLAG,
+    NOT_NEGATIVE,
+    NUMBER,
+    PAIR,
+    POSITIVE,
+    TABLE,
+    TEXT,
+    Key,
+    choice,
+    read_model,
+    whole,
+)
 from pipeline.text.tables import Table
 
 if TYPE_CHECKING:
@@ -16,11 +32,12 @@ if TYPE_CHECKING:
 KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco", "squares")
 
 _MOST_OF_A_BOARD = 500  # columns, and rows
+POLARITY = choice("auto", "light", "dark")
 if TYPE_CHECKING:
     from measure.tie_points.find_points import TieOptions
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class TargetSettings:
     """What the targets are: single disks or crosses, or a board whose corners or dots have their places on it.
 
@@ -37,49 +54,165 @@ class TargetSettings:
     polarity: Polarity = "auto"
     board: "BoardSpec | None" = None
     code: "RingCode | None" = None
-    numbers: Mapping[int, str] = field(default_factory=dict)
+    numbers: Mapping[int, str] = dataclasses.field(default_factory=dict)
     transparent: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class TargetTable:
+    """What every table [targets] has."""
+
+    kind: Annotated[str, choice(*KINDS)] = Field(description="What the targets are.")
+    transparent: Annotated[bool, FLAG] = Field(
+        default=False, description="Whether a flat field can be seen from both sides."
+    )
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class SingleTargetTable(TargetTable):
+    """What targets have that stand by themselves."""
+
+    polarity: Annotated[Polarity, POLARITY] = Field(
+        default="auto", description="Whether marks are lighter than their ground."
+    )
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class DiskTable(SingleTargetTable):
+    """[targets] of disks."""
+
+    diameter_mm: Annotated[float, POSITIVE] = Field(description="In object space, for the eccentricity correction.")
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class CrossTable(SingleTargetTable):
+    """[targets] of crosses."""
+
+    arm_mm: Annotated[float, POSITIVE] = Field(description="Half the length of a bar in object space.")
+    line_mm: Annotated[float, POSITIVE] = Field(description="Width of the bars in object space.")
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class CodedRingTable(SingleTargetTable):
+    """[targets] of dots of which some have a ring of segments about them."""
+
+    diameter_mm: Annotated[float | None, POSITIVE] = Field(default=None, description="Of the dots, in object space.")
+    bits: Annotated[int | None, whole()] = Field(default=None, description="Segments of a ring; absent: 12.")
+    ring: Annotated[tuple[float, float] | None, PAIR] = Field(
+        default=None, description="Inner and outer radius of the ring in units of the dot's."
+    )
+    codes: Annotated[object, Key("table of numbers by point", Table.table)] = Field(
+        default=None, description="Points with rings and their numbers; absent: a point is named by its number."
+    )
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class BoardTable(TargetTable):
+    """What every board has."""
+
+    columns: Annotated[int, whole(1, _MOST_OF_A_BOARD)] = Field(description="Inner corners, squares, dots or markers.")
+    rows: Annotated[int, whole(1, _MOST_OF_A_BOARD)] = Field(description="As columns.")
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class ChessboardTable(BoardTable):
+    """[targets] of a chessboard."""
+
+    square_mm: Annotated[float, POSITIVE] = Field(description="Side of a square.")
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class CircleGridTable(BoardTable):
+    """[targets] of a grid of dots."""
+
+    spacing_mm: Annotated[float, POSITIVE] = Field(description="Between the centres of neighbours in a row.")
+    diameter_mm: Annotated[float, POSITIVE] = Field(description="Of a dot.")
+    asymmetric: Annotated[bool, FLAG] = Field(default=False, description="Whether every second row is staggered.")
+    row_spacing_mm: Annotated[float | None, POSITIVE] = Field(
+        default=None, description="Between rows, where it is another."
+    )
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class SquaresTable(ChessboardTable):
+    """[targets] of a grid of single squares."""
+
+    gap_mm: Annotated[float, POSITIVE] = Field(description="Between squares.")
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class CharucoTable(ChessboardTable):
+    """[targets] of a ChArUco board."""
+
+    dictionary: Annotated[str, TEXT] = Field(description='Of the markers, such as "4X4_50".')
+    marker_mm: Annotated[float, POSITIVE] = Field(description="Side of a marker.")
+    legacy: Annotated[bool | None, FLAG] = Field(default=None, description="The older layout; absent: both are tried.")
+    first_id: Annotated[int, whole()] = Field(default=0, description="Number of the first marker.")
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class ArucoTable(BoardTable):
+    """[targets] of a grid of ArUco markers."""
+
+    dictionary: Annotated[str, TEXT] = Field(description='Of the markers, such as "4X4_50".')
+    marker_mm: Annotated[float, POSITIVE] = Field(description="Side of a marker.")
+    gap_mm: Annotated[float, POSITIVE] = Field(description="Between markers.")
+    first_marker: Annotated[int, whole()] = Field(default=0, description="Number of the first marker.")
+
+
+TARGET_TABLES: Mapping[str, type[TargetTable]] = dict(
+    zip(
+        KINDS,
+        (
+            DiskTable,
+            CrossTable,
+            CodedRingTable,
+            ChessboardTable,
+            CircleGridTable,
+            ArucoTable,
+            CharucoTable,
+            SquaresTable,
+        ),
+        strict=True,
+    )
+)
 
 
 def read_targets(table: Table) -> TargetSettings:
     """Read the table. Raises InputError naming the key that is wrong."""
     kind = table.text("kind", choices=KINDS)
-    if kind == "disk":
-        settings = TargetSettings(kind, table.number("diameter_mm", above=0.0), polarity=_polarity(table))
-    elif kind == "cross":
-        settings = _crosses(table)
-    elif kind == "coded-ring":
-        settings = _coded(table)
-    else:
-        try:
-            board = _board(kind, table)
-        except ValueError as error:
-            raise table.error("kind", f"this {kind} is impossible: {error}.") from None
-        diameter = getattr(board, "diameter_mm", None)
-        settings = TargetSettings(kind, diameter, board=board)
-    settings = replace(settings, transparent=table.flag("transparent", False))
-    table.done()
-    return settings
-
-
-def _crosses(table: Table) -> TargetSettings:
-    arm, line = table.number("arm_mm", above=0.0), table.number("line_mm", above=0.0)
-    if line >= arm:
-        raise table.error("line_mm", f"a line of {line:g} mm is no line for arms of {arm:g} mm. Give its width.")
-    return TargetSettings("cross", arm_mm=arm, cross_line=line / arm, polarity=_polarity(table))
-
-
-def _coded(table: Table) -> TargetSettings:
-    from measure.targets.ring_codes import RingCode
-
-    default = RingCode()
-    diameter = table.number("diameter_mm", above=0.0) if "diameter_mm" in table else None
-    bits = table.whole("bits", default.bits)
+    given = read_model(table, TARGET_TABLES[kind])
     try:
-        code = RingCode(bits, table.pair("ring", default.ring))
+        return _settings(given, table)
     except ValueError as error:
-        raise table.error("kind", f"this coded-ring is impossible: {error}.") from None
-    return TargetSettings("coded-ring", diameter, polarity=_polarity(table), code=code, numbers=_numbers(table, code))
+        raise table.error("kind", f"this {kind} is impossible: {error}.") from None
+
+
+def _settings(given: TargetTable, table: Table) -> TargetSettings:
+    kind, transparent = given.kind, given.transparent
+    match given:
+        case DiskTable():
+            return TargetSettings(kind, given.diameter_mm, polarity=given.polarity, transparent=transparent)
+        case CrossTable():
+            arm, line = given.arm_mm, given.line_mm
+            if line >= arm:
+                raise table.error(
+                    "line_mm", f"a line of {line:g} mm is no line for arms of {arm:g} mm. Give its width."
+                )
+            return TargetSettings(
+                kind, arm_mm=arm, cross_line=line / arm, polarity=given.polarity, transparent=transparent
+            )
+        case CodedRingTable():
+            from measure.targets.ring_codes import RingCode
+
+            usual = RingCode()
+            code = RingCode(usual.bits if given.bits is None else given.bits, given.ring or usual.ring)
+            numbers, diameter = _numbers(table, code), given.diameter_mm
+            return TargetSettings(
+                kind, diameter, polarity=given.polarity, code=code, numbers=numbers, transparent=transparent
+            )
+    board = _board(given)
+    return TargetSettings(kind, getattr(board, "diameter_mm", None), board=board, transparent=transparent)
 
 
 def _numbers(table: Table, code: "RingCode") -> dict[int, str]:
@@ -97,38 +230,42 @@ def _numbers(table: Table, code: "RingCode") -> dict[int, str]:
     return points
 
 
-def _polarity(table: Table) -> Polarity:
-    return cast(Polarity, table.text("polarity", "auto", ("auto", "light", "dark")))
+def _board(given: TargetTable) -> "BoardSpec":
+    from measure.boards import specs
+
+    match given:
+        case CircleGridTable():
+            staggered, row_spacing = given.asymmetric, given.row_spacing_mm
+            return specs.CircleGridSpec(
+                given.columns, given.rows, given.spacing_mm, given.diameter_mm, staggered, row_spacing
+            )
+        case SquaresTable():
+            return specs.SquareGridSpec(given.columns, given.rows, given.square_mm, given.gap_mm)
+        case CharucoTable():
+            square, marker, first = given.square_mm, given.marker_mm, given.first_id
+            return specs.CharucoSpec(given.dictionary, given.columns, given.rows, square, marker, given.legacy, first)
+        case ArucoTable():
+            marker, gap, first = given.marker_mm, given.gap_mm, given.first_marker
+            return specs.ArucoSpec(given.dictionary, given.columns, given.rows, marker, gap, first)
+    assert isinstance(given, ChessboardTable)
+    return specs.ChessboardSpec(given.columns, given.rows, given.square_mm)
 
 
-def _board(kind: str, table: Table) -> "BoardSpec":
-    from measure.boards.specs import (
-        ArucoSpec,
-        CharucoSpec,
-        ChessboardSpec,
-        CircleGridSpec,
-        SquareGridSpec,
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class TieTable:
+    """The table [ties]."""
+
+    wanted: Annotated[int | None, whole()] = Field(default=None, description="Natural points of an image; absent: 300.")
+    images: Annotated[int | None, whole()] = Field(
+        default=None, description="Images that a point is to be in; absent: 2."
+    )
+    height: Annotated[float | None, NUMBER] = Field(default=None, description="Of the ground, object units.")
+    height_sigma: Annotated[float | None, NOT_NEGATIVE] = Field(
+        default=None, description="Its standard deviation, object units; goes with height."
     )
 
-    columns, rows = (table.whole(key, least=1, most=_MOST_OF_A_BOARD) for key in ("columns", "rows"))
-    if kind == "chessboard":
-        return ChessboardSpec(columns, rows, table.number("square_mm", above=0.0))
-    if kind == "circle-grid":
-        spacing, diameter = table.number("spacing_mm", above=0.0), table.number("diameter_mm", above=0.0)
-        row_spacing = table.number("row_spacing_mm", above=0.0) if "row_spacing_mm" in table else None
-        return CircleGridSpec(columns, rows, spacing, diameter, table.flag("asymmetric", False), row_spacing)
-    if kind == "squares":
-        return SquareGridSpec(columns, rows, table.number("square_mm", above=0.0), table.number("gap_mm", above=0.0))
-    dictionary, marker = table.text("dictionary"), table.number("marker_mm", above=0.0)
-    if kind == "charuco":
-        square = table.number("square_mm", above=0.0)
-        legacy = table.flag("legacy", False) if "legacy" in table else None
-        return CharucoSpec(dictionary, columns, rows, square, marker, legacy, table.whole("first_id", 0))
-    first = table.whole("first_marker", 0)
-    return ArucoSpec(dictionary, columns, rows, marker, table.number("gap_mm", above=0.0), first)
 
-
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class TieSettings:
     """height: of the ground on which the natural points lie, object units, with its standard deviation; None where it
     is not known."""
@@ -145,14 +282,15 @@ def read_ties(table: Table) -> TieSettings:
     """Read the table. Raises InputError naming the key that is wrong."""
     from measure.tie_points.find_points import TieOptions
 
-    usual = TieOptions()
-    wanted, images = table.whole("wanted", usual.wanted), table.whole("images", usual.images)
+    given, usual = read_model(table, TieTable), TieOptions()
     try:
-        options = TieOptions(wanted, images)
+        options = TieOptions(
+            usual.wanted if given.wanted is None else given.wanted,
+            usual.images if given.images is None else given.images,
+        )
     except ValueError as error:
         raise table.error("wanted", f"these natural points are impossible: {error}.") from None
     height = None
-    if "height" in table or "height_sigma" in table:
+    if given.height is not None or given.height_sigma is not None:
         height = Prior(table.number("height"), table.number("height_sigma", least=0.0))
-    table.done()
     return TieSettings(options, height)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.targets.ring_codes import RingCode
-from pipeline.files.project_file import UNITS_MM
+from pipeline.files.project_tables import UNITS_MM
 from pipeline.text.tables import Table
 from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarget, RingFigure
 

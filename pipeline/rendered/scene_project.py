@@ -14,7 +14,7 @@ from measure.marks import shapes
 from pipeline.files.camera_file import CameraFile, GivenFiducial
 from pipeline.files.camera_text import camera_text
 from pipeline.files.mark_table import saved_in
-from pipeline.files.project_file import UNITS_MM
+from pipeline.files.project_tables import UNITS_MM
 from pipeline.rendered.design_table import DesignSettings
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line

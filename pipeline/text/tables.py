@@ -94,7 +94,9 @@ class Table:
         if not isinstance(value, str):
             raise self.error(key, f'must be text in quotes, not {shown(value)}. Write {key} = "...".')
         if choices and value not in choices:
-            raise self.error(key, f"is {shown(value)}; possible are {_listed(choices)}.{did_you_mean(value, choices)}")
+            raise self.error(
+                key, f"is {shown(value)}; possible are {list_words(choices)}.{did_you_mean(value, choices)}"
+            )
         return value
 
     def path_of(self, key: str, default: str | None = None) -> Path:
@@ -137,7 +139,7 @@ class Table:
         value = self._get(key, default)
         if isinstance(value, str) and value not in choices:
             also = f"{did_you_mean(value, choices)} A number above {above:g}, without quotes, is possible, too."
-            raise self.error(key, f"is {shown(value)}; possible are {_listed(choices)}.{also}")
+            raise self.error(key, f"is {shown(value)}; possible are {list_words(choices)}.{also}")
         if isinstance(value, str):
             return value
         return self.number(key, default if isinstance(default, float) else None, above=above)
@@ -225,7 +227,7 @@ class Table:
         known = sorted(self._known)
         unknown = [key for key in self.values if key not in self._known]
         messages = [
-            str(self.error(key, f"is no key of this table.{did_you_mean(key, known)} Known here: {_listed(known)}."))
+            str(self.error(key, f"is no key of this table.{did_you_mean(key, known)} Known here: {list_words(known)}."))
             for key in unknown[:LISTED]
         ]
         if len(unknown) > LISTED:
@@ -296,5 +298,6 @@ class Table:
         return starts[which] + 1 or None
 
 
-def _listed(words: Sequence[str]) -> str:
+def list_words(words: Sequence[str]) -> str:
+    """Words in quotes, with commas between."""
     return ", ".join(repr(word) for word in words) or "none"

@@ -22,6 +22,9 @@ LARGEST = 1e15  # of a coordinate, a size, a standard deviation, in whatever uni
 SMALLEST_SIGMA = 1e-9  # of a coordinate, in mm, m or degrees: weights of smaller ones swallow all others
 
 
+FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
+
+
 def read_bytes(path: Path, most_mb: int = MOST_MB) -> bytes:
     """The content of a file.
 

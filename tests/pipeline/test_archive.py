@@ -157,7 +157,7 @@ def test_what_was_measured_with_other_options_comes_back_without_measuring(folde
 
 
 def test_a_new_revision_of_measuring_measures_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.provenance.fingerprint.__defaults__", (-1,))
+    monkeypatch.setattr("pipeline.provenance.result_key.__defaults__", (-1,))
     measure(folder)
     assert sorted(measured) == ["a", "b", "c"]
 

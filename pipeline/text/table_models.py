@@ -1,0 +1,149 @@
+"""TOML tables as pydantic models: each field is a key with its type, default and meaning.
+
+Names, defaults and unknown keys are pydantic's; a value is read by `Table`, whose errors name file, line and key.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from functools import cache
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+from pydantic import ConfigDict, GetCoreSchemaHandler, PlainValidator, TypeAdapter, ValidationError, ValidationInfo
+from pydantic.fields import FieldInfo
+
+from pipeline.errors import InputError
+from pipeline.text.tables import Table, list_words
+from pipeline.text.wording import LISTED, did_you_mean, nearest
+
+Model = TypeVar("Model")
+
+TABLE = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+_UNITS = {"mm": "mm", "um": "µm", "deg": "°", "px": "px", "ppm": "ppm", "urad": "µrad", "dm": "dm"}
+
+
+@dataclass(frozen=True)
+class Key:
+    """How a key is read from its table, and what its type is called. model: of a table below this one."""
+
+    words: str
+    read: Callable[[Table, str], Any]
+    model: type | None = None
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        return PlainValidator(self._validated).__get_pydantic_core_schema__(Any, handler)  # `Table` knows the type
+
+    def _validated(self, value: Any, info: ValidationInfo) -> Any:
+        """A value from a file is read from its table; one that a program gives stands as it is."""
+        if not isinstance(info.context, Table):
+            return value
+        assert info.field_name is not None
+        return self.read(info.context, info.field_name)
+
+
+TEXT = Key("text", Table.text)
+TEXTS = Key("list of texts", Table.texts)
+PATH = Key("path", Table.path_text)
+PATHS = Key("list of paths", Table.path_texts)
+FLAG = Key("true or false", lambda table, key: table.flag(key, False))
+NUMBER = Key("number", Table.number)
+POSITIVE = Key("number above 0", lambda table, key: table.number(key, above=0.0))
+NOT_NEGATIVE = Key("number, 0 or more", lambda table, key: table.number(key, least=0.0))
+SIGMA = Key('standard deviation, 0 or "free"', Table.sigma)
+PAIR = Key("[x, y]", Table.pair)
+NUMBER_OR_PAIR = Key("number or [x, y]", Table.number_or_pair)
+TRIPLE = Key("[x, y, z]", Table.triple)
+
+
+def whole(least: int = 0, most: int = 10**9) -> Key:
+    """A whole number within limits."""
+    limits = f", {least} or more" if most == 10**9 else f" of {least} to {most}"
+    return Key(f"whole number{limits}", lambda table, key: table.whole(key, least=least, most=most))
+
+
+def choice(*words: str) -> Key:
+    """One of some words."""
+    return Key(" or ".join(f'"{word}"' for word in words), lambda table, key: table.text(key, choices=words))
+
+
+def subtable(model: type) -> Key:
+    """A table below this one."""
+    return Key("table", lambda table, key: read_model(table.table(key), model), model)
+
+
+def read_model(table: Table, model: type[Model]) -> Model:
+    """Read a table as a model.
+
+    Raises
+    ------
+    InputError
+        With file, line and key, for a wrong value, a missing key or, all in one message, unknown keys.
+    """
+    try:
+        given: Model = _adapter(model).validate_python(dict(table.values), context=table)
+        return given
+    except ValidationError as error:
+        raise _input_error(table, model, error) from None
+
+
+_adapter: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
+
+
+def _input_error(table: Table, model: type, error: ValidationError) -> InputError:
+    known = sorted(one.name for one in fields(model))
+    unknown = [key for key in table.values if key not in known]
+    for each in error.errors(include_url=False, include_context=False, include_input=False):
+        key = str(each["loc"][0])
+        if each["type"] == "missing":
+            near = nearest(key, unknown)
+            return table.error(key, "is missing. Add it" + (f", or rename {near!r} to it." if near else "."))
+    messages = [
+        str(table.error(key, f"is no key of this table.{did_you_mean(key, known)} Known here: {list_words(known)}."))
+        for key in unknown[:LISTED]
+    ]
+    if len(unknown) > LISTED:
+        messages.append(f"{table.file}: {len(unknown) - LISTED} more keys are not known.")
+    return InputError("\n".join(messages))
+
+
+@dataclass(frozen=True)
+class KeyRow:
+    """A row of the table of keys: default "" where the key must be given."""
+
+    name: str
+    type: str
+    unit: str
+    default: str
+    meaning: str
+
+
+def key_rows(model: type) -> Iterator[KeyRow]:
+    """The keys of a model, in their order."""
+    hints = get_type_hints(model, include_extras=True)
+    for field in fields(model):
+        key, hint = (
+            next((each for each in _annotations(hints[field.name]) if isinstance(each, Key)), None),
+            field.default,
+        )
+        default, meaning = hint, ""
+        if isinstance(hint, FieldInfo):
+            default, meaning = (MISSING if hint.is_required() else hint.get_default()), hint.description or ""
+        unit = _UNITS.get(field.name.rpartition("_")[2], "")
+        yield KeyRow(field.name, key.words if key else "", unit, _default_text(default, field), meaning)
+
+
+def _annotations(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+
+
+def _default_text(default: Any, field: Field[Any]) -> str:
+    if default is MISSING:
+        return "required" if field.default_factory is MISSING else ""
+    if default is None or default == ():
+        return "none"
+    if is_dataclass(default):  # of a table below this one
+        return ""
+    if isinstance(default, bool):
+        return str(default).lower()
+    return (
+        f'"{default}"' if isinstance(default, str) else f"{default:g}" if isinstance(default, float) else str(default)
+    )
