@@ -35,7 +35,6 @@ from pipeline.archive.results_database import Store
 from pipeline.archive.results_integrity import DamagedError
 from pipeline.archive.status import archive_summary, shard_summary
 from pipeline.archive.thumbnails import ThumbnailStore
-from pipeline.archive.work import NotMeasured, WorkOptions
 from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
 from pipeline.files.project_file import Project
@@ -60,6 +59,7 @@ from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.results.record_json import write_record
 from pipeline.summary import Summary, summarise
+from pipeline.workers import NotMeasured, WorkOptions
 
 if TYPE_CHECKING:
     from pipeline.opencv_check.opencv_corners import BoardPictures

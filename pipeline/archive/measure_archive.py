@@ -15,7 +15,7 @@ from pipeline.archive.cross_scan_checks import find_copies, input_of, judged_lot
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import tell_inapplicable
 from pipeline.archive.thumbnails import ThumbnailStore
-from pipeline.archive.work import Work, WorkOptions
+from pipeline.archive.work import Work
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
@@ -27,7 +27,7 @@ from pipeline.measuring.tone_stage import said_of_tones
 from pipeline.progress import Reporter
 from pipeline.provenance import FileStates, Identity, content_hash, parts_hash, shard_of
 from pipeline.text.wording import counted, gathered
-from pipeline.workers import worker_pool
+from pipeline.workers import WorkOptions, worker_pool
 
 
 def check_measurable(project: Project) -> tuple[str, ...]:

@@ -5,7 +5,6 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from functools import lru_cache
 
 from measure.scans.remote import scan_path
@@ -21,30 +20,12 @@ from pipeline.provenance import FileState, FileStates, Identity, options_hash, p
 from pipeline.results.measured_record import record_of, scan_of
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.wording import counted, listed, without_file
-from pipeline.workers import TASKS_A_CORE, results_of
+from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, results_of
 
 _HOUR_S, _MINUTE_S = 3600.0, 60.0
 _NAMED = 3
 _SAID_EVERY_S = 30.0
 _hash_of = lru_cache(maxsize=4096)(options_hash)
-
-
-@dataclass(frozen=True)
-class WorkOptions:
-    """How the work is shared. shard: (K, N), only the scans of the K-th of N parts. cluster: a scheduler's address, or
-    `local`. retry: measure again what failed. moved: keep results of files whose content is the same elsewhere.
-    workers: processes, if not one a core. only_kept: nothing is measured; what is missing stays so."""
-
-    shard: tuple[int, int] | None = None
-    cluster: str | None = None
-    retry: bool = False
-    moved: bool = False
-    workers: int | None = None
-    only_kept: bool = False
-
-
-class NotMeasured(Exception):
-    """Something is missing, and nothing is to be measured now."""
 
 
 class ExpectedTime:

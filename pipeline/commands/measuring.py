@@ -89,7 +89,7 @@ def measuring(stage: str, told: str) -> Callable[..., int]:
         max_pixels: MaxPixels = None,
     ) -> int:
         from pipeline import stages
-        from pipeline.archive.work import WorkOptions
+        from pipeline.workers import WorkOptions
 
         work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
         return with_project(project, partial(getattr(stages, stage), work=work), as_json, max_pixels)
