@@ -37,9 +37,9 @@ def _exists(name: str) -> bool:
 
 
 def test_every_link_of_the_pages_leads_somewhere() -> None:
-    for page in DOCS.glob("*.md"):
-        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
-            assert (DOCS / target).exists(), f"{page.name}: {target}"
+    for page in DOCS.rglob("*.md"):
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists(), f"{page.relative_to(DOCS)}: {target}"
 
 
 def test_the_gallery_quotes_the_program() -> None:
