@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from synthetic_images.areas import Area
 from synthetic_images.bend import Bend
 from synthetic_images.projection import camera_from_object
-from synthetic_images.scene import Scene, SceneImage
+from synthetic_images.scene import Film, Scene, SceneImage
 
 Array = NDArray[np.float64]
 
@@ -21,8 +21,8 @@ INVERSION_STEPS = 5  # of the smooth deformation, each a ten-thousandth of the o
 class FrameGeometry:
     """Where things of one frame come to lie in its scan.
 
-    width_px, height_px: of the scan. comparator_from_camera: (2, 3), exact where the film has no smooth deformation and
-    the scanner no bend.
+    width_px, height_px: of the scan. comparator_from_camera: (3, 3), of homogeneous coordinates, exact where film has
+    no smooth deformation and the scanner no bend.
     amplitudes_mm, waves_per_mm (WAVES, 2), phases_rad (WAVES,): the smooth deformation, a sum of sines.
     """
 
@@ -38,7 +38,7 @@ class FrameGeometry:
     def pixel_from_camera(self, camera_mm: Array) -> Array:
         """(n, 2) column and row of points (n, 2) of the camera frame."""
         film = camera_mm + self.deformation_mm(camera_mm)
-        comparator = film @ self.comparator_from_camera[:, :2].T + self.comparator_from_camera[:, 2]
+        comparator = _projected(self.comparator_from_camera, film)
         if self.bend.terms_um:
             comparator = self.bend.scan_from_bed(comparator)
         return np.asarray(comparator * self._pixel_per_mm, np.float64)
@@ -51,11 +51,15 @@ class FrameGeometry:
         """(n, 2) points of the camera frame from column and row (n, 2), the inverse of `pixel_from_camera`."""
         if self.bend.terms_um:
             pixels = self.bend.bed_from_scan(pixels / self._pixel_per_mm) * self._pixel_per_mm
-        film = pixels @ self.camera_from_pixel[:2, :2].T + self.camera_from_pixel[:2, 2]
+        film = self.straight_camera_from_scan(pixels)
         camera_mm = film
         for _ in range(INVERSION_STEPS):
             camera_mm = film - self.deformation_mm(camera_mm)
         return np.asarray(camera_mm)
+
+    def straight_camera_from_scan(self, pixels: Array) -> Array:
+        """The same without the smooth deformation and the scanner's bend."""
+        return _projected(self.camera_from_pixel, pixels)
 
     def pixel_area(self, camera_mm: Area) -> Area:
         return tuple(self.pixel_from_camera(outline) for outline in camera_mm)
@@ -71,14 +75,13 @@ class FrameGeometry:
     @cached_property
     def camera_from_pixel(self) -> Array:
         """(3, 3) the camera frame from column, row, 1, without the smooth deformation and the scanner's bend."""
-        pixel_from_camera = np.eye(3)
-        pixel_from_camera[:2] = self.comparator_from_camera * self._pixel_per_mm[:, None]
-        return np.asarray(np.linalg.inv(pixel_from_camera), np.float64)
+        return self.camera_from_comparator @ np.diag([*(1 / self._pixel_per_mm), 1.0])
 
     @cached_property
     def camera_from_comparator(self) -> Array:
-        """(2, 3) the truth that an adjustment seeks."""
-        return np.linalg.inv(np.vstack([self.comparator_from_camera, [0.0, 0.0, 1.0]]))[:2]
+        """(3, 3) the truth that an adjustment seeks."""
+        matrix = np.linalg.inv(self.comparator_from_camera)
+        return np.asarray(matrix / matrix[2, 2], np.float64)
 
     @cached_property
     def _pixel_per_mm(self) -> Array:
@@ -94,8 +97,12 @@ def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
     center = np.array([(whole_px - 1) / 2 - first_px, -(height_px - 1) / 2]) * pitch_mm
     mirror = np.diag([-1.0, 1.0]) if image.pose.endswith("m") else np.eye(2)
     bed_from_film = turn(image.turn_rad) @ _quarter_turn(image.pose) @ mirror
-    film_from_camera = turn(film.rotation_rad) @ np.array([[film.scale[0], film.shear_rad], [0.0, film.scale[1]]])
+    film_from_camera = np.eye(3)
+    film_from_camera[:2, :2] = turn(film.rotation_rad) @ [[film.scale[0], film.shear_rad], [0.0, film.scale[1]]]
+    bed_from_photograph = np.eye(3)
+    bed_from_photograph[:2, :2] = bed_from_film
     shift = bed_from_film @ np.asarray(film.shift_mm) + center + np.asarray(image.offset_mm)
+    bed_from_photograph[:2, 2] = shift
     frames = [each.frame for each in scene.images]  # the film deforms once, however many scans there are of it
     generator = np.random.default_rng([scene.seed, frames.index(image.frame), 1])
     directions = generator.uniform(0, 2 * np.pi, WAVES)
@@ -106,12 +113,27 @@ def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
         image=image,
         width_px=end_px - first_px,
         height_px=height_px,
-        comparator_from_camera=np.column_stack([bed_from_film @ film_from_camera, shift]),
+        comparator_from_camera=bed_from_photograph @ photograph_from_film(scene.film) @ film_from_camera,
         # A sine's mean square is 1/2, and the waves' squares add up.
         amplitudes_mm=generator.normal(size=(WAVES, 2)) * rms_mm * np.sqrt(2 / WAVES),
         waves_per_mm=np.stack([np.cos(directions), np.sin(directions)], axis=1) * waves[:, None],
         phases_rad=generator.uniform(0, 2 * np.pi, WAVES),
     )
+
+
+def photograph_from_film(film: Film) -> Array:
+    """(3, 3) the picture of a film in its own scale, taken by a camera that was tilted about a line in the film."""
+    tilt_rad, direction = np.deg2rad(film.tilt_deg), turn(np.deg2rad(film.tilt_direction_deg))
+    tilted = np.diag([np.cos(tilt_rad), 1.0, 1.0])
+    tilted[2, 0] = np.sin(tilt_rad) / film.photographed_from_mm
+    along = np.eye(3)
+    along[:2, :2] = direction
+    return np.asarray(along @ tilted @ along.T, np.float64)
+
+
+def _projected(matrix: Array, points: Array) -> Array:
+    homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
+    return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:], np.float64)
 
 
 def scanner_bend(scene: Scene) -> Bend:

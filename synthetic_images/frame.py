@@ -160,12 +160,12 @@ def _hidden(geometry: FrameGeometry, target: Target, outline_px: Array) -> str:
 
 
 def _inside_frame(geometry: FrameGeometry, pixels: Array) -> bool:
-    camera = np.column_stack([pixels, np.ones(len(pixels))]) @ geometry.camera_from_pixel.T
-    return bool((np.abs(camera[:, :2]) < np.asarray(geometry.scene.camera.frame_mm) / 2).all())
+    camera = geometry.straight_camera_from_scan(pixels)
+    return bool((np.abs(camera) < np.asarray(geometry.scene.camera.frame_mm) / 2).all())
 
 
 def _behind_a_fiducial(geometry: FrameGeometry, pixels: Array) -> bool:
-    camera = (np.column_stack([pixels, np.ones(len(pixels))]) @ geometry.camera_from_pixel.T)[:, :2]
+    camera = geometry.straight_camera_from_scan(pixels)
     return any(
         bool((np.linalg.norm(camera - fiducial.xy_mm, axis=1) < _reach_mm(fiducial, geometry)).any())
         for fiducial in geometry.scene.camera.fiducials

@@ -22,7 +22,8 @@ Family = Literal["none", "torlegard", "brown", "australis", "aicon", "opencv", "
 Side = Literal["left", "right", "top", "bottom"]
 Compression = Literal["none", "lzw", "deflate", "zstd", "jpeg"]
 Background = Literal["plain", "wall", "terrain"]
-FilmKind = Literal["similarity", "affine"]
+MOST_TILTED_DEG = 30  # of a camera that photographs film
+FilmKind = Literal["similarity", "affine", "projective"]
 
 TONES = ("srgb", "s-curve")
 POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
@@ -259,10 +260,15 @@ class Film:
     """What the film adds, alike in every frame: kind names the true transformation.
 
     deformation_um: rms of a smooth deformation; grain: its rms as a share of full scale, correlated as white noise
-    after a Gaussian of grain_px; dust, scratches, hairs: how many in a frame.
+    after a Gaussian of grain_px; dust, scratches, hairs: how many in a frame. tilt_deg: of a camera that photographed
+    the film from a distance of photographed_from_mm, about a line across tilt_direction_deg (from x' to y'): a
+    projective transformation.
     """
 
     kind: FilmKind = "affine"
+    tilt_deg: float = 0.0
+    tilt_direction_deg: float = 0.0
+    photographed_from_mm: float = 600.0
     deformation_um: float = 0.0
     grain: float = 0.0
     grain_px: float = 1.0
@@ -272,6 +278,10 @@ class Film:
 
     def __post_init__(self) -> None:
         one_of("film transformation", self.kind, get_args(FilmKind))
+        if self.tilt_deg and self.kind != "projective":
+            raise ValueError('film that a tilted camera photographed (tilt_deg) has transformation = "projective"')
+        if not abs(self.tilt_deg) <= MOST_TILTED_DEG:
+            raise ValueError(f"tilt_deg is {self.tilt_deg}; between -{MOST_TILTED_DEG} and {MOST_TILTED_DEG} is right")
         not_negative("deformation_um", self.deformation_um)
         not_negative("grain", self.grain)
         not_negative("grain_px", self.grain_px)

@@ -111,6 +111,7 @@ def _camera(scene: Scene) -> dict[str, Any]:
 def _frame(frame: FrameTruth) -> dict[str, Any]:
     geometry = frame.geometry
     image = geometry.image
+    projective = geometry.scene.film.kind == "projective"
     exterior = np.array([*image.exterior[:3], *np.rad2deg(image.exterior[3:])])
     return {
         "width_px": geometry.width_px,
@@ -120,7 +121,8 @@ def _frame(frame: FrameTruth) -> dict[str, Any]:
         "writing": [_written(writing, geometry) for writing in image.writing],
         "transformation": {"kind": geometry.scene.film.kind}
         | _values(("a1", "a2", "a3"), geometry.camera_from_comparator[0][[2, 0, 1]])
-        | _values(("b1", "b2", "b3"), geometry.camera_from_comparator[1][[2, 0, 1]]),
+        | _values(("b1", "b2", "b3"), geometry.camera_from_comparator[1][[2, 0, 1]])
+        | (_values(("c1", "c2"), geometry.camera_from_comparator[2][:2]) if projective else {}),
         "deformation_um": geometry.scene.film.deformation_um,
         "exterior": _values(("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg"), exterior),
         "fiducials": {

@@ -162,6 +162,9 @@ def _area(part: shapes.Part) -> areas.Area:
 def _film(table: Table) -> scene.Film:
     return scene.Film(
         kind=cast(scene.FilmKind, table.text("transformation", "affine", get_args(scene.FilmKind))),
+        tilt_deg=table.number("tilt_deg", 0.0),
+        tilt_direction_deg=table.number("tilt_direction_deg", 0.0),
+        photographed_from_mm=table.number("photographed_from_mm", 600.0, above=0.0),
         deformation_um=table.number("deformation_um", 0.0),
         grain=table.number("grain", 0.0),
         grain_px=table.number("grain_px", 1.0),

@@ -4,12 +4,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from small_scene import OBLIQUE, PLACES, SCANNER, rendered, scene
 from test_render import CENTER_PX, centroid
 
 from synthetic_images.film import frame_geometry
+from synthetic_images.scene import Film
 
 BEND_UM = {"a20": 60.0, "b11": -50.0, "a03": 20.0, "b60": 2.0}
 BENT = replace(SCANNER, bend_um=BEND_UM)
@@ -59,3 +61,29 @@ def test_the_truth_says_the_bend(tmp_path: Path) -> None:
 def test_a_term_that_there_is_not_is_refused() -> None:
     with pytest.raises(ValueError, match="no term 'c20'"):
         replace(SCANNER, bend_um={"c20": 1.0})
+
+
+@pytest.mark.parametrize("pose", ["0", "90m"])
+def test_film_photographed_by_a_tilted_camera_is_seen_as_a_pinhole_sees_it(tmp_path: Path, pose: str) -> None:
+    """The film's points turned about an axis in it and projected, by the collinearity of a pinhole 80 mm away."""
+    image = replace(OBLIQUE, pose=pose)
+    film = Film("projective", tilt_deg=8.0, tilt_direction_deg=30.0, photographed_from_mm=80.0)
+    _, truth = rendered(tmp_path, scene(images=(image,), film=film))
+    flat = frame_geometry(scene(images=(image,)), 0)
+    axis = np.array([-np.sin(np.deg2rad(30.0)), np.cos(np.deg2rad(30.0)), 0.0])
+    rotation = cv2.Rodrigues(-np.deg2rad(8.0) * axis)[0]
+    for id, place in PLACES.items():
+        turned = rotation @ (*(np.asarray(place) * image.film.scale), 0.0) + (0.0, 0.0, 80.0)
+        pictured = 80.0 * turned[:2] / turned[2] / image.film.scale
+        expected_px = flat.pixel_from_camera(pictured[None])[0]
+        np.testing.assert_allclose(truth.frames[0].fiducials[id].center_px, expected_px, atol=1e-6)
+    geometry = truth.frames[0].geometry
+    camera_mm = np.random.default_rng(1).uniform(-5.5, 5.5, (20, 2))
+    np.testing.assert_allclose(geometry.camera_from_scan(geometry.pixel_from_camera(camera_mm)), camera_mm, atol=1e-10)
+    told = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))["images"][image.name]["transformation"]
+    assert {"a1", "b3", "c1", "c2"} < told.keys()
+
+
+def test_film_that_a_tilted_camera_photographed_is_projective() -> None:
+    with pytest.raises(ValueError, match="projective"):
+        Film("affine", tilt_deg=2.0)
