@@ -29,7 +29,7 @@ from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from benchmarks.measured_marks import CONTRAST, GROUND, drawn, measured, start_off
 from measure.boards.corners import junction
-from measure.fiducials.interior_orientation import outliers
+from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.noise.damage import _opened
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 
@@ -146,7 +146,8 @@ def _outliers_told(frames: int, marks_mm: Array, off: int) -> str:
         seen[wrong] += GROSS_MM * np.column_stack([np.cos(angle), np.sin(angle)])
         truth = np.isin(np.arange(len(seen)), wrong)
         _, kept = ransac((marks_mm, seen), AffineTransform, 3, GATE_MM, max_trials=60, rng=number)
-        one_by_one = outliers(marks_mm, seen, np.full(len(seen), FILM_MM), np.eye(2), GATE_MM)
+        marks = FrameMarks.from_places(marks_mm, seen, np.zeros((len(seen), 2, 2)))
+        one_by_one = gross_errors(marks, Scatter(FILM_MM), GATE_MM)
         for name, out in (("RANSAC", ~kept if kept is not None else ~truth), ("one by one", one_by_one)):
             told[name][0] += np.array_equal(out, truth)
             told[name][1] += bool((out & ~truth).any())

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtrc, logsumexp
 
-from measure.fiducials.interior_orientation import film_terms, interleaved
+from measure.fiducials.film_model import film_terms, interleaved
 from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_DEGREES, SCATTER_MM
-from measure.flags import FALSE_DOUBT
+from measure.flags import FALSE_DOUBT, TRUE_MARK_AN_OUTLIER
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,8 @@ _RANK = 1e-9  # of the largest singular value: directions below it are not deter
 _LEAST_MM = 1e-6  # standard deviation of a mark
 _KNOWN = 1e6  # degrees of freedom of a variance that is known
 _MOST_OFF_MM = 0.5  # standard deviation of a wrong mark: none is sought farther off than some 1 mm
+_FEWEST = 3  # marks of a frame
+_LEAST_GATE = 0.1  # of the gate: film bends marks so far off, however well most agree
 _TURNED = 0.2  # of what a wrong pitch stretches: sheared in a frame that is turned by up to 6 degrees
 _MOST_STRETCHED = 0.05  # of a frame in a wrong pitch
 _MOST_PERSPECTIVE = 2e-4  # per mm: of film photographed from 0.6 m, tilted by 7 degrees
@@ -63,13 +65,15 @@ class Scatter:
 
 @dataclass(frozen=True, eq=False)
 class Affinity:
-    """Size, stretch and shear of the frames that lie alike: mean (3,) and the scatter of each."""
+    """Size, stretch and shear of the frames that lie alike: mean (3,) and the scatter of each. size_is_free: of a lone
+    frame, whose size speaks of its pitch."""
 
     mean: Array = field(default_factory=lambda: np.zeros(3))
     scatter: Scatter = field(default_factory=lambda: Scatter(AFFINITY_SIGMA))
+    size_is_free: bool = False
 
 
-LONE_FILM, LONE_AFFINITY = Scatter(SCATTER_MM, SCATTER_DEGREES), Affinity()
+LONE_FILM, LONE_AFFINITY = Scatter(SCATTER_MM, SCATTER_DEGREES), Affinity(size_is_free=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +114,7 @@ class FrameMarks:
     @cached_property
     def perspective(self) -> Array:
         """(2n, 2) by a perspective that moves the outermost mark by about a mm."""
-        return film_terms("projective", self.given_mm) / self.radius_mm**2
+        return film_terms("projective", self.given_mm, self.given_mm + self.off_mm) / self.radius_mm**2
 
     @cached_property
     def _beyond_affine(self) -> "_Reduced":
@@ -162,6 +166,12 @@ class FrameMarks:
         """Add (n,) to the variances of each mark's coordinates."""
         return replace(self, covariance_mm2=self.covariance_mm2 + np.diag(np.repeat(variances_mm2, 2)))
 
+    def select(self, index: NDArray[np.intp]) -> "FrameMarks":
+        """Some of the marks, by index."""
+        both = (2 * index[:, None] + np.arange(2)).ravel()
+        covariance = self.covariance_mm2[np.ix_(both, both)]
+        return replace(self, given_mm=self.given_mm[index], off_mm=self.off_mm[index], covariance_mm2=covariance)
+
     def rotate(self, turn: Array) -> "FrameMarks":
         """In axes turned by (2, 2)."""
         every = np.kron(np.eye(len(self.given_mm)), turn)
@@ -187,7 +197,8 @@ class _Reduced:
         """also: (2n, k) what is free beside shift, rotation and the film model's terms."""
         x, y = marks.given_mm.T
         one, none = np.ones_like(x), np.zeros_like(x)
-        more = film_terms(marks.model, marks.given_mm / marks.radius_mm)
+        measured = (marks.given_mm + marks.off_mm) / marks.radius_mm
+        more = film_terms(marks.model, marks.given_mm / marks.radius_mm, measured)
         free = np.hstack([interleaved((one, none), (none, one), (-y, x)), also, more])
         free = np.hstack([free, marks.affine]) if more.shape[1] else free
         left, sizes, _ = np.linalg.svd(free / np.linalg.norm(free, axis=0))
@@ -245,7 +256,9 @@ def frame_p_value(marks: FrameMarks, film: Scatter = LONE_FILM, affinity: Affini
     fitted, covariance = marks.affinity(film.sigma)
     if np.linalg.matrix_rank(covariance, tol=_RANK * np.trace(covariance)) == len(fitted):
         apart, spread = fitted - affinity.mean, covariance + affinity.scatter.sigma**2 * np.eye(3)
-        p_values.append(float(fdtrc(3, affinity.scatter.degrees, apart @ np.linalg.solve(spread, apart) / 3)))
+        first = int(affinity.size_is_free)
+        apart, spread, tested = apart[first:], spread[first:, first:], len(apart) - first
+        p_values.append(float(fdtrc(tested, affinity.scatter.degrees, apart @ np.linalg.solve(spread, apart) / tested)))
     if degrees > 2:
         n = len(marks.given_mm)
         pulls = (weight @ off).reshape(n, 2)
@@ -305,6 +318,32 @@ def frame_consistency(
     return FrameConsistency(frame_p_value(marks, film, affinity), evidence, shifts)
 
 
+def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np.bool_]:
+    """Find the marks of a lone frame that have no part in its interior orientation.
+
+    The likeliest wrong mark is set aside until the others agree. Those marks are taken that together explain the frame
+    far better than none does, each if it is named beside the marks that agree, or lies off by more than the gate.
+    """
+    order, odds, kept = list[int](), [0.0], np.arange(len(marks.given_mm))
+    while len(kept) > _FEWEST and frame_p_value(own := marks.select(kept), film) < TRUE_MARK_AN_OUTLIER:
+        whole = logsumexp(frame_consistency(own, film).log_evidence, axis=0)
+        worst = int(whole[1:].argmax())
+        order.append(int(kept[worst]))
+        odds.append(odds[-1] + float(whole[1 + worst] - whole[0]))
+        kept = np.delete(kept, worst)
+    out = np.zeros(len(marks.given_mm), dtype=bool)
+    if max(odds) <= NAMED:
+        return out
+    wrong = order[: int(np.argmax(odds))]
+    agreeing = np.setdiff1d(np.arange(len(out)), wrong)
+    for mark in wrong:
+        own = marks.select(np.append(agreeing, mark))
+        found = frame_consistency(own, film)
+        is_far = float(np.hypot(*found.off_mm[-1])) > _LEAST_GATE * gate_mm
+        out[mark] = (is_far and found.wrong_mark == len(agreeing)) or own.distances_mm().max() > gate_mm
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class _States:
     """s states of film and scan: hypothesis (s,), film (s,) variance, effects (s, 5) variances of affinity and
@@ -334,6 +373,7 @@ def _states(marks: FrameMarks, film: Scatter, affinity: Affinity) -> _States:
     effects = np.repeat([stretch, perspective], [3, 2], axis=0).T
     is_pitch = hypothesis == Hypothesis.PITCH
     effects[is_pitch, :3] = stretches.mean() + stretch[is_pitch, None] * (1.0, 1.0, _TURNED**2)
+    effects[:, 0] += (_MOST_STRETCHED * affinity.size_is_free) ** 2
     return _States(hypothesis.astype(np.intp), film_mm2, effects, prior)
 
 

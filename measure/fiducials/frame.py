@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from measure.detection.localisation import MarkPrediction
+from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.fiducials.constellation import NARROW, Placement, mark_sign
-from measure.fiducials.interior_orientation import fit_frame, outliers
+from measure.fiducials.interior_orientation import FilmFit, fit_frame
 from measure.fiducials.mark_fit import Detection
-from measure.fiducials.options import CLICK_SIGMA_PX, SCATTER_MM, FiducialOptions
+from measure.fiducials.options import CLICK_SIGMA_PX, SCATTER_DEGREES, SCATTER_MM, FiducialOptions
 from measure.flags import LARGE_ERROR, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
@@ -57,6 +58,7 @@ class Frame:
     where fewer than two marks agree; linear_sigma: the standard deviation of its rotation (rad), scale, stretch and
     shear, inf before. detections: of all marks. inliers: (n,) marks that were found and agree; certain: (n,) those that
     stand out so much of their texture that they need not. weights: of the channels. tone: the curve by its marks.
+    film: what the project's film model adds to pixel_from_camera, None of an affine one.
     """
 
     scan: Scan
@@ -70,6 +72,7 @@ class Frame:
     linear_sigma: float = np.inf
     weights: tuple[float, ...] | None = None
     tone: FrameTone = field(default_factory=lambda: FrameTone(LINEAR))
+    film: FilmFit | None = None
 
     @classmethod
     def from_placement(
@@ -112,7 +115,15 @@ class Frame:
     @cached_property
     def predicted_px(self) -> Array:
         """(n, 2) where the interior orientation puts the marks."""
+        if self.film is not None:
+            return self.film.places_mm(self.camera_mm) * (1.0, -1.0) / self.pitch_mm
         return np.asarray(self.camera_mm @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2])
+
+    def linear(self, index: int) -> Array:
+        """(2, 2) the derivatives of the interior orientation at a mark, px per mm."""
+        if self.film is None:
+            return self.pixel_from_camera[:, :2]
+        return np.asarray(np.diag([1.0, -1.0] / self.pitch_mm) @ self.film.linear(self.camera_mm[index]))
 
     @cached_property
     def misfit_mm(self) -> Array:
@@ -131,7 +142,7 @@ class Frame:
         for click in self.options.clicks:
             if click.point == mark.id:
                 place, search_px = np.array([click.col_px, click.row_px]), min(search_px, _CLICK_REACH_PX)
-        start = np.column_stack([self.pixel_from_camera[:, :2], place])
+        start = np.column_stack([self.linear(index), place])
         sign = mark_sign(mark.mark, self.placement.polarity)
         return MarkPrediction(mark.mark, start, search_px, sign, self.weights, self.placement.surroundings)
 
@@ -319,14 +330,23 @@ def orient_frame(frame: Frame) -> Frame:
     index = np.flatnonzero(found)
     fits = [frame.detections[i].fit for i in index]
     up = np.array([fit.center_px for fit in fits if fit]) * frame.pitch_mm * (1.0, -1.0)
-    traces = np.array([np.trace(fit.covariance_px2) for fit in fits if fit])
+    scaled = np.diag(frame.pitch_mm)
+    covariances = np.array([scaled @ fit.covariance_px2 @ scaled for fit in fits if fit])
     given = np.array([min(*frame.layout.marks[i].sigma_mm, MOST_GIVEN_SIGMA_MM) for i in index])
-    sigma = np.sqrt(traces / 2 * frame.pitch_mm.mean() ** 2 + given**2 + frame.options.film_sigma_mm**2)
+    covariances += given[:, None, None] ** 2 * np.eye(2)
+    film, camera, model = (
+        Scatter(frame.options.film_sigma_mm, SCATTER_DEGREES),
+        frame.camera_mm,
+        frame.options.film_model,
+    )
     clicked = {click.point for click in frame.options.clicks}
     known = frame.certain | [mark.id in clicked for mark in frame.layout.marks]
-    turn, camera = up_from_camera(frame.placement.pose), frame.camera_mm
-    out = outliers(camera[index], up, sigma, turn, frame.options.gate_mm) & ~known[index]
+    out = gross_errors(FrameMarks.from_places(camera[index], up, covariances, model), film, frame.options.gate_mm)
+    out &= ~known[index]
     inliers[index[out]] = False
-    fit = fit_frame(camera[index[~out]], up[~out], sigma[~out], turn)
+    sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2 + film.sigma**2)
+    fit = fit_frame(camera[index[~out]], up[~out], sigma[~out], up_from_camera(frame.placement.pose), model)
     pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / frame.pitch_mm[:, None]
-    return replace(frame, inliers=inliers, pixel_from_camera=pixel_from_camera, linear_sigma=fit.linear_sigma)
+    return replace(
+        frame, inliers=inliers, pixel_from_camera=pixel_from_camera, linear_sigma=fit.linear_sigma, film=fit.film
+    )

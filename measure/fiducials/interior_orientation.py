@@ -1,53 +1,30 @@
-"""The frame through its marks: by weighted least squares a similarity, with the affinity that film and scanner have."""
+"""The interior orientation by weighted least squares: a similarity with the affinity that film and scanner have, and
+what the film model of the project adds."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.fiducials.film_model import film_terms
 from measure.fiducials.options import AFFINITY_SIGMA
-from measure.flags import TRUE_MARK_AN_OUTLIER
 
 Array = NDArray[np.float64]
 
-_MANY = 8  # marks whose scatter says more than the gate
 _LINEAR = [0, 1, 4, 5]  # of the unknowns: all but the shift
-_LEAST_GATE = 0.1  # of the gate: film bends marks so far off, however well most agree
-
-
-def interleaved(*columns: tuple[Array, Array]) -> Array:
-    """(2n, k) of k columns, each of them (n,) in x and (n,) in y."""
-    return np.stack([np.stack(each, axis=1).ravel() for each in columns], axis=1)
-
-
-def film_terms(model: str, places: Array) -> Array:
-    """(2n, k) what a film model adds to an affine transformation at places (n, 2), to first order.
-
-    model: projective, bilinear, conformal(n) or polynomial(n); any other adds nothing.
-    """
-    x, y = places.T
-    none = np.zeros_like(x)
-    name, _, order = model.rstrip(")").partition("(")
-    powers = range(2, int(order) + 1) if order.isdigit() else range(0)
-    if name == "projective":
-        return interleaved((x**2, x * y), (x * y, y**2))
-    if name == "bilinear":
-        return interleaved((x * y, none), (none, x * y))
-    if name == "conformal" and powers:
-        z = [(x + 1j * y) ** power for power in powers]
-        return interleaved(*[(each.real, each.imag) for each in z], *[(-each.imag, each.real) for each in z])
-    if name == "polynomial" and powers:
-        terms = [x ** (degree - q) * y**q for degree in powers for q in range(degree + 1)]
-        return interleaved(*[(each, none) for each in terms], *[(none, each) for each in terms])
-    return np.zeros((2 * len(places), 0))
+_FREE = 0.03  # standard deviation of stretch, shear and film terms that are free, as shares of the frame's radius
+_INVERSIONS = 6  # of a perspective, each a fiftieth of the one before
+_STEP_MM = 0.01  # of derivatives
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """up_from_camera: (2, 3), camera mm to the scan's mm (right, up). residuals_mm: (n, 2) measured less predicted.
+    """An interior orientation. up_from_camera: (2, 3), camera mm to the scan's mm (right, up), the best affine one.
+    residuals_mm: (n, 2) measured less predicted.
 
-    chi_square holds the affinity's two pseudo-observations too; redundancy counts them: 2 n - 4. linear_sigma: standard
-    deviation of rotation (rad), scale, stretch and shear, the root of their mean variance.
+    chi_square holds the pseudo-observations of affinity and film terms too; redundancy counts them: 2 n - 4.
+    linear_sigma: standard deviation of rotation (rad), scale, stretch and shear, the root of their mean variance.
+    film: what a film model adds, None of an affine one.
     """
 
     up_from_camera: Array
@@ -55,69 +32,96 @@ class FrameFit:
     chi_square: float
     redundancy: int
     linear_sigma: float
+    film: "FilmFit | None" = None
 
 
-def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array) -> FrameFit:
+@dataclass(frozen=True, eq=False)
+class FilmFit:
+    """A film model of more than an affine transformation: centered, in units of radius_mm, an affine part (2, 3) and
+    the coefficients (k,) of its terms; turn (2, 2): of the scan orientation; center_mm (2,): in the scan."""
+
+    model: str
+    turn: Array
+    radius_mm: float
+    center_mm: Array
+    affine: Array
+    terms: Array
+
+    def places_mm(self, camera_mm: Array) -> Array:
+        """(n, 2) in the scan (right, up) of places (n, 2) in the camera."""
+        given = camera_mm @ self.turn.T / self.radius_mm
+        straight = given @ self.affine[:, :2].T + self.affine[:, 2]
+        places = straight
+        for _ in range(_INVERSIONS):
+            places = straight + (film_terms(self.model, given, places) @ self.terms).reshape(-1, 2)
+        return np.asarray(places * self.radius_mm + self.center_mm)
+
+    def linear(self, place_mm: Array) -> Array:
+        """(2, 2) derivatives at a place (2,) of the camera."""
+        steps = place_mm + _STEP_MM * np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+        right, left, up, down = self.places_mm(steps)
+        return np.column_stack([right - left, up - down]) / (2 * _STEP_MM)
+
+
+def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, model: str = "affine") -> FrameFit:
     """Fit the frame to n >= 2 marks at camera_mm (n, 2) seen at up_mm (n, 2), with standard deviations sigma_mm (n,).
 
-    turn: the pose's (2, 2), so that the similarity is a small one on top of it. Raises ValueError for fewer than two
+    turn: the pose's (2, 2), so that the similarity is a small one on top of it. model: the film deformation model.
+    Raises ValueError for fewer than two
     marks: they determine nothing.
     """
     if len(camera_mm) < 2:
         raise ValueError(f"{len(camera_mm)} marks do not determine a frame; two or more do")
-    x, y = (camera_mm @ turn.T).T
+    given = camera_mm @ turn.T
+    radius_mm, center_mm = float(np.hypot(*given.T).max()), up_mm.mean(axis=0)
+    more = film_terms(model, given / radius_mm, (up_mm - center_mm) / radius_mm)
+    if more.shape[1]:
+        return _fit_film(model, turn, given, up_mm, sigma_mm, more)
+    solution, inverse, chi_square, residuals = _solve(given, up_mm, sigma_mm, more, AFFINITY_SIGMA)
+    linear, shift = _linear(solution, turn), solution[2:4]
+    sigma = float(np.sqrt(np.sum(inverse[_LINEAR] ** 2, axis=1).mean()) / np.hypot(*solution[:2]))
+    up_from_camera = np.column_stack([linear, shift])
+    return FrameFit(up_from_camera, residuals, chi_square, 2 * len(camera_mm) - 4, sigma)
+
+
+def _fit_film(model: str, turn: Array, given: Array, up_mm: Array, sigma_mm: Array, terms: Array) -> FrameFit:
+    """With the terms (2n, k) of a film model beside an affine transformation."""
+    radius_mm, center_mm = float(np.hypot(*given.T).max()), up_mm.mean(axis=0)
+    unit, measured, sigma = given / radius_mm, (up_mm - center_mm) / radius_mm, sigma_mm / radius_mm
+    solution, inverse, chi_square, _ = _solve(unit, measured, sigma, terms, _FREE)
+    affine = np.column_stack([_linear(solution, np.eye(2)), solution[2:4]])
+    film = FilmFit(model, turn, radius_mm, center_mm, affine, solution[6:])
+    camera = given @ turn
+    places = film.places_mm(camera)
+    design = np.column_stack([camera, np.ones(len(camera))])
+    best = np.linalg.lstsq(design, places, rcond=None)[0].T if np.linalg.matrix_rank(design) == 3 else affine
+    linear_sigma = float(np.sqrt(np.sum(inverse[_LINEAR] ** 2, axis=1).mean()) / np.hypot(*solution[:2]))
+    return FrameFit(best, up_mm - places, chi_square, 2 * len(camera) - 4, linear_sigma, film)
+
+
+def _linear(solution: Array, turn: Array) -> Array:
+    """(2, 2) of rotation and scale, stretch and shear."""
+    a, b, _, _, stretch, shear = solution[:6]
+    return np.asarray(np.array([[a + stretch, -b + shear], [b + shear, a - stretch]]) @ turn)
+
+
+def _solve(
+    given: Array, measured: Array, sigma: Array, terms: Array, affinity_sigma: float
+) -> tuple[Array, Array, float, Array]:
+    """Rotation and scale, shift, stretch and shear and coefficients of the terms by least squares, with pseudo-
+    observations of all but the first four: the solution, its inverse design, chi-square and the residuals (n, 2)."""
+    x, y = given.T
     one, none = np.ones_like(x), np.zeros_like(x)
     rows = np.concatenate([np.stack([x, -y, one, none, x, y], axis=1), np.stack([y, x, none, one, -y, x], axis=1)])
-    values, weight = up_mm.T.ravel(), np.tile(1 / sigma_mm, 2)
-    prior = np.zeros((2, 6))
-    prior[0, 4] = prior[1, 5] = 1 / AFFINITY_SIGMA
+    rows = np.hstack([rows, np.concatenate([terms[::2], terms[1::2]])])
+    values, weight = measured.T.ravel(), np.tile(1 / sigma, 2)
+    prior = np.zeros((2 + terms.shape[1], 6 + terms.shape[1]))
+    prior[0, 4] = prior[1, 5] = 1 / affinity_sigma
+    prior[2:, 6:] = np.eye(terms.shape[1]) / _FREE
     design = np.concatenate([rows * weight[:, None], prior])
-    right = np.concatenate([values * weight, np.zeros(2)])
+    right = np.concatenate([values * weight, np.zeros(len(prior))])
     size = np.linalg.norm(design, axis=0)
     inverse = np.linalg.pinv(design / size) / size[:, None]
     solution = inverse @ right
-    a, b, shift_x, shift_y, stretch, shear = solution
-    linear = np.array([[a + stretch, -b + shear], [b + shear, a - stretch]]) @ turn
     residuals = (values - rows @ solution).reshape(2, -1).T
-    chi_square = float(np.sum((design @ solution - right) ** 2))
-    up_from_camera = np.column_stack([linear, [shift_x, shift_y]])
-    linear_sigma = float(np.sqrt(np.sum(inverse[_LINEAR] ** 2, axis=1).mean()) / np.hypot(a, b))
-    return FrameFit(up_from_camera, residuals, chi_square, 2 * len(camera_mm) - 4, linear_sigma)
-
-
-def outliers(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, gate_mm: float) -> NDArray[np.bool_]:
-    """(n,) which marks do not belong: one by one, the mark that disagrees most with the others is taken out, until
-    none is off by more than the gate or by what the others' own scatter allows, or only three are left."""
-    out = np.zeros(len(camera_mm), dtype=bool)
-    while (~out).sum() > 3:
-        kept = np.flatnonzero(~out)
-        size = np.hypot(*fit_frame(camera_mm[kept], up_mm[kept], sigma_mm[kept], turn).residuals_mm.T)
-        rest = [np.delete(kept, index) for index in range(len(kept))]
-        fits = [fit_frame(camera_mm[others], up_mm[others], sigma_mm[others], turn) for others in rest]
-        if len(kept) >= _MANY:
-            predicted = np.array(
-                [fit.up_from_camera @ (*camera_mm[index], 1.0) for fit, index in zip(fits, kept, strict=True)]
-            )
-            off = np.hypot(*(up_mm[kept] - predicted).T)
-            chance = np.array([_chance(*pair) for pair in zip(size * off, fits, strict=True)])
-            outlying = (size > _LEAST_GATE * gate_mm) & (chance < TRUE_MARK_AN_OUTLIER / len(kept)) | (size > gate_mm)
-            worst = int(np.where(outlying, chance, 2.0).argmin())
-        else:
-            outlying = size > gate_mm
-            worst = int(np.argmin([fit.chi_square for fit in fits]))
-        if not outlying.any():
-            break
-        out[kept[worst]] = True
-    return out
-
-
-def _chance(product_mm2: float, others: FrameFit) -> float:
-    """The probability of a misfit: of the residual times the distance from where the others alone put the mark, over
-    the others' variance, which is the square of the residual studentised without it, on two degrees of freedom.
-
-    The variance is from the median, which other outliers do not widen: half of Rayleigh's squares are below 2 ln 2.
-    """
-    free = others.redundancy
-    squares = np.sum(others.residuals_mm**2, axis=1)
-    variance = float(np.median(squares)) / (2 * np.log(2)) * 2 * len(squares) / free
-    return float((1 + product_mm2 / max(free * variance, 1e-12)) ** (-free / 2))
+    return solution, inverse, float(np.sum((design @ solution - right) ** 2)), residuals

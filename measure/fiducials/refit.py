@@ -83,7 +83,7 @@ def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
 
 def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
     """Whether a fit changes with the frame's rotation and scale, or with its stretch and shear."""
-    mark, linear = frame.layout.marks[index].mark, frame.pixel_from_camera[:, :2]
+    mark, linear = frame.layout.marks[index].mark, frame.linear(index)
     error_px = strain_error_px(mark, fit.pixel_from_mark[:, :2], linear, _linear_sigma(frame))
     return is_held_by_frame(mark) or error_px > _STRAINED * fit.sigma_px
 
@@ -170,9 +170,8 @@ def _compare_shapes(frame: Frame) -> Frame:
             groups[mark].append(index)
         elif _is_drawn(frame, index) and fit.own_shape is not None:
             groups[None].append(index)
-    linear = frame.pixel_from_camera[:, :2]
     for drawn, indices in groups.items():
-        figures = [_shape_figures(fits[index], linear, drawn is None) for index in indices]
+        figures = [_shape_figures(fits[index], frame.linear(index), drawn is None) for index in indices]
         shapes = shared_shapes(*(np.array(each) for each in zip(*figures, strict=True)))
         for index, shape in zip(indices, shapes, strict=True):
             if shape is not None:

@@ -154,7 +154,7 @@ class _Named:
         measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in fits])[near] * pitch.mean()
         sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
         up = centers[near] * pitch * (1.0, -1.0)
-        fit = fit_frame(camera[own], up, sigma, up_from_camera(placement.pose))
+        fit = fit_frame(camera[own], up, sigma, up_from_camera(placement.pose), options.film_model)
         return cls(placement.pose, tuple(names.tolist()), fit)
 
     def posed_mark(self, site: int, layout: FiducialLayout) -> PosedMark:

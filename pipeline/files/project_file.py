@@ -93,9 +93,10 @@ class Project:
 
     @property
     def film(self) -> BelievedFilm:
-        """What film and scanner scatter a mark by, as the project says it, or else as it is believed of any film."""
-        stated_mm = self.adjust.film_sigma_um / 1000.0
-        return BelievedFilm(stated_mm, is_stated=True) if stated_mm else ANY_FILM
+        """What film and scanner scatter a mark by, and how film is deformed, as the project says it, or else as it is
+        believed of any film."""
+        stated_mm, model = self.adjust.film_sigma_um / 1000.0, self.adjust.transformation or ANY_FILM.model
+        return BelievedFilm(stated_mm, True, model) if stated_mm else replace(ANY_FILM, model=model)
 
     @property
     def title(self) -> str:

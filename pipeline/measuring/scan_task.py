@@ -141,7 +141,10 @@ def options_of(project: Project, said: Mapping[str, tuple[ToneInformation, ...]]
         part = bool(project.part_of(name))
         key = (key_of[id(given)], pose, known is None, part, *map(id, told), id(exterior))
         if key not in shared:
-            options = FiducialOptions(pose, film_sigma_mm=project.film.sigma_mm, writing=project.reads, part=part)
+            film = project.film
+            options = FiducialOptions(
+                pose, film_sigma_mm=film.sigma_mm, film_model=film.model, writing=project.reads, part=part
+            )
             camera = cameras[key_of[id(given)]]
             shared[key] = ScanOptions(camera, project.pitch_um, options, known, project.tone, told, targets, exterior)
         return shared[key]
