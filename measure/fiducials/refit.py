@@ -82,7 +82,10 @@ def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
 
 
 def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
-    """Whether a fit changes with the frame's rotation and scale, or with its stretch and shear."""
+    """Whether a fit changes with the frame's rotation and scale, or with its stretch and shear: on film that is more
+    than affinely deformed every one does, for there marks look otherwise at each place."""
+    if frame.film is not None:
+        return True
     mark, linear = frame.layout.marks[index].mark, frame.linear(index)
     error_px = strain_error_px(mark, fit.pixel_from_mark[:, :2], linear, _linear_sigma(frame))
     return is_held_by_frame(mark) or error_px > _STRAINED * fit.sigma_px

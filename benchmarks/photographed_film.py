@@ -1,0 +1,90 @@
+"""Film photographed by a tilted camera, rendered, measured as projective and as affine: errors and claims of its marks.
+
+python -m benchmarks photographed_film [FRAMES] [--seed 1]
+"""
+
+import argparse
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from small_scene import CROSS
+
+from measure.fiducials.across_frames import check_frames
+from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.options import BelievedFilm, FiducialOptions
+from measure.flags import Status
+from measure.marks.shapes import Bar, FiducialLayout, LayoutMark, MarkShape, Ring
+from measure.scans.opening import open_scan
+from measure.tone.curve import LINEAR
+from synthetic_images.render import render_scene
+from synthetic_images.scene import (
+    DiskField,
+    DiskTarget,
+    Distortion,
+    Film,
+    Scanner,
+    Scene,
+    SceneCamera,
+    SceneFiducial,
+    SceneImage,
+    Tones,
+)
+
+TILTS_DEG = (0.5, 1.0, 2.0, 5.0)
+HALF_MM, PITCH_UM = 106.0, 60.0
+PLACES = [(HALF_MM * x, HALF_MM * y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
+MARK = MarkShape(
+    (Ring((0.0, 0.0), 0.5, 0.1), Bar((-0.4, 0.0), (0.4, 0.0), 0.1), Bar((0.0, -0.4), (0.0, 0.4), 0.1)), "light"
+)
+LAYOUT = FiducialLayout(
+    tuple(LayoutMark(str(k), place, (0.002, 0.002), MARK) for k, place in enumerate(PLACES)), (228.0, 228.0)
+)
+
+
+def main() -> None:
+    """Print a line a tilt and a film model."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("frames", type=int, nargs="?", default=4)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    print("tilt, degrees | model | measured | largest error, px | rms error / rms claim | problems")
+    for tilt_deg in TILTS_DEG:
+        for model in ("projective", "affine"):
+            rows = [photographed(given.seed + number, tilt_deg, 40.0 * number, model) for number in range(given.frames)]
+            errors, sigmas = (np.concatenate([row[k] for row in rows]) for k in (0, 1))
+            ratio = float(np.sqrt(np.mean(errors**2) / np.mean(sigmas**2))) if len(errors) else np.nan
+            problems = sorted({str(problem)[:60] for row in rows for problem in row[3]})
+            marks = f"{sum(row[2] for row in rows)} of {8 * given.frames}"
+            print(f"{tilt_deg} | {model} | {marks} | {np.abs(errors).max(initial=0):.3f} | {ratio:.2f} | {problems}")
+
+
+def photographed(
+    seed: int, tilt_deg: float, direction_deg: float, model: str
+) -> tuple[np.ndarray, np.ndarray, int, tuple[str, ...]]:
+    """Errors and standard deviations of coordinates, px, how many marks are measured, and the frame's problems."""
+    fiducials = tuple(SceneFiducial(str(k), place, CROSS) for k, place in enumerate(PLACES))
+    camera = SceneCamera("film", (228.0, 228.0), 150.0, (0.0, 0.0), Distortion("torlegard", {}), fiducials)
+    scanner = Scanner((PITCH_UM, PITCH_UM), margin_mm=6.0, noise=0.01)
+    film = Film("projective", tilt_deg=tilt_deg, tilt_direction_deg=direction_deg)
+    targets = DiskField((DiskTarget("1", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),), 0.001)
+    image = SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
+    scene = Scene("film", seed, camera, targets, (image,), scanner, film, Tones(contrast=0.0))
+    with TemporaryDirectory() as folder:
+        truth = render_scene(scene, Path(folder)).frames[0]
+        with open_scan(next(Path(folder).rglob("*.tif"))) as scan:
+            options = FiducialOptions("0", film_model=model)
+            frame = measure_fiducials(scan.replace_tone(LINEAR), LAYOUT, (PITCH_UM, PITCH_UM), options)
+    checked = check_frames([frame], LAYOUT, [(PITCH_UM, PITCH_UM)], BelievedFilm(model=model)).frames[0]
+    errors, sigmas = [], []
+    for mark in checked.marks:
+        if mark.status is Status.MEASURED and mark.center_px is not None and mark.covariance is not None:
+            errors.append(mark.center_px - truth.fiducials[mark.point].center_px)
+            sigmas.append(np.sqrt(np.diag(mark.covariance.px2)))
+    shape = (-1, 2)
+    problems = tuple(str(problem) for problem in checked.problems)
+    return np.reshape(errors, shape), np.reshape(sigmas, shape), len(errors), problems
+
+
+if __name__ == "__main__":
+    main()
