@@ -96,6 +96,7 @@ def _fit_film(model: str, turn: Array, given: Array, up_mm: Array, sigma_mm: Arr
     design = np.column_stack([camera, np.ones(len(camera))])
     best = np.linalg.lstsq(design, places, rcond=None)[0].T if np.linalg.matrix_rank(design) == 3 else affine
     linear_sigma = float(np.sqrt(np.sum(inverse[_LINEAR] ** 2, axis=1).mean()) / np.hypot(*solution[:2]))
+    best = np.asarray(best, dtype=np.float64)
     return FrameFit(best, up_mm - places, chi_square, 2 * len(camera) - 4, linear_sigma, film)
 
 
