@@ -23,6 +23,7 @@ ALLOWED = {
 }
 ADJUST_FROM_THE_GROUND_UP = (
     "errors",
+    "array_types",
     "linear_algebra",
     "functional_model",
     "problem",

@@ -10,12 +10,10 @@ All parameters are in mm at the edge of the frame. A family with them is spelled
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.correction import Correct, Correction, Image, Imaged, Settings
 from adjust.linear_algebra.small_matrices import columns, matrices, vectors
-
-Array = NDArray[np.float64]
 
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)
 RADIAL = tuple(f"+r{degree}" for degree in RADIAL_DEGREES)

@@ -7,9 +7,8 @@ air, refractivity by Edlén (1966) at 0.55 um; from 0.4 to 0.7 um it differs by 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from adjust.array_types import Array
 
 SEA_LEVEL_K, SEA_LEVEL_HPA = 288.15, 1013.25
 LAPSE_K_PER_M, TROPOPAUSE_M = 0.0065, 11000.0

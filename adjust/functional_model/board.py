@@ -8,9 +8,8 @@ middle the two add up.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from adjust.array_types import Array
 
 BOARD_NAMES = ("bend_x", "bend_y")
 LARGEST_RELIEF = 0.02  # of the longest extent: what has more is no board

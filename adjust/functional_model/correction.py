@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.linear_algebra.small_matrices import applied
-
-Array = NDArray[np.float64]
 
 
 class Settings(Protocol):

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.added_terms import ADDED_NAMES, correction_with_terms, image_without_terms
 from adjust.functional_model.correction import (
     Correct,
@@ -51,8 +51,6 @@ from adjust.functional_model.physical import (
     torlegard,
 )
 from adjust.functional_model.polynomial_sets import EBNER, GRUEN, PolynomialSet, correct, degree_groups, legendre
-
-Array = NDArray[np.float64]
 
 LEGENDRE_ORDERS = range(2, 10)  # from 2, the degree of the tilts that are left out, to one digit an index
 FOURIER_ORDERS = range(1, 10)

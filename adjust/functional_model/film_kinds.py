@@ -11,12 +11,9 @@ from math import comb
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Mask
 from adjust.linear_algebra.small_matrices import applied, determinant, solved
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 NEWTON_STEPS = 30
 NEWTON_TOLERANCE = 1e-9  # of a coordinate: the error left is the square of the last step

@@ -15,9 +15,8 @@ calibration, ISPRS Journal of Photogrammetry and Remote Sensing 71 (2012), 76-85
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.correction import Correction, Settings
-
-Array = NDArray[np.float64]
 
 
 def fourier_names(order: int) -> tuple[str, ...]:

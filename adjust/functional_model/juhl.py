@@ -1,11 +1,9 @@
 """Juhl's correction of the observed point (program sANA): tangential, radial and affine deformations."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.correction import Correction, Settings
-
-Array = NDArray[np.float64]
 
 JUHL_NAMES = ("t1", "t2", "t3", "t4", "r1", "r2", "r3", "af", "sh")
 JUHL_UNITS = ("µm at 1 dm",) * len(JUHL_NAMES)

@@ -13,14 +13,12 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Mask
 from adjust.functional_model.correction import Correction, Imaged, no_correction
 from adjust.functional_model.families import family, parameter_names
 from adjust.linear_algebra.small_matrices import columns, determinant, solved, zeros
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Decentering = Literal["reduced", "paper"]
 
 INTERIOR_NAMES = ("c", "x0", "y0")

@@ -9,13 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Lens
-
-Array = NDArray[np.float64]
 
 SAME = 1e-9  # of the principal distance: what two descriptions of one lens may differ by, of rounding
 _GRID = 25  # points a side of the grid over the frame

@@ -8,11 +8,9 @@ higher.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.atmosphere import bending
-
-Array = NDArray[np.float64]
 
 EARTH_RADIUS_M = 6.371e6  # mean; the local one differs by half a percent, and the curvature with it
 SMALL_RAD = 1e-2  # angle at the earth's centre below which a series is exact

@@ -6,12 +6,10 @@ its axes.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.correction import DistortedRay, straight
 from adjust.linear_algebra.small_matrices import applied, matrices, product, vectors
-
-Array = NDArray[np.float64]
 
 OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "b1", "b2")
 OPENCV_DENOMINATOR = ("k4", "k5", "k6")  # at 0 their derivatives are those of k1, k2, k3 with the other sign

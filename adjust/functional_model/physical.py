@@ -7,12 +7,10 @@ ideal one.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.correction import Correction, Settings
 from adjust.linear_algebra.small_matrices import matrices, vectors
-
-Array = NDArray[np.float64]
 
 TORLEGARD_NAMES = ("k3", "k5", "k7", "p1", "p2", "p3", "p4")
 BROWN_NAMES = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")

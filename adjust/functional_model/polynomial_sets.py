@@ -23,11 +23,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre as series
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.correction import Correction, Settings
-
-Array = NDArray[np.float64]
 
 STRETCH, SHEAR, TILT_X, TILT_Y = "stretch", "shear", "tilt x", "tilt y"
 Term = str | tuple[int, int, int]  # one of the four combinations, or (0 for dx or 1 for dy, m, n)

@@ -3,16 +3,13 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import STRAIGHT, LineOfSight, sight_vectors
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film
 from adjust.linear_algebra.small_matrices import applied, product
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

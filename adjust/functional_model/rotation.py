@@ -4,9 +4,8 @@ A change of attitude is a rotation vector t in the camera frame, M_new = exp([t]
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from adjust.array_types import Array
 
 GIMBAL_LOCK = 1e-12  # cos(phi) below which only omega + kappa or omega - kappa is defined
 

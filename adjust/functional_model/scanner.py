@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Mask
 from adjust.functional_model.correction import Correction
 from adjust.functional_model.polynomial_sets import (
     SHEAR,
@@ -30,9 +30,6 @@ from adjust.functional_model.polynomial_sets import (
 )
 from adjust.functional_model.transformation import polynomial_order
 from adjust.linear_algebra.small_matrices import determinant, solved
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 SMOOTH = (2, 3)  # degrees of the products that a bend consists of
 ALONG = (4, 5, 6)  # degrees of those along one axis alone, the carriage's, which tests may ask for

@@ -18,21 +18,16 @@ import re
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import numpy as np
-from numpy.typing import NDArray
-
+from adjust.array_types import Array, Mask
 from adjust.functional_model.film_kinds import (
     Conformal,
     Congruent,
     FilmKind,
     Identity,
-    Mask,
     Polynomial,
     Projective,
     least_marks,
 )
-
-Array = NDArray[np.float64]
 
 HIGHEST_ORDER = 5
 POSSIBLE = (

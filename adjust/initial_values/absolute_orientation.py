@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from adjust.array_types import Array, Mask
 from adjust.functional_model.rotation import rotation_from_vector
-
-Array = NDArray[np.float64]
 
 STARTS = 400  # attitudes tried, some 25 degrees apart
 REFINED = 12
@@ -83,13 +81,13 @@ def levelled(model: Array, heights: Array, stations: Array) -> Similarity | None
     return Similarity(scale, rotation, np.array([0.0, 0.0, height]) - scale * rotation @ middle)
 
 
-def _centred(xyz: Array, given: NDArray[np.bool_]) -> Array:
+def _centred(xyz: Array, given: Mask) -> Array:
     """Each axis less its mean over the given coordinates; 0 where not given."""
     mean = np.where(given, xyz, 0.0).sum(axis=0) / given.sum(axis=0)
     return np.where(given, xyz - mean, 0.0)
 
 
-def _misfit(rotation: Array, model: Array, target: Array, given: NDArray[np.bool_]) -> Array:
+def _misfit(rotation: Array, model: Array, target: Array, given: Mask) -> Array:
     """What the best scale and shift leave of the coordinates with this attitude; a negative scale is no solution."""
     turned = _centred(model @ rotation.T, given)
     return np.asarray(_scale(turned, target) * turned - target)
@@ -99,7 +97,7 @@ def _scale(turned: Array, target: Array) -> float:
     return max(float((turned * target).sum() / (turned**2).sum()), 0.0)
 
 
-def _refined(start: Array, model: Array, target: Array, given: NDArray[np.bool_]) -> tuple[float, Array]:
+def _refined(start: Array, model: Array, target: Array, given: Mask) -> tuple[float, Array]:
     """The sum of squares and the attitude at the minimum near a start."""
     from scipy.optimize import least_squares  # takes longer to import than most adjustments
 
@@ -110,7 +108,7 @@ def _refined(start: Array, model: Array, target: Array, given: NDArray[np.bool_]
     return 2.0 * float(found.cost), rotation_from_vector(found.x) @ start
 
 
-def _determined(rotation: Array, model: Array, target: Array, given: NDArray[np.bool_]) -> bool:
+def _determined(rotation: Array, model: Array, target: Array, given: Mask) -> bool:
     """Whether every small turn changes the misfit, and the model has a size."""
     step = 1e-5
     columns = [
@@ -123,7 +121,7 @@ def _determined(rotation: Array, model: Array, target: Array, given: NDArray[np.
     return bool(singular[2] > SINGULAR * np.linalg.norm(target))
 
 
-def _similarity(rotation: Array, model: Array, known: Array, given: NDArray[np.bool_]) -> Similarity:
+def _similarity(rotation: Array, model: Array, known: Array, given: Mask) -> Similarity:
     turned = model @ rotation.T
     scale = _scale(_centred(turned, given), _centred(np.where(given, known, 0.0), given))
     left = np.where(given, known - scale * turned, 0.0)

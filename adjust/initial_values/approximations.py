@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
@@ -21,8 +21,6 @@ from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Image, Network
 from adjust.problem.reduction import Reduction
 from adjust.validation import validate
-
-Array = NDArray[np.float64]
 
 FEWEST_KNOWN = 4  # points of an image that tell a principal distance together with others
 STRAIGHT = 0.1  # change of scale across the image of a flat field that is hardly any

@@ -4,14 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.intersection import intersect
 from adjust.initial_values.pose import KnownField, Pose
 from adjust.initial_values.resection import resect_images
-
-Array = NDArray[np.float64]
 
 SURE_RESECTION = 6  # points that make a resection trustworthy; with fewer it waits until nothing better comes
 WELL_DETERMINED = 1e-3  # determination (see intersect) from which an intersected point may orient further images

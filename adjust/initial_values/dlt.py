@@ -9,15 +9,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.rotation import rotation_from_vector
 from adjust.initial_values.pose import REJECTION, KnownField, Pose, robust_sigmas, trimmed_count
 from adjust.initial_values.pose_refinement import refined_distance, refined_poses, squared_residuals
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 FEWEST = 6  # points of an image: fewer do not show whether they agree
 FEWEST_TRIMMED = 16  # points of an image, half of which still show whether they agree

@@ -4,15 +4,12 @@ from itertools import combinations
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.functional_model.film_kinds import Congruent, FilmKind, Identity, Projective, least_marks
 from adjust.functional_model.transformation import film_kind, marks_needed, simpler
 from adjust.linear_algebra.small_matrices import applied
 from adjust.problem.network import Transformation
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 MOST_SUBSETS = 100
 GROSS = 13.8  # squared distance, in variances of a coordinate, beyond which a mark is left out (0.1 % point)

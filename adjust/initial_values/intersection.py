@@ -1,17 +1,15 @@
 """Intersection: object points from the rays of images whose exterior orientation is known."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from adjust.array_types import Array, Indices, Mask
 
 ITERATIONS = 16
 SMALLEST_ANGLE = 1e-12
 WEAKEST = 1e-8  # smallest eigenvalue of the normal matrix that still gives a point: rays 0.01 degrees apart
 
 
-def intersect(centers: Array, directions: Array, point: Index, known: Array) -> tuple[Array, Array]:
+def intersect(centers: Array, directions: Array, point: Indices, known: Array) -> tuple[Array, Array]:
     """Points nearest to their rays by angle, robustly: one gross error among several rays does no harm.
 
     centers, directions (m, 3): a row a ray, directions of any length, pointing away from the camera; point (m,) says
@@ -21,9 +19,9 @@ def intersect(centers: Array, directions: Array, point: Index, known: Array) -> 
     """
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    sought: NDArray[np.bool_] = np.isnan(known)
+    sought: Mask = np.isnan(known)
     determination = _smallest_eigenvalue(across, point, sought)
-    usable: NDArray[np.bool_] = determination > WEAKEST
+    usable: Mask = determination > WEAKEST
     weights = np.ones(len(point))
     for iteration in range(ITERATIONS):
         points = _nearest(across * weights[:, None, None], centers, point, known, usable)
@@ -41,7 +39,7 @@ def intersect(centers: Array, directions: Array, point: Index, known: Array) -> 
     return np.where(good[:, None], points, np.nan), np.where(good, determination, 0.0)
 
 
-def _smallest_eigenvalue(across: Array, point: Index, sought: NDArray[np.bool_]) -> Array:
+def _smallest_eigenvalue(across: Array, point: Indices, sought: Mask) -> Array:
     normal = np.zeros((len(sought), 3, 3))
     np.add.at(normal, point, across)
     normal = np.where(sought[:, :, None] & sought[:, None, :], normal, 0.0)
@@ -49,7 +47,7 @@ def _smallest_eigenvalue(across: Array, point: Index, sought: NDArray[np.bool_])
     return np.asarray(np.linalg.eigvalsh(normal)[:, 0], dtype=np.float64)
 
 
-def _nearest(across: Array, centers: Array, point: Index, known: Array, usable: NDArray[np.bool_]) -> Array:
+def _nearest(across: Array, centers: Array, point: Indices, known: Array, usable: Mask) -> Array:
     """Weighted least-squares points (p, 3), given coordinates kept; nan where not usable."""
     normal, right = np.zeros((len(known), 3, 3)), np.zeros((len(known), 3))
     np.add.at(normal, point, across)

@@ -10,15 +10,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import LATTICE, fit_transformation
 from adjust.problem.network import Image, Network
 from adjust.problem.observations import Observations
 
-Array = NDArray[np.float64]
 Film = tuple[Array, bool]  # parameters, and whether the scan is mirrored
 Mark = tuple[str, str]  # kind and point
 

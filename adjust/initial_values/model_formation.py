@@ -4,15 +4,13 @@ from collections.abc import Mapping
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.absolute_orientation import Similarity, absolute_orientation, levelled
 from adjust.initial_values.block import Block, extend
 from adjust.initial_values.pose import Pose, image_distances
 from adjust.initial_values.relative_orientation import relative_poses
-
-Array = NDArray[np.float64]
 
 FEWEST_SHARED = 8  # common points from which the relative orientation of two images has some redundancy
 PAIRS = 3

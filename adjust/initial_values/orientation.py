@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.errors import AdjustmentError, UnorientedError
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import rotation_from_angles
@@ -17,8 +17,6 @@ from adjust.initial_values.resection import resect_images
 from adjust.initial_values.vertical_block import orient_vertical_block
 from adjust.problem.network import Exterior, Network
 from adjust.problem.observations import Distance
-
-Array = NDArray[np.float64]
 
 TILTED = 0.005  # typical residual, in principal distances, that frames tilted by three degrees leave a vertical block
 CLEARLY_WORSE = 5.0  # a given orientation whose residuals are this many times a resection's is set aside

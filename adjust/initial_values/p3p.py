@@ -1,12 +1,11 @@
 """Where a camera can stand that sees three points as observed: Grunert's solution, for many triples at once."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from adjust.array_types import Array, Indices
 
 
-def triple_poses(points: Array, tangents: Array) -> tuple[Array, Array, NDArray[np.intp]]:
+def triple_poses(points: Array, tangents: Array) -> tuple[Array, Array, Indices]:
     """Rotations (k, 3, 3) and shifts (k, 3), camera = R X + t, of every triple, and which one (k,) each is of: points
     (m, 3, 3), tangents (m, 3, 2).
 

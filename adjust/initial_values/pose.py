@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.initial_values.pose_refinement import BEHIND, squared_residuals
 
-Array = NDArray[np.float64]
-Count = TypeVar("Count", int, NDArray[np.intp])
+Count = TypeVar("Count", int, Indices)
 
 REJECTION = 13.8  # 0.1 % point of the squared residual's chi-square (2) distribution, in sigma²
 
@@ -47,7 +46,7 @@ def trimmed_count(n: Count) -> Count:
     return (n + 4) // 2
 
 
-def robust_sigmas(squared: Array, counts: NDArray[np.intp]) -> Array:
+def robust_sigmas(squared: Array, counts: Indices) -> Array:
     """Standard deviations (k,) of a coordinate from the smallest half of chi-square (2) distributed squares (k, n).
 
     Of these, counts (k,) are there, the others are infinite.

@@ -5,11 +5,9 @@ Arrays (k, n) hold n points of k images; those that an image does not have are t
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.rotation import rotation_from_vector
-
-Array = NDArray[np.float64]
 
 LM_ITERATIONS = 12
 SETTLED = 1e-6  # relative change of a sum of squares that is none

@@ -7,15 +7,12 @@ not even a single image of a plane fits with a wrong one.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.projection import rays
 from adjust.initial_values.dlt import LINE, PLANE, principal_distance_together
 from adjust.initial_values.pose import KnownField
 from adjust.initial_values.resection import Resection, refine, resect
-
-Array = NDArray[np.float64]
 
 GRID = np.geomspace(0.35, 16.0, 14)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
 FEWEST = 4  # points of an image

@@ -1,12 +1,9 @@
 """Relative orientation of two images from five and more common points (the essential matrix)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.initial_values.pose import Pose
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 SAMPLES = 150
 CANDIDATES = 4  # poses handed on: the two interpretations of a flat scene must both be among them

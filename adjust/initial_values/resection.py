@@ -6,8 +6,8 @@ from itertools import combinations
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.initial_values.dlt import closed_form_poses
 from adjust.initial_values.p3p import triple_poses
 from adjust.initial_values.pose import (
@@ -19,8 +19,6 @@ from adjust.initial_values.pose import (
     trimmed_count,
 )
 from adjust.initial_values.pose_refinement import refined_poses, squared_residuals
-
-Array = NDArray[np.float64]
 
 IMPLAUSIBLE = 0.05  # residuals, in principal distances, of a pose whose points cannot be the ones they are named
 MAX_TRIPLES = 120  # enough for one free of gross errors among them when every third point is wrong
@@ -41,7 +39,7 @@ class Resection:
 
     pose: Pose
     distances_mm: Array
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     sigma_mm: float
 
 
@@ -138,7 +136,7 @@ class _Field:
         return Pose(rotation, self.origin - self.size * rotation.T @ shift)
 
 
-def _triples(tangents: Array, rng: np.random.Generator) -> NDArray[np.intp]:
+def _triples(tangents: Array, rng: np.random.Generator) -> Indices:
     """Triples of points (m, 3), the slender ones left out: they give poor poses."""
     n = len(tangents)
     if comb(n, 3) <= MAX_TRIPLES:
@@ -180,9 +178,7 @@ def _are_collinear(points: Array) -> bool:
     return bool(width < LINE * length)
 
 
-def _refined_resection(
-    rotations: Array, shifts: Array, field: _Field, inliers: NDArray[np.bool_], sigma_mm: float
-) -> Resection:
+def _refined_resection(rotations: Array, shifts: Array, field: _Field, inliers: Mask, sigma_mm: float) -> Resection:
     """The one pose (1, 3, 3), (1, 3) fitted to its inliers, back in object units."""
     rotations, shifts = refined_poses(rotations, shifts, field.points, field.tangents, inliers[None].astype(np.float64))
     squared = squared_residuals(rotations, shifts, field.points, field.tangents)[0]

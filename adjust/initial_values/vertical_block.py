@@ -4,15 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from adjust.array_types import Array, Complex
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.pose import Pose
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 FEWEST_SHARED = 2
 REWEIGHTINGS = 6

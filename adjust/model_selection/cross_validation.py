@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel
 from adjust.initial_values.intersection import intersect
@@ -20,9 +20,6 @@ from adjust.solution.result import Adjustment
 from adjust.solution.reweighting import run
 from adjust.validation import validate
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 Owner = tuple[Kind, str, str]  # of a parameter: its kind, owner and id
 
 FOLDS = 5

@@ -11,9 +11,9 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
+from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
 from adjust.problem.images import adjusted_image
@@ -22,8 +22,6 @@ from adjust.problem.parameter import Parameter
 from adjust.quality.significance import LEVEL
 from adjust.rank_defect.scanner_directions import HARDLY, scan_poses, undetermined_term_sentences
 from adjust.solution.result import Adjustment
-
-Array = NDArray[np.float64]
 
 WEAK_MM = 0.1  # prior of every term in the trial, taken off again: what is not told stays as small as scanners bend
 
@@ -131,7 +129,7 @@ class _Equations:
             return self.terms[best], float(fdtrc(1, redundancy, explained[best] / left * redundancy))
         return self.terms[best], float(chdtrc(1, explained[best]))
 
-    def _reduced(self, taken: Sequence[str]) -> tuple[NDArray[np.bool_], Array]:
+    def _reduced(self, taken: Sequence[str]) -> tuple[Mask, Array]:
         """Of every term beside those taken: whether it is told, and by how much it makes v'Pv smaller."""
         at = [self.terms.index(each) for each in taken]
         solved = np.linalg.solve(self.normal[np.ix_(at, at)], np.column_stack([self.normal[at], self.right[at]]))

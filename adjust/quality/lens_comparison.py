@@ -12,14 +12,13 @@ from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import qr
 from scipy.special import fdtrc
 
+from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Lens
 
-Array = NDArray[np.float64]
 Use = Literal["space", "flat"]
 
 _GRID = 7  # points a side of the field

@@ -5,13 +5,10 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.rotation import angles_near, rotation_from_vector
 from adjust.problem.problem import Problem, State
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 EXACT = 1e-9  # what a generator may move of a given quantity and still be unhindered: rounding
 FLAT = 1e-3  # the same where relief, in parts of the field's extent, is too little to carry a datum
@@ -134,7 +131,7 @@ def centered(problem: Problem, state: State, members: Indices) -> State:
     return state
 
 
-def _nearest(motion: Array, off: Array, first: NDArray[np.bool_]) -> Array:
+def _nearest(motion: Array, off: Array, first: Mask) -> Array:
     """Amounts (d,) of motions (n, d) nearest to off (n,): by the rows `first`, then as far as these leave it open."""
     count = motion.shape[1]
     _, strength, right = np.linalg.svd(np.vstack([motion[first], np.zeros((count, count))]), full_matrices=False)
@@ -168,7 +165,7 @@ def _transformed(problem: Problem, state: State, datum: ObjectDatum, amounts: Ar
     return State(values, np.where(_fixed_attitudes(problem)[:, None, None], state.rotations, rotations))
 
 
-def _fixed_attitudes(problem: Problem) -> NDArray[np.bool_]:
+def _fixed_attitudes(problem: Problem) -> Mask:
     """Images whose attitude is fixed."""
     return np.asarray((problem.unknowns.sigma[problem.exterior[:, 3:]] == 0.0).all(axis=1))
 

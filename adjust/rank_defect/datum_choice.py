@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.errors import DatumError
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import Network, ObjectPoint
@@ -13,9 +13,6 @@ from adjust.problem.parameter import Parameter, object_coordinate
 from adjust.problem.problem import Problem
 from adjust.rank_defect.datum import FLAT, ObjectDatum, free_coordinates, object_datum
 from adjust.rank_defect.named_directions import DATUM_DIRECTIONS
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 DEPENDENT = 1e-6  # part of a coordinate's motion that those before it must leave open, or it is theirs already
 

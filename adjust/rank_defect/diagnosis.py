@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import NullDirection
 from adjust.problem.parameter import Parameter, description
@@ -15,9 +15,6 @@ from adjust.rank_defect.named_directions import camera_directions, datum_sentenc
 from adjust.rank_defect.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
 from adjust.rank_defect.scanner_directions import scanner_directions
 from adjust.rank_defect.unnamed_directions import many_sentence, own_sentence, unnamed_sentence
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 WEAK = 1e-4  # singular values of the scaled rows, over the largest, below which noise makes the solution
 INVOLVED = 0.01  # part of a null vector's largest component that is worth a name

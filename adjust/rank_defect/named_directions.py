@@ -5,15 +5,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.functional_model.families import family
 from adjust.functional_model.transformation import follows_tilts
 from adjust.problem.parameter import Kind, Parameter
 from adjust.problem.problem import Problem, State
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 FLAT = 0.01  # least over largest extent of the field, below which there is no relief to speak of
 PARALLEL_RAD = np.radians(1.0)  # axes within this of each other are parallel

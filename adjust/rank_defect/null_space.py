@@ -4,14 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import Factor
 from adjust.linear_algebra.multifrontal import with_rows
 from adjust.linear_algebra.sparse_factor import Triangle
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 SINGULAR = 1e-8  # singular values of the scaled rows, over the largest, below which there is no solution
 DENSE = 100  # shared unknowns up to which all singular values are computed

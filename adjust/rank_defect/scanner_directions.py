@@ -3,8 +3,8 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.functional_model.scanner import is_left, term_degree
 from adjust.linear_algebra.factor import Factor
@@ -13,8 +13,6 @@ from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
 from adjust.rank_defect.named_directions import NamedDirection, Reason, unit_direction
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Pose = tuple[int, bool]  # how a frame is turned in its scan, degrees, and whether it is mirrored
 
 SCANNER_RANK = -2

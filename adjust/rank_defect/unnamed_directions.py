@@ -3,13 +3,11 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.problem.network import Image
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
-
-Array = NDArray[np.float64]
 
 IN_LINE = 1e-3  # width over length of marks in an image, and base over distance of stations, that are next to none
 SHOWN = 3  # names that are listed one by one

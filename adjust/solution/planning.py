@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import qr
 
+from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
@@ -23,8 +23,6 @@ from adjust.rank_defect.null_space import null_vectors
 from adjust.solution.adjustment import Options, adjust_problem, with_datum
 from adjust.solution.result import Adjustment
 from adjust.validation import validate_plan
-
-Array = NDArray[np.float64]
 
 STILL = 1e-6  # part of a null direction's motion that is rounding: what moves less is determined
 

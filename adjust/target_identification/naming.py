@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.initial_values.pose import Pose
 from adjust.initial_values.resection import resect
 from adjust.target_identification.naming_growth import OF_POSE, Grown, View, grow, log10_of_chance
@@ -29,8 +29,6 @@ from adjust.target_identification.naming_hypotheses import (
     promising,
 )
 from adjust.target_identification.unnamed_marks import Marks
-
-Array = NDArray[np.float64]
 
 LEAST_POINTS = 5
 MOST_LOG10_CHANCE = -6.0

@@ -3,13 +3,10 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.rotation import rotation_from_vector
 from adjust.target_identification.unnamed_marks import Marks, log10_of_agreement
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 _ROUNDS = 25
 _GATE_SIGMAS = 3.5
@@ -34,7 +31,7 @@ class View:
         p = self._ideal(xyz)
         return np.asarray((1.0 + self.scale) * p * (1.0 + self.radial * (p**2).sum(axis=1, keepdims=True)))
 
-    def facing(self, xyz: Array, normals: Array) -> NDArray[np.bool_]:
+    def facing(self, xyz: Array, normals: Array) -> Mask:
         """Which points turn their faces to the camera, as far as it is known where they face."""
         station = -self.rotation.T @ self.shift
         return np.asarray(~(np.einsum("ni,ni->n", normals, station - xyz) <= 0.0))
@@ -119,7 +116,7 @@ def _near(
     return shown[kept], nearest[kept].astype(np.intp)
 
 
-def _shown_points(view: View, xyz: Array, normals: Array, marks: Marks) -> NDArray[np.bool_]:
+def _shown_points(view: View, xyz: Array, normals: Array, marks: Marks) -> Mask:
     return np.asarray(marks.inside(view.images(xyz)) & view.facing(xyz, normals))
 
 

@@ -5,15 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.initial_values.p3p import triple_poses
 from adjust.initial_values.pose_refinement import refined_poses
 from adjust.target_identification.unnamed_marks import Marks
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 _DIRECTIONS = 24  # from which the field is looked at to learn how near in a picture its clusters stay
 _NEARBY = 6  # next points in space, two of which make a cluster with a point
@@ -195,7 +192,7 @@ def _nearest_points(xyz: Array, points: Indices, count: int) -> Indices:
     return np.asarray(np.take_along_axis(near, order, axis=1), dtype=np.intp)
 
 
-def _facing(rotations: Array, shifts: Array, xyz: Array, normals: Array, points: Indices) -> NDArray[np.bool_]:
+def _facing(rotations: Array, shifts: Array, xyz: Array, normals: Array, points: Indices) -> Mask:
     """Whether all three points turn their faces to the camera; where a point faces is not always known."""
     stations = -np.einsum("kji,kj->ki", rotations, shifts)
     towards = np.einsum("kpi,kpi->kp", normals[points], stations[:, None] - xyz[points])
@@ -204,7 +201,7 @@ def _facing(rotations: Array, shifts: Array, xyz: Array, normals: Array, points:
 
 def _tested(
     rotations: Array, shifts: Array, points: Array, anchors: Array, marks: Marks, reach: float
-) -> tuple[Array, Indices, NDArray[np.bool_]]:
+) -> tuple[Array, Indices, Mask]:
     """The evidence (k,) for poses, and for each of the points (k, p, 3) the nearest mark and whether it agrees."""
     places = _projected(rotations, shifts, points)
     nearest = marks.nearest(places)

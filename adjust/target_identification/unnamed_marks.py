@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from adjust.array_types import Array, Indices, Mask
 
 _CELLS = 600  # of the look-up along either side of the frame
 _COARSE_CELLS = 60  # of that of the density
@@ -45,7 +43,7 @@ class Marks:
             places, least, greatest, sigma_mm / c, c, c_sigma, tree, nearest, np.maximum(density, mean)
         )  # fmt: skip
 
-    def inside(self, places: Array) -> NDArray[np.bool_]:
+    def inside(self, places: Array) -> Mask:
         """Which of the places (..., 2) lie in the frame."""
         return np.asarray(((places >= self.least) & (places <= self.greatest)).all(axis=-1))
 
