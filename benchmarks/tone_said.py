@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from benchmarks.tone_frames import PITCH_UM, STORED, TIPS, Case, draw_case
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.frame_edges import edge_tone_information
 from measure.fiducials.mark_fit import detect_mark
 from measure.fiducials.options import FiducialOptions
+from measure.fiducials.refit import edge_tone_information
 from measure.marks.frame_border import limit_to_frame
 from measure.tone.curve import Tone, ToneInformation
 from synthetic_images.tone_curve import coded

@@ -11,10 +11,9 @@ from measure.detection.localisation import localise
 from measure.detection.responses import Effort
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.hypotheses import PitchHypothesis
 from measure.fiducials.measure_frame import detect_frame
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.search import FrameSearch
+from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.flags import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
 from measure.marks.shapes import FiducialLayout
 from measure.matching.options import MatchOptions

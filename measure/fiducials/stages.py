@@ -14,11 +14,10 @@ from measure.annotations.fields import Line
 from measure.detection.correlation import CLOSE, GRAINY
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.hypotheses import Hypotheses, is_searched_by_windows, slightly_longer
 from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
-from measure.fiducials.search import FrameSearch
+from measure.fiducials.search import FrameSearch, Hypotheses, is_searched_by_windows, slightly_longer
 from measure.fiducials.significance import doubt_frame, false_frames
 from measure.flags import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE
 from measure.geometry import POSES

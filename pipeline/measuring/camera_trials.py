@@ -15,8 +15,8 @@ from measure.annotations.detect_text import networks
 from measure.annotations.read import read_writing
 from measure.fiducials.camera_recognition import Answer, likeness, recognise_frame, search_camera
 from measure.fiducials.frame import Frame
-from measure.fiducials.hypotheses import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.fiducials.options import FiducialOptions
+from measure.fiducials.search import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.flags import CAMERA_BY_CHANCE
 from measure.marks.frame_border import limit_to_frame
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon, thinnest_mm

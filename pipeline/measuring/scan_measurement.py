@@ -13,8 +13,7 @@ import numpy as np
 from measure.annotations.detect_text import MISSING, networks
 from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
 from measure.fiducials.frame_checks import pitch_problem, with_damage
-from measure.fiducials.measurement import measure_fiducials
-from measure.fiducials.second_frame import second_frame
+from measure.fiducials.measurement import measure_fiducials, second_frame
 from measure.flags import Code, Reason, Status
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout

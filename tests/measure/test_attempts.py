@@ -11,9 +11,8 @@ from drawn_frames import ALIKE
 from measure.detection.correlation import CLOSE, GRAINY
 from measure.fiducials import stages
 from measure.fiducials.frame import Frame
-from measure.fiducials.hypotheses import PitchHypothesis, pitch_hypotheses
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.search import FrameSearch
+from measure.fiducials.search import FrameSearch, PitchHypothesis, pitch_hypotheses
 from measure.fiducials.stages import Attempt, Found, find_frame
 from measure.flags import FRAMES_BY_CHANCE
 

@@ -10,10 +10,9 @@ import tifffile
 from brute_marks import Array, written_scan
 from drawn_frames import CORNERS, NUMBERED, RING_CROSS, assert_right, frame_picture, layout_of, pixel_from_camera
 
-from measure.fiducials.hypotheses import PitchHypothesis, is_lattice, room_mm
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.search import FrameSearch
+from measure.fiducials.search import FrameSearch, PitchHypothesis, is_lattice, room_mm
 from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
 from measure.results import FrameMeasurement
@@ -27,7 +26,7 @@ PITCH_UM = (50.0, 50.0)
 
 @pytest.fixture(autouse=True)
 def _small_scans_count_as_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("measure.fiducials.hypotheses._LARGE_PX", 1)
+    monkeypatch.setattr("measure.fiducials.search._LARGE_PX", 1)
 
 
 def measured(

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from measure.fiducials import measurement
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.hypotheses import PitchHypothesis, pitch_hypotheses
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.orientation_pictures import SPOILT, MarkSite, PosedMark
 from measure.fiducials.rows import present_frame
 from measure.fiducials.scan_orientation import decide_pose
-from measure.fiducials.search import FrameSearch
+from measure.fiducials.search import FrameSearch, PitchHypothesis, pitch_hypotheses
 from measure.fiducials.significance import doubt_frame
 from measure.flags import Status
 from measure.geometry import POSES, up_from_camera

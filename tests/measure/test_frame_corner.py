@@ -9,9 +9,9 @@ from drawn import drawn, scan_of, transformed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from measure.fiducials.frame_edges import edge_tone_information
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
+from measure.fiducials.refit import edge_tone_information
 from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, frame_corner, polygon
 from measure.matching.frame_edge import fit_frame_corner

@@ -14,11 +14,10 @@ from scipy.ndimage import gaussian_filter
 from measure.detection.localisation import localise
 from measure.fiducials import mark_fit
 from measure.fiducials.constellation import Placement
-from measure.fiducials.hypotheses import pitch_hypotheses
 from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.search import FrameSearch
+from measure.fiducials.search import FrameSearch, pitch_hypotheses
 from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, polygon, turned_part
 

@@ -8,9 +8,8 @@ import pytest
 from brute_marks import written_scan
 from drawn_frames import ALIKE, FRAME_PX, PITCH_UM, frame_picture, pixel_from_camera
 
-from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.measurement import measure_fiducials, second_frame
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.second_frame import second_frame
 from measure.results import moved_frame
 from measure.scans.opening import crop_scan
 
