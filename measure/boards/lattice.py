@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import product
 
 import cv2
@@ -9,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from measure.boards.specs import FoundBoard, FoundCorner, SquareGridSpec, corners_of_square
-from measure.flags import Code, Reason
+from measure.boards.specs import CircleGridSpec, FoundBoard, FoundCorner, SquareGridSpec, corners_of_square
+from measure.flags import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -182,29 +183,52 @@ def _outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integer
     return [-least - np.array(spare) for spare in product(range(int(extra[0]) + 1), range(int(extra[1]) + 1))]
 
 
+@dataclass(frozen=True, eq=False)
+class FoundGrid:
+    """assignment: the index of the point at each place, empty where there is no grid, and then the reason why;
+    others_px: the middles of further grids; notes: what the user should know."""
+
+    assignment: dict[Place, int]
+    others_px: tuple[Array, ...] = ()
+    notes: tuple[str, ...] = ()
+    reason: Reason = NO_REASON
+
+
+def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | SquareGridSpec, what: str) -> FoundGrid:
+    """Find the one grid that points make, the most upright one in the scan.
+
+    Parameters
+    ----------
+    points_px, appearances : as `grid_places` takes them.
+    what : the word for the points, in messages.
+    """
+    size, places = f"{spec.columns} x {spec.rows} {what}", spec.places()
+    assignments = grid_places(points_px, appearances, places)
+    if not is_whole(assignments):
+        message = f"no grid of {size} is wholly seen; {len(points_px)} spots look like {what}"
+        if assignments:
+            message = f"a grid of more than {size} is seen, or one with a line of it hidden"
+        return FoundGrid({}, reason=Reason(message, Code.NO_BOARD))
+    assignment = max(assignments, key=lambda found: upright(found, points_px))
+    notes = ("the grid looks the same when turned: it was taken as upright in the scan",)
+    others = other_grids(points_px, appearances, assignment, places)
+    return FoundGrid(assignment, others, notes[: len(assignments) - 1])
+
+
 def find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:
     """Find the corners of a grid of separate dark squares in a picture, a pixel or so off; steps are the square's sides
     that leave the corner. Nearly all squares must be seen."""
-    message = ""
+    reason = NO_REASON
     for share in _BLOCKS:
         quads = list(_dark_quads(picture, share))
         centers = np.array([quad.mean(axis=0) for quad in quads]).reshape(-1, 2)
         appearances = np.log([[cv2.contourArea(quad.astype(np.float32))] for quad in quads] or np.ones((0, 1)))
-        assignments = grid_places(centers, appearances, spec.places())
-        if is_whole(assignments):
-            assignment = max(assignments, key=lambda found: upright(found, centers))
-            notes = ("the grid looks the same when turned: it was taken as upright in the scan",)
-            others = other_grids(centers, appearances, assignment, spec.places())
-            corners = _square_corners(quads, centers, assignment, spec)
-            return FoundBoard(corners, others_px=others, notes=notes[: len(assignments) - 1])
-        message = (
-            f"no grid of {spec.columns} x {spec.rows} squares is wholly seen; {len(quads)} spots look like squares"
-        )
-        if assignments:
-            message = (
-                f"a grid of more than {spec.columns} x {spec.rows} squares is seen, or one with a line of it hidden"
-            )
-    return FoundBoard({}, Reason(message, Code.NO_BOARD))
+        grid = find_grid(centers, appearances, spec, "squares")
+        reason = grid.reason
+        if not reason:
+            corners = _square_corners(quads, centers, grid.assignment, spec)
+            return FoundBoard(corners, others_px=grid.others_px, notes=grid.notes)
+    return FoundBoard({}, reason)
 
 
 def _dark_quads(picture: Bytes, share: float) -> Iterator[Array]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from measure.boards.corners import Corner, Surface, crossing, fit_corner, quarter
 from measure.boards.find import find_board
-from measure.boards.lattice import Place, grid_places, is_whole, other_grids, upright
+from measure.boards.lattice import Place, find_grid
 from measure.boards.specs import (
     ArucoSpec,
     BoardSpec,
@@ -44,36 +44,29 @@ _WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out 
 
 
 @dataclass(frozen=True)
-class CircleGridMeasurement:
-    """A grid in a scan: one mark for each of its dots; reason: why it was not found; notes: what the user should know;
-    others_px: the middles of further grids that look the same."""
+class BoardMeasurement:
+    """A board in a scan: one mark for each of its points, found or not; reason: why the board was not found; notes:
+    what the user should know; refused: markers that were read and are not used, one sentence each; ambiguous: what else
+    in the scan may be the board as well, so that none of its points is an observation."""
 
     marks: tuple[MarkMeasurement, ...]
     reason: Reason = NO_REASON
     notes: tuple[str, ...] = ()
-    others_px: tuple[Array, ...] = ()
+    refused: tuple[Reason, ...] = ()
+    ambiguous: Reason = NO_REASON
 
 
-def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> CircleGridMeasurement:
-    """Measure the dots of a grid, and say where else the scan shows one. A grid that is not there is no error."""
-    names = {place: f"r{place[0]}c{place[1]}" for place in spec.places()}
+def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
+    """The dots of a grid; those that were not seen are sought where the others put them."""
     patches = disk_candidates(scan, DiskSearch((_SMALLEST_DOT_PX, _largest_dot_px(scan, spec))))
     centers = np.array([patch.center_px for patch in patches]).reshape(-1, 2)
-    appearances = _appearances(patches)
-    assignments = grid_places(centers, appearances, spec.places())
-    if not is_whole(assignments):
-        message = f"no grid of {spec.columns} x {spec.rows} dots is wholly seen; {len(patches)} spots look like dots"
-        if assignments:
-            message = f"a grid of more than {spec.columns} x {spec.rows} dots is seen, or one with a line of it hidden"
-        reason = Reason(message, Code.NO_BOARD)
-        absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, reason) for name in names.values())
-        return CircleGridMeasurement(tuple(absent), reason)
-    assignment = max(assignments, key=lambda found: upright(found, centers))
-    notes = (
-        ("the grid looks the same when turned: it was taken as upright in the scan",) if len(assignments) > 1 else ()
-    )
+    grid = find_grid(centers, _appearances(patches), spec, "dots")
+    names = {place: f"r{place[0]}c{place[1]}" for place in spec.places()}
+    if grid.reason:
+        absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, grid.reason) for name in names.values())
+        return BoardMeasurement(tuple(absent), grid.reason)
     detected = {
-        place: (patches[index].center_px, patches[index].pixel_from_disk) for place, index in assignment.items()
+        place: (patches[index].center_px, patches[index].pixel_from_disk) for place, index in grid.assignment.items()
     }
     gap = 1 - spec.diameter_mm / spec.shortest_distance_mm
     marks = []
@@ -81,8 +74,8 @@ def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> CircleGridMeasureme
         center, shape = detected[place] if place in detected else _predicted(place, detected)
         margin = gap / (1 - gap) * 2 * float(np.linalg.svd(shape, compute_uv=False)[1])
         marks.append(_dot_mark(name, fit_disk(scan, center, shape, longest_margin_px=margin), place in detected))
-    others = other_grids(centers, appearances, assignment, spec.places())
-    return CircleGridMeasurement(tuple(marks), NO_REASON, notes, others)
+    measured = BoardMeasurement(tuple(marks), notes=grid.notes)
+    return _unless_alone(measured, f"grids of {spec.columns} x {spec.rows} dots", grid.others_px)
 
 
 def _appearances(patches: list[Candidate]) -> Array:
@@ -120,19 +113,6 @@ def _dot_mark(name: str, disk: FittedDisk, is_detected: bool) -> MarkMeasurement
     return MarkMeasurement(name, "target", disk.center_px, disk.covariance, status, weakness, disk.quality)
 
 
-@dataclass(frozen=True)
-class BoardMeasurement:
-    """A board in a scan: one mark for each of its points, found or not; reason: why the board was not found; notes:
-    what the user should know; refused: markers that were read and are not used, one sentence each; ambiguous: what else
-    in the scan may be the board as well, so that none of its points is an observation."""
-
-    marks: tuple[MarkMeasurement, ...]
-    reason: Reason = NO_REASON
-    notes: tuple[str, ...] = ()
-    refused: tuple[Reason, ...] = ()
-    ambiguous: Reason = NO_REASON
-
-
 def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     """Measure a chessboard, grid of dots or squares, ArUco or ChArUco board.
 
@@ -141,9 +121,7 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     One mark for each point of the board, found or not. A board that is not there is no error, but a reason.
     """
     if isinstance(spec, CircleGridSpec):
-        grid = measure_circle_grid(scan, spec)
-        kind = f"grids of {spec.columns} x {spec.rows} dots"
-        return _unless_alone(BoardMeasurement(grid.marks, grid.reason, grid.notes), kind, grid.others_px)
+        return _measure_circle_grid(scan, spec)
     board = find_board(scan, spec)
     reach = _common_reach_px(board.corners.values()) if board.corners else 0.0
     fitted = {name: _fit_found(scan, found, spec, reach) for name, found in board.corners.items()}

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.marks.shapes import Polarity
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate, Patches, search_blocks
@@ -34,15 +35,13 @@ class CrossSearch:
 
     half_px: tuple[float, float]
     line: float
-    polarity: str = "auto"
+    polarity: Polarity = "auto"
     least_contrast: float = 0.02
 
     def __post_init__(self) -> None:
-        DiskSearch((2.0 * self.half_px[0], 2.0 * self.half_px[1]), "auto", self.least_contrast)
+        DiskSearch((2.0 * self.half_px[0], 2.0 * self.half_px[1]), self.polarity, self.least_contrast)
         if not 0.0 < self.line < 1.0:
             raise ValueError(f"line is {self.line} of half a cross; a share between 0 and 1 is right")
-        if self.polarity not in ("light", "dark", "auto"):
-            raise ValueError(f"polarity is {self.polarity!r}; light, dark or auto is right")
 
 
 def cross_candidates(scan: Scan, search: CrossSearch) -> list[Candidate]:

@@ -9,12 +9,12 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.marks.shapes import Polarity
 from measure.noise.robust_estimation import robust_scales
 from measure.scans.scan import Scan
 from measure.targets.block_search import Block, Candidate, Patches, concatenate, search_blocks
@@ -177,7 +177,7 @@ class DiskSearch:
     """
 
     diameter_px: tuple[float, float]
-    polarity: Literal["light", "dark", "auto"] = "auto"
+    polarity: Polarity = "auto"
     least_contrast: float = 0.02
 
     def __post_init__(self) -> None:

@@ -3,7 +3,7 @@ checked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from measure.detection.peaks import local_maxima
 from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.rendering import extent_px, picture
-from measure.marks.shapes import MarkShape, cross, thinnest_mm
+from measure.marks.shapes import MarkShape, Polarity, cross, thinnest_mm
 from measure.noise.robust_estimation import robust_scale
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
@@ -32,7 +32,6 @@ _AFFINE_FROM = 8  # targets that agree: from so many on the shared shift may var
 _VOTE_SHARE = 0.2  # of the farthest link: how far shifts may differ and still count as one
 _ROUNDS = 5  # of the shared shift and the gate, each by the other
 _FORBIDDEN = 1e9  # px: the cost of a link that there is not
-Polarity = Literal["light", "dark", "auto"]
 
 
 class Prediction(Protocol):
@@ -97,7 +96,7 @@ def _spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) 
     compared = _compared_part(prediction.pixel_from_disk / factor, half, shape)
     score = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED, mask=compared)
     score = np.asarray(np.nan_to_num(score, posinf=0.0, neginf=0.0), np.float32)
-    signed: NDArray[np.float32] = {"light": score, "dark": -score}.get(polarity, np.abs(score))
+    signed = np.asarray({"light": score, "dark": -score}.get(polarity, np.abs(score)), np.float32)
     peaks, _ = local_maxima(signed, signed.size, _LEAST_CORRELATION, 1)
     places = (peaks + half) * factor + (factor - 1) / 2 + corner
     within = np.hypot(*(places - prediction.center_px).T) <= prediction.search_px + factor
