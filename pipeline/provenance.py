@@ -70,8 +70,8 @@ def _json(value: Any) -> Any:
     if value.__class__ in _PLAIN or (value.__class__ is float and math.isfinite(value)):
         return value
     if is_dataclass(value) and not isinstance(value, type):
-        told = {one.name: _json(getattr(value, one.name)) for one in fields(value) if one.metadata != NO_FINGERPRINT}
-        return {"is": type(value).__name__, **told}
+        values = {one.name: _json(getattr(value, one.name)) for one in fields(value) if one.metadata != NO_FINGERPRINT}
+        return {"is": type(value).__name__, **values}
     if isinstance(value, Mapping):
         if all(isinstance(key, str) for key in value):
             return {str(key): _json(item) for key, item in value.items()}
@@ -221,8 +221,8 @@ def result_key(identity: Identity, options_hash: str, revision: int = MEASURE_RE
     """SHA-256 (hexadecimal) of a scan's identity, the hash of its options, and the revision of `measure`. It is the
     same on every machine, so results of several may be joined."""
     state = identity.state
-    told = [state.uri, state.bytes, state.mtime_ns, state.etag, identity.parts_hash, options_hash, revision]
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+    values = [state.uri, state.bytes, state.mtime_ns, state.etag, identity.parts_hash, options_hash, revision]
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
 def options_hash(options_json: str) -> str:

@@ -72,7 +72,7 @@ def judge(store: Store, made_from: Mapping[str, str], input_hash: str, frames: I
 def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots: Iterable[Lot]) -> str:
     """Keep a judging of all frames, whole or not at all, and give its digest. A lot whose input was judged before is
     taken from there. Of a frame only what is another than it was measured takes room."""
-    told = hashlib.sha256(json.dumps([dict(made_from), input_hash], sort_keys=True).encode())
+    hasher = hashlib.sha256(json.dumps([dict(made_from), input_hash], sort_keys=True).encode())
     db = store.connection
     with store.writing():
         db.execute(f"delete from judging where {_UNFINISHED}")
@@ -81,10 +81,10 @@ def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots
         assert row is not None
     for number, lot in enumerate(lots):
         output = _taken(store, row, number, lot) or _judged(store, row, number, lot.frames())
-        told.update(output.encode())
+        hasher.update(output.encode())
         with store.writing():
             db.execute("insert into judged_lot values (?, ?, ?, ?)", (row, number, lot.input, output))
-    digest = told.hexdigest()
+    digest = hasher.hexdigest()
     with store.writing():
         db.execute("delete from judging where digest = ?", (digest,))
         db.execute("update judging set digest = ? where id = ?", (digest, row))
@@ -145,12 +145,12 @@ def _own_marks(db: sqlite3.Connection, judging: int, result: int) -> list[tuple[
 
 def _judged(store: Store, judging: int, number: int, frames: Iterable[JudgedScan]) -> str:
     """Judge a lot, and give what is told of it."""
-    told, left = hashlib.sha256(), iter(frames)
+    hasher, left = hashlib.sha256(), iter(frames)
     while some := list(islice(left, _AT_A_TIME)):  # what makes them may have to measure, and write, meanwhile
         with store.writing():
             for frame in some:
-                told.update(_write(store.connection, judging, number, frame, store.record(frame.result)))
-    return told.hexdigest()
+                hasher.update(_write(store.connection, judging, number, frame, store.record(frame.result)))
+    return hasher.hexdigest()
 
 
 def drop_all_but(store: Store, digest: str) -> None:

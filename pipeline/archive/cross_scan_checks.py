@@ -34,15 +34,15 @@ def judged_lots(
     work: Work,
     copies: Mapping[str, str],
     share: Callable[[Sequence[MeasuredScan]], Iterable[MeasuredScan]],
-    told: str,
+    input_hash: str,
 ) -> Iterator[Lot]:
     """Every scan as all of them show it, in lots: those whose scans are as they were need not be judged again.
 
     project: with its learned marks. copies: by image the one whose file its own is a copy of. share: the third step of
-    measuring; told: `input_of` all. A lot is held at a time.
+    measuring; input_hash: `input_of` all. A lot is held at a time.
     """
     own = [task for task in tasks if task.name not in copies]
-    keys, said = work.keys(), _said_by_writing(project, own, work)
+    keys, remarks = work.keys(), _said_by_writing(project, own, work)
 
     def lot(some: Sequence[ScanTask], depends_on: object, scans: Callable[[], Iterable[MeasuredScan]]) -> Lot:
         results = [
@@ -54,16 +54,16 @@ def judged_lots(
             fingerprint([results, depends_on, made_by]), lambda: (_judged(scan, work, project) for scan in scans())
         )
 
-    def seen(of_cameras: Sequence[OfCamera]) -> Iterable[MeasuredScan]:
+    def checked_lot(of_cameras: Sequence[OfCamera]) -> Iterable[MeasuredScan]:
         scans = [scan for each in of_cameras for scan in _checked_beside(project, *each, work)]
-        return share([_with_said(scan, said) for scan in scans])
+        return share([_with_said(scan, remarks) for scan in scans])
 
     for of_cameras in _lots(project, own):
         some = [task for _, each in of_cameras for task in each]
-        of_writing = [said[task.name] for task in some if task.name in said]
+        of_writing = [remarks[task.name] for task in some if task.name in remarks]
         cameras = [camera for camera, _ in of_cameras]
-        depends_on = [cameras, project.film, of_writing, _shared(project, some, told)]
-        yield lot(some, depends_on, partial(seen, of_cameras))
+        depends_on = [cameras, project.film, of_writing, _shared(project, some, input_hash)]
+        yield lot(some, depends_on, partial(checked_lot, of_cameras))
     if copies:
         again = sorted(copies.items())
         yield lot(
@@ -101,8 +101,8 @@ def input_of(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str], m
     keys = work.keys()
     results = [[task.name, keys[task.name]] for task in tasks]
     made_by = [version("reseau"), MEASURE_REVISION]
-    told = json.dumps([results, sorted(copies.items()), dict(made_from), made_by], sort_keys=True)
-    return hashlib.sha256(told.encode()).hexdigest()
+    content = json.dumps([results, sorted(copies.items()), dict(made_from), made_by], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _lots(project: Project, tasks: Sequence[ScanTask]) -> Sequence[Sequence[OfCamera]]:
@@ -113,10 +113,10 @@ def _lots(project: Project, tasks: Sequence[ScanTask]) -> Sequence[Sequence[OfCa
     return [of_cameras] if project.ties is not None or are_few else [[each] for each in of_cameras]
 
 
-def _shared(project: Project, tasks: Sequence[ScanTask], told: str) -> object:
+def _shared(project: Project, tasks: Sequence[ScanTask], input_hash: str) -> object:
     """What of the project the third step depends on, beside the scans themselves."""
     if project.ties is not None:
-        return told
+        return input_hash
     points = None if project.targets is None else project.object_points
     return [project.targets, points, [project.part_of(task.name) for task in tasks] if project.has_parts else None]
 
@@ -155,12 +155,12 @@ def _said_by_writing(project: Project, tasks: Sequence[ScanTask], work: Work) ->
     for camera in project.cameras.values():
         own = [work.read_writing(name) for name in names if project.camera_of(name) is camera]
         bare |= {scan.frame.image: scan for scan in with_plates(camera, own, project.cameras)}
-    seen = with_same_frames([bare[name] for name in names], project.part_of)
-    return {scan.frame.image: (scan.frame.problems, scan.notes) for scan in seen if scan.frame.problems or scan.notes}
+    noted = with_same_frames([bare[name] for name in names], project.part_of)
+    return {scan.frame.image: (scan.frame.problems, scan.notes) for scan in noted if scan.frame.problems or scan.notes}
 
 
-def _with_said(scan: MeasuredScan, said: Said) -> MeasuredScan:
-    problems, notes = said.get(scan.frame.image, ((), ()))
+def _with_said(scan: MeasuredScan, remarks: Said) -> MeasuredScan:
+    problems, notes = remarks.get(scan.frame.image, ((), ()))
     frame = replace(scan.frame, problems=(*scan.frame.problems, *problems))
     return replace(scan, frame=frame, notes=(*scan.notes, *notes))
 

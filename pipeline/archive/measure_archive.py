@@ -148,14 +148,14 @@ def measure_archive(
         _check_any(store)
         copies = find_copies(store, tasks, work)
         made = made_from()
-        told = input_of(tasks, work, copies, made)
+        input_hash = input_of(tasks, work, copies, made)
         before = latest(store)
-        if before is not None and before.input == told:
+        if before is not None and before.input == input_hash:
             tell_inapplicable(learned, store, before.digest, work)
             return before.digest
         share = partial(tied, learned, reporter=reporter, executor=executor)
-        lots = judged_lots(learned, tasks, work, copies, share, told)
-        digest = judge_lots(store, made, told, lots)
+        lots = judged_lots(learned, tasks, work, copies, share, input_hash)
+        digest = judge_lots(store, made, input_hash, lots)
         tell_inapplicable(learned, store, digest, work)
         return digest
 

@@ -84,8 +84,8 @@ def decisions_by(store: Store, digest: str) -> dict[DecidedBy, int]:
         "join judging on judging.id = judging where judging.digest = ? and told is not null",
         (digest,),
     )
-    for camera, told in rows:
-        counts.update({(camera, who): count for who, count in json.loads(told).items()})
+    for camera, counts_json in rows:
+        counts.update({(camera, who): count for who, count in json.loads(counts_json).items()})
     return dict(sorted(counts.items()))
 
 
@@ -115,9 +115,9 @@ def fingerprints_of(path: Path, digest: str, images: Collection[str]) -> dict[st
 
 def tell_place(store: Store, project_folder: Path) -> None:
     """Let the store know where the paths of its scans begin, seen from itself: so a whole project can be moved."""
-    told = os.path.relpath(project_folder.resolve(), store.path.resolve().parent)
-    if store.told(_PLACE) != {"path": told}:
-        store.tell(_PLACE, {"path": told})
+    relative = os.path.relpath(project_folder.resolve(), store.path.resolve().parent)
+    if store.told(_PLACE) != {"path": relative}:
+        store.tell(_PLACE, {"path": relative})
 
 
 def measured_scans(path: Path, digest: str = "", images: Collection[str] | None = None) -> Iterator[MeasuredScan]:

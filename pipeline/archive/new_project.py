@@ -97,12 +97,12 @@ class NewProject:
         if mute:
             scans = sum(len(group.paths) for group, _ in mute)
             pixels = [um for _, kind in mute if (um := _pixel_um(kind))]
-            told = f", {np.median(pixels):.1f} um in the samples" if pixels else ""
+            spacing_text = f", {np.median(pixels):.1f} um in the samples" if pixels else ""
             are_all = len(mute) == len(self.named)
             sets = "sets it" if are_all else "is that of all scans: to set it, give these a project of their own"
             yield (
                 f"{scans} scans do not say their resolution ({mute[0][0].head.pitch.note}): the marks' separations "
-                f"tell it{told}; pitch_um in the project {sets}."
+                f"tell it{spacing_text}; pitch_um in the project {sets}."
             )
         plates = sorted({number for _, kind in self.named for number in kind.numbers})
         if plates:
@@ -129,9 +129,9 @@ class NewProject:
 
     def _contradicted_pitches(self) -> Iterator[str]:
         for group, kind in self.named:
-            told = next((against for sample in kind.samples if (against := sample.against_pitch())), "")
-            if told:
-                yield f"{group.folder}: {told}"
+            contradiction = next((against for sample in kind.samples if (against := sample.against_pitch())), "")
+            if contradiction:
+                yield f"{group.folder}: {contradiction}"
 
 
 def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pixels: int | None = None) -> NewProject:

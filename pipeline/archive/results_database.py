@@ -251,7 +251,7 @@ class Store:
                 "where uri = ?",
                 (state.uri,),
             ).fetchall()
-            keys = {before: result_key(identity, told, revision) for before, told, revision in results}
+            keys = {before: result_key(identity, hashed, revision) for before, hashed, revision in results}
             self._db.executemany(
                 "update result set fingerprint = ? where fingerprint = ?",
                 ((now, before) for before, now in keys.items()),
@@ -358,19 +358,19 @@ class Store:
         return result
 
     def _options(self, options_json: str) -> int:
-        told = options_hash(options_json)
-        self._db.execute("insert or ignore into options (hash, json) values (?, ?)", (told, options_json))
-        return int(self._db.execute("select id from options where hash = ?", (told,)).fetchone()[0])
+        hashed = options_hash(options_json)
+        self._db.execute("insert or ignore into options (hash, json) values (?, ?)", (hashed, options_json))
+        return int(self._db.execute("select id from options where hash = ?", (hashed,)).fetchone()[0])
 
     @cached_property
     def _program(self) -> int:
         libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
-        told = (version("reseau"), MEASURE_REVISION, platform.python_version(), libraries)
+        versions = (version("reseau"), MEASURE_REVISION, platform.python_version(), libraries)
         self._db.execute(
-            "insert or ignore into program (version, measure_revision, python, libraries) values (?, ?, ?, ?)", told
+            "insert or ignore into program (version, measure_revision, python, libraries) values (?, ?, ?, ?)", versions
         )
         where = "version = ? and measure_revision = ? and python = ? and libraries = ?"
-        return int(self._db.execute(f"select id from program where {where}", told).fetchone()[0])
+        return int(self._db.execute(f"select id from program where {where}", versions).fetchone()[0])
 
 
 def known_identities(path: Path) -> dict[str, Identity]:
@@ -402,22 +402,30 @@ def row_of(mark: Mapping[str, Any]) -> tuple[Any, ...]:
     covariance = mark["covariance_px2"]
     variances = _NO_NUMBER if covariance is None else (covariance[0][0], covariance[1][1], covariance[0][1])
     causes = None if mark["causes_px2"] is None else json.dumps({"sum": covariance, "of": mark["causes_px2"]})
-    told = (mark["status"], mark["reason_code"], mark["reason"], json.dumps(mark["quality"]))
-    return (mark["point"], mark["kind"], mark["col_px"], mark["row_px"], *map(_number, variances), causes, *told)
+    ends = (mark["status"], mark["reason_code"], mark["reason"], json.dumps(mark["quality"]))
+    return (
+        mark["point"],
+        mark["kind"],
+        mark["col_px"],
+        mark["row_px"],
+        *map(_number, variances),
+        causes,
+        *ends,
+    )
 
 
 def mark_of(row: Sequence[Any]) -> Json:
-    told = dict(zip(_MARK, row, strict=True))
-    causes = told["causes"] and json.loads(told["causes"])
+    values = dict(zip(_MARK, row, strict=True))
+    causes = values["causes"] and json.loads(values["causes"])
     return {
-        "point": told["point"],
-        "kind": told["kind"],
-        "col_px": told["col_px"],
-        "row_px": told["row_px"],
+        "point": values["point"],
+        "kind": values["kind"],
+        "col_px": values["col_px"],
+        "row_px": values["row_px"],
         "covariance_px2": causes and causes["sum"],
         "causes_px2": causes and causes["of"],
-        "status": told["status"],
-        "reason": told["reason"],
-        "reason_code": told["reason_code"],
-        "quality": json.loads(told["quality"]),
+        "status": values["status"],
+        "reason": values["reason"],
+        "reason_code": values["reason_code"],
+        "quality": json.loads(values["quality"]),
     }

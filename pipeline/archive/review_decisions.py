@@ -35,19 +35,19 @@ Marks = Mapping[tuple[str, str], bool]  # by point and kind whether something wa
 def asked_of(project: Project) -> Callable[[str], str]:
     """A hash of it, by the image's name. Raises InputError for marks that cannot be sought."""
     options, hashes = options_of(project, {}), dict[int, str]()
-    decided = {
+    decisions_of = {
         image: [one for one in decisions if one.decision in _MEASURED]
         for image, decisions in by_image(project.decisions).items()
     }
 
-    def asked(image: str) -> str:
+    def request_hash(image: str) -> str:
         own = options(image)
         if id(own) not in hashes:
             hashes[id(own)] = options_hash(f"{own.json} {MEASURE_REVISION}")
-        told = decided.get(image)
-        return fingerprint([hashes[id(own)], told]) if told else hashes[id(own)]
+        own_decisions = decisions_of.get(image)
+        return fingerprint([hashes[id(own)], own_decisions]) if own_decisions else hashes[id(own)]
 
-    return asked
+    return request_hash
 
 
 # What a person decided, as input of measuring: which decisions count for a scan, and what they change.
@@ -67,22 +67,22 @@ class Decided:
 
 def by_image(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Decision]]:
     """The decisions about each scan, the oldest first; those about a camera's marks left out."""
-    told = defaultdict[str, list[Decision]](list)
+    grouped = defaultdict[str, list[Decision]](list)
     for one in decisions:
         if one.about[2] != LEARNED:
-            told[one.image].append(one)
-    return told
+            grouped[one.image].append(one)
+    return grouped
 
 
 def decisions_hash(decisions: Sequence[Decision]) -> str:
     """Of all decisions about an image; "" where there are none."""
     if not decisions:
         return ""
-    told = [
+    values = [
         (str(one.decision), *one.about, one.col_px, one.row_px, one.pose, one.note, one.who, one.fingerprint)
         for one in decisions
     ]
-    return row_digest(*told)
+    return row_digest(*values)
 
 
 def decided(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf) -> Decided:
@@ -91,17 +91,17 @@ def decided(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_o
     if not decisions:
         return Decided(task, {})
     counted, now, key = list[Decision](), task, key_of(task)
-    seen = {key}  # of the results that a decision may have been made about
-    ever = set(seen)
+    current_keys = {key}  # of the results that a decision may have been made about
+    ever = set(current_keys)
     for one in decisions:
-        known = ever if one.decision is Choice.POSE else seen
+        known = ever if one.decision is Choice.POSE else current_keys
         if one.decision is not Choice.UNDO and one.fingerprint and one.fingerprint not in known:
             continue
         before, old_key, counted = now, key, [*counted, one]
         now = _with(task, standing(counted).values())
         key = key_of(now)
-        seen = seen | {key} if _names_alike(before, now, pose_of(old_key)) else {key}
-        ever |= seen
+        current_keys = current_keys | {key} if _names_alike(before, now, pose_of(old_key)) else {key}
+        ever |= current_keys
     return Decided(now, standing(counted))
 
 
@@ -164,14 +164,14 @@ def _decided(mark: MarkMeasurement, decision: Decision | None) -> MarkMeasuremen
 
 def tell_inapplicable(project: Project, store: Store, digest: str, work: "Work") -> None:
     """Keep, beside a judging, what is to be said of decisions that it could not take in."""
-    told = [*unknown_images(project), *_of_known(project, store, digest, work)]
-    store.tell(_TOLD, {"digest": digest, "lines": [f"line {number}: {why}" for number, why in sorted(told)]})
+    lines = [*unknown_images(project), *_of_known(project, store, digest, work)]
+    store.tell(_TOLD, {"digest": digest, "lines": [f"line {number}: {why}" for number, why in sorted(lines)]})
 
 
 def inapplicable(store: Store, digest: str) -> tuple[str, ...]:
     """What is to be said of the decisions that a judging could not take in; the first of them, if they are many."""
-    told = store.told(_TOLD) or {}
-    return shortened(told["lines"]) if told.get("digest") == digest else ()
+    kept = store.told(_TOLD) or {}
+    return shortened(kept["lines"]) if kept.get("digest") == digest else ()
 
 
 def shortened(lines: Sequence[str]) -> tuple[str, ...]:

@@ -24,13 +24,13 @@ def name_cameras(
     """The groups, in their order, with what their samples say, which are tried in processes side by side; and why
     samples could not be read."""
     samples = [path for group in groups for path in spread(group.paths)]
-    told, unread = dict[Path, Identification](), dict[Path, str]()
+    identified, unread = dict[Path, Identification](), dict[Path, str]()
     with reporter.stage("tried") as count, worker_pool(len(samples)) as workers:
         futures = {workers.submit(_identified, path, max_pixels): path for path in samples}
         for done, future in enumerate(as_completed(futures), 1):
             path, answer = futures[future], future.result()
             if isinstance(answer, Identification):
-                told[path] = answer
+                identified[path] = answer
             else:
                 unread[path] = answer
             count(f"{done} of {len(samples)} scans on the camera library", done, len(samples))
@@ -39,7 +39,7 @@ def name_cameras(
             group.paths,
             group.head.width_px,
             group.head.height_px,
-            tuple(told[path] for path in spread(group.paths) if path in told),
+            tuple(identified[path] for path in spread(group.paths) if path in identified),
         )
         for group in groups
     ]

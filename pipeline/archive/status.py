@@ -86,16 +86,16 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
             idle = inapplicable(store, judging.digest) if judging is not None else ()
     files, cameras = FileStates(project.path.resolve().parent), project.cameras.values()
     camera_names = {id(camera): camera.path.name for camera in cameras}
-    scans, asked, decisions = [], asked_of(project), by_image(project.decisions)
+    scans, request_hash, decisions = [], asked_of(project), by_image(project.decisions)
     for name, file in as_named(project.scans).items():
         state, camera = files.of(file), camera_names[id(project.camera_of(name))]
         found = rows.get(state.uri)
         if found is None or found[5] is None:
             scans.append(ScanStatus(name, state.uri, camera, Verdict.WAITING))
             continue
-        _, bytes_, mtime_ns, etag, is_current, verdict, why, failure, seconds, finished, told, taken_in = found
+        _, bytes_, mtime_ns, etag, is_current, verdict, why, failure, seconds, finished, request, taken_in = found
         is_same = is_current and (bytes_, mtime_ns, etag) == (state.bytes, state.mtime_ns, state.etag)
-        is_now = is_same and told in (None, asked(name))
+        is_now = is_same and request in (None, request_hash(name))
         now = _VERDICTS[verdict] if is_now else Verdict.OLD
         if is_now and taken_in is not None and taken_in != decisions_hash(decisions.get(name, ())):
             now, why = Verdict.OLD, "what is decided about it now is not taken in yet"
@@ -110,8 +110,8 @@ def _checked(store: Store) -> Iterator[Sequence[Any]]:
     rows, judging = store.connection.execute(_QUERY).fetchall(), latest(store)
     if judging is not None:
         check_judging(store.connection, judging.row, store.path)
-    told = {row[-2] for row in rows if row[6] and row[-2]}
-    records = judged_records(store, judging, told) if judging is not None and told else ()
+    names_to_check = {row[-2] for row in rows if row[6] and row[-2]}
+    records = judged_records(store, judging, names_to_check) if judging is not None and names_to_check else ()
     damaged = {name for name, record in records if isinstance(record, DamagedError)}
     why = "what is stored of it is not what was measured: `reseau measure --retry` measures it again"
     for *row, name, is_whole in rows:
@@ -210,8 +210,8 @@ def print_status(status: ArchiveStatus, console: Console, every: bool = False) -
 
 def worst_named(scans: Sequence[ScanStatus], most: int, every: bool) -> tuple[list[ScanStatus], int]:
     """The first of those that need a look, the worst first; and how many there are beside them."""
-    look = [scan for verdict in _LOOK for scan in scans if scan.verdict is verdict] if not every else list(scans)
-    return look[:most], max(len(look) - most, 0)
+    to_name = [scan for verdict in _LOOK for scan in scans if scan.verdict is verdict] if not every else list(scans)
+    return to_name[:most], max(len(to_name) - most, 0)
 
 
 def archive_summary(project: Project, files: Mapping[str, Path]) -> Summary:
@@ -227,8 +227,8 @@ def shard_summary(project: Project, path: Path, shard: tuple[int, int]) -> Summa
 
 
 def _summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
-    told = ", ".join(f"{count} {verdict}" for verdict, count in status.counts.items() if count) or "none"
-    sentence = f"Measured: {len(status.scans)} scans: {told}."
+    counts_text = ", ".join(f"{count} {verdict}" for verdict, count in status.counts.items() if count) or "none"
+    sentence = f"Measured: {len(status.scans)} scans: {counts_text}."
     named, more = worst_named(status.scans, NAMED, False)
     problems = [Problem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
     problems += [Problem(f"decisions.jsonl, {line}", "It does not count.") for line in status.idle_decisions]

@@ -184,7 +184,7 @@ class Work:
         """Measure these, the last of so many scans: those that are measured already count as done."""
         cameras = [self._project.camera_of(task.name).path.stem for task in tasks]
         expected = ExpectedTime(tasks, cameras, self._at_a_time)
-        said_s, failed = time.monotonic(), defaultdict[str, list[str]](list)
+        reported_s, failed = time.monotonic(), defaultdict[str, list[str]](list)
         with reporter.stage("measured") as count:
             for done, (task, row, kept) in enumerate(self._measured(tasks, as_scans=True), 1):
                 measured = scans - len(tasks) + done
@@ -199,8 +199,8 @@ class Work:
                 left = f"{measured} of {scans}{f', {failures} failed' if failures else ''}"
                 count(left if reporter.is_terminal or len(tasks) <= TASKS_A_CORE else "", measured, scans)
                 now_s = time.monotonic()
-                if done < len(tasks) and (done == self._at_a_time or now_s - said_s > _SAID_EVERY_S):
-                    said_s = now_s
+                if done < len(tasks) and (done == self._at_a_time or now_s - reported_s > _SAID_EVERY_S):
+                    reported_s = now_s
                     reporter.say(f"{left}; {expected.sentence}")
         for first, *others in failed.values():
             if others:
@@ -243,26 +243,26 @@ class Work:
             raise NotMeasured
         states = {task.name: self.state(task) for task in tasks}
         for task, result in results_of(measure_file, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
-            seen = result if isinstance(result, MeasuredFile) else MeasuredFile(ended_scan(task, result), "", -1)
-            kept = self._kept(task, states[task.name], seen)
-            if self._thumbnails is not None and seen.thumbnails:
-                self._thumbnails.keep(kept.fingerprint, seen.thumbnails)
-            asked = self._asked(task.name) if as_scans else None
-            row = self._store.keep(kept, task.name if as_scans else None, as_scans, asked)
+            file = result if isinstance(result, MeasuredFile) else MeasuredFile(ended_scan(task, result), "", -1)
+            kept = self._kept(task, states[task.name], file)
+            if self._thumbnails is not None and file.thumbnails:
+                self._thumbnails.keep(kept.fingerprint, file.thumbnails)
+            request_hash = self._asked(task.name) if as_scans else None
+            row = self._store.keep(kept, task.name if as_scans else None, as_scans, request_hash)
             self._identities[kept.identity.state.uri], self._rows[kept.fingerprint] = kept.identity, row
             self._now.add(row)
             yield task, row, kept
 
-    def _kept(self, task: ScanTask, state: FileState, seen: MeasuredFile) -> Kept:
+    def _kept(self, task: ScanTask, state: FileState, file: MeasuredFile) -> Kept:
         known = self._identities.get(state.uri)
-        lost = not seen.parts_hash and known is not None and known.state == state
-        parts = known.parts_hash if lost and known is not None else seen.parts_hash
+        lost = not file.parts_hash and known is not None and known.state == state
+        parts = known.parts_hash if lost and known is not None else file.parts_hash
         return Kept(
             Identity(state, parts),
             _options_json(task),
-            record_of(seen.scan, self._folder),
-            seen.scan.seconds,
-            seen.bytes_read,
+            record_of(file.scan, self._folder),
+            file.scan.seconds,
+            file.bytes_read,
             self._project.camera_of(task.name).path.name,
         )
 

@@ -126,14 +126,14 @@ def _image(expected: Expected, image: Image) -> Json:
 
 
 def _points(expected: Expected) -> Json:
-    seen = [
+    observed = [
         point
         for point, kind in zip(expected.network.observations.point, expected.network.observations.kind, strict=True)
         if kind == "target"
     ]
     return {
         point.id: {axis: _quantity(expected, Parameter.point(point.id, axis)) for axis in "XYZ"}
-        | {"images": seen.count(point.id)}
+        | {"images": observed.count(point.id)}
         for point in expected.network.points
     }
 
@@ -142,11 +142,11 @@ def _point_summary(expected: Expected) -> Json:
     """Over the points whose coordinate is not fixed and is determined; how many are not determined."""
     summary: Json = {}
     for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
-        told = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
+        estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
         summary[axis] = {
-            "rms": rms(told),
-            "largest": float(told.max(initial=0.0)),
-            "estimated": len(told),
+            "rms": rms(estimated),
+            "largest": float(estimated.max(initial=0.0)),
+            "estimated": len(estimated),
             "undetermined": int(np.isinf(sigmas).sum()),
         }
     return summary

@@ -141,10 +141,10 @@ class Expected:
         parameters in their own units, `ray`: where a ray is imaged at the largest radius, um.
         """
         names = list(self._unknowns)
-        told = dict(zip(names, self.plan.sigmas(self._full_names, np.eye(len(names))), strict=True))
-        sigmas = {name: UM_PER_MM * float(told[name]) for name in INTERIOR}
-        sigmas |= {name: float(told[name]) for name in self.family_parameters}
-        marks = [float(told[name]) for name in names[len(INTERIOR) + len(self._parameters) :]]
+        by_name = dict(zip(names, self.plan.sigmas(self._full_names, np.eye(len(names))), strict=True))
+        sigmas = {name: UM_PER_MM * float(by_name[name]) for name in INTERIOR}
+        sigmas |= {name: float(by_name[name]) for name in self.family_parameters}
+        marks = [float(by_name[name]) for name in names[len(INTERIOR) + len(self._parameters) :]]
         sigmas |= {"fiducials": UM_PER_MM * rms(marks), "ray": self.curve[-1].ray_um}
         sigmas |= {"scanner": UM_PER_MM * rms(list(self.scanner_sigmas.values()))}
         return {name: sigma for name, sigma in sigmas.items() if sigma > 0.0}

@@ -137,17 +137,17 @@ def planned_network(setup: Setup) -> tuple[Network, Approximations]:
     visible mark is measured. A point of which nothing is known and
     that fewer than two images show has no part in it. Raises InputError where an image shows too few targets.
     """
-    seen = {image.name: setup.seen_by(image) for image in setup.images}
-    for name, rows in seen.items():
+    visible = {image.name: setup.seen_by(image) for image in setup.images}
+    for name, rows in visible.items():
         if len(rows) < FEWEST_TARGETS:
             raise InputError(
                 f"Image {name!r} would show {len(rows)} targets and needs {FEWEST_TARGETS}. Move or turn it towards "
                 "the field, or leave it out."
             )
-    rays = Counter(i for rows in seen.values() for i in rows)
+    rays = Counter(i for rows in visible.values() for i in rows)
     used = [i for i in sorted(rays) if rays[i] >= 2 or math.isfinite(min(_sigmas(setup.points[i])))]
     camera = _camera(setup)
-    observations = _observations(setup, seen, set(used))
+    observations = _observations(setup, visible, set(used))
     points = [setup.points[i] for i in used]
     planned = Network(
         cameras=(camera,),
@@ -207,7 +207,7 @@ def _object_point(point: PlannedPoint) -> network.ObjectPoint:
     return network.ObjectPoint(point.id, Prior(x, plane), Prior(y, plane), Prior(z, height))
 
 
-def _observations(setup: Setup, seen: dict[str, list[int]], used: set[int]) -> Observations:
+def _observations(setup: Setup, visible: dict[str, list[int]], used: set[int]) -> Observations:
     """One row a visible mark; the coordinates are computed when the network is planned."""
     film_um = setup.settings.film_sigma_um
     rows: list[tuple[str, str, ObservationKind, float]] = []
@@ -217,7 +217,7 @@ def _observations(setup: Setup, seen: dict[str, list[int]], used: set[int]) -> O
             shown = [one.id for one in setup.camera.fiducials if one.id not in image.covered]
             rows += [(image.name, id, "fiducial", sigma) for id in shown]
         sigma = math.hypot(setup.settings.sigma_target_um, film_um)
-        rows += [(image.name, setup.points[i].id, "target", sigma) for i in seen[image.name] if i in used]
+        rows += [(image.name, setup.points[i].id, "target", sigma) for i in visible[image.name] if i in used]
     images, points, kinds, sigmas_um = zip(*rows, strict=True)
     variances_mm2 = (np.array(sigmas_um) / 1000.0) ** 2
     return Observations(images, points, kinds, np.zeros((len(rows), 2)), variances_mm2[:, None, None] * np.eye(2))

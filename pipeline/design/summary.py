@@ -200,8 +200,8 @@ def _scanner_table(expected: Expected) -> Table:
 def _point_table(expected: Expected) -> Table:
     table = Table("coordinate", "rms", "largest", title="Object points, sigma", title_justify="left")
     for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
-        told = [float(sigma) for sigma in sigmas if sigma > 0.0]
-        table.add_row(axis, _sigma(rms(told)) if told else "fixed", _sigma(max(told)) if told else "fixed")
+        free = [float(sigma) for sigma in sigmas if sigma > 0.0]
+        table.add_row(axis, _sigma(rms(free)) if free else "fixed", _sigma(max(free)) if free else "fixed")
     return table
 
 

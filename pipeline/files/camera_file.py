@@ -265,8 +265,8 @@ def _writing(table: Table) -> tuple[shapes.WrittenPlace, ...]:
 def written_place_text(place: shapes.WrittenPlace) -> str:
     """A place as a camera file has it."""
     direction = [word for word, pose in READS.items() if pose == place.pose]
-    told = [*(["plate"] if place.plate else []), *(f"reads {word}" for word in direction)]
-    return f"{place.side}: {' '.join(told)}" if told else place.side
+    parts = [*(["plate"] if place.plate else []), *(f"reads {word}" for word in direction)]
+    return f"{place.side}: {' '.join(parts)}" if parts else place.side
 
 
 def _source(table: Table) -> Source:
@@ -293,8 +293,8 @@ def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
         for other in fiducials.values():
             if other.xy_mm == xy:
                 raise entry.error("xy_mm", f"fiducial {other.id!r} has the same place. Every mark has one of its own.")
-        seen = entry.pair("seen_mm") if "seen_mm" in entry else None
-        fiducials[id] = GivenFiducial(id, xy, sigma, drawn, mark == NO_MARK and drawn is None, seen)
+        origin_mm = entry.pair("seen_mm") if "seen_mm" in entry else None
+        fiducials[id] = GivenFiducial(id, xy, sigma, drawn, mark == NO_MARK and drawn is None, origin_mm)
         entry.done()
     return tuple(fiducials.values())
 

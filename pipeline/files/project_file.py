@@ -88,8 +88,8 @@ class Project:
     @property
     def reads(self) -> Reads:
         """In which scans writing is read: in all where images.csv asks for what it says, unless the user forbids it."""
-        asked = self.given_images is not None and self.given_images.asks_writing
-        return "all" if asked and self.writing == "pose" else self.writing
+        is_requested = self.given_images is not None and self.given_images.asks_writing
+        return "all" if is_requested and self.writing == "pose" else self.writing
 
     @property
     def film(self) -> BelievedFilm:

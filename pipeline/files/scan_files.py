@@ -146,8 +146,8 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
     scans: dict[str, Named] = {}
     for file, name in zip(files, names_below(files), strict=True):
         if not name.isprintable():
-            told = f"the file name {Path(file).name!a} is not text in UTF-8 on one line. Rename it."
-            raise table.error("scans", told)
+            message = f"the file name {Path(file).name!a} is not text in UTF-8 on one line. Rename it."
+            raise table.error("scans", message)
         if name in scans:
             raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
         scans[name] = file

@@ -47,18 +47,18 @@ def is_whole_plate(lines: Sequence[Line]) -> bool:
 
 def contradictions(camera: CameraFile, plate: dict[str, str]) -> list[str]:
     """How a plate says that it is of another camera, a clause each."""
-    told = []
+    clauses = []
     makers = [maker for maker in _MAKERS if maker.lower() in camera.name.lower()]
     if "camera_type" in plate and makers and plate["camera_type"] not in makers:
-        told.append(f"it is of a camera by {plate['camera_type']}")
+        clauses.append(f"it is of a camera by {plate['camera_type']}")
     given = camera.principal_distance_mm
     if given and "principal_distance_mm" in plate:
         read = float(plate["principal_distance_mm"])
         if abs(read / given - 1.0) > _OTHER_CONE:
-            told.append(f"it gives a principal distance of {read:g} mm")
+            clauses.append(f"it gives a principal distance of {read:g} mm")
     if camera.number and plate.get("camera_number", camera.number) != camera.number:
-        told.append(f"it gives the number {plate['camera_number']}, the file {camera.number}")
-    return told
+        clauses.append(f"it gives the number {plate['camera_number']}, the file {camera.number}")
+    return clauses
 
 
 def with_plates(
@@ -204,18 +204,18 @@ class Identification:
                 "faint; --pitch helps where the scan's file does not say it."
             )
         first = self.best[0]
-        told = (
+        text = (
             f"{self.scan.name}: {' or '.join(first.cameras)}, score {first.score:.2f}: {first.found} of {first.drawn} "
             f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; {first.against_chance}."
         )
         if len(self.best) > 1:
-            told += f" {' or '.join(self.best[1].cameras)} comes close with {self.best[1].score:.2f}."
+            text += f" {' or '.join(self.best[1].cameras)} comes close with {self.best[1].score:.2f}."
         elif len(first.cameras) > 1:
-            told += " Their marks are alike; the data strip or the focal length must decide."
+            text += " Their marks are alike; the data strip or the focal length must decide."
         named = [name for trial in self.best for name in trial.cameras if name in self.unreported]
-        told += "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
+        text += "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
         against = self.against_pitch()
-        return told + self._of_forms() + self._of_plate() + (f" {against}" if against else "")
+        return text + self._of_forms() + self._of_plate() + (f" {against}" if against else "")
 
     def much_alike(self) -> tuple[str, ...]:
         """Other cameras whose marks are drawn much like those that stand out: wings, notches or arrows."""
@@ -261,8 +261,8 @@ class Identification:
     def as_json(self) -> Json:
         trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
         best = [name for trial in self.best for name in trial.cameras]
-        told = {"scan": str(self.scan), "best": best, "sentence": self.sentence(), "trials": trials}
-        return {**told, "plate": dict(self.plate), "contradicted": sorted(self.contradicted)}
+        head = {"scan": str(self.scan), "best": best, "sentence": self.sentence(), "trials": trials}
+        return {**head, "plate": dict(self.plate), "contradicted": sorted(self.contradicted)}
 
 
 def print_identification(identification: Identification, console: Console) -> None:

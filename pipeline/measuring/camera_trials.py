@@ -193,8 +193,8 @@ def identify(
     trials = [replace(trial, pixel_um=trial.pixel_um and trial.pixel_um / times) for trial in trials]
     ranked = tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected)))
     plate = _plate(picture) if any(trial.stands_out for trial in trials) else {}
-    told = {name: contradictions(camera, plate) for name, camera in cameras.items()}
-    contradicted = {name: against for name, against in told.items() if against}
+    against_plate = {name: contradictions(camera, plate) for name, camera in cameras.items()}
+    contradicted = {name: against for name, against in against_plate.items() if against}
     return Identification(path, ranked, unreported, given, plate, contradicted, drawn_alike(layouts))
 
 
@@ -211,7 +211,7 @@ def _as_seen(layout: FiducialLayout) -> FiducialLayout:
     more than a corner, and answers to many a thing: it is taken as drawn."""
     half_mm = np.array(layout.frame_mm) / 2
     pairs = zip(layout.marks, limit_to_frame(layout).marks, strict=True)
-    marks = tuple(seen if (np.abs(given.xy_mm) < half_mm).all() else given for given, seen in pairs)
+    marks = tuple(limited if (np.abs(given.xy_mm) < half_mm).all() else given for given, limited in pairs)
     return replace(layout, marks=marks)
 
 

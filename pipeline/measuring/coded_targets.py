@@ -198,10 +198,10 @@ def measure_coded_field(
         if (reason := _contradiction(one, misread))
     }
     sought = [one for one in predictions if one.point not in contradicted]
-    seen = {mark.point: mark for mark in measure_disks(scan, sought, TargetOptions(points.settings.polarity))}
+    fitted = {mark.point: mark for mark in measure_disks(scan, sought, TargetOptions(points.settings.polarity))}
     unseen = Reason("it lies behind the camera", Code.OUTSIDE)
     absent = {id: MarkMeasurement(id, "target", None, None, Status.ABSENT, unseen) for id in points.ids}
-    marks = tuple((absent | seen | contradicted).values())
+    marks = tuple((absent | fitted | contradicted).values())
     return checked_places(marks, field, named.model, measured), notes
 
 

@@ -83,8 +83,8 @@ def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Place
         return
     given = _up_from_camera(_through_clicks(task.options, scan, px))
     clicked = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
-    asked = task.options.fiducials.pose
-    if asked == clicked or (asked == "auto" and (scan.orientation == 1 or camera.clicks.who)):
+    setting = task.options.fiducials.pose
+    if setting == clicked or (setting == "auto" and (scan.orientation == 1 or camera.clicks.who)):
         return
     tag = (
         f"The file's orientation tag ({scan.orientation}) asks viewers to turn the picture, and columns and rows count "
@@ -92,7 +92,7 @@ def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Place
         if scan.orientation != 1
         else ""
     )
-    does = f"sets {asked}" if asked != "auto" else "sets none"
+    does = f"sets {setting}" if setting != "auto" else "sets none"
     raise InputError(
         f"{camera.path}: the clicks in {task.name} show the frame in the scan orientation {clicked}, and the project "
         f"{does}. {tag}Click the marks in `reseau review`, which shows it as stored, or set the right orientation "
@@ -110,11 +110,13 @@ def _in_common(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor 
         )
     compared = [tasks[round(k)] for k in np.linspace(0, len(tasks) - 1, min(len(tasks), _COMPARED))]
     views = list(map_items(workers, _view, compared))
-    seen = [(task, view) for task, view in zip(compared, views, strict=True) if view is not None]
-    if len(seen) < 2:
-        raise MeasurementError(f"{camera.path}: {_NOT_COMMON} the drawn marks were found in {len(seen)} of its scans.")
+    usable = [(task, view) for task, view in zip(compared, views, strict=True) if view is not None]
+    if len(usable) < 2:
+        raise MeasurementError(
+            f"{camera.path}: {_NOT_COMMON} the drawn marks were found in {len(usable)} of its scans."
+        )
     jobs = [
-        (seen[0][1].windows[one.id], [view.windows[one.id] for _, view in seen[1:]], one.learned_mm)
+        (usable[0][1].windows[one.id], [view.windows[one.id] for _, view in usable[1:]], one.learned_mm)
         for one in camera.learned
     ]
     found = list(map_items(workers, _recurrence, jobs))
@@ -122,9 +124,9 @@ def _in_common(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor 
     if lost:
         raise MeasurementError(
             f"{camera.path}: {_NOT_COMMON} nothing near the coordinates of fiducial {', '.join(lost)} recurs in all of "
-            f"{len(seen)} scans in one place."
+            f"{len(usable)} scans in one place."
         )
-    task, view = seen[0]
+    task, view = usable[0]
     matrix = view.placement
     px = {
         one.id: matrix[:, :2] @ (np.array(one.xy_mm) + each.offset_mm) + matrix[:, 2]

@@ -200,11 +200,11 @@ def _with_common_origins(camera: CameraFile, poses: Collection[str]) -> CameraFi
     places = np.array([one.seen_mm or one.xy_mm for one in learned])
     marks = [one.mark for one in learned if isinstance(one.mark, MarkTemplate)]
     templates, moves = share_origins(marks, places, poses)
-    seen = {
+    moved = {
         one.id: replace(one, mark=template, seen_mm=(float(x), float(y)))
         for one, template, (x, y) in zip(learned, templates, places + moves, strict=True)
     }
-    return replace(camera, fiducials=tuple(seen.get(one.id, one) for one in camera.fiducials))
+    return replace(camera, fiducials=tuple(moved.get(one.id, one) for one in camera.fiducials))
 
 
 def _stored(camera: CameraFile, place: Path, folder: Path) -> CameraFile:

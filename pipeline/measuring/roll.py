@@ -103,11 +103,11 @@ def _first(tasks: Sequence[ScanTask]) -> list[ScanTask]:
 def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:
     """The lines by which to know, on frames that are not read yet, that they lie as some of these do: of each way in
     which two or more lie in their scans the one that tells itself best."""
-    seen = [(known, line) for frame in frames for line in frame.writing or () if (known := _known(frame, line))]
+    lines = [(known, line) for frame in frames for line in frame.writing or () if (known := _known(frame, line))]
     recurring = [
         (known, line)
-        for known, line in seen
-        if sum(known.side == other.side and known.matches(again) for other, again in seen) > 1
+        for known, line in lines
+        if sum(known.side == other.side and known.matches(again) for other, again in lines) > 1
     ]
     best: dict[str, tuple[KnownLine, Line]] = {}
     for known, line in sorted(recurring, key=lambda each: -each[1].lead):
@@ -133,10 +133,10 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
     poses = {frame.image: frame.pose for frame in frames if frame.pose is not None and frame.pose.writing}
     if len(poses) < 2:
         return {}
-    told = _writing_likelihoods([frame for frame in frames if frame.image in poses], places)
-    alike = [turn for turn in _TURNS if told[turn] > -DECIDED]
+    likelihoods = _writing_likelihoods([frame for frame in frames if frame.image in poses], places)
+    alike = [turn for turn in _TURNS if likelihoods[turn] > -DECIDED]
     usual = Counter(_turn(pose) for pose in poses.values())
-    chosen = max(alike, key=lambda turn: (told[turn] > -TOLD, usual[turn]))
+    chosen = max(alike, key=lambda turn: (likelihoods[turn] > -TOLD, usual[turn]))
     undecided = [frame for frame in frames if frame.image in poses and not poses[frame.image].decided]
     return {frame.image: _together(frame, chosen, len(alike) == 1, len(poses)) for frame in undecided}
 
@@ -149,9 +149,9 @@ def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[Wr
         assert frame.pose is not None
         for line in frame.writing or ():
             texts.setdefault(re.sub(r"[\W\d]", "", line.text) or re.sub(r"\d", "0", line.text), (frame.pose, line))
-    decided = {_turn(frame.pose) for frame in frames if frame.pose and frame.pose.decided}
+    decided_turns = {_turn(frame.pose) for frame in frames if frame.pose and frame.pose.decided}
     scores = [sum(line_score(line, places, _in_scan(pose, turn)) for pose, line in texts.values()) for turn in _TURNS]
-    likelihoods = bounded(np.array(scores)) - [DECIDED if decided - {turn} else 0.0 for turn in _TURNS]
+    likelihoods = bounded(np.array(scores)) - [DECIDED if decided_turns - {turn} else 0.0 for turn in _TURNS]
     return dict(zip(_TURNS, (likelihoods - likelihoods.max()).tolist(), strict=True))
 
 
@@ -213,11 +213,11 @@ def checked(
     scans = roll.named([scan for scan in measured if not scan.failure], {scan.frame.image: scan for scan in again})
     marks = one_definition([scan.frame.marks for scan in scans])
     frames = [replace(scan.frame, marks=own) for scan, own in zip(scans, marks, strict=True)]
-    told = {
+    by_image = {
         scan.frame.image: replace(scan, frame=frame)
         for scan, frame in zip(scans, _judged(camera, frames, scans, film), strict=True)
     }
-    return tuple(CheckedScan(told.get(scan.frame.image, scan)) for scan in measured)
+    return tuple(CheckedScan(by_image.get(scan.frame.image, scan)) for scan in measured)
 
 
 def _judged(
@@ -258,9 +258,9 @@ def _with_problem(
     ]
     if not name or not others:
         return scan
-    told = ", ".join(f"{field} {value}" for field, value in name)
+    text = ", ".join(f"{field} {value}" for field, value in name)
     problem = Reason(
-        f"its writing says {told}, and so does that of {' and '.join(others)}: these are scans of one frame, or a line "
+        f"its writing says {text}, and so does that of {' and '.join(others)}: these are scans of one frame, or a line "
         "is misread. Leave one of them out, or look at frames.csv.",
         Code.AMBIGUOUS,
     )

@@ -64,10 +64,10 @@ class ScanKind:
         counts = Counter(name for names in self._named for name in names)
         if not counts:
             return f"no camera stands out in {len(self.samples)} of them"
-        told = ", ".join(f"{name} in {count}" for name, count in counts.most_common())
+        counts_text = ", ".join(f"{name} in {count}" for name, count in counts.most_common())
         if 2 * sum(map(bool, self._named)) > len(self.samples) and frozenset.intersection(*filter(None, self._named)):
-            return f"what is seen are marks of {told}, and the camera's plate in the picture says another one"
-        return f"of {len(self.samples)} samples not all show the same camera ({told})"
+            return f"what is seen are marks of {counts_text}, and the camera's plate in the picture says another one"
+        return f"of {len(self.samples)} samples not all show the same camera ({counts_text})"
 
     @property
     def _named(self) -> list[frozenset[str]]:

@@ -50,11 +50,11 @@ def measure_scans(
 
 def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
     """Of a scan that its executor has lost."""
-    told = "" if isinstance(error, BrokenExecutor) else f" ({' '.join(str(error).split())})"
+    detail = "" if isinstance(error, BrokenExecutor) else f" ({' '.join(str(error).split())})"
     return failed_scan(
         task,
         FailureCode.ENDED,
-        f"{task.shown_scan}: the process that measured it was ended, most likely because the memory was full{told}. "
+        f"{task.shown_scan}: the process that measured it was ended, most likely because the memory was full{detail}. "
         "Close other programs, and measure it again.",
     )
 
@@ -84,29 +84,29 @@ def failed_scan(task: ScanTask, code: FailureCode, sentence: str) -> MeasuredSca
 
 
 def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
-    told = " ".join(str(error).split())
+    sentence = " ".join(str(error).split())
     match error:
         case TooLargeError():
-            return FailureCode.TOO_LARGE, told
+            return FailureCode.TOO_LARGE, sentence
         case MissingError():
-            return FailureCode.MISSING, told
+            return FailureCode.MISSING, sentence
         case UnreachableError():
-            return FailureCode.UNREACHABLE, told
+            return FailureCode.UNREACHABLE, sentence
         case MeasurementError():
-            return FailureCode.UNREADABLE, told
+            return FailureCode.UNREADABLE, sentence
         case InputError():
-            return FailureCode.PITCH, told
+            return FailureCode.PITCH, sentence
         case MemoryError():
             return (
                 FailureCode.MEMORY,
                 f"{task.shown_scan}: the memory was full. Close other programs, and measure it again.",
             )
         case OSError():
-            return FailureCode.UNREADABLE, f"{task.shown_scan}: {error.strerror or told}. {what_to_do(error)}"
+            return FailureCode.UNREADABLE, f"{task.shown_scan}: {error.strerror or sentence}. {what_to_do(error)}"
     where = traceback.extract_tb(error.__traceback__)[-1]
     return (
         FailureCode.FAULT,
-        f"{task.shown_scan}: a fault of reseau itself; please report it: {type(error).__name__}: {told}, in "
+        f"{task.shown_scan}: a fault of reseau itself; please report it: {type(error).__name__}: {sentence}, in "
         f"{Path(where.filename).name}, line {where.lineno}.",
     )
 
@@ -123,14 +123,14 @@ def _opened_and_measured(task: ScanTask, look: Look | None) -> MeasuredScan:
 def _in_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
     """The scan with what a window of it shows, all places in pixels of the whole scan."""
     try:
-        seen = crop_scan(scan, window)
+        cropped = crop_scan(scan, window)
     except ValueError as error:
         raise MeasurementError(f"{scan.path}: {error}: correct images.csv") from None
     first = np.array(window[:2], float)
     fiducials = task.options.fiducials
     clicks = (replace(one, col_px=one.col_px - first[0], row_px=one.row_px - first[1]) for one in fiducials.clicks)
     options = replace(task.options, fiducials=replace(fiducials, clicks=tuple(clicks)))
-    measured = _measured(task, seen, options)
+    measured = _measured(task, cropped, options)
     frame = moved_frame(measured.frame, first)
     return replace(measured, width_px=scan.width_px, height_px=scan.height_px, frame=frame)
 
@@ -141,7 +141,7 @@ def _measured(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     tone = tone_before(options.tone, options.said, scan.path)
     frame = replace(_fiducials(options, scan.replace_tone(tone)), image=task.name)
     pitch, problems, notes = _pitch(options, scan, frame)
-    of_file = (Reason(f"{told[0].upper()}{told[1:]}.", Code.SECOND_PICTURE) for told in scan.problems)
+    of_file = (Reason(f"{problem[0].upper()}{problem[1:]}.", Code.SECOND_PICTURE) for problem in scan.problems)
     frame = replace(frame, problems=(*of_file, *frame.problems, *problems))
     curve = (frame.tone.note,) if frame.tone else ()
     file_notes = (f"{note[0].upper()}{note[1:]}." for note in scan.notes)
@@ -186,8 +186,8 @@ def _missed_reading(options: ScanOptions, frame: FrameMeasurement) -> tuple[str,
     """A note where something would have been read, but nothing is there that reads."""
     writing = options.fiducials.writing
     undecided = writing == "pose" and frame.pose is not None and not frame.pose.decided
-    asked = writing == "all" or undecided
-    return (f"{MISSING[0].upper()}{MISSING[1:]}.",) if asked and networks() is None else ()
+    is_requested = writing == "all" or undecided
+    return (f"{MISSING[0].upper()}{MISSING[1:]}.",) if is_requested and networks() is None else ()
 
 
 def _with_sizes(

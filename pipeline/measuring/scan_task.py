@@ -136,17 +136,19 @@ def options_of(project: Project, said: Mapping[str, tuple[ToneInformation, ...]]
     def options_for(name: str) -> ScanOptions:
         given = project.camera_of(name)
         pose, known = _pose(project, given, name)
-        told = said.get(name, ())
+        by_others = said.get(name, ())
         exterior = project.given_images.exterior.get(name) if project.given_images and targets else None
         part = bool(project.part_of(name))
-        key = (key_of[id(given)], pose, known is None, part, *map(id, told), id(exterior))
+        key = (key_of[id(given)], pose, known is None, part, *map(id, by_others), id(exterior))
         if key not in shared:
             film = project.film
             options = FiducialOptions(
                 pose, film_sigma_mm=film.sigma_mm, film_model=film.model, writing=project.reads, part=part
             )
             camera = cameras[key_of[id(given)]]
-            shared[key] = ScanOptions(camera, project.pitch_um, options, known, project.tone, told, targets, exterior)
+            shared[key] = ScanOptions(
+                camera, project.pitch_um, options, known, project.tone, by_others, targets, exterior
+            )
         return shared[key]
 
     return options_for

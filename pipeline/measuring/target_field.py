@@ -84,10 +84,10 @@ def disk_images(
     place, visible = model.comparator_from_object(centers)
     columns = []
     for direction in (first, second):
-        ahead, seen_ahead = model.comparator_from_object(centers + radius * direction)
-        behind, seen_behind = model.comparator_from_object(centers - radius * direction)
+        ahead, visible_ahead = model.comparator_from_object(centers + radius * direction)
+        behind, visible_behind = model.comparator_from_object(centers - radius * direction)
         columns.append(pixel_from_comparator((ahead - behind) / 2.0, pitch_um))
-        visible = visible & seen_ahead & seen_behind
+        visible = visible & visible_ahead & visible_behind
     maps = np.stack(columns, axis=-1)
     depth = (model.station - centers) @ model.rotation[2]
     deeper = -np.stack([first, second], axis=1) @ model.rotation[2] * radius / depth[:, None]
@@ -196,13 +196,13 @@ def checked_places(
     """The marks, those doubted or refused that lie where a right one seldom or never does; model: the image, oriented
     to some degrees."""
     observed = {mark.point: mark for mark in marks if mark.status.is_observation}
-    seen = np.array([mark.center_px for mark in observed.values()]).reshape(-1, 2)
+    places_px = np.array([mark.center_px for mark in observed.values()]).reshape(-1, 2)
     covariances = np.array([mark.covariance_px2 for mark in observed.values()]).reshape(-1, 2, 2)
     if len(observed) < 2:
         return tuple(marks)
     row = {id: i for i, id in enumerate(field.ids)}
     targets = target_places(field.of([row[id] for id in observed]), model, scan)
-    comparison = compared(targets, seen, covariances, (scan.width_px, scan.height_px))
+    comparison = compared(targets, places_px, covariances, (scan.width_px, scan.height_px))
     far = np.linalg.norm(comparison.off_px, axis=1)
     verdicts = dict(zip(observed, zip(far.tolist(), comparison.chance.tolist(), strict=True), strict=True))
     return tuple(_judged(mark, verdicts) for mark in marks)

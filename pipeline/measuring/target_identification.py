@@ -347,11 +347,11 @@ def frame_mm(camera: CameraFile, model: ImageModel, measured: MeasuredScan) -> A
     """(2, 2) least and greatest camera coordinates of what the scan shows of the exposed frame."""
     last = np.array([measured.width_px - 1, measured.height_px - 1])
     corners = comparator_from_pixel(np.array([(0, 0), (1, 0), (0, 1), (1, 1)]) * last, measured.pitch_um)
-    seen = model.camera_from_comparator(corners)
+    shown_mm = model.camera_from_comparator(corners)
     if camera.fiducials and camera.frame_mm is not None:
         half = np.array(camera.frame_mm) / 2.0
-        seen = np.clip(seen, -half, half)
-    return np.stack([seen.min(axis=0), seen.max(axis=0)])
+        shown_mm = np.clip(shown_mm, -half, half)
+    return np.stack([shown_mm.min(axis=0), shown_mm.max(axis=0)])
 
 
 def _camera_from_comparator(camera: CameraFile, measured: MeasuredScan) -> Film | None:

@@ -138,8 +138,8 @@ def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) ->
         marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in field.ids)
         return with_targets(measured, marks, (*notes, f"No target has a name: {found}."))
     model, predictions = found
-    seen = measure_single_targets(scan, predictions, settings)
-    return with_targets(measured, checked_places(seen, field, model, measured), notes)
+    fitted = measure_single_targets(scan, predictions, settings)
+    return with_targets(measured, checked_places(fitted, field, model, measured), notes)
 
 
 def with_targets(
@@ -151,8 +151,8 @@ def with_targets(
     """The scan with these targets instead of the ones it has; code: of the problems."""
     frame = measured.frame
     fiducials = tuple(mark for mark in frame.marks if mark.kind in ON_FILM)
-    told = (Reason(problem, code) for problem in problems)
-    return replace(measured, frame=replace(frame, marks=(*fiducials, *targets), problems=(*frame.problems, *told)))
+    reasons = (Reason(problem, code) for problem in problems)
+    return replace(measured, frame=replace(frame, marks=(*fiducials, *targets), problems=(*frame.problems, *reasons)))
 
 
 def _oriented_by_targets(

@@ -45,11 +45,11 @@ def with_joins(
     for scan in scans:
         if frame := project.part_of(scan.frame.image):
             by_frame.setdefault(frame, []).append(scan)
-    told: dict[str, MeasuredScan] = {}
+    joined: dict[str, MeasuredScan] = {}
     for done, (frame, parts) in enumerate(sorted(by_frame.items()), 1):
-        told |= {scan.frame.image: scan for scan in _joined(project, frame, parts, workers)}
+        joined |= {scan.frame.image: scan for scan in _joined(project, frame, parts, workers)}
         count(frame, done, len(by_frame))
-    return tuple(told.get(scan.frame.image, scan) for scan in scans)
+    return tuple(joined.get(scan.frame.image, scan) for scan in scans)
 
 
 def _joined(
@@ -97,8 +97,8 @@ def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
                 continue
             for scan, other in ((first, second), (second, first)):
                 result[scan.frame.image] = _contradicted(result[scan.frame.image], other, off_mm)
-    told = [_unchecked(result[scan.frame.image], scan.frame.image in checked) for scan in scans]
-    return [_with_others(scan, told) for scan in told]
+    checked_parts = [_unchecked(result[scan.frame.image], scan.frame.image in checked) for scan in scans]
+    return [_with_others(scan, checked_parts) for scan in checked_parts]
 
 
 def _with_others(scan: MeasuredScan, parts: Sequence[MeasuredScan]) -> MeasuredScan:
@@ -138,11 +138,11 @@ def _movement(first: MeasuredScan, second: MeasuredScan) -> Array | None:
 
 def _discrepancy_mm(first: MeasuredScan, second: MeasuredScan, second_from_first: Array) -> float | None:
     """How far, rms, the fiducials of the second lie from where the frame of the first puts them, through the joins."""
-    frame, seen = first.frame.pixel_from_camera, second.frame.pixel_from_camera
-    if frame is None or seen is None or not _fiducials(second):
+    frame, second_frame = first.frame.pixel_from_camera, second.frame.pixel_from_camera
+    if frame is None or second_frame is None or not _fiducials(second):
         return None
     there = np.array(list(_fiducials(second).values()))
-    camera = (there - seen[:, 2]) @ np.linalg.inv(seen[:, :2]).T
+    camera = (there - second_frame[:, 2]) @ np.linalg.inv(second_frame[:, :2]).T
     here = camera @ frame[:, :2].T + frame[:, 2]
     predicted = here @ second_from_first[:, :2].T + second_from_first[:, 2]
     off_px = np.hypot(*(predicted - there).T)
@@ -156,18 +156,18 @@ def _span_mm(first: MeasuredScan, second: MeasuredScan) -> float:
 
 def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> MeasuredScan:
     """With a problem; the fiducials of the scan that shows no more of them are rejected."""
-    told = (
+    what = (
         f"the fiducial marks contradict those of {other.frame.image}, another part of this frame: what joins both puts "
         f"them {off_mm:.1f} mm apart"
     )
     problem = Reason(
-        f"{told[0].upper()}{told[1:]}. One of the frames lies elsewhere than it was found, or in another pose: look at "
+        f"{what[0].upper()}{what[1:]}. One of the frames lies elsewhere than it was found, or in another pose: look at "
         "both, and place the marks or set the pose in a review.",
         Code.AMBIGUOUS,
     )
     marks: Sequence[MarkMeasurement] = scan.frame.marks
     if len(_fiducials(scan)) <= len(_fiducials(other)):
-        marks = _changed(scan, Status.REJECTED, Reason(told, Code.AMBIGUOUS))
+        marks = _changed(scan, Status.REJECTED, Reason(what, Code.AMBIGUOUS))
     return replace(scan, frame=replace(scan.frame, marks=tuple(marks), problems=(*scan.frame.problems, problem)))
 
 
@@ -247,12 +247,12 @@ def tied(
 ) -> tuple[TiedScan, ...]:
     """Checked scans as all of the project together show them, in their order: points of a sheet or board that
     contradict its other pictures, what joins the parts of frames, and natural points."""
-    seen = with_checked_sheet(project, [scan for scan in scans if not scan.failure])
+    together = with_checked_sheet(project, [scan for scan in scans if not scan.failure])
     if project.has_parts:
         with reporter.stage("parts joined of") as count:
-            seen = with_joins(project, seen, count, executor)
+            together = with_joins(project, together, count, executor)
     if project.ties is not None:
         with reporter.stage("natural points sought in") as count:
-            seen = with_ties(project, project.ties, seen, count, executor)
-    told = {scan.frame.image: scan for scan in seen}
-    return tuple(TiedScan(told.get(scan.frame.image, scan)) for scan in scans)
+            together = with_ties(project, project.ties, together, count, executor)
+    by_image = {scan.frame.image: scan for scan in together}
+    return tuple(TiedScan(by_image.get(scan.frame.image, scan)) for scan in scans)

@@ -42,7 +42,7 @@ def said_of_tones(
         kinds.setdefault(_kind(project, name), []).append(name)
     keys = {kind: _key(project, kind, of_kind) for kind, of_kind in kinds.items() if len(of_kind) > 1}
     before = {kind: memory.told(key) for kind, key in keys.items()}
-    samples = {kind: few_of(kinds[kind], _SAMPLES) for kind, told in before.items() if told is None}
+    samples = {kind: few_of(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
     said = {name: said_of(one) for kept in before.values() for name, one in (kept or {}).items()}
     with reporter.stage("tone curve looked for in") as tell:
@@ -52,13 +52,13 @@ def said_of_tones(
                 said[scan.frame.image] = scan.frame.tone.information
     for kind, names_of in samples.items():
         memory.tell(keys[kind], {name: said_record(said[name]) for name in names_of if name in said})
-    told = dict[str, tuple[ToneInformation, ...]]()
+    by_image = dict[str, tuple[ToneInformation, ...]]()
     for kind, kept in before.items():
         of_kind = samples[kind] if kept is None else list(kept)
         by_others = {name: tuple(said[one] for one in of_kind if one in said and one != name) for name in of_kind}
         by_all = tuple(said[one] for one in of_kind if one in said)
-        told |= {name: by_others.get(name, by_all) for name in kinds[kind]}
-    return told
+        by_image |= {name: by_others.get(name, by_all) for name in kinds[kind]}
+    return by_image
 
 
 def _key(project: Project, kind: str, names: Sequence[str]) -> str:
@@ -80,8 +80,8 @@ def _prior(setting: float | str, scan: Path) -> Tone:
 def _kind(project: Project, image: str) -> str:
     """One scanner codes light in one way, but for files of another kind or that say another curve."""
     scan = project.scans[image]
-    told = sha256(np.ascontiguousarray(_prior(project.tone, scan).base).tobytes()).hexdigest()[:8]
-    return f"{project.scanner_of(image)} {scan.suffix.lower()} {told}"
+    curve_hash = sha256(np.ascontiguousarray(_prior(project.tone, scan).base).tobytes()).hexdigest()[:8]
+    return f"{project.scanner_of(image)} {scan.suffix.lower()} {curve_hash}"
 
 
 def _leans_on_tone(camera: CameraFile) -> bool:

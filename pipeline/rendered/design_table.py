@@ -155,8 +155,8 @@ def _orientations(tables: Sequence[Table]) -> tuple[PlannedOrientation, ...]:
     for table in tables:
         image = table.text("image", "")
         if image in orientations:
-            told = f"image {image!r}" if image else "all images"
-            raise table.error("image", f"an orientation of {told} is given already. Remove one of both.")
+            whose = f"image {image!r}" if image else "all images"
+            raise table.error("image", f"an orientation of {whose} is given already. Remove one of both.")
         position, angles = (_free_sigmas(table, key) for key in ("position_sigma", "angles_sigma_deg"))
         if all(math.isinf(sigma) for sigma in (*position, *angles)):
             raise table.error("position_sigma", "or angles_sigma_deg must be given: else nothing is observed.")

@@ -145,10 +145,10 @@ def _images_csv(scene_file: SceneFile, middle: Array, generator: np.random.Gener
     columns = ["image", "X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg"]
     images = scene_file.scene.images
     has_parts = any(image.part_of for image in images)
-    rows, told = [], set[str]()
+    rows, written = [], set[str]()
     for image in images:
-        exterior = _given_exterior(scene_file, image, middle, generator) if image.frame not in told else [""] * 6
-        told.add(image.frame)
+        exterior = _given_exterior(scene_file, image, middle, generator) if image.frame not in written else [""] * 6
+        written.add(image.frame)
         rows.append([image.name, *exterior, *([image.part_of] if has_parts else [])])
     return _csv([*columns, *(["part_of"] if has_parts else [])], rows)
 

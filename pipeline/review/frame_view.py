@@ -191,8 +191,8 @@ class Looking:
     def others(self, image: str, point: str, kind: str) -> Sequence[str]:
         """Frames beside which the mark is shown: of the same camera, where it was measured."""
         with Store(self._store) as store:
-            told = (image, _NEAR, _NEAR, image, point, kind, _OTHERS)
-            rows = store.connection.execute(_BESIDE, told).fetchall()
+            sql_parameters = (image, _NEAR, _NEAR, image, point, kind, _OTHERS)
+            rows = store.connection.execute(_BESIDE, sql_parameters).fetchall()
         return [name for (name,) in rows]
 
 
@@ -240,8 +240,8 @@ def _second(mark: MarkMeasurement) -> list[float] | None:
 def _causes(mark: MarkMeasurement) -> list[Json]:
     """What its sigma consists of, the largest part first."""
     parts = mark.covariance.parts.items() if mark.covariance else ()
-    told = [(str(c), CAUSE_MEANING[c], float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
-    return [{"cause": c, "meaning": m, "sigma_px": s} for c, m, s in sorted(told, key=lambda one: -one[2])]
+    parts_px = [(str(c), CAUSE_MEANING[c], float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
+    return [{"cause": c, "meaning": m, "sigma_px": s} for c, m, s in sorted(parts_px, key=lambda one: -one[2])]
 
 
 def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) -> MeasuredScan:

@@ -153,11 +153,11 @@ def _residual(scan: Scan, mark: Mark, pixel_from_mark: Array, blur_px: float, ha
     model = np.asarray(picture(mark, local, width, width, blur_px), dtype=np.float64)
     rows, cols = np.mgrid[-1 : 1 : width * 1j, -1 : 1 : width * 1j]
     design = np.stack([model, np.ones_like(model), rows, cols], axis=-1).reshape(-1, 4)
-    left, told = grey.ravel(), np.ones(grey.size, dtype=bool)
+    left, is_fitted = grey.ravel(), np.ones(grey.size, dtype=bool)
     for _ in range(_ROUNDS):  # what is damaged is to be seen, and not to spoil the rest
-        values, *_ = np.linalg.lstsq(design[told], grey.ravel()[told], rcond=None)
+        values, *_ = np.linalg.lstsq(design[is_fitted], grey.ravel()[is_fitted], rcond=None)
         left = grey.ravel() - design @ values
-        told = np.abs(left) <= _OUTLYING * np.median(np.abs(left))
+        is_fitted = np.abs(left) <= _OUTLYING * np.median(np.abs(left))
     shown = left.reshape(grey.shape)
     reach = max(np.percentile(np.abs(shown), 99.5), 1e-12)
     return np.asarray(np.rint(np.clip(shown / reach, -1.0, 1.0) * 127.0 + 128.0), dtype=np.uint8)

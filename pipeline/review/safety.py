@@ -73,8 +73,8 @@ def _refused(text: str) -> Response:
 def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            told: Mapping[str, str] = HEADERS
-            message["headers"] = [*message["headers"], *((k.lower().encode(), v.encode()) for k, v in told.items())]
+            own: Mapping[str, str] = HEADERS
+            message["headers"] = [*message["headers"], *((k.lower().encode(), v.encode()) for k, v in own.items())]
         await send(message)
 
     return sending

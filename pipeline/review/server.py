@@ -134,10 +134,10 @@ class _Answers:
 
     def mark(self, query: "_Query", body: Any) -> Any:
         image, point, kind = query.text("image"), query.text("point"), query.text("kind")
-        seen, session = self._session.looking.at(image), self._session
+        view, session = self._session.looking.at(image), self._session
         others = [session.looking.at(name) for name in session.looking.others(image, point, kind)]
         return {
-            **seen.detail_json(point, kind),
+            **view.detail_json(point, kind),
             "decided": session.decided_in(image),
             "others": [
                 {
@@ -179,13 +179,13 @@ class _Answers:
         return self._pictures.window(self._scan(query), *place, query.whole("size", 8, _WIDEST_PX))
 
     def residual(self, query: "_Query") -> bytes:
-        seen = self._session.looking.at(query.text("image"))
+        view = self._session.looking.at(query.text("image"))
         point, kind = query.text("point"), query.text("kind")
-        matrix, blur_px = seen.pixel_from_mark(point, kind), seen.mark(point, kind).quality.get("blur_px", 0.0)
+        matrix, blur_px = view.pixel_from_mark(point, kind), view.mark(point, kind).quality.get("blur_px", 0.0)
         if matrix is None or blur_px <= 0:
             raise MeasurementError("nothing was fitted there")
-        drawn = seen.drawn[point].mark
-        return self._pictures.residual(seen.scan.scan, drawn, matrix, blur_px, seen.window_px(point, kind))
+        drawn = view.drawn[point].mark
+        return self._pictures.residual(view.scan.scan, drawn, matrix, blur_px, view.window_px(point, kind))
 
     def whole(self, query: "_Query") -> bytes:
         return self._pictures.frame(self._scan(query))
@@ -210,8 +210,8 @@ class _Answers:
         self._session.looking.at(image)  # raises for one that is none
         if not isinstance(clicks, list) or len(clicks) < 3:
             raise InputError("three clicks on named marks or more are needed.")
-        told = [Click(str(one["point"]), float(one["col_px"]), float(one["row_px"])) for one in clicks]
-        return _trial_json(measured_from_clicks(self._session.learned, image, told))
+        given = [Click(str(one["point"]), float(one["col_px"]), float(one["row_px"])) for one in clicks]
+        return _trial_json(measured_from_clicks(self._session.learned, image, given))
 
     def learn(self, query: "_Query", body: Any) -> Any:
         """One scan measured with the marks as another one, or itself, shows them."""

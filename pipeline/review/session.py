@@ -189,8 +189,8 @@ class Session:
                 entry = self._by_key[key]
                 frames = tuple(zip(entry.images, entry.fingerprints, strict=True))
                 decisions = [replace(one, image=image, fingerprint=seen) for one in decisions for image, seen in frames]
-            told = [replace(self._of_file(one), who=self.who, when=when) for one in decisions]
-            append_decisions(self.project.decisions_path, told)
+            complete = [replace(self._of_file(one), who=self.who, when=when) for one in decisions]
+            append_decisions(self.project.decisions_path, complete)
             self.refresh()
 
     def page(self, filters: Filters, start: int = 0) -> Json:
@@ -287,16 +287,16 @@ class Session:
             case Question.CAMERA:
                 return self._ledger.learned(frozenset(entry.images))
             case Question.FRAME:
-                told = [one for one in self._ledger.of_image(entry.images[0]) if _is_about(one, entry.fingerprints[0])]
-                return told[-1] if told else None
+                made = [one for one in self._ledger.of_image(entry.images[0]) if _is_about(one, entry.fingerprints[0])]
+                return made[-1] if made else None
         if entry.question is Question.MARK:
             pose = self._ledger.get((entry.images[0], "", ""))
             if pose is not None and _is_about(pose, entry.fingerprints[0]) and pose.pose != entry.pose:
                 return pose  # the mark will have another name
         first = None
-        for image, seen in zip(entry.images, entry.fingerprints, strict=True):
+        for image, fingerprint in zip(entry.images, entry.fingerprints, strict=True):
             one = self._ledger.get((image, entry.point, entry.kind))
-            if one is None or not _is_about(one, seen):
+            if one is None or not _is_about(one, fingerprint):
                 return None
             first = first or one
         return first
@@ -319,8 +319,8 @@ class Session:
             self._check_learned(one)
             return
         try:
-            seen = self.looking.at(one.image)
-            mark = seen.mark(one.point, one.about[2]) if one.point else None
+            view = self.looking.at(one.image)
+            mark = view.mark(one.point, one.about[2]) if one.point else None
         except KeyError as error:
             raise InputError(f"there is no image or mark {error.args[0]!r}.") from None
         if one.decision in (Choice.ACCEPT, Choice.REJECT) and (mark is None or mark.covariance is None):
@@ -344,6 +344,6 @@ def _is_about(one: Decision, fingerprint: str) -> bool:
 
 
 def _answer_json(one: Decision) -> Json:
-    told = {"decision": str(one.decision), "point": one.point, "kind": one.about[2], "who": one.who, "when": one.when}
+    head = {"decision": str(one.decision), "point": one.point, "kind": one.about[2], "who": one.who, "when": one.when}
     place = {"pose": one.pose, "note": one.note, "col_px": one.col_px, "row_px": one.row_px}
-    return {**told, **place, "image": one.image, "px": one.px}
+    return {**head, **place, "image": one.image, "px": one.px}
