@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from shutil import copy, copytree
@@ -32,6 +33,7 @@ Array = NDArray[np.float64]
 pytestmark = pytest.mark.xdist_group("learned")  # the frames are rendered, and their marks learned, once for all
 CORNERS = {"1": (6.0, -6.0), "2": (-6.0, -6.0), "3": (-6.0, 6.0), "4": (6.0, 6.0)}
 ARROW = areas.polygon(((0.0, 0.0), (1.1, 0.2), (0.5, 0.5), (0.3, 0.7)))  # lopsided: a mirror shows
+SHOWN = {2: "0m", 3: "180", 4: "180m", 5: "90m", 6: "270", 7: "270m", 8: "90"}  # how a viewer shows a frame of pose 0
 LEARNED = """
 name = "small"
 frame_mm = [16.0, 16.0]
@@ -317,6 +319,32 @@ def test_clicks_that_contradict_the_set_orientation_are_asked(pose: str, rendere
     assert "orientation tag (3) asks viewers to turn the picture" in str(raised.value)
     if pose == "0":
         learned(project_of(tmp_path, LEARNED + clicks(rendered)))
+
+
+@pytest.mark.parametrize(
+    ("tag", "shown"),
+    [
+        (2, lambda col, row, last_col, last_row: (last_col - col, row)),
+        (3, lambda col, row, last_col, last_row: (last_col - col, last_row - row)),
+        (4, lambda col, row, last_col, last_row: (col, last_row - row)),
+        (5, lambda col, row, last_col, last_row: (row, col)),
+        (6, lambda col, row, last_col, last_row: (last_row - row, col)),
+        (7, lambda col, row, last_col, last_row: (last_row - row, last_col - col)),
+        (8, lambda col, row, last_col, last_row: (row, last_col - col)),
+    ],
+)
+def test_clicks_in_a_picture_turned_by_any_orientation_tag_are_asked(
+    tag: int, shown: Callable[[float, float, float, float], tuple[float, float]], rendered: Path, tmp_path: Path
+) -> None:
+    """The tag's own definition (TIFF 6.0, page 36) says where a viewer shows a pixel."""
+    picture = tifffile.imread(rendered / "scans" / "f1.tif")
+    (tmp_path / "scans").mkdir()
+    tifffile.imwrite(tmp_path / "scans" / "f1.tif", picture, extratags=[(274, 3, 1, tag, True)])
+    last_row, last_col = (size - 1 for size in picture.shape[:2])
+    places = [shown(col, row, last_col, last_row) for col, row in truth(rendered)["f1"].tolist()]
+    lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, places, strict=True))
+    with pytest.raises(InputError, match=f"in the scan orientation {SHOWN[tag]}, .*orientation tag .{tag}. asks"):
+        learned(project_of(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="0"))
 
 
 def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_path: Path) -> None:
