@@ -261,9 +261,6 @@ FAINT_MARK_BY_NOISE = _limit(  # counted: in some four hundred places
 )
 
 # The marks of a frame.
-TRUE_MARK_AN_OUTLIER = _limit(
-    1e-3, "taking any true mark for an outlier, were the film's deformation random", "it has no part in the frame's fit"
-)
 MARK_UNLIKE_THE_OTHERS = _limit(
     0.01, "doubting any good mark of a frame by its blur, size or turn", "the mark is weak, or not this mark"
 )

@@ -21,7 +21,7 @@ from scipy.special import chdtri, fdtrc, logsumexp
 
 from measure.fiducials.film_model import film_terms, interleaved
 from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_DEGREES, SCATTER_MM
-from measure.flags import FALSE_DOUBT, TRUE_MARK_AN_OUTLIER
+from measure.flags import FALSE_DOUBT
 
 Array = NDArray[np.float64]
 
@@ -325,7 +325,7 @@ def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np
     far better than none does, each if it is named beside the marks that agree, or lies off by more than the gate.
     """
     order, odds, kept = list[int](), [0.0], np.arange(len(marks.given_mm))
-    while len(kept) > _FEWEST and frame_p_value(own := marks.select(kept), film) < TRUE_MARK_AN_OUTLIER:
+    while len(kept) > _FEWEST and frame_p_value(own := marks.select(kept), film) < FALSE_DOUBT:
         whole = logsumexp(frame_consistency(own, film).log_evidence, axis=0)
         worst = int(whole[1:].argmax())
         order.append(int(kept[worst]))
