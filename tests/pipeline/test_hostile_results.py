@@ -17,7 +17,7 @@ from simulated import simulated
 from pipeline.cli import run
 
 SAID = pytest.CaptureFixture[str]
-VALUES = ("text", "9", -1, 1e300, 2.5, True, None, [], {}, [[1.0]], {"a": 1})
+VALUES: tuple[Any, ...] = ("text", "9", -1, 1e300, 2.5, True, None, [], {}, [[1.0]], {"a": 1})
 MISSING = "missing"
 FORMATS = ("csv", "opencv", "colmap", "micmac", "mmvii", "metashape", "asp", "bingo", "geojson")
 LONGEST_MESSAGE = 2000
