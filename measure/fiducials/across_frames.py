@@ -459,7 +459,12 @@ def _clipped_variance(chi_squares: Callable[[float], Array], degrees: Array) -> 
     def excess(variance: float) -> float:
         return float((np.minimum(chi_squares(variance), limit) - expected).sum())
 
-    return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, _UNKNOWN_MM**2))
+    if excess(0.0) <= 0:
+        return 0.0
+    most = _UNKNOWN_MM**2
+    while excess(most) > 0:
+        most *= 10
+    return float(brentq(excess, 0.0, most))
 
 
 # What the user reads.
