@@ -46,7 +46,7 @@ def validate_plan(network: Network) -> None:
     _check_values(network.observations)
     _check_parts(network)
     frames = {image.frame: image for image in network.images}
-    for (frame, image), shown in zip(frames.items(), _shown(network).tolist()[: len(frames)], strict=True):
+    for (frame, image), shown in zip(frames.items(), _mark_counts(network).tolist()[: len(frames)], strict=True):
         _check_image(replace(image, name=frame), *shown)
 
 
@@ -103,11 +103,13 @@ def _check_scanners(network: Network) -> None:
 
 def _check_boards(network: Network) -> None:
     _check_unique("board", (board.name for board in network.boards))
-    seen: dict[str, str] = {}
+    board_by_point: dict[str, str] = {}
     for board in network.boards:
         for id_ in board.places:
-            if seen.setdefault(id_, board.name) != board.name:
-                raise AdjustmentError(f"point {id_} is on the boards {seen[id_]} and {board.name}; it can be on one.")
+            if board_by_point.setdefault(id_, board.name) != board.name:
+                raise AdjustmentError(
+                    f"point {id_} is on the boards {board_by_point[id_]} and {board.name}; it can be on one."
+                )
             point = network.point_by_id.get(id_)
             known = point is not None and all(
                 p is not None and np.isfinite(p.sigma) for p in (point.X, point.Y, point.Z)
@@ -311,7 +313,7 @@ def _check_parts(network: Network) -> None:
             )
 
 
-def _shown(network: Network) -> NDArray[np.intp]:
+def _mark_counts(network: Network) -> NDArray[np.intp]:
     """(frames, 2) how many object points, and how many fiducials, every frame shows, those in several parts once."""
     observations, frames = network.observations, network.frame_numbers[network.image_numbers]
     names, points = observations.numbered_points

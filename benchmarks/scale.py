@@ -197,7 +197,7 @@ class SparseProblem:
         """(2 n,) residuals and (2 n, unknowns) derivatives, in standard deviations, at changes x of the start."""
         step = np.zeros(len(self.problem.unknowns))
         step[self.numbering.free] = x
-        linear = linearise(self.numbering, self.covariance, self.problem.moved(self.first, step))
+        linear = linearise(self.numbering, self.covariance, self.problem.step_state(self.first, step))
         assert linear is not None
         by = -np.linalg.solve(linear.by_observation, linear.rows.root @ linear.rows.matrix) / SIGMA_MM
         used = np.broadcast_to((self.numbers != ABSENT)[:, None, :], by.shape)

@@ -43,7 +43,7 @@ def approximate(network: Network) -> Approximations:
 
 def initial_values(network: Network) -> Approximations:
     """As `approximate`, of a network that was validated."""
-    reduction = Reduction.of(network)
+    reduction = Reduction.to_centroid(network)
     return reduction.inverse.approximations(_initial_values(reduction.network(network)))
 
 

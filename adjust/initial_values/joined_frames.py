@@ -116,7 +116,7 @@ def whole_frames(network: Network, films: Mapping[str, Film]) -> Network:
     """
     first: dict[str, Image] = {}
     for image in network.images:
-        if image.name not in network.without_object:
+        if image.name not in network.objectless_images:
             first.setdefault(image.frame, image)
     observations, xy_mm = network.observations, network.straight_xy_mm.copy()
     for i, image in enumerate(network.images):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.least_squares.numbering import Numbering
-from adjust.least_squares.rows import WhitenedRows, of_cameras, prior_differences, prior_root_weights, whitened_rows
+from adjust.least_squares.rows import WhitenedRows, camera_mask, prior_differences, prior_root_weights, whitened_rows
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
@@ -102,7 +102,7 @@ def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera
     """The square root of the normal equations, with or without the priors of the cameras (F5 to F9)."""
     weights = prior_root_weights(numbering)
     if not camera_priors:
-        weights = np.where(of_cameras(numbering), 0.0, weights)
+        weights = np.where(camera_mask(numbering), 0.0, weights)
     differences = prior_differences(numbering.problem, at.state)[numbering.free]
     system = len(numbering.free), weights, weights * differences
     # Without these priors the factor tells what is weak: nothing is solved with it.
@@ -195,7 +195,7 @@ def _step(
             # The damping's rows, which hold the scaled unknowns where they are, take their part of the decrease.
             promised = factor.length() ** 2 + damping * float(((factor.scale * solution) ** 2).sum())
             bent = step if damping == 0.0 else _bent(numbering, at, damping, step)
-            moved = None if bent is None else linearise(numbering, covariance_mm2, problem.moved(at.state, bent))
+            moved = None if bent is None else linearise(numbering, covariance_mm2, problem.step_state(at.state, bent))
             is_rounding = damping == 0.0 and factor.length() < ROUNDING_SIGMAS  # and so is what it does to v'Pv
             is_better = moved is not None and (is_rounding or moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv))
             if bent is not None and moved is not None and is_better:
@@ -224,7 +224,7 @@ def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, be
     sizes = [float(np.linalg.norm(each[numbering.free] * factor.scale)) for each in (step, taken)]
     if not sizes[1] <= LARGEST_STRETCH * sizes[0]:
         return None
-    moved = linearise(numbering, covariance_mm2, problem.moved(at.state, taken))
+    moved = linearise(numbering, covariance_mm2, problem.step_state(at.state, taken))
     if moved is None or moved.vpv > at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
         return None
     return _Moved(moved, length, 0.0, 1.0, 1, step, taken)
@@ -237,12 +237,12 @@ def _bent(numbering: Numbering, at: Linearised, damping: float, step: Array) -> 
     geodesic acceleration (Transtrum and Sethna 2012, Improvements to the Levenberg-Marquardt algorithm).
     """
     problem = numbering.problem
-    ahead = computed_observations(problem, problem.moved(at.state, PROBE * step))
+    ahead = computed_observations(problem, problem.step_state(at.state, PROBE * step))
     if ahead is None:
         return None
     change_mm = at.rows.change_mm(at.by_observation, step)
     half_curvature_mm = ((ahead - at.computed_mm) / PROBE - change_mm) / PROBE
-    rows = at.rows.of_discrepancies(at.by_observation, at.v_mm + half_curvature_mm)
+    rows = at.rows.replace_discrepancies(at.by_observation, at.v_mm + half_curvature_mm)
     factor = factorise(numbering, replace(at, rows=rows), damping)
     bent = np.zeros_like(step)
     bent[numbering.free] = factor.solution()

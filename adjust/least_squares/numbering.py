@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from adjust.linear_algebra.fronts import Fronts, band_order, fronts_of
+from adjust.linear_algebra.fronts import Fronts, band_order, make_fronts
 from adjust.linear_algebra.schur_complement import Pattern
 from adjust.problem.problem import ABSENT, Problem, side_by_side
 
@@ -49,12 +49,12 @@ class Numbering:
     def free(self) -> Indices:
         """Positions of the free unknowns; the shared ones as they are eliminated."""
         free = np.flatnonzero(self.problem.unknowns.sigma > 0.0)
-        return np.concatenate([self._shared.positions, free[np.isin(free, self._blocks.owned)]])
+        return np.concatenate([self._shared_order.positions, free[np.isin(free, self._blocks.owned)]])
 
     @property
     def fronts(self) -> Fronts:
         """In which the shared unknowns are eliminated."""
-        return self._shared.fronts
+        return self._shared_order.fronts
 
     @cached_property
     def touched(self) -> list[Touched]:
@@ -81,12 +81,12 @@ class Numbering:
             every[place.columns],
         )
         of_images = np.hstack([problem.exterior[:, exterior.members], problem.film_positions[:, film.members]])
-        of_points = self._of_points[:, place.members]
+        of_points = self._point_unknowns[:, place.members]
         place_of = np.full(len(unknowns) + 1, len(of_points), dtype=np.intp)  # the last stands for ABSENT
-        place_of[self._of_points[:, :1]] = np.arange(len(of_points))[:, None]
+        place_of[self._point_unknowns[:, :1]] = np.arange(len(of_points))[:, None]
         images = image_columns, of_images, problem.image_numbers
         points = place_columns, of_points, place_of[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
-        if not self._points_own and (unknowns.join or len(self._of_frames) < len(of_images)):
+        if not self._points_own and (unknowns.join or len(self._frame_unknowns) < len(of_images)):
             return None
         owning, grouped = (points, images) if self._points_own else (images, points)
         own, members = (
@@ -106,10 +106,10 @@ class Numbering:
 
     @property
     def _shared_count(self) -> int:
-        return len(self._shared.positions)
+        return len(self._shared_order.positions)
 
     @cached_property
-    def _shared(self) -> "_Shared":
+    def _shared_order(self) -> "_Shared":
         """The shared unknowns: images, or points, that are neighbours one after the other, what is of none behind.
 
         As they are numbered where all of them are one front.
@@ -119,9 +119,9 @@ class Numbering:
         group = self._group[shared]
         sizes = np.bincount(group[group >= 0], minlength=len(self._grouped))
         present = np.flatnonzero(sizes)
-        met = self._met[:, present]
+        met = self._group_meetings[:, present]
         order = band_order(met)
-        fronts = fronts_of(met[:, order], sizes[present[order]], int((group < 0).sum()))
+        fronts = make_fronts(met[:, order], sizes[present[order]], int((group < 0).sum()))
         if len(fronts) == 1:
             return _Shared(shared, fronts)
         rank = np.full(len(sizes) + 1, len(sizes), dtype=np.intp)  # the last stands for what is in no group
@@ -131,7 +131,7 @@ class Numbering:
     @property
     def _grouped(self) -> Indices:
         """Positions (g, k) of the unknowns of every frame, or of every point: those that blocks do not own."""
-        return self._of_frames if self._points_own else self._of_points
+        return self._frame_unknowns if self._points_own else self._point_unknowns
 
     @cached_property
     def _group(self) -> Indices:
@@ -142,7 +142,7 @@ class Numbering:
         return group
 
     @property
-    def _met(self) -> csr_array:
+    def _group_meetings(self) -> csr_array:
         """Which groups (b, g) every block of observations meets, and behind these every further observation."""
         groups = [self._group[self.problem.columns].max(axis=1)]
         blocks = [self._blocks.of]
@@ -156,15 +156,15 @@ class Numbering:
 
     @property
     def _blocks(self) -> "_Blocks":
-        return self._by_point if self._points_own else self._by_frame
+        return self._point_blocks if self._points_own else self._frame_blocks
 
     @cached_property
     def _points_own(self) -> bool:
         free = np.append(self.problem.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
-        return bool(free[self._by_point.owned].sum() > free[self._by_frame.owned].sum())
+        return bool(free[self._point_blocks.owned].sum() > free[self._frame_blocks.owned].sum())
 
     @cached_property
-    def _tied(self) -> NDArray[np.bool_]:
+    def _is_tied(self) -> NDArray[np.bool_]:
         """By position: what further observations tie to other unknowns; the last stands for ABSENT."""
         tied = np.zeros(len(self.problem.unknowns) + 1, dtype=bool)
         for further in self.problem.further:
@@ -172,7 +172,7 @@ class Numbering:
         return tied
 
     @cached_property
-    def _of_frames(self) -> Indices:
+    def _frame_unknowns(self) -> Indices:
         """Positions (frames, k) of the unknowns of every frame, ABSENT behind those that have less."""
         unknowns = self.problem.unknowns
         own: dict[str, list[Indices]] = {}
@@ -188,25 +188,25 @@ class Numbering:
         return self.problem.network.frame_numbers[self.problem.image_numbers]
 
     @cached_property
-    def _of_points(self) -> Indices:
+    def _point_unknowns(self) -> Indices:
         """Positions (points, 3) of the unknowns of every point."""
         return np.array(list(self.problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
 
     @cached_property
-    def _by_frame(self) -> "_Blocks":
-        owned = self._of_frames.copy()
-        owned[self._tied[owned].any(axis=1)] = ABSENT
+    def _frame_blocks(self) -> "_Blocks":
+        owned = self._frame_unknowns.copy()
+        owned[self._is_tied[owned].any(axis=1)] = ABSENT
         return _Blocks(owned, self._frame_of_rows)
 
     @cached_property
-    def _by_point(self) -> "_Blocks":
+    def _point_blocks(self) -> "_Blocks":
         problem, unknowns = self.problem, self.problem.unknowns
-        points = self._of_points
-        points = points[(unknowns.sigma[points] > 0.0).any(axis=1) & ~self._tied[points].any(axis=1)]
+        points = self._point_unknowns
+        points = points[(unknowns.sigma[points] > 0.0).any(axis=1) & ~self._is_tied[points].any(axis=1)]
         of_point = np.full(len(unknowns) + 1, len(points), dtype=np.intp)  # the last stands for ABSENT
         of_point[points[:, 0]] = np.arange(len(points))
         block = of_point[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
-        nothing = np.full((len(self._of_frames), 3), ABSENT, dtype=np.intp)
+        nothing = np.full((len(self._frame_unknowns), 3), ABSENT, dtype=np.intp)
         others = block == len(points)
         return _Blocks(np.concatenate([points, nothing]), block + np.where(others, self._frame_of_rows, 0))
 

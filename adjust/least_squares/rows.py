@@ -38,7 +38,7 @@ class WhitenedRows:
             yield _blocks(touched, self.matrix, self.right)
         yield from self.further
 
-    def of_discrepancies(self, by_observation: Array, v_mm: Array) -> "WhitenedRows":
+    def replace_discrepancies(self, by_observation: Array, v_mm: Array) -> "WhitenedRows":
         """The same rows with other v (n, 2) on the right side; by_observation: A (n, 2, 2)."""
         return replace(self, right=_whitened(self.root, applied(by_observation, v_mm)[..., None])[..., 0])
 
@@ -88,14 +88,14 @@ def _whitened(root: Array, rows: Array) -> Array:
 def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
     """The rows of blocks of equal shape, of all (n, 2, k), with every derivative in its unknown's column."""
     (count, height), width = touched.rows.shape, touched.own.shape[1] + touched.shared.shape[1]
-    of_blocks = _of_rows(right, touched.rows).reshape(count, 2 * height)
+    of_blocks = _row_values(right, touched.rows).reshape(count, 2 * height)
     if touched.columns.shape[:2] == (1, 1) and np.array_equal(touched.columns[0, 0], np.arange(width)):
-        as_they_are = _of_rows(matrix, touched.rows).reshape(count, 2 * height, width)
+        as_they_are = _row_values(matrix, touched.rows).reshape(count, 2 * height, width)
         return Blocks(touched.own, touched.shared, as_they_are, of_blocks)
     by_column = np.zeros((count, width + 1, height, 2))  # what an operation on a column takes stands together
     if touched.columns.shape[:2] == (1, 1):
         for k, column in enumerate(touched.columns[0, 0]):
-            by_column[:, column] = _of_rows(matrix[..., k], touched.rows)
+            by_column[:, column] = _row_values(matrix[..., k], touched.rows)
     elif len(touched.columns) == 1 and height <= count:
         for row, columns in enumerate(touched.columns[0]):
             by_column[:, columns, row] = matrix[touched.rows[:, row]].swapaxes(1, 2)
@@ -106,7 +106,7 @@ def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
     return Blocks(touched.own, touched.shared, dense, of_blocks)
 
 
-def _of_rows(values: Array, rows: Indices) -> Array:
+def _row_values(values: Array, rows: Indices) -> Array:
     """Values (b, m, ...), of all (n, ...), of some rows (b, m); without a copy where they stand in order."""
     first, count = int(rows[0, 0]) if rows.size else 0, rows.size
     if np.array_equal(rows.ravel(), np.arange(first, first + count)):
@@ -119,7 +119,7 @@ def _further_block(numbering: Numbering, further: FurtherObservation, values: Ar
     numbers = numbering.numbers[further.positions]
     free = numbers != ABSENT
     root = np.linalg.cholesky(further.covariance)
-    matrix = np.linalg.solve(root, further.by_unknowns(values)[:, free])
+    matrix = np.linalg.solve(root, further.jacobian(values)[:, free])
     right = np.linalg.solve(root, further.observed - further.computed(values))
     return Blocks(np.empty((1, 0), dtype=np.intp), numbers[None, free], matrix[None], right[None])
 
@@ -129,7 +129,7 @@ def prior_root_weights(numbering: Numbering) -> Array:
     return np.asarray(1.0 / numbering.problem.prior_sigma[numbering.free])
 
 
-def of_cameras(numbering: Numbering) -> NDArray[np.bool_]:
+def camera_mask(numbering: Numbering) -> NDArray[np.bool_]:
     """Which free unknowns (f,) are those of cameras and scanners: fiducials, interior orientation, distortion (F5 to
     F9), and the terms of bends."""
     unknowns = numbering.problem.unknowns

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
-from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, of_columns
+from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, column_values
 from adjust.linear_algebra.fronts import Fronts
-from adjust.linear_algebra.multifrontal import of_normal_equations, reflected, reflections_cost, triangle_of
+from adjust.linear_algebra.multifrontal import factorise_normal_equations, qr_triangle, reflected, reflections_cost
 from adjust.linear_algebra.schur_complement import SparseRows, eliminated
 from adjust.linear_algebra.sparse_factor import TEN_DIGITS
 
@@ -61,11 +61,11 @@ def eliminate(
     scale = np.where(squares > 0.0, np.sqrt(squares), 1.0)
     priors = _prior_rows(prior_root_weight / scale, prior_right, damping)
     if sparse is not None and fronts is not None and is_large:
-        factor = _by_normal_equations(sparse, scale, priors, fronts, 0.0 if sharp else SAFE)
+        factor = _eliminate_normally(sparse, scale, priors, fronts, 0.0 if sharp else SAFE)
         least = SAFE if cost > REFLECTED else TEN_DIGITS
         if factor is not None and (not sharp or factor.triangle.reciprocal_condition > least):
             return factor
-    return _by_reflections(blocks, scale, priors, fronts)
+    return _reflect_all(blocks, scale, priors, fronts)
 
 
 def _column_squares(blocks: Iterable[Blocks], count: int) -> Array:
@@ -73,7 +73,7 @@ def _column_squares(blocks: Iterable[Blocks], count: int) -> Array:
     squares = np.zeros(count)
     for block in blocks:
         of_block = np.einsum("bmk,bmk->bk", block.matrix, block.matrix)
-        squares += np.bincount(of_columns(np.arange(count), block).ravel(), of_block.ravel(), count)
+        squares += np.bincount(column_values(np.arange(count), block).ravel(), of_block.ravel(), count)
     return squares
 
 
@@ -83,9 +83,7 @@ def _prior_rows(root_weight: Array, right: Array, damping: float) -> tuple[Array
     return together, root_weight * right / np.where(together > 0.0, together, 1.0)
 
 
-def _by_reflections(
-    blocks: Iterable[Blocks], scale: Array, priors: tuple[Array, Array], fronts: Fronts | None
-) -> Factor:
+def _reflect_all(blocks: Iterable[Blocks], scale: Array, priors: tuple[Array, Array], fronts: Fronts | None) -> Factor:
     factors = []
     rests = []
     for block in blocks:
@@ -97,7 +95,7 @@ def _by_reflections(
     return Factor(DenseBlocks(tuple(factors)), triangle, right, scale)
 
 
-def _rows_of(priors: tuple[Array, Array], unknowns: Indices) -> Array:
+def _prior_blocks(priors: tuple[Array, Array], unknowns: Indices) -> Array:
     """The prior rows (..., k, k + 1) of some unknowns (..., k), the right side behind."""
     root_weight, right = priors
     rows = root_weight[unknowns][..., None] * np.eye(unknowns.shape[-1])
@@ -108,18 +106,18 @@ def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array])
     """The blocks' triangles, and their remaining rows (b, k, s + 1) in the shared unknowns, right side behind."""
     (count, height, width), own_count = blocks.matrix.shape, blocks.own.shape[1]
     rows = np.zeros((count, height + own_count, width + 1))
-    np.divide(blocks.matrix, of_columns(scale, blocks)[:, None, :], out=rows[:, :height, :-1])
+    np.divide(blocks.matrix, column_values(scale, blocks)[:, None, :], out=rows[:, :height, :-1])
     rows[:, :height, -1] = blocks.right
-    prior_rows = _rows_of(priors, blocks.own)
+    prior_rows = _prior_blocks(priors, blocks.own)
     rows[:, height:, :own_count] = prior_rows[..., :-1]
     rows[:, height:, -1] = prior_rows[..., -1]
-    triangle = triangle_of(rows)
+    triangle = qr_triangle(rows)
     own = triangle[:, :own_count]
     factor = BlockFactors(blocks.own, blocks.shared, own[..., :own_count], own[..., own_count:-1], own[..., -1])
     return factor, triangle[:, own_count:, own_count:]
 
 
-def _by_normal_equations(
+def _eliminate_normally(
     rows: SparseRows, scale: Array, priors: tuple[Array, Array], fronts: Fronts, lift: float
 ) -> Factor | None:
     """None where the normal equations of the shared unknowns are not positive definite."""
@@ -130,7 +128,7 @@ def _by_normal_equations(
     normal = over @ (normal - blocks.border.square()) @ over + diags_array(root_weight**2 + lift**2)
     right = over @ (right - blocks.border.transposed_times(blocks.right.ravel())) + root_weight * prior_right
     try:
-        triangle, right = of_normal_equations(fronts, csr_array(normal), right)
+        triangle, right = factorise_normal_equations(fronts, csr_array(normal), right)
     except np.linalg.LinAlgError:
         return None
     steady = lift == 0.0 and triangle.reciprocal_condition > TEN_DIGITS and blocks.norm_of_inverse() <= STEADY

@@ -140,7 +140,7 @@ class Factor:
         """The cofactor matrices (g, k, k) of groups of unknowns (g, k), each of one block's own or of shared ones."""
         cofactors = np.empty((*groups.shape, groups.shape[1]))
         shared = groups[:, 0] < self.shared_count
-        cofactors[shared] = self.triangle.cofactors_of(groups[shared])
+        cofactors[shared] = self.triangle.group_cofactors(groups[shared])
         place = np.full(len(self.scale) + 1, -1, dtype=np.intp)
         for own, of_own in self._own_cofactors:
             place[own] = np.arange(own.size).reshape(own.shape)
@@ -153,7 +153,7 @@ class Factor:
         scale = self.scale[groups]
         return cofactors / (scale[:, :, None] * scale[:, None, :])
 
-    def cofactor_of(self, functions: csr_array) -> Array:
+    def function_cofactor(self, functions: csr_array) -> Array:
         """The cofactor matrix (k, k) of linear functions (k, n) of the unknowns."""
         columns = (functions / self.scale).tocsc()
         shared = np.asarray(columns[:, : self.shared_count].toarray(), dtype=np.float64)
@@ -188,7 +188,7 @@ class Factor:
         """The adjusted rows of blocks that own and share what those factorised do, one after the other."""
         for rows, block in zip(blocks, self.blocks, strict=True):
             count = block.own.shape[1]
-            matrix = rows.matrix / of_columns(self.scale, rows)[:, None, :]
+            matrix = rows.matrix / column_values(self.scale, rows)[:, None, :]
             own = matrix[..., :count] @ np.linalg.inv(block.triangle)
             yield ReducedRows(own, rows.shared, matrix[..., count:] - own @ block.border)
 
@@ -197,6 +197,6 @@ class Factor:
         return tuple(self.eliminated.own_cofactors(self.triangle))
 
 
-def of_columns(values: NDArray[Number], blocks: Blocks) -> NDArray[Number]:
+def column_values(values: NDArray[Number], blocks: Blocks) -> NDArray[Number]:
     """The values (b, o + s), one an unknown, of what the blocks' columns stand for."""
     return np.concatenate([values[blocks.own], values[blocks.shared]], axis=1)

@@ -97,7 +97,7 @@ def band_order(met: csr_array) -> Indices:
     return np.asarray(reverse_cuthill_mckee(csr_array(met.T @ met), symmetric_mode=True), dtype=np.intp)
 
 
-def fronts_of(met: csr_array, sizes: Indices, border: int) -> Fronts:
+def make_fronts(met: csr_array, sizes: Indices, border: int) -> Fronts:
     """The fronts of groups of some unknowns each (g,), in their order, and of a border of unknowns that all may meet.
 
     met as in `band_order`. Neighbours are put together as long as that makes the elimination of an unknown cheaper.

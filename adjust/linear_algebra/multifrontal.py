@@ -52,7 +52,7 @@ def reflected(
     return Triangle(fronts, tuple(own), tuple(borders)), right
 
 
-def with_rows(triangle: Triangle, rows: Iterable[tuple[Indices, Array]]) -> Triangle:
+def append_rows(triangle: Triangle, rows: Iterable[tuple[Indices, Array]]) -> Triangle:
     """The triangle of further rows (k, s') in some unknowns (s',) each, besides its own rows."""
     itself = [(front.columns, np.hstack(parts)) for front, *parts in triangle.parts]
     all_rows = [(unknowns[None], np.pad(each, ((0, 0), (0, 1)))[None]) for unknowns, each in (*itself, *rows)]
@@ -60,7 +60,7 @@ def with_rows(triangle: Triangle, rows: Iterable[tuple[Indices, Array]]) -> Tria
     return reflected(triangle.fronts, all_rows, nothing, nothing)[0]
 
 
-def of_normal_equations(fronts: Fronts, normal: csr_array, right: Array) -> tuple[Triangle, Array]:
+def factorise_normal_equations(fronts: Fronts, normal: csr_array, right: Array) -> tuple[Triangle, Array]:
     """The triangle and right side (s,) of normal equations (s, s), by Cholesky.
 
     Raises numpy.linalg.LinAlgError where they are not positive definite.
@@ -118,9 +118,9 @@ def _condensed(rows: Sequence[Rows], priors: Array) -> Array:
             pending.append(_spread(unknowns[first : first + count], each[first : first + count], width))
             height += len(pending[-1])
             if height >= together:
-                triangle = triangle_of(np.vstack([triangle, *pending]))
+                triangle = qr_triangle(np.vstack([triangle, *pending]))
                 pending, height = [], 0
-    return triangle_of(np.vstack([triangle, *pending]))
+    return qr_triangle(np.vstack([triangle, *pending]))
 
 
 def _spread(unknowns: Indices, rows: Array, width: int) -> Array:
@@ -131,6 +131,6 @@ def _spread(unknowns: Indices, rows: Array, width: int) -> Array:
     return spread.reshape(-1, width + 1)
 
 
-def triangle_of(rows: Array) -> Array:
+def qr_triangle(rows: Array) -> Array:
     """The factors R (..., k, n) of Householder factorisations of rows (..., m, n), k the smaller of m and n."""
     return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)

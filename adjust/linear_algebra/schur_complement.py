@@ -53,14 +53,14 @@ class Pattern:
         return order[: np.searchsorted(self.block[order], len(self.own) - 1)]
 
     @cached_property
-    def of(self) -> Indices:
+    def block_numbers(self) -> Indices:
         """(m,) their blocks."""
         return self.block[self.order]
 
     @cached_property
     def first(self) -> Indices:
         """(b + 1,) where each block's begin among them, and where they end."""
-        return np.searchsorted(self.of, np.arange(len(self.own)))
+        return np.searchsorted(self.block_numbers, np.arange(len(self.own)))
 
     @cached_property
     def cells(self) -> tuple[Indices, Indices, Indices]:
@@ -78,7 +78,7 @@ class Pattern:
         """(o, c, m) where the products of own and single columns are summed up in borders (b, o, t + 1)."""
         place = np.full(self.count + 1, len(self.singles), dtype=np.intp)
         place[self.singles] = np.arange(len(self.singles))
-        rows = self.of * self.own.shape[1] + np.arange(self.own.shape[1])[:, None]
+        rows = self.block_numbers * self.own.shape[1] + np.arange(self.own.shape[1])[:, None]
         return np.asarray(rows[:, None] * (len(self.singles) + 1) + place[self.single[self.order]].T)
 
     @cached_property
@@ -154,10 +154,10 @@ class SparseRows:
         pattern, (order, first, unknowns) = self.pattern, self.pattern.cells
         width = unknowns.shape[1]
         squares = np.empty((len(unknowns), width + 1, width + 1))
-        for cells in _at_once(first):
+        for cells in _batches(first):
             rows = order[first[cells.start] : first[cells.stop]]
             columns = np.concatenate(
-                [_taken(self.matrix, np.concatenate(pattern.columns[1:]), rows), self.right[rows].T[None]]
+                [_take_columns(self.matrix, np.concatenate(pattern.columns[1:]), rows), self.right[rows].T[None]]
             )
             starts = first[cells] - first[cells.start]
             for i, (x, y) in enumerate(columns):
@@ -172,7 +172,7 @@ class SparseRows:
         return normal, right[:-1]
 
 
-def _at_once(first: Indices) -> Iterator[slice]:
+def _batches(first: Indices) -> Iterator[slice]:
     """Runs of sets of rows, the i-th from first[i] up to the next, as many as the processor's cache holds."""
     start = 0
     while start < len(first) - 1:
@@ -181,7 +181,7 @@ def _at_once(first: Indices) -> Iterator[slice]:
         start = stop
 
 
-def _taken(matrix: Array, columns: Indices, order: Indices) -> Array:
+def _take_columns(matrix: Array, columns: Indices, order: Indices) -> Array:
     """Some columns (c, 2, m) of pairs of rows (n, 2, k), these in some order (m,)."""
     taken = np.empty((len(columns), 2, len(order)))
     for into, i in zip(taken, columns, strict=True):
@@ -209,14 +209,14 @@ def eliminated(rows: SparseRows, root_weight: Array, prior_right: Array, scale: 
     orthonormal = np.empty((own.shape[1], 2, len(pattern.order)))
     parts = np.empty((len(pattern.order), own.shape[1], pattern.members.shape[1]))
     alone = np.empty((*own.shape, len(pattern.singles) + 1))
-    for blocks in _at_once(pattern.first):
+    for blocks in _batches(pattern.first):
         some = slice(pattern.first[blocks.start], pattern.first[blocks.stop])
-        order, of = pattern.order[some], pattern.of[some] - blocks.start
+        order, of = pattern.order[some], pattern.block_numbers[some] - blocks.start
         by_block = csr_array(
             (np.ones(len(of)), np.arange(len(of)), pattern.first[blocks.start : blocks.stop + 1] - some.start),
             shape=(blocks.stop - blocks.start, len(of)),
         )
-        by_own, by_group, by_single = (_taken(rows.matrix, columns, order) for columns in pattern.columns)
+        by_own, by_group, by_single = (_take_columns(rows.matrix, columns, order) for columns in pattern.columns)
         by_own.swapaxes(1, 2)[(own[blocks][of] < 0).T] = 0.0
         by_prior = weight[blocks].T[..., None] * np.eye(own.shape[1])[:, None, :]
         first = _orthonormal(by_block, of, by_own, by_prior)

@@ -41,7 +41,7 @@ def laid_out(array: Array) -> Array:
     return _members_first(np.ascontiguousarray(_members_last(array)))
 
 
-def of_each(array: Array, numbers: Indices) -> Array:
+def take_members(array: Array, numbers: Indices) -> Array:
     """The members (n, ...) of an array (m, ...) that have these numbers (n,)."""
     return _members_first(np.take(_members_last(array), numbers, axis=-1))
 

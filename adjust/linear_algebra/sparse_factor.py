@@ -135,7 +135,7 @@ class Triangle:
         of_fronts = [(root[: f.count] ** 2).sum(axis=1) for f, root in zip(self.fronts, self.roots, strict=True)]
         return np.concatenate([np.empty(0), *of_fronts])
 
-    def cofactors_of(self, groups: Indices) -> Array:
+    def group_cofactors(self, groups: Indices) -> Array:
         """The cofactor matrices (b, s', s') of groups (b, s') of unknowns that some front touches."""
         result = np.empty((*groups.shape, groups.shape[1]))
         home = self.fronts.home(groups)
@@ -155,7 +155,7 @@ class Triangle:
                 continue
             at_once = max(1, ELEMENTS_AT_ONCE // (groups.shape[1] * len(self)))
             for some in np.split(members, range(at_once, len(members), at_once)):
-                roots = rows[some] @ self.root_of(groups[some])
+                roots = rows[some] @ self.group_roots(groups[some])
                 result[some] = roots @ roots.swapaxes(1, 2)
         return result
 
@@ -168,7 +168,7 @@ class Triangle:
         """The reciprocal conditions of the fronts' roots."""
         return [float(dtrcon(root)[0]) for root in self.roots]
 
-    def root_of(self, groups: Indices) -> Array:
+    def group_roots(self, groups: Indices) -> Array:
         """Roots (b, s', k) of the cofactor matrices of groups (b, s') of unknowns that some front touches."""
         if self._is_narrow:
             return self.roots[0][groups]

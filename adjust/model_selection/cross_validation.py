@@ -15,7 +15,7 @@ from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Kind, Parameter, object_coordinate
 from adjust.problem.problem import number
 from adjust.problem.reduction import Reduction
-from adjust.solution.adjustment import Options, with_datum
+from adjust.solution.adjustment import Options, settle_datum
 from adjust.solution.result import Adjustment
 from adjust.solution.reweighting import run
 from adjust.validation import validate
@@ -128,12 +128,12 @@ def _refitted_models(
     )
     if reduced.unoriented - network.unoriented:
         return None
-    reduction = Reduction.of(reduced)
+    reduction = Reduction.to_centroid(reduced)
     start = reduction.approximations(adjusted_values(adjustment))
     try:
         validate(reduced)
         problem = number(reduction.network(reduced), start, options.method == "elements")
-        last = run(with_datum(problem, options), options)
+        last = run(settle_datum(problem, options), options)
     except AdjustmentError:
         return None
     if not last.converged:

@@ -17,7 +17,7 @@ from adjust.functional_model.correction import Imaged
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import SightVectors, sight_vectors
 from adjust.functional_model.projection import rays
-from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, of_each, product, zeros
+from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, product, take_members, zeros
 from adjust.problem.problem import Films, Part, Problem, State
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ class Derivatives:
 
 
 @dataclass(frozen=True)
-class SeenTargets:
+class TargetImages:
     """The targets of one camera as they appear for a state.
 
     rows: their observations; rotation (n, 3, 3) of their images; ray (n, 2) and the image of it; in_camera (n, 3): the
@@ -56,7 +56,7 @@ class Computed:
     """Observations (n, 2) in mm that satisfy F1 to F4, in the comparator, and what they were computed from."""
 
     xy_mm: Array
-    targets: tuple[SeenTargets, ...]
+    targets: tuple[TargetImages, ...]
 
 
 def computed_observations(problem: Problem, state: State) -> Array | None:
@@ -67,7 +67,7 @@ def computed_observations(problem: Problem, state: State) -> Array | None:
 
 def compute(problem: Problem, state: State) -> Computed | None:
     """The observations that satisfy F1 to F4, as derivatives are taken at; None where some point has no image."""
-    targets = tuple(_seen(problem, state, name, rows) for name, rows in problem.targets_by_camera.items())
+    targets = tuple(_image_targets(problem, state, name, rows) for name, rows in problem.targets_by_camera.items())
     camera_xy = _computed_in_camera(problem, state, targets)
     if camera_xy is None:
         return None
@@ -75,39 +75,39 @@ def compute(problem: Problem, state: State) -> Computed | None:
     return Computed(xy_mm, targets) if found.all() else None
 
 
-def _computed_in_camera(problem: Problem, state: State, targets: Iterable[SeenTargets]) -> Array | None:
+def _computed_in_camera(problem: Problem, state: State, targets: Iterable[TargetImages]) -> Array | None:
     """The camera coordinates (n, 2) of all marks; None where some point has no image."""
     camera_xy = state.values[problem.places.T[:2]].T  # fiducials stay, targets follow
     observed = observed_in_camera(problem, state) if problem.by_elements else camera_xy
-    for seen in targets:
-        lens = _lens(problem, state, seen.camera)
+    for shown in targets:
+        lens = _lens(problem, state, shown.camera)
         if lens.interior[0] <= 0.0:
             return None
         if problem.by_elements:
-            at = lens.equations_with_image(observed[seen.rows], seen.imaged)
-            xy_mm, found = observed[seen.rows] - at.value, np.isfinite(at.value).all(axis=1)
+            at = lens.equations_with_image(observed[shown.rows], shown.imaged)
+            xy_mm, found = observed[shown.rows] - at.value, np.isfinite(at.value).all(axis=1)
         else:
-            xy_mm, found = lens.camera_from_image(seen.imaged)
-        if not (found & (seen.in_camera[:, 2] < 0.0)).all():
+            xy_mm, found = lens.camera_from_image(shown.imaged)
+        if not (found & (shown.in_camera[:, 2] < 0.0)).all():
             return None
-        camera_xy[seen.rows] = xy_mm
+        camera_xy[shown.rows] = xy_mm
     return camera_xy
 
 
-def _seen(problem: Problem, state: State, camera: str, targets: Indices) -> SeenTargets:
+def _image_targets(problem: Problem, state: State, camera: str, targets: Indices) -> TargetImages:
     """Some targets as they appear from their stations."""
-    rows = _in_order(targets)
+    rows = _as_slice(targets)
     images = problem.image_numbers[rows]
     stations = state.values[problem.exterior[:, :3].T[:, images]].T
     points = state.values[problem.places.T[:, rows]].T
     if problem.network.boards:
         bends = state.values[problem.board_positions[rows]]  # of a point on none any values, which lift it by 0
-        points = points + (bends[:, :, None] * problem.lifted_by[rows]).sum(axis=1)
+        points = points + (bends[:, :, None] * problem.lift_directions[rows]).sum(axis=1)
     sight = sight_vectors(problem.network.line_of_sight, stations, points)
-    rotation = of_each(state.rotations, images)
+    rotation = take_members(state.rotations, images)
     ray, in_camera = rays(rotation, sight.vector)
     imaged = _lens(problem, state, camera).image(ray)
-    return SeenTargets(camera, rows, sight, rotation, ray, in_camera, imaged)
+    return TargetImages(camera, rows, sight, rotation, ray, in_camera, imaged)
 
 
 def _lens(problem: Problem, state: State, camera: str) -> Lens:
@@ -138,7 +138,7 @@ def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) ->
     xy_mm = np.empty_like(camera_xy)
     found = np.empty(len(camera_xy), dtype=bool)
     for films in problem.films:
-        parameters, rows = state.values[films.positions][films.of], _in_order(films.rows)
+        parameters, rows = state.values[films.positions][films.of], _as_slice(films.rows)
         xy_mm[rows], found[rows] = films.kind.inverse(parameters, camera_xy[rows], films.centers_mm)
     for scans in problem.scans:
         rows = scans.rows
@@ -157,17 +157,17 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     by_unknowns = np.zeros((parts.width, len(xy_mm), 2)).transpose(1, 2, 0)  # columns, as blocks have them
     by_unknowns[:, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4; those of targets follow
     straight = problem.network.line_of_sight.is_straight
-    for seen in computed.targets:
-        lens = _lens(problem, state, seen.camera)
-        images, rows = problem.image_numbers[seen.rows], seen.rows
-        at = lens.equations_with_image(at_distorted.camera_xy[rows], seen.imaged)
-        by_in_camera = _by_in_camera(at.ray_jacobian, seen)
-        by_vector = product(by_in_camera, seen.rotation)
-        by_attitude = cross(seen.in_camera[:, None, :], by_in_camera)
+    for shown in computed.targets:
+        lens = _lens(problem, state, shown.camera)
+        images, rows = problem.image_numbers[shown.rows], shown.rows
+        at = lens.equations_with_image(at_distorted.camera_xy[rows], shown.imaged)
+        by_in_camera = _camera_axes_derivative(at.ray_jacobian, shown)
+        by_vector = product(by_in_camera, shown.rotation)
+        by_attitude = cross(shown.in_camera[:, None, :], by_in_camera)
         if problem.keeps_angles.any():
-            by_attitude = product(by_attitude, of_each(problem.attitude_by_unknowns(state), images))
-        by_station = -by_vector if straight else product(by_vector, seen.sight.by_station)
-        by_point = by_vector if straight else product(by_vector, seen.sight.by_point)
+            by_attitude = product(by_attitude, take_members(problem.attitude_by_unknowns(state), images))
+        by_station = -by_vector if straight else product(by_vector, shown.sight.by_station)
+        by_point = by_vector if straight else product(by_vector, shown.sight.by_point)
         if len(at.value) == len(xy_mm):
             by_camera_xy = at.xy_jacobian
         else:
@@ -176,7 +176,10 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
         _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
         _fill(
-            by_unknowns, rows, parts.board, [applied(by_point, problem.lifted_by[rows, k]) for k in parts.board.members]
+            by_unknowns,
+            rows,
+            parts.board,
+            [applied(by_point, problem.lift_directions[rows, k]) for k in parts.board.members],
         )
         own = [k for k in parts.camera.members if k < len(lens.quantities)]  # others have other families
         _fill(by_unknowns, rows, parts.camera, [at.quantity_derivative(k) for k in own])
@@ -198,10 +201,10 @@ def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Sequence[Arra
         by_unknowns[..., column][rows] = derivative
 
 
-def _by_in_camera(ray_jacobian: Array, seen: SeenTargets) -> Array:
+def _camera_axes_derivative(ray_jacobian: Array, shown: TargetImages) -> Array:
     """Derivative (n, 2, 3) by U, V, W of what has a derivative (n, 2, 2) by the ray -U/W, -V/W."""
-    by_in_plane = ray_jacobian / -seen.in_camera[:, 2, None, None]
-    return columns([by_in_plane[..., 0], by_in_plane[..., 1], applied(by_in_plane, seen.ray)])
+    by_in_plane = ray_jacobian / -shown.in_camera[:, 2, None, None]
+    return columns([by_in_plane[..., 0], by_in_plane[..., 1], applied(by_in_plane, shown.ray)])
 
 
 @dataclass(frozen=True)
@@ -217,7 +220,7 @@ class _FilmDerivatives:
 
 
 def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
-    film = _by_film(problem, state, _straight(problem, state, xy_mm))
+    film = _film_terms(problem, state, _straight(problem, state, xy_mm))
     if not problem.scans:
         return film
     width = max(len(scans.positions) for scans in problem.scans)
@@ -230,9 +233,9 @@ def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDeri
     return replace(film, xy_jacobian=xy_jacobian, by_scanner=by_scanner)
 
 
-def _by_film(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
+def _film_terms(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
     """Of places that are freed of the scanners' bends, without the derivatives by these."""
-    of_films = [_of_films(films, state, xy_mm) for films in problem.films]
+    of_films = [_kind_terms(films, state, xy_mm) for films in problem.films]
     if len(of_films) == 1:
         return of_films[0]
     count, width = len(xy_mm), max(each.parameter_jacobian.shape[2] for each in of_films)
@@ -243,16 +246,16 @@ def _by_film(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
     return result
 
 
-def _of_films(films: Films, state: State, xy_mm: Array) -> _FilmDerivatives:
+def _kind_terms(films: Films, state: State, xy_mm: Array) -> _FilmDerivatives:
     """The derivatives of the films of one kind alone."""
-    parameters, xy = state.values[films.positions][films.of], xy_mm[_in_order(films.rows)]
+    parameters, xy = state.values[films.positions][films.of], xy_mm[_as_slice(films.rows)]
     design = films.kind.design(parameters, xy, films.centers_mm, films.halves_mm)
     return _FilmDerivatives(
         films.kind.apply(parameters, xy), films.kind.gradient(parameters, xy), design, zeros(len(xy), 2, 0)
     )
 
 
-def _in_order(rows: Indices) -> Rows:
+def _as_slice(rows: Indices) -> Rows:
     """Ascending rows, as a slice, which takes no copy, where none is left out."""
     whole = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
     return slice(int(rows[0]), int(rows[-1]) + 1) if whole else rows
@@ -266,26 +269,30 @@ def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
     for name, rows in problem.targets_by_camera.items():
         lens = _lens(problem, state, name)
         if lens.interior[0] <= 0.0:
-            told = f"the principal distance of camera {name} is {lens.interior[0]:.6g} mm and must be positive"
-            return {"": (told, "Give a positive one.")}
-        seen = _seen(problem, state, name, rows)
-        behind = seen.in_camera[:, 2] >= 0.0
-        _, found = lens.camera_from_image(seen.imaged)
+            reason = f"the principal distance of camera {name} is {lens.interior[0]:.6g} mm and must be positive"
+            return {"": (reason, "Give a positive one.")}
+        shown = _image_targets(problem, state, name, rows)
+        behind = shown.in_camera[:, 2] >= 0.0
+        _, found = lens.camera_from_image(shown.imaged)
         for which, is_behind in ((behind, True), (~found, False)):
             for row in _first_of_images(rows[which], numbers):
                 blind.setdefault(numbers[row], _blind_target(problem, row, is_behind))
-    targets = [] if blind else [_seen(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
+    targets = (
+        []
+        if blind
+        else [_image_targets(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
+    )
     camera_xy = None if blind else _computed_in_camera(problem, state, targets)
     if camera_xy is not None:
         _, found = _computed_in_comparator(problem, state, camera_xy)
         for row in _first_of_images(np.flatnonzero(~found), numbers):
             image = problem.network.images[numbers[row]]
-            told = (
+            reason = (
                 f"{observations.kind[row]} {observations.point[row]} is where the {image.transformation} "
                 f"transformation of image {image.name} folds over"
             )
             check = "Check its number and those of the fiducial marks, or choose a transformation of a lower order."
-            blind[numbers[row]] = told, check
+            blind[numbers[row]] = reason, check
     return {problem.network.images[number].name: reason for number, reason in blind.items()}
 
 
@@ -301,5 +308,5 @@ def _blind_target(problem: Problem, row: int, is_behind: bool) -> tuple[str, str
     if is_behind:
         why = "lies behind the camera"
         check = "the sign of W: M rotates from object to camera, which looks along its negative z axis"
-    told = f"point {problem.network.observations.point[row]} {why} in image {image.name}"
-    return told, f"Check {placed}, and {check}."
+    reason = f"point {problem.network.observations.point[row]} {why} in image {image.name}"
+    return reason, f"Check {placed}, and {check}."

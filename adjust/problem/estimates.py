@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem.network import Network
-from adjust.problem.parameter import Parameter, parameter_of
+from adjust.problem.parameter import Parameter, as_parameter
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -58,11 +58,11 @@ class Cofactor(Protocol):
     @property
     def variances(self) -> Array: ...
 
-    def of(self, at: Indices) -> Array:
+    def part(self, at: Indices) -> Array:
         """The matrix (k, k) of some quantities, by their positions."""
         ...
 
-    def of_each(self, groups: Indices) -> Array:
+    def parts(self, groups: Indices) -> Array:
         """The matrices (g, k, k) of groups of quantities (g, k), each of one point's or of one image's."""
         ...
 
@@ -102,10 +102,10 @@ class Estimates:
         return tuple(each.text for each in self.parameters)
 
     def has(self, parameter: Parameter | str) -> bool:
-        return parameter_of(parameter) in self._positions
+        return as_parameter(parameter) in self._positions
 
     def index(self, parameter: Parameter | str) -> int:
-        return self._positions[parameter_of(parameter)]
+        return self._positions[as_parameter(parameter)]
 
     @cached_property
     def _positions(self) -> dict[Parameter, int]:
@@ -120,7 +120,7 @@ class Estimates:
 
     def cofactor_of(self, parameters: Sequence[Parameter | str]) -> Array:
         """The cofactor matrix (k, k) of some quantities."""
-        return self.cofactor.of(np.array([self.index(each) for each in parameters], dtype=np.intp))
+        return self.cofactor.part(np.array([self.index(each) for each in parameters], dtype=np.intp))
 
     def sigma(self, parameter: Parameter | str) -> float:
         """A-posteriori standard deviation."""

@@ -45,7 +45,7 @@ class FurtherObservation(Protocol):
         """What the functions (m,) give for the values (n,) of all unknowns."""
         ...
 
-    def by_unknowns(self, values: Array) -> Array:
+    def jacobian(self, values: Array) -> Array:
         """Their derivatives (m, k) by the unknowns at `positions`."""
         ...
 
@@ -76,7 +76,7 @@ class ObservedDistance:
     def computed(self, values: Array) -> Array:
         return np.array([np.linalg.norm(self._difference(values))])
 
-    def by_unknowns(self, values: Array) -> Array:
+    def jacobian(self, values: Array) -> Array:
         difference = self._difference(values)
         direction = difference / np.linalg.norm(difference)
         return np.concatenate([-direction, direction])[None, :]
@@ -118,7 +118,7 @@ class ObservedCalibration:
     def computed(self, values: Array) -> Array:
         return np.asarray(values[self.positions])
 
-    def by_unknowns(self, values: Array) -> Array:
+    def jacobian(self, values: Array) -> Array:
         return np.eye(len(self.positions))
 
 
@@ -165,7 +165,7 @@ class ObservedAntenna:
         rotation = rotation_from_angles(values[self.positions[3:]])
         return np.asarray((values[self.positions[:3]] + rotation.T @ self.offset)[self.axes])
 
-    def by_unknowns(self, values: Array) -> Array:
+    def jacobian(self, values: Array) -> Array:
         """A rotation by the vector t on top of M takes M' a to M' (a - t x a)."""
         angles = values[self.positions[3:]]
         by_attitude = rotation_from_angles(angles).T @ cross_matrix(self.offset)
@@ -192,7 +192,7 @@ def _antennas(network: Network, unknowns: Unknowns) -> Iterator[ObservedAntenna]
             )
 
 
-def at_computed(network: Network, unknowns: Unknowns, values: Array) -> Network:
+def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
     """The network with distances, calibrations and antennas as if they had been observed without error."""
     distances = tuple(
         replace(each, value=float(observed.computed(values)[0]))
@@ -203,17 +203,17 @@ def at_computed(network: Network, unknowns: Unknowns, values: Array) -> Network:
         replace(each, values=np.array([values[number[key]] for key in each.parameters]))
         for each in network.calibrations
     )
-    seen = {each.frame: each for each in _antennas(network, unknowns)}
+    antennas = {each.frame: each for each in _antennas(network, unknowns)}
     images = tuple(
-        replace(image, exterior=_with_antenna_at(image.exterior, seen[image.frame], values))
-        if image.exterior is not None and image.frame in seen
+        replace(image, exterior=_error_free_antenna(image.exterior, antennas[image.frame], values))
+        if image.exterior is not None and image.frame in antennas
         else image
         for image in network.images
     )
     return replace(network, distances=distances, calibrations=calibrations, images=images)
 
 
-def _with_antenna_at(exterior: Exterior, antenna: ObservedAntenna, values: Array) -> Exterior:
+def _error_free_antenna(exterior: Exterior, antenna: ObservedAntenna, values: Array) -> Exterior:
     computed = exterior.values.copy()
     computed[antenna.axes] = antenna.computed(values)
     return replace(exterior, values=computed)

@@ -29,7 +29,7 @@ def adjusted_image(estimates: Estimates, name: str) -> ImageModel:
 
     exterior = values("exterior", image.frame, EXTERIOR_NAMES)
     parameters = values("film", name, film_parameter_names(image.transformation))
-    bend = bend_of(network, image)
+    bend = scanner_bend(network, image)
     return ImageModel(
         lens=adjusted_lens(estimates, image.camera),
         rotation=rotation_from_angles(exterior[3:]),
@@ -62,11 +62,11 @@ def lifted(estimates: Estimates, points: Sequence[str]) -> Array:
         bends = estimates.values_of(Parameter.board(board.name, name) for name in BOARD_NAMES)
         for row, point in enumerate(points):
             if point in board.places:
-                offsets[row] = bends @ board.lifted_by[point]
+                offsets[row] = bends @ board.lift_directions[point]
     return offsets
 
 
-def bend_of(network: Network, image: Image) -> Bend:
+def scanner_bend(network: Network, image: Image) -> Bend:
     """That of the image's scanner."""
     return network.scanner_by_name[image.scanner].bend if image.scanner else NO_BEND
 
@@ -83,7 +83,7 @@ def approximate_image(network: Network, approximations: Approximations, name: st
         station=exterior[:3],
         film=_film(network, image, film_parameters, name in approximations.mirrored),
         line_of_sight=network.line_of_sight,
-        bend=bend_of(network, image),
+        bend=scanner_bend(network, image),
         bend_parameters=network.scanner_by_name[image.scanner].given if image.scanner else np.empty(0),
     )
 

@@ -149,7 +149,7 @@ class Board:
         board_form(np.array(list(self.places.values())))  # refuses what is no board
 
     @cached_property
-    def lifted_by(self) -> dict[str, Array]:
+    def lift_directions(self) -> dict[str, Array]:
         """(2, 3) by id: where a bend of 1 along each axis moves a point."""
         form = board_form(np.array(list(self.places.values())))
         return {id_: shape[:, None] * form.normal for id_, shape in zip(self.places, form.shapes, strict=True)}
@@ -247,6 +247,16 @@ class Network:
         return {key: np.array(own, dtype=np.intp) for key, own in rows.items()}
 
     @cached_property
+    def known_places(self) -> dict[str, Array]:
+        """The coordinates (3,) of the points that are given in X, Y and Z, by id."""
+        given = {point.id: [each for each in (point.X, point.Y, point.Z) if each] for point in self.points}
+        return {
+            id_: np.array([each.value for each in priors])
+            for id_, priors in given.items()
+            if len(priors) == len("XYZ") and all(np.isfinite(each.sigma) for each in priors)
+        }
+
+    @cached_property
     def observed_points(self) -> frozenset[str]:
         """The object points that are seen in an image."""
         names, of_name = self.observations.numbered_points
@@ -259,7 +269,7 @@ class Network:
         return frozenset((self.images[self.image_numbers[row]].camera, self.observations.point[row]) for row in rows)
 
     @cached_property
-    def without_object(self) -> frozenset[str]:
+    def objectless_images(self) -> frozenset[str]:
         """The images whose frames show no object point, only fiducials or nothing."""
         frames = self.frame_numbers
         of_targets = frames[self.image_numbers[~self.observations.is_fiducial]]
@@ -269,12 +279,12 @@ class Network:
     @cached_property
     def unoriented(self) -> frozenset[str]:
         """Those of them whose exterior orientation is not observed either: a film transformation is all they have."""
-        return frozenset(name for name in self.without_object if not self.image_by_name[name].is_observed)
+        return frozenset(name for name in self.objectless_images if not self.image_by_name[name].is_observed)
 
     @cached_property
     def idle_cameras(self) -> frozenset[str]:
         """The cameras none of whose images shows an object point: their interior orientation has no part."""
-        busy = {image.camera for image in self.images if image.name not in self.without_object}
+        busy = {image.camera for image in self.images if image.name not in self.objectless_images}
         return frozenset(camera.name for camera in self.cameras if camera.name not in busy)
 
     @cached_property

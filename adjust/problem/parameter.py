@@ -93,7 +93,7 @@ class Parameter(NamedTuple):
             case "point":
                 owner = self.id
             case "fiducial" | "join" if self.id:
-                owner = f"{self.owner}.{_without_dots(self.id)}"
+                owner = f"{self.owner}.{_escape_dots(self.id)}"
             case _:
                 owner = self.owner
         return f"{CODES[self.kind]}.{owner}.{self.quantity}"
@@ -183,10 +183,10 @@ def _parameter(text: str) -> Parameter:
     owner, dot, id = owner.rpartition(".")
     if not dot:
         raise ValueError(f"{text!r} names no quantity of an adjustment: {CODES[kind]} takes two names")
-    return Parameter(kind, owner, _with_dots(id), quantity)
+    return Parameter(kind, owner, _unescape_dots(id), quantity)
 
 
-def parameter_of(parameter: Parameter | str) -> Parameter:
+def as_parameter(parameter: Parameter | str) -> Parameter:
     """A key as it is, or that of a text."""
     return parameter_from_text(parameter) if isinstance(parameter, str) else parameter
 
@@ -199,12 +199,12 @@ def object_coordinate(text: str) -> Parameter:
     return Parameter.point(point, axis)
 
 
-def _without_dots(name: str) -> str:
+def _escape_dots(name: str) -> str:
     """A percent sign is written %25 where it could be mistaken for the beginning of %2E or %25."""
     return re.sub(r"%(?=2E|25)", "%25", name).replace(".", "%2E") if "." in name or "%" in name else name
 
 
-def _with_dots(name: str) -> str:
+def _unescape_dots(name: str) -> str:
     return re.sub(r"%(2E|25)", lambda found: "." if found[1] == "2E" else "%", name)
 
 

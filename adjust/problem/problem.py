@@ -136,7 +136,7 @@ class Problem:
         values = self.unknowns.start
         return State(values, rotation_from_angles(values[self.exterior[:, 3:]]))
 
-    def moved(self, state: State, step: Array) -> State:
+    def step_state(self, state: State, step: Array) -> State:
         """The state after a step (n,) of the unknowns.
 
         Rotation vectors stand in the places of the angles, centred film parameters in those of the film parameters.
@@ -145,9 +145,9 @@ class Problem:
         for positions, centred_jacobian in self.films_by_centred(state):
             values[positions] = state.values[positions] + (centred_jacobian @ step[positions][..., None])[..., 0]
         rotations = rotation_from_vector(step[self.exterior[:, 3:]]) @ state.rotations
-        kept, told = self.exterior[self.keeps_angles, 3:], self.exterior[~self.keeps_angles, 3:]
+        kept, free = self.exterior[self.keeps_angles, 3:], self.exterior[~self.keeps_angles, 3:]
         rotations[self.keeps_angles] = rotation_from_angles(values[kept])
-        values[told] = angles_near(rotations[~self.keeps_angles], state.values[told])
+        values[free] = angles_near(rotations[~self.keeps_angles], state.values[free])
         return State(values, rotations)
 
     def attitude_by_unknowns(self, state: State) -> Array:
@@ -279,15 +279,15 @@ class Problem:
     def board_positions(self) -> Indices:
         """(n, 2) positions of the bends of the board that each point is on, ABSENT where it is on none."""
         of_point = {id_: self.unknowns.board[board.name] for board in self.network.boards for id_ in board.places}
-        return self._of_points(of_point, np.full(2, ABSENT, dtype=np.intp))
+        return self._point_values(of_point, np.full(2, ABSENT, dtype=np.intp))
 
     @cached_property
-    def lifted_by(self) -> Array:
+    def lift_directions(self) -> Array:
         """(n, 2, 3): where a bend of 1 along each of its board's axes moves the point; 0 where it is on none."""
-        of_point = {id_: lifted for board in self.network.boards for id_, lifted in board.lifted_by.items()}
-        return self._of_points(of_point, np.zeros((2, 3)))
+        of_point = {id_: lifted for board in self.network.boards for id_, lifted in board.lift_directions.items()}
+        return self._point_values(of_point, np.zeros((2, 3)))
 
-    def _of_points(self, of_point: Mapping[str, NDArray[Number]], of_others: NDArray[Number]) -> NDArray[Number]:
+    def _point_values(self, of_point: Mapping[str, NDArray[Number]], of_others: NDArray[Number]) -> NDArray[Number]:
         """What every observation's point has, or what others have."""
         names, of_name = self.network.observations.numbered_points
         rows = np.stack([of_point.get(name, of_others) for name in names])[of_name]

@@ -23,7 +23,7 @@ class Reduction:
     origin: Array
 
     @classmethod
-    def of(cls, network: Network) -> "Reduction":
+    def to_centroid(cls, network: Network) -> "Reduction":
         """To a round place near the middle of what is given; none where the middle is nearer to 0 than the field is
         wide.
 
@@ -67,7 +67,7 @@ class Reduction:
             return start
         return replace(
             start,
-            exterior={image: values - self._of_elements for image, values in start.exterior.items()},
+            exterior={image: values - self._element_shift for image, values in start.exterior.items()},
             points={point: xyz - self.origin for point, xyz in start.points.items()},
         )
 
@@ -85,14 +85,14 @@ class Reduction:
         return whole
 
     @property
-    def _of_elements(self) -> Array:
+    def _element_shift(self) -> Array:
         """(6,) what is taken off an exterior orientation."""
         return np.append(self.origin, np.zeros(3))
 
     def _image(self, image: Image) -> Image:
         if image.exterior is None:
             return image
-        values = image.exterior.values - self._of_elements
+        values = image.exterior.values - self._element_shift
         return replace(image, exterior=replace(image.exterior, values=values))
 
     def _point(self, point: ObjectPoint) -> ObjectPoint:

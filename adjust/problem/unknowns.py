@@ -96,7 +96,7 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
         for id_, mark in each.fiducials.items():
             priors = (mark.x_mm, mark.y_mm)
             if (each.name, id_) not in observed:
-                priors = (_held(mark.x_mm), _held(mark.y_mm))
+                priors = (_hold(mark.x_mm), _hold(mark.y_mm))
             pair: list[Quantity] = [("x", priors[0], None), ("y", priors[1], None)]
             fiducial[each.name, id_] = listing.add("fiducial", each.name, id_, pair)
     scanner = {
@@ -163,7 +163,7 @@ class _Listing:
         return given, sigma, start
 
 
-def _held(prior: Prior) -> Prior:
+def _hold(prior: Prior) -> Prior:
     """A quantity that nothing observes: fixed if it is free, otherwise its prior alone makes it regular."""
     return prior if np.isfinite(prior.sigma) else Prior(prior.value, 0.0)
 

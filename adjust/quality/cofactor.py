@@ -27,15 +27,15 @@ class NoCofactor:
     def variances(self) -> Array:
         return np.zeros(self.count)
 
-    def of(self, at: Indices) -> Array:
+    def part(self, at: Indices) -> Array:
         return np.zeros((len(at), len(at)))
 
-    def of_each(self, groups: Indices) -> Array:
+    def parts(self, groups: Indices) -> Array:
         return np.zeros((*groups.shape, groups.shape[1]))
 
 
 @dataclass(frozen=True)
-class Datum:
+class InnerDatum:
     """Baarda's S-transformation of cofactors: with V = Q P', Q becomes Q - M V' - V M' + M P V M'.
 
     motion M (n, d): how the quantities move with the free datum; through V (n, d); inner P V (d, d).
@@ -45,7 +45,7 @@ class Datum:
     through: Array
     inner: Array
 
-    def of(self, at: Indices) -> Array:
+    def part(self, at: Indices) -> Array:
         """What is added (k, k) to the cofactors of some quantities."""
         motion, through = self.motion[at], self.through[at]
         crossed = motion @ through.T
@@ -67,14 +67,14 @@ class FactorCofactor:
 
     factor: Factor
     by_free: csr_array
-    datum: Datum | None = None
+    datum: InnerDatum | None = None
 
-    def of(self, at: Indices) -> Array:
+    def part(self, at: Indices) -> Array:
         """The cofactor matrix (k, k) of some quantities, by their positions in the result."""
-        cofactor = self.factor.cofactor_of(self.by_free[at])
-        return cofactor if self.datum is None else cofactor + self.datum.of(at)
+        cofactor = self.factor.function_cofactor(self.by_free[at])
+        return cofactor if self.datum is None else cofactor + self.datum.part(at)
 
-    def of_each(self, groups: Indices) -> Array:
+    def parts(self, groups: Indices) -> Array:
         """The cofactor matrices (g, k, k) of groups of quantities (g, k), each of one point's or of one image's."""
         functions = self.by_free[groups.ravel()]
         (count, width), free = groups.shape, self.by_free.shape[1]
@@ -90,7 +90,7 @@ class FactorCofactor:
             numbers = pairs[first[some][:, None] + np.arange(widths[some[0]])] % free
             by = by_unknowns[some][..., : numbers.shape[1]]
             cofactors[some] = by @ self.factor.cofactors(numbers) @ by.swapaxes(1, 2)
-        return cofactors if self.datum is None else cofactors + np.array([self.datum.of(at) for at in groups])
+        return cofactors if self.datum is None else cofactors + np.array([self.datum.part(at) for at in groups])
 
     @cached_property
     def variances(self) -> Array:
@@ -125,7 +125,7 @@ def inner_cofactor(
     part = np.zeros((len(problem.unknowns), motion.shape[1]))
     part[members] = np.linalg.pinv(motion[members]).T
     through = factor.cofactor_times(part[numbering.free])
-    datum = Datum(reported @ motion, by_free @ through, part[numbering.free].T @ through)
+    datum = InnerDatum(reported @ motion, by_free @ through, part[numbering.free].T @ through)
     return FactorCofactor(factor, by_free, datum)
 
 

@@ -60,18 +60,18 @@ def calibration_tests(
             continue
         root = np.linalg.cholesky(each.covariance)
         free, directions = np.linalg.eigh(surplus(block, factor))
-        seen = free > UNSEEN
-        freedom = int(seen.sum())
+        visible = free > UNSEEN
+        freedom = int(visible.sum())
         if not freedom:
             continue
         u = directions.T @ np.linalg.solve(root, each.computed(state.values) - each.observed)
-        chi_square = float((u[seen] ** 2 / free[seen]).sum())
+        chi_square = float((u[visible] ** 2 / free[visible]).sum())
         left = redundancy - freedom
         variance = (vpv - chi_square) / left if left > 0 and vpv > chi_square else 1.0
-        along = _as_marks_show(root @ directions, ~seen, each.parameters)
-        difference = along[:, seen] @ (u[seen] / free[seen])
-        sigma = np.sqrt(variance * (along[:, seen] ** 2 / free[seen]).sum(axis=1))
-        hidden = (along[:, ~seen] ** 2).sum(axis=1) > UNSEEN * np.diag(each.covariance)
+        along = _as_marks_show(root @ directions, ~visible, each.parameters)
+        difference = along[:, visible] @ (u[visible] / free[visible])
+        sigma = np.sqrt(variance * (along[:, visible] ** 2 / free[visible]).sum(axis=1))
+        hidden = (along[:, ~visible] ** 2).sum(axis=1) > UNSEEN * np.diag(each.covariance)
         test = chi_square / freedom / variance
         yield CalibrationTest(
             group=each.group,

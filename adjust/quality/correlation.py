@@ -54,7 +54,7 @@ def correlations(estimates: Estimates, above: float = HIGH) -> tuple[Correlation
     """
     if not estimates.converged:
         return ()
-    found = [each for camera in estimates.network.cameras for each in _of_camera(estimates, camera, above)]
+    found = [each for camera in estimates.network.cameras for each in _camera_correlations(estimates, camera, above)]
     return tuple(sorted(found, key=lambda each: -abs(each.rho)))
 
 
@@ -69,22 +69,22 @@ class _Kind:
         return self.name + "'" * (self.group == "point")
 
 
-def _of_camera(estimates: Estimates, camera: Camera, above: float) -> Iterator[Correlation]:
+def _camera_correlations(estimates: Estimates, camera: Camera, above: float) -> Iterator[Correlation]:
     kinds = [kind for kind in _kinds(camera) if _is_free(estimates, Parameter.interior(camera.name, kind.name))]
     if not kinds:
         return
     own = [Parameter.interior(camera.name, kind.name) for kind in kinds]
     marks = _free_marks(estimates, camera)
-    of_camera = _correlation(_held(estimates.cofactor_of([*own, *marks]), len(own), _figure(estimates, marks)))
+    own_rho = _correlation(_hold_figure(estimates.cofactor_of([*own, *marks]), len(own), _figure(estimates, marks)))
     known = _field_is_known(estimates.network)
     for i, j in combinations(range(len(own)), 2):
-        if abs(of_camera[i, j]) > above:
-            yield _of_pair(camera.name, kinds[i], kinds[j], float(of_camera[i, j]), known)
+        if abs(own_rho[i, j]) > above:
+            yield _pair_correlation(camera.name, kinds[i], kinds[j], float(own_rho[i, j]), known)
     frames = (image.frame for image in estimates.network.images if image.camera == camera.name)
     images = list(dict.fromkeys(frames))
     rho = np.concatenate(
         [
-            _with_exteriors(estimates, own, marks, images[i : i + IMAGES_AT_ONCE])
+            _exterior_correlations(estimates, own, marks, images[i : i + IMAGES_AT_ONCE])
             for i in range(0, len(images), IMAGES_AT_ONCE)
         ]
     )
@@ -93,7 +93,7 @@ def _of_camera(estimates: Estimates, camera: Camera, above: float) -> Iterator[C
         if len(rows):
             of = [images[row] for row in rows]
             value = float(rho[rows, i, direction][np.argmax(np.abs(rho[rows, i, direction]))])
-            yield _of_images(estimates, camera.name, kind, direction, of, len(images), value, known)
+            yield _image_correlation(estimates, camera.name, kind, direction, of, len(images), value, known)
 
 
 def _kinds(camera: Camera) -> list[_Kind]:
@@ -126,7 +126,7 @@ def _figure(estimates: Estimates, marks: Sequence[Parameter]) -> Array:
     return np.array([np.stack(pair, axis=1).ravel() for pair in pairs])
 
 
-def _held(cofactor: Array, count: int, figure: Array) -> Array:
+def _hold_figure(cofactor: Array, count: int, figure: Array) -> Array:
     """The cofactor matrix of the first quantities, for the figure (k, m) of the last m in its place.
 
     Holding functions f x: Q - Q f' (f Q f')^-1 f Q, of a vague datum Baarda's S-transformation.
@@ -145,19 +145,21 @@ def _correlation(cofactor: Array) -> Array:
     return np.asarray(cofactor / np.outer(scale, scale))
 
 
-def _with_exteriors(estimates: Estimates, own: list[Parameter], marks: list[Parameter], images: list[str]) -> Array:
+def _exterior_correlations(
+    estimates: Estimates, own: list[Parameter], marks: list[Parameter], images: list[str]
+) -> Array:
     """Correlations (images, k, 6) of k parameters with the six directions of every exterior orientation."""
     exterior = [Parameter.exterior(image, element) for image in images for element in EXTERIOR_NAMES]
-    cofactor = _held(estimates.cofactor_of([*own, *marks, *exterior]), len(own), _figure(estimates, marks))
+    cofactor = _hold_figure(estimates.cofactor_of([*own, *marks, *exterior]), len(own), _figure(estimates, marks))
     turn = np.eye(len(cofactor))
     for i, image in enumerate(images):
         at = slice(len(own) + 6 * i, len(own) + 6 * i + 6)
-        turn[at, at] = _in_camera_axes(estimates, image)
+        turn[at, at] = _camera_axes(estimates, image)
     rho = _correlation(turn @ cofactor @ turn.T)[: len(own), len(own) :]
     return rho.reshape(len(own), len(images), 6).transpose(1, 0, 2)
 
 
-def _in_camera_axes(estimates: Estimates, image: str) -> Array:
+def _camera_axes(estimates: Estimates, image: str) -> Array:
     """The derivative (6, 6) of the six directions by the elements of an exterior orientation."""
     angles = estimates.values_of(Parameter.exterior(image, element) for element in EXTERIOR_NAMES[3:])
     turn = np.zeros((6, 6))
@@ -167,20 +169,17 @@ def _in_camera_axes(estimates: Estimates, image: str) -> Array:
 
 
 def _field_is_known(network: Network) -> bool:
-    known = [
-        all(q is not None and np.isfinite(q.sigma) for q in (point.X, point.Y, point.Z)) for point in network.points
-    ]
-    return sum(known) >= FIELD
+    return len(network.known_places) >= FIELD
 
 
-def _of_pair(camera: str, first: _Kind, second: _Kind, rho: float, known: bool) -> Correlation:
+def _pair_correlation(camera: str, first: _Kind, second: _Kind, rho: float, known: bool) -> Correlation:
     why, remedy = _why(first.group, second.group, known)
     cause = f"{first} and {second} of camera {camera} are correlated by {rho:.3f}: {why}."
     pair = Parameter.interior(camera, first.name), Parameter.interior(camera, second.name)
     return Correlation(pair, rho, cause, remedy)
 
 
-def _of_images(
+def _image_correlation(
     estimates: Estimates,
     camera: str,
     kind: _Kind,
@@ -209,7 +208,7 @@ def _of_images(
 
 def _elements(estimates: Estimates, images: list[str], direction: int) -> list[str]:
     """The elements of exterior orientations that have a share in a direction."""
-    shares = np.array([np.abs(_in_camera_axes(estimates, image)[direction]) for image in images]).max(axis=0)
+    shares = np.array([np.abs(_camera_axes(estimates, image)[direction]) for image in images]).max(axis=0)
     return [name for name, share in zip(EXTERIOR_NAMES, shares, strict=True) if share > SHARE]
 
 

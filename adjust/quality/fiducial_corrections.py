@@ -81,7 +81,7 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
         if np.abs(design @ step).max() < STILL_MM:
             break
     projector = np.eye(len(design)) - design @ inverse
-    by_source = _by_coordinates(projector, kind.gradient(parameters, source))
+    by_source = _block_product(projector, kind.gradient(parameters, source))
     return Corrections(common, kind.apply(parameters, source) - given_mm, by_source @ by_unknowns)
 
 
@@ -91,11 +91,11 @@ def _comparator_by_unknowns(film: Film, xy_mm: Array) -> Array:
     center = xy_mm.mean(axis=0)
     by_film = kind.design(film.parameters, xy_mm, center, half).reshape(2 * len(xy_mm), -1)
     by_film = by_film @ np.linalg.inv(kind.centred_jacobian(film.parameters, center, half))
-    back = _by_coordinates(np.eye(2 * len(xy_mm)), np.asarray(np.linalg.inv(film.gradient(xy_mm)), dtype=np.float64))
+    back = _block_product(np.eye(2 * len(xy_mm)), np.asarray(np.linalg.inv(film.gradient(xy_mm)), dtype=np.float64))
     return np.hstack([back, -back @ by_film])
 
 
-def _by_coordinates(matrix: Array, by_place: Array) -> Array:
+def _block_product(matrix: Array, by_place: Array) -> Array:
     """A matrix (m, 2n) times that with the blocks (n, 2, 2) on its diagonal."""
     by_pairs = matrix.reshape(len(matrix), -1, 2)
     return np.asarray(np.einsum("inj,njk->ink", by_pairs, by_place).reshape(len(matrix), -1))

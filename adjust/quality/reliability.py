@@ -30,7 +30,7 @@ Indices = NDArray[np.intp]
 Effects = tuple[Array, Callable[[int], str]]  # of errors on the cameras' parameters (k, c), and the errors' names
 
 UNCHECKED = 1e-9  # an observation of a smaller redundancy is not checked by any other
-UNCONTROLLED = 1e-4  # below this an error must be hundreds of standard deviations to be seen: told apart from the rest
+UNCONTROLLED = 1e-4  # below this an error must be hundreds of standard deviations to show: counted apart
 
 
 @dataclass(frozen=True)
@@ -119,13 +119,13 @@ def misfits(numbering: Numbering, end: Linearised, factor: Factor) -> Misfits:
     transform, back = _transforms(numbering.problem, end, units)
     hat = np.zeros((len(units) + 1, 2, 2))  # the last stands for ABSENT
     for rows in unit_rows(numbering, end, factor):
-        roots = np.concatenate([rows.own, rows.through @ factor.triangle.root_of(rows.shared)[:, None]], axis=3)
+        roots = np.concatenate([rows.own, rows.through @ factor.triangle.group_roots(rows.shared)[:, None]], axis=3)
         hat[rows.units] = roots @ roots.swapaxes(2, 3)
     hat = hat[:-1]
     hat[units.sizes == 1, 1, 1] = 1.0
     v = np.zeros((len(units), 2))
     v[: len(end.v_mm)] = end.v_mm
-    v[len(end.v_mm) :] = -_of_pairs(units, prior_differences(numbering.problem, end.state))
+    v[len(end.v_mm) :] = -_prior_pairs(units, prior_differences(numbering.problem, end.state))
     transform, hat = laid_out(transform), laid_out(hat)
     return Misfits(transform, laid_out(back), hat, applied(transform, laid_out(v)))
 
@@ -135,9 +135,7 @@ def unit_rows(numbering: Numbering, end: Linearised, factor: Factor) -> Iterator
     units = TestedUnits(numbering.problem)
     unit_of = _prior_units(numbering, units)
     touched = numbering.touched
-    with_priors = (
-        _with_own_priors(numbering, block) if i < len(touched) else block for i, block in enumerate(end.rows)
-    )
+    with_priors = (_append_priors(numbering, block) if i < len(touched) else block for i, block in enumerate(end.rows))
     for block, rows in zip(touched, factor.reduced_rows(with_priors), strict=False):  # behind: further observations
         own_units = np.concatenate([block.rows, unit_of[block.own]], axis=1)
         pairs = (*own_units.shape, 2)
@@ -146,7 +144,7 @@ def unit_rows(numbering: Numbering, end: Linearised, factor: Factor) -> Iterator
     shared = numbering.numbers[units.positions]
     given = np.flatnonzero(shared[:, 0] < factor.shared_count)
     shared = np.where(shared[given] == ABSENT, 0, shared[given])
-    weights = -_of_pairs(units, _prior_root_weights(numbering.problem))[given] / factor.scale[shared]
+    weights = -_prior_pairs(units, _prior_root_weights(numbering.problem))[given] / factor.scale[shared]
     through = weights[:, :, None] * np.eye(2)
     nothing = np.zeros((len(given), 1, 2, 0))
     yield UnitRows(len(end.v_mm) + given[:, None], nothing, shared, through[:, None])
@@ -161,7 +159,7 @@ def _prior_units(numbering: Numbering, units: TestedUnits) -> Indices:
     return unit_of
 
 
-def _with_own_priors(numbering: Numbering, blocks: Blocks) -> Blocks:
+def _append_priors(numbering: Numbering, blocks: Blocks) -> Blocks:
     """Blocks with the priors of their own unknowns behind: a pair of rows each, of which the second is zero."""
     count, width = blocks.own.shape
     weights = _prior_root_weights(numbering.problem)[numbering.free]
@@ -177,7 +175,7 @@ def _prior_root_weights(problem: Problem) -> Array:
     return np.where(unknowns.has_prior, 1.0 / np.where(unknowns.has_prior, unknowns.sigma, 1.0), 0.0)
 
 
-def _of_pairs(units: TestedUnits, values: Array) -> Array:
+def _prior_pairs(units: TestedUnits, values: Array) -> Array:
     """Values (n,) of unknowns as (m, 2) of the priors that are tested, 0 for what is absent."""
     return np.append(values, 0.0)[units.positions]
 
@@ -187,7 +185,7 @@ def _transforms(problem: Problem, end: Linearised, units: TestedUnits) -> tuple[
     transform, back = np.zeros((2, len(units), 2, 2))
     count, root, a = len(end.v_mm), end.rows.root, end.by_observation
     transform[:count], back[:count] = product(inverse(root), a), product(inverse(a), root)
-    weights = _of_pairs(units, _prior_root_weights(problem))
+    weights = _prior_pairs(units, _prior_root_weights(problem))
     transform[count:, [0, 1], [0, 1]] = weights
     back[count:, [0, 1], [0, 1]] = np.where(weights > 0.0, 1.0 / np.where(weights > 0.0, weights, 1.0), 0.0)
     return transform, back
@@ -215,8 +213,8 @@ def statistics(misfits: Misfits, weights: Array) -> Statistics:
     free = np.clip(1.0 - adjusted, 0.0, None)
     of_given = weights[:, None] * free + adjusted
     along = applied(axes.transpose(0, 2, 1), misfits.residual)
-    seen = free > UNCHECKED
-    squares = np.where(seen, along**2 / np.where(seen, free * of_given, 1.0), 0.0)
+    visible = free > UNCHECKED
+    squares = np.where(visible, along**2 / np.where(visible, free * of_given, 1.0), 0.0)
     inward = product(misfits.transform.transpose(0, 2, 1), axes)
     weight = product(inward * (free / of_given)[:, None, :], inward.transpose(0, 2, 1))
     pull = applied(inward, along / of_given)
@@ -224,9 +222,9 @@ def statistics(misfits: Misfits, weights: Array) -> Statistics:
     variance = np.einsum("nii->ni", weight)
     checked = variance > UNCHECKED * own_weight
     w = np.where(checked, pull / np.sqrt(np.where(checked, variance, 1.0)), 0.0)
-    contradiction = applied(axes, np.where(seen, -along / np.where(seen, free, 1.0), 0.0))
+    contradiction = applied(axes, np.where(visible, -along / np.where(visible, free, 1.0), 0.0))
     error = applied(misfits.back, contradiction)
-    return Statistics(w, squares.sum(axis=1), seen.sum(axis=1), weight, error, checked)
+    return Statistics(w, squares.sum(axis=1), visible.sum(axis=1), weight, error, checked)
 
 
 def redundancies(misfits: Misfits) -> Array:
@@ -284,8 +282,8 @@ def reliability(
 
 
 def _over(shift: float, variance: Array, checked: NDArray[np.bool_]) -> Array:
-    told = checked & (variance > 0.0)  # rounding may leave the smaller of two eigenvalues below zero
-    return np.where(told, shift / np.sqrt(np.where(told, variance, 1.0)), np.inf)
+    is_checked = checked & (variance > 0.0)  # rounding may leave the smaller of two eigenvalues below zero
+    return np.where(is_checked, shift / np.sqrt(np.where(is_checked, variance, 1.0)), np.inf)
 
 
 def _outer(
@@ -356,7 +354,7 @@ def _further_effects(
     for each, block in zip(numbering.problem.further, end.rows.further, strict=True):
         inward = np.linalg.inv(np.linalg.cholesky(each.covariance))
         through = block.matrix[0] / factor.scale[block.shared[0]]
-        roots = through @ factor.triangle.root_of(block.shared)[0]
+        roots = through @ factor.triangle.group_roots(block.shared)[0]
         variance = np.diag(inward.T @ (np.eye(len(roots)) - roots @ roots.T) @ inward)
         controlled = variance > UNCONTROLLED * (inward**2).sum(axis=0)
         errors = np.where(controlled, _over(shift, variance, controlled), 0.0)

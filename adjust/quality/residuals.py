@@ -105,7 +105,7 @@ def further_residuals(
 
 def surplus(block: Blocks, factor: Factor) -> Array:
     """I - H (m, m) of a block without own unknowns."""
-    roots = (block.matrix / factor.scale[block.shared][:, None, :] @ factor.triangle.root_of(block.shared))[0]
+    roots = (block.matrix / factor.scale[block.shared][:, None, :] @ factor.triangle.group_roots(block.shared))[0]
     return np.asarray(np.eye(len(roots)) - roots @ roots.T)
 
 

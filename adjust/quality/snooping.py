@@ -136,7 +136,7 @@ def contradictions(search: Search) -> list[GrossError]:
         scale = learnt
 
 
-def rest_without(search: Search, units: Sequence[int]) -> tuple[float, float]:
+def rest_after(search: Search, units: Sequence[int]) -> tuple[float, float]:
     """v'Pv and redundancy of an adjustment that would do without some units."""
     return _rest(search, _Covariance(search), units)
 
@@ -157,13 +157,13 @@ def _median_scale(search: Search, covariance: "_Covariance", left_out: Sequence[
     """What the median of the other image points' statistics tells, no less than 1."""
     points = np.setdiff1d(np.arange(len(search.end.v_mm)), left_out)
     sizes = np.where(np.isfinite(search.critical[points]), 2, 0)
-    return max(1.0, robust_scale(_without(search, covariance, left_out)[points], sizes))
+    return max(1.0, robust_scale(_reduced_statistics(search, covariance, left_out)[points], sizes))
 
 
 def _chosen(search: Search, covariance: "_Covariance", limits: Array, most: int) -> list[int]:
     chosen: list[int] = []
     for _ in range(2 * most):
-        statistic = _without(search, covariance, chosen)
+        statistic = _reduced_statistics(search, covariance, chosen)
         worst = int(np.argmax(statistic / limits))
         found = [worst] if statistic[worst] > limits[worst] else _hidden_pair(search, covariance, chosen, limits)
         if not found or len(chosen) + len(found) > most:
@@ -187,11 +187,11 @@ def _hidden_pair(search: Search, covariance: "_Covariance", chosen: Sequence[int
     rest, redundancy = _rest(search, covariance, chosen)
     if special.chdtrc(redundancy, rest / raised) > search.probabilities.family:
         return []
-    alone = _without(search, covariance, chosen)
+    alone = _reduced_statistics(search, covariance, chosen)
     candidates = np.argsort(-alone / search.critical, kind="stable")[:PAIRED]
     covariance.prepare([int(unit) for unit in candidates])
     critical = raised * search.probabilities.critical(np.array([4]), len(candidates) * (len(candidates) - 1) // 2)[0]
-    given = np.array([_without(search, covariance, [*chosen, int(unit)])[candidates] for unit in candidates])
+    given = np.array([_reduced_statistics(search, covariance, [*chosen, int(unit)])[candidates] for unit in candidates])
     of_pair = alone[candidates][:, None] + given
     hidden = (of_pair > critical) & (given > limits[candidates]) & (limits[candidates][:, None] < given.T)
     if not hidden.any():
@@ -262,7 +262,7 @@ def _columns(search: Search, units: Sequence[int]) -> dict[int, Array]:
     return columns
 
 
-def _without(search: Search, covariance: _Covariance, left_out: Sequence[int]) -> Array:
+def _reduced_statistics(search: Search, covariance: _Covariance, left_out: Sequence[int]) -> Array:
     """The statistics (N,) as they would be without some units; 0 for these."""
     residual, cofactor = search.found.residual, np.eye(2) - search.found.hat
     if left_out:
@@ -273,8 +273,8 @@ def _without(search: Search, covariance: _Covariance, left_out: Sequence[int]) -
         cofactor = cofactor - through @ columns.transpose(0, 2, 1)
     variance, axes = eigen(cofactor)
     along = applied(axes.transpose(0, 2, 1), residual)
-    seen = variance > UNCHECKED
-    statistic: Array = np.where(seen, along**2 / np.where(seen, variance, 1.0), 0.0).sum(axis=1)
+    visible = variance > UNCHECKED
+    statistic: Array = np.where(visible, along**2 / np.where(visible, variance, 1.0), 0.0).sum(axis=1)
     statistic[left_out] = 0.0
     return statistic
 
@@ -282,8 +282,8 @@ def _without(search: Search, covariance: _Covariance, left_out: Sequence[int]) -
 def _inverse(cofactor: Array) -> Array:
     """The inverse, what nothing checks left out."""
     variance, axes = np.linalg.eigh(cofactor)
-    seen = variance > UNCHECKED
-    return np.asarray((axes[:, seen] / variance[seen]) @ axes[:, seen].T)
+    visible = variance > UNCHECKED
+    return np.asarray((axes[:, visible] / variance[visible]) @ axes[:, visible].T)
 
 
 def _joint(search: Search, covariance: _Covariance, chosen: Sequence[int]) -> tuple[Array, Array]:
@@ -293,8 +293,8 @@ def _joint(search: Search, covariance: _Covariance, chosen: Sequence[int]) -> tu
     own = inverse.reshape(len(chosen), 2, len(chosen), 2)
     variance, axes = np.linalg.eigh(np.einsum("kikj->kij", own))
     along = (axes.transpose(0, 2, 1) @ errors[..., None])[..., 0]
-    seen = variance > UNCHECKED
-    return errors, np.where(seen, along**2 / np.where(seen, variance, 1.0), 0.0).sum(axis=1)
+    visible = variance > UNCHECKED
+    return errors, np.where(visible, along**2 / np.where(visible, variance, 1.0), 0.0).sum(axis=1)
 
 
 def _contradiction(
@@ -302,7 +302,7 @@ def _contradiction(
 ) -> GrossError:
     errors, joint = _joint(search, covariance, chosen)
     at = chosen.index(unit)
-    others = _without(search, covariance, [each for each in chosen if each != unit])
+    others = _reduced_statistics(search, covariance, [each for each in chosen if each != unit])
     near = np.flatnonzero((others > limits) & (others > joint[at] - TOLD_APART))
     alike = sorted((int(other) for other in near if other != unit), key=lambda other: -others[other])
     error = search.found.back[unit] @ errors[at]

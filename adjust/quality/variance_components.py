@@ -69,16 +69,16 @@ def _traces(numbering: Numbering, end: Linearised, factor: Factor, members: Sequ
     """
     within = np.zeros((len(members), len(members)))
     normals = [csr_array((factor.shared_count, factor.shared_count)) for _ in members]
-    belongs = np.append(
+    is_member = np.append(
         np.array(members), np.zeros((len(members), 1), dtype=bool), axis=1
     )  # the last stands for ABSENT
     for rows in unit_rows(numbering, end, factor):
         count = len(rows.units)
-        masks = belongs[:, rows.units][..., None, None]
+        masks = is_member[:, rows.units][..., None, None]
         shape = len(members), count, 2 * rows.units.shape[1]
         own = (masks * rows.own).reshape(*shape, rows.own.shape[3])
         through = (masks * rows.through).reshape(*shape, rows.through.shape[3])
-        roots = through @ factor.triangle.root_of(rows.shared)
+        roots = through @ factor.triangle.group_roots(rows.shared)
         for i, j in product(range(len(members)), repeat=2):
             between = roots[i] @ roots[j].swapaxes(1, 2)
             within[i, j] += ((own[i] @ own[j].swapaxes(1, 2) + between) ** 2).sum() - (between**2).sum()
@@ -86,10 +86,10 @@ def _traces(numbering: Numbering, end: Linearised, factor: Factor, members: Sequ
             normals[i] = normals[i] + spread_squares(
                 rows.shared, of_group.swapaxes(1, 2) @ of_group, factor.shared_count
             )
-    return within + _between(factor, normals)
+    return within + _shared_traces(factor, normals)
 
 
-def _between(factor: Factor, normals: Sequence[csr_array]) -> Array:
+def _shared_traces(factor: Factor, normals: Sequence[csr_array]) -> Array:
     """The traces (g, g) of N_i Q N_j Q, with N (s, s) what a group tells of the shared unknowns and Q their cofactors.
 
     Some columns of Q at a time: all of it would be too large in a large network.
@@ -100,6 +100,6 @@ def _between(factor: Factor, normals: Sequence[csr_array]) -> Array:
         some = slice(first, first + COLUMNS_AT_ONCE)
         columns = factor.triangle.cofactor_times(unit)
         for j, of_group in enumerate(normals):
-            told = factor.triangle.cofactor_times(of_group @ columns)
-            traces[:, j] += [np.trace(normal[some] @ told) for normal in normals]
+            through_group = factor.triangle.cofactor_times(of_group @ columns)
+            traces[:, j] += [np.trace(normal[some] @ through_group) for normal in normals]
     return traces

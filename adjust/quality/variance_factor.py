@@ -96,7 +96,7 @@ def _given_groups(numbering: Numbering, state: State, factor: Factor, weighting:
     problem = numbering.problem
     sigma, differences = problem.unknowns.sigma, prior_differences(problem, state)
     for group, positions in _owned(problem, weighting):
-        q = factor.cofactor_of(_rows(numbering.numbers[positions], len(numbering.free)))
+        q = factor.function_cofactor(_rows(numbering.numbers[positions], len(numbering.free)))
         free = np.eye(len(positions)) - q / np.outer(sigma[positions], sigma[positions])
         vpv = float(((differences[positions] / sigma[positions]) ** 2).sum())
         redundancy = float(np.trace(free))
@@ -115,7 +115,7 @@ def _owned(problem: Problem, weighting: Weighting) -> Iterator[tuple[GivenGroup,
         fiducials.setdefault(camera, []).extend(pair[takes_part[pair]].tolist())
     for camera, members in fiducials.items():
         positions = np.array(members, dtype=np.intp)
-        for some in _of_one_source(positions, unknowns.sigma[positions]):
+        for some in _split_sources(positions, unknowns.sigma[positions]):
             yield GivenGroup("datum", camera), some
     for name, owned in (("interior", unknowns.camera), ("scanner", unknowns.scanner), ("board", unknowns.board)):
         for owner, positions in owned.items():
@@ -123,7 +123,7 @@ def _owned(problem: Problem, weighting: Weighting) -> Iterator[tuple[GivenGroup,
                 yield GivenGroup(name, owner), positions[takes_part[positions]]
 
 
-def _of_one_source(positions: Indices, sigma: Array) -> list[Indices]:
+def _split_sources(positions: Indices, sigma: Array) -> list[Indices]:
     """Positions apart where their standard deviations, in order, leap."""
     order = np.argsort(sigma, kind="stable")
     leaps = np.flatnonzero(sigma[order][1:] > APART * sigma[order][:-1]) + 1

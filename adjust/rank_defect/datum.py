@@ -48,7 +48,7 @@ def _further_motions(problem: Problem, state: State, generators: Array) -> Array
     """How further observations change (m, 7), each by one unit at most, however short a distance may be."""
     rows = [np.zeros((7, 7))]
     for further in problem.further:
-        by_unknowns = further.by_unknowns(state.values)
+        by_unknowns = further.jacobian(state.values)
         motions = by_unknowns @ generators[further.positions]
         lengths = np.linalg.norm(motions, axis=1, keepdims=True)
         strength = lengths[:, 0] > EXACT * np.linalg.norm(by_unknowns, axis=1)

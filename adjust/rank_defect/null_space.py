@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import Factor
-from adjust.linear_algebra.multifrontal import with_rows
+from adjust.linear_algebra.multifrontal import append_rows
 from adjust.linear_algebra.sparse_factor import Triangle
 
 SINGULAR = 1e-8  # singular values of the scaled rows, over the largest, below which there is no solution
@@ -83,7 +83,7 @@ def _shared_triangle(factor: Factor, blind: Sequence[BlindBlock]) -> Triangle:
     """The shared triangle, where blocks have null vectors together with the rows that these leave over."""
     if not blind:
         return factor.triangle
-    return with_rows(factor.triangle, [(block.shared, block.left.T @ block.border) for block in blind])
+    return append_rows(factor.triangle, [(block.shared, block.left.T @ block.border) for block in blind])
 
 
 def _smallest(triangle: Triangle, below: float) -> tuple[Array, Array]:

@@ -98,7 +98,7 @@ def weak_term_sentences(
         if not hardly:
             continue
         lens = [int(i) for camera in unknowns.camera.values() for i in camera[3:] if int(i) in places]
-        held = held_variances(cofactor.of(np.array([*hardly, *lens])), len(hardly))
+        held = held_variances(cofactor.part(np.array([*hardly, *lens])), len(hardly))
         scale = factor.scale[[places[position] for position in hardly]]
         names = [unknowns.parameters[position].quantity for position in hardly]
         by_lens = [term for term, ratio in zip(names, np.sqrt(held) * scale, strict=True) if ratio <= HARDLY]

@@ -17,15 +17,15 @@ from adjust.problem.reduction import Reduction
 from adjust.rank_defect.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.rank_defect.datum_choice import chosen_coordinates, chosen_points, held_as_known
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
-from adjust.solution.coordinate_blunders import Slip, far_points, few_points, freed, slips
-from adjust.solution.left_out_images import fitting, with_lens, without_images
+from adjust.solution.coordinate_blunders import Slip, coordinate_slips, far_points, few_points, free_points
+from adjust.solution.left_out_images import adopt_lens, fitting, leave_out
 from adjust.solution.options import Datum, Method, Options
-from adjust.solution.plausibility import with_plausibility
+from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, is_fixed, run_result
 from adjust.solution.reweighting import Run, again, run
 from adjust.validation import validate
 
-__all__ = ["Datum", "Method", "Options", "adjust", "adjust_problem", "with_datum"]
+__all__ = ["Datum", "Method", "Options", "adjust", "adjust_problem", "settle_datum"]
 
 Indices = NDArray[np.intp]
 
@@ -54,12 +54,12 @@ def adjust(
     keep_freed_memory()
     validate(network)
     options = options or Options()
-    tried, family = partial(_tried, options=options), options.probabilities.family
+    tried, family = partial(_try_network, options=options), options.probabilities.family
     if approximations is not None:
-        return with_plausibility(_as_a_whole(network, approximations, None, options), tried, family)
-    result, left_out = _without_blind_images(*_orientable(network, options), options)
-    found = _tried_again(network, result, left_out, options) if left_out else result
-    return with_plausibility(found, tried, family)
+        return check_plausibility(_as_a_whole(network, approximations, None, options), tried, family)
+    result, left_out = _leave_out_blind(*_orientable(network, options), options)
+    found = _try_again(network, result, left_out, options) if left_out else result
+    return check_plausibility(found, tried, family)
 
 
 def _orientable(network: Network, options: Options) -> tuple[Network, Approximations | None, dict[str, str]]:
@@ -69,14 +69,14 @@ def _orientable(network: Network, options: Options) -> tuple[Network, Approximat
     try:
         return network, initial_values(held_as_known(network, options.datum_coordinates)), {}
     except UnorientedError as error:
-        part, reasons = without_images(network, error.reasons), error.reasons
+        part, reasons = leave_out(network, error.reasons), error.reasons
     except AdjustmentError:
         return network, None, {}
     start = None if part is None else _own_start(part, options)
     return (network, None, {}) if part is None or start is None else (part, start, reasons)
 
 
-def _without_blind_images(
+def _leave_out_blind(
     part: Network, start: Approximations | None, left_out: dict[str, str], options: Options
 ) -> tuple[Adjustment, dict[str, str]]:
     """The adjustment of a network without those images, too, in which some point has no image to begin with, and why
@@ -84,26 +84,26 @@ def _without_blind_images(
     try:
         return _as_a_whole(part, None, start, options), left_out
     except NoImageError as error:
-        rest = without_images(part, error.reasons) if error.reasons else None
+        rest = leave_out(part, error.reasons) if error.reasons else None
         begun = None if rest is None else _own_start(rest, options)
         if rest is None or begun is None:
             raise
         reasons = error.reasons
-    return _without_blind_images(rest, begun, left_out | reasons, options)
+    return _leave_out_blind(rest, begun, left_out | reasons, options)
 
 
-def _tried_again(network: Network, rest: Adjustment, left_out: dict[str, str], options: Options) -> Adjustment:
+def _try_again(network: Network, rest: Adjustment, left_out: dict[str, str], options: Options) -> Adjustment:
     """The adjustment with those images that were left out and that fit once the lens is known."""
     found = rest
     if rest.converged:
-        _, start, reasons = _orientable(with_lens(network, rest), options)
+        _, start, reasons = _orientable(adopt_lens(network, rest), options)
         came = left_out.keys() - reasons.keys()
         while start is not None and came:
-            part = without_images(network, left_out.keys() - came)
+            part = leave_out(network, left_out.keys() - came)
             if part is None:
                 break
             try:
-                tried = _adjusted(part, start, options)
+                tried = _adjust_points(part, start, options)
                 fit = fitting(tried, came, rest.sigma0) if tried.converged else set()
             except NoImageError as error:
                 tried, fit = rest, came - error.reasons.keys()
@@ -125,7 +125,7 @@ def _as_a_whole(
         _check_whole(network, _plainly(network, own, options), options)
     try:
         start = approximations or own or initial_values(held_as_known(network, options.datum_coordinates))
-        result = _adjusted(network, start, options)
+        result = _adjust_points(network, start, options)
     except DatumError:  # whatever the observations say
         raise
     except AdjustmentError:
@@ -143,12 +143,12 @@ def _as_a_whole(
 
 def _check_whole(network: Network, given: Adjustment | None, options: Options) -> None:
     """Raise AdjustmentError where a slip of the whole network explains what the network as it is given does not."""
-    slip = blunder_sentence(network, given, partial(_tried, options=options), options.probabilities.family)
+    slip = blunder_sentence(network, given, partial(_try_network, options=options), options.probabilities.family)
     if slip:
         raise AdjustmentError(slip)
 
 
-def _tried(network: Network, options: Options) -> Adjustment | None:
+def _try_network(network: Network, options: Options) -> Adjustment | None:
     """Another network adjusted from its own approximations; None where it cannot begin."""
     return _plainly(network, _own_start(network, options), options)
 
@@ -167,43 +167,43 @@ def _plainly(network: Network, start: Approximations | None, options: Options) -
         return None
     plain = replace(options.plain, iteration_limit=min(options.iteration_limit, TRIAL_STEPS))
     try:
-        return _solved(network, start, plain)
+        return _solve(network, start, plain)
     except AdjustmentError:
         return None
 
 
-def _adjusted(network: Network, approximations: Approximations, options: Options) -> Adjustment:
+def _adjust_points(network: Network, approximations: Approximations, options: Options) -> Adjustment:
     """The adjustment, and what is to be said of single given points."""
-    begun = _without_slips(network, approximations, options) if options.robust or options.snooping else None
+    begun = _start_robustly(network, approximations, options) if options.robust or options.snooping else None
     if begun is not None and begun.converged:
-        return begun if _agrees(begun, options) else _with_slips(begun, network, approximations, options)
+        return begun if _agrees(begun, options) else _report_slips(begun, network, approximations, options)
     try:
-        result = _solved(network, approximations, options)
+        result = _solve(network, approximations, options)
     except NoImageError as error:
         if found := _slips(network, approximations, options):
             raise AdjustmentError(" ".join(slip.sentence for slip in found)) from error
         raise
     if result.termination not in ("converged", "singular"):
-        result = _begun_anew(network, approximations, options, result)
+        result = _begin_anew(network, approximations, options, result)
     if result.termination == "singular" or _agrees(result, options):
         return result
-    return _with_slips(result, network, approximations, options)
+    return _report_slips(result, network, approximations, options)
 
 
-def _with_slips(result: Adjustment, network: Network, approximations: Approximations, options: Options) -> Adjustment:
+def _report_slips(result: Adjustment, network: Network, approximations: Approximations, options: Options) -> Adjustment:
     """The same, with what is to be said of given points where the observations do not agree."""
     if found := _slips(network, approximations, options):
         return replace(result, slips=tuple(slip.sentence for slip in found))
     return result if result.converged else replace(result, remarks=(*result.remarks, *few_points(network)))
 
 
-def _solved(
+def _solve(
     network: Network, approximations: Approximations, options: Options, doubted_points: Iterable[str] = ()
 ) -> Adjustment:
     """A network adjusted about its centroid, in its own coordinates; without the given places of some points to begin
     with.
     """
-    reduction = Reduction.of(network)
+    reduction = Reduction.to_centroid(network)
     problem = _numbered(reduction.network(network), reduction.approximations(approximations), options)
     unknowns = problem.unknowns
     doubted = [int(position) for name in doubted_points for position in unknowns.point[name]]
@@ -221,7 +221,7 @@ def _agrees(result: Adjustment, options: Options) -> bool:
     return result.converged and bool(chance)
 
 
-def _without_slips(network: Network, approximations: Approximations, options: Options) -> Adjustment | None:
+def _start_robustly(network: Network, approximations: Approximations, options: Options) -> Adjustment | None:
     """Robust estimation or data snooping that begins without the given points that are slips; None without any.
 
     From an adjustment with a slip in it neither finds back: its linear equations say nothing of errors so large.
@@ -229,9 +229,9 @@ def _without_slips(network: Network, approximations: Approximations, options: Op
     found = _slips(network, approximations, options)
     if not found:
         return None
-    _, start = freed(network, approximations, [slip.far for slip in found])
+    _, start = free_points(network, approximations, [slip.far for slip in found])
     try:
-        return _solved(network, start, options, [slip.far.name for slip in found])
+        return _solve(network, start, options, [slip.far.name for slip in found])
     except NoImageError:
         return None
 
@@ -241,24 +241,24 @@ def _slips(network: Network, approximations: Approximations, options: Options) -
     far = far_points(_numbered(network, approximations, options), options.probabilities.family)
     if not far:
         return []
-    without, start = freed(network, approximations, far)
+    without, start = free_points(network, approximations, far)
     plain = options.plain
     try:
-        return slips(network, far, _solved(without, start, plain), options)
+        return coordinate_slips(network, far, _solve(without, start, plain), options)
     except AdjustmentError:  # without these points it cannot even begin
         return []
 
 
-def _begun_anew(network: Network, approximations: Approximations, options: Options, stopped: Adjustment) -> Adjustment:
+def _begin_anew(network: Network, approximations: Approximations, options: Options, stopped: Adjustment) -> Adjustment:
     """The adjustment from the network's own approximations; what is there already where these are no better."""
-    for known in (*_without_guesses(network), network):
+    for known in (*_free_guesses(network), network):
         try:
             own = initial_values(held_as_known(known, options.datum_coordinates))
         except AdjustmentError:
             continue
         if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):
             continue
-        result = _solved(network, own, options)
+        result = _solve(network, own, options)
         if result.converged:
             warning = (
                 f"From the given approximations the iteration did not come to rest ({stopped.termination} after "
@@ -269,7 +269,7 @@ def _begun_anew(network: Network, approximations: Approximations, options: Optio
     return stopped
 
 
-def _without_guesses(network: Network) -> Iterator[Network]:
+def _free_guesses(network: Network) -> Iterator[Network]:
     """The network without principal distances of which so little is known that images of known points tell more."""
     guessed = {
         camera.name
@@ -291,25 +291,25 @@ def adjust_problem(
     given values of those `doubted` are left out to begin with (see `run`).
     """
     members = chosen_points(problem, options.datum_points)
-    solved = with_datum(problem, options)
+    solved = settle_datum(problem, options)
     solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted)
     if options.datum == "free":
-        solution = _freed(problem, solution, members, options)
+        solution = _center_datum(problem, solution, members, options)
     result = run_result(problem, solution, members if options.datum == "free" else None, options.probabilities)
     return replace(result, network=problem.network)
 
 
-def with_datum(problem: Problem, options: Options) -> Problem:
+def settle_datum(problem: Problem, options: Options) -> Problem:
     """The problem that is solved: with a minimal datum held fixed, unless what is given is to be the datum."""
     unknowns = problem.unknowns
     if options.datum_coordinates:
         unknowns = unknowns.fixed_as_given(chosen_coordinates(problem, options.datum_coordinates))
     elif options.datum != "control":
         unknowns = unknowns.fixed(minimal_datum(problem))
-    return _without_bending_for_a_datum(replace(problem, unknowns=unknowns))
+    return _straighten_sight(replace(problem, unknowns=unknowns))
 
 
-def _without_bending_for_a_datum(problem: Problem) -> Problem:
+def _straighten_sight(problem: Problem) -> Problem:
     """Straight lines of sight where the datum is lacking: bent ones would hold it, but by next to nothing."""
     bent = not problem.network.line_of_sight.is_straight
     if bent and object_datum(problem, problem.start()).free.shape[1] > 0:
@@ -317,7 +317,7 @@ def _without_bending_for_a_datum(problem: Problem) -> Problem:
     return problem
 
 
-def _freed(problem: Problem, last: Run, members: Indices, options: Options) -> Run:
+def _center_datum(problem: Problem, last: Run, members: Indices, options: Options) -> Run:
     """A run with minimal datum, brought to inner constraints over some coordinates; as it is where nothing was fixed.
 
     Where priors leave only some of the similarity transformations free, these are so to the first order alone: after

@@ -16,7 +16,7 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
-from adjust.solution.left_out_images import without_images
+from adjust.solution.left_out_images import leave_out
 from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ def blunder_sentence(network: Network, given: Adjustment | None, tried: Tried, f
         found = tried(alike[0].network)
         better = found is not None and (given is None or CLEARLY * found.sigma0 < given.sigma0 or not given.converged)
         if found is not None and better and explains(found, family):
-            return _told(_as_stations_are_given(network, alike, found), found, given, family)
+            return _sentence(_as_stations_are_given(network, alike, found), found, given, family)
     return ""
 
 
@@ -92,7 +92,7 @@ def explains(result: Adjustment, family: float) -> bool:
     return checked and bool(chdtrc(result.redundancy, result.vpv / TOLERATED**2) > family)
 
 
-def _told(slips: Sequence[Hypothesis], found: Adjustment, given: Adjustment | None, family: float) -> str:
+def _sentence(slips: Sequence[Hypothesis], found: Adjustment, given: Adjustment | None, family: float) -> str:
     words = [each.words for each in slips]
     if len(words) >= len(AXES):  # nothing tells which of the mirrors it is
         words = [MIRRORED, *words[len(AXES) :]]
@@ -136,13 +136,13 @@ def _hypotheses(
 
 def _mirrored(network: Network) -> Iterator[Hypothesis]:
     for words, moved in AXES.items():
-        yield Hypothesis(words, "Correct it.", _with_points(network, moved), moved)
+        yield Hypothesis(words, "Correct it.", _move_points(network, moved), moved)
 
 
 def _other_unit(network: Network) -> Iterator[Hypothesis]:
     for factor in (*UNITS, *(1.0 / each for each in UNITS)):
         moved = factor * np.eye(3)
-        yield Hypothesis(_unit_words(factor), _UNIT_REMEDY, _with_points(network, moved), moved)
+        yield Hypothesis(_unit_words(factor), _UNIT_REMEDY, _move_points(network, moved), moved)
 
 
 _UNIT_REMEDY = "Give both in the unit that [object] unit names."
@@ -154,12 +154,12 @@ def _unit_words(factor: float) -> str:
     return f"the coordinates of the points are {times:.4g} times too {how} beside stations or distances: another unit"
 
 
-def _with_points(network: Network, moved: Array) -> Network:
+def _move_points(network: Network, moved: Array) -> Network:
     """With all points moved by a matrix that has one entry a row."""
-    return replace(network, points=tuple(_moved(point, moved) for point in network.points))
+    return replace(network, points=tuple(_move_point(point, moved) for point in network.points))
 
 
-def _moved(point: ObjectPoint, moved: Array) -> ObjectPoint:
+def _move_point(point: ObjectPoint, moved: Array) -> ObjectPoint:
     given = (point.X, point.Y, point.Z)
     priors: list[Prior | None] = []
     for row in moved:
@@ -177,7 +177,7 @@ def _y_down(network: Network, given: Adjustment | None) -> Iterator[Hypothesis]:
     turned = np.array([image.transformation == "none" for image in network.images])[network.image_numbers]
     xy_mm = network.observations.xy_mm * np.where(turned[:, None], [1.0, -1.0], 1.0)
     where = "the y' axis of the camera's fiducial marks" if films else "the y axis of the comparator coordinates"
-    cameras = tuple(_turned(camera) for camera in network.cameras)
+    cameras = tuple(_turn_camera(camera) for camera in network.cameras)
     observations = replace(network.observations, xy_mm=xy_mm)
     yield Hypothesis(
         f"{where} points down, and it has to point up",
@@ -227,12 +227,12 @@ def _middle_mm(network: Network, camera: Camera) -> float:
 def _mirrored_images(network: Network, given: Adjustment | None, tried: Tried, family: float) -> Iterator[Hypothesis]:
     """Single images of a digital camera, the worst first, without which all others agree."""
     images = [image for image in network.images if image.transformation == "none"]
-    images = [image for image in images if image.name not in network.without_object]
+    images = [image for image in images if image.name not in network.objectless_images]
     if len(images) < FEWEST_IMAGES:
         return
     worst = _squares(network, given)
     for image in sorted(images, key=lambda image: (-worst[image.name], image.name))[:MOST_MIRRORED]:
-        others = without_images(network, [image.frame])
+        others = leave_out(network, [image.frame])
         rest = None if others is None else tried(others)
         if rest is not None and explains(rest, family):
             yield Hypothesis(
@@ -264,7 +264,7 @@ def _mirrored_image(network: Network, name: str, rest: Adjustment) -> Network:
     return replace(turned, images=images, cameras=(*turned.cameras, own))
 
 
-def _turned(camera: Camera) -> Camera:
+def _turn_camera(camera: Camera) -> Camera:
     """With y' pointing the other way."""
     marks = {id: Fiducial(mark.x_mm, _opposite(mark.y_mm)) for id, mark in camera.fiducials.items()}
     y0_mm = camera.y0_mm and _opposite(camera.y0_mm)
@@ -307,7 +307,7 @@ def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[Hy
 def _pairs(network: Network, given: Adjustment | None) -> list[tuple[str, str]]:
     """Frames of one camera with film transformations of their own, those with the largest residuals first."""
     images = [image for image in network.images if image.transformation != "none"]
-    images = [image for image in images if image.name not in network.without_object]
+    images = [image for image in images if image.name not in network.objectless_images]
     worst = _squares(network, given)
     ordered = sorted(images, key=lambda image: (-worst[image.name], image.name))
     pairs = [(a.name, b.name) for a, b in combinations(ordered, 2) if a.camera == b.camera]
@@ -354,8 +354,8 @@ def _stations(result: Adjustment, of: dict[str, Array]) -> tuple[Array, Array]:
 
 
 def _points(result: Adjustment) -> Array:
-    seen = [point.id for point in result.network.points if point.id in result.network.observed_points]
-    return result.values_of(Parameter.point(id, axis) for id in seen for axis in "XYZ").reshape(-1, 3)
+    ids = [point.id for point in result.network.points if point.id in result.network.observed_points]
+    return result.values_of(Parameter.point(id, axis) for id in ids for axis in "XYZ").reshape(-1, 3)
 
 
 def _near(stations: Array, given: Array, depths: Array) -> NDArray[np.bool_]:

@@ -55,7 +55,7 @@ def far_points(problem: Problem, family: float) -> list[FarPoint]:
     rays = _rays_of_given(problem, sights)
     if not rays:
         return []
-    miss = {name: float(np.median([ray.distance_mm for ray in seen])) for name, seen in rays.items()}
+    miss = {name: float(np.median([ray.distance_mm for ray in own])) for name, own in rays.items()}
     noise = float(np.median([sight.sigma_mm for sight in sights.values()]))
     falling = sorted(miss, key=lambda name: (-miss[name], name))
     limits = [max(miss[name], noise) / np.sqrt(family) for name in falling]  # for those before each
@@ -105,7 +105,7 @@ def _rays_of_given(problem: Problem, sights: Mapping[str, Sight]) -> dict[str, l
         for row, distance in zip(rows, distances, strict=True):
             ray = _Ray(center, sight.rays[row] @ rotation, sight.principal_distance_mm, float(distance))
             rays[sight.points[row]].append(ray)
-    return {name: seen for name, seen in sorted(rays.items()) if len(seen) >= FEWEST_IMAGES}
+    return {name: own for name, own in sorted(rays.items()) if len(own) >= FEWEST_IMAGES}
 
 
 def _sights(problem: Problem) -> dict[str, Sight]:
@@ -122,7 +122,7 @@ def _sights(problem: Problem) -> dict[str, Sight]:
 
 def _places(rays: Mapping[str, list[_Ray]]) -> dict[str, Array]:
     """Where the rays of each point meet (3,), nan where they do not."""
-    rows = [(number, ray) for number, seen in enumerate(rays.values()) for ray in seen]
+    rows = [(number, ray) for number, own in enumerate(rays.values()) for ray in own]
     points, _ = intersect(
         np.array([ray.center for _, ray in rows]),
         np.array([ray.direction for _, ray in rows]),
@@ -162,7 +162,7 @@ class Slip:
         )
 
 
-def freed(network: Network, start: Approximations, far: Sequence[FarPoint]) -> tuple[Network, Approximations]:
+def free_points(network: Network, start: Approximations, far: Sequence[FarPoint]) -> tuple[Network, Approximations]:
     """The network with nothing known of the far points' coordinates, and its start with them where their rays meet."""
     places = {each.name: each.place for each in far}
     points = tuple(_unknown(point) if point.id in places else point for point in network.points)
@@ -173,7 +173,7 @@ def _unknown(point: ObjectPoint) -> ObjectPoint:
     return ObjectPoint(point.id, *(Prior(each.value, np.inf) for each in (point.X, point.Y, point.Z) if each))
 
 
-def slips(network: Network, far: Sequence[FarPoint], without: Adjustment, options: Options) -> list[Slip]:
+def coordinate_slips(network: Network, far: Sequence[FarPoint], without: Adjustment, options: Options) -> list[Slip]:
     """Which of the far points are slips, by an adjustment `without` their coordinates; none where that has no solution.
 
     The difference of given and adjusted coordinates over its covariance is chi-square with 3 degrees of freedom. What
@@ -182,7 +182,7 @@ def slips(network: Network, far: Sequence[FarPoint], without: Adjustment, option
     """
     if not without.converged:
         return []
-    given = _given(network)
+    given = network.known_places
     critical = float(options.probabilities.critical(np.array([3]), len(given))[0]) * max(without.sigma0, 1.0) ** 2
     found = []
     for each in far:
@@ -199,23 +199,13 @@ def slips(network: Network, far: Sequence[FarPoint], without: Adjustment, option
 
 def few_points(network: Network) -> list[str]:
     """What is to be said of an adjustment without a solution where too few points are given to check one another."""
-    seen = sorted(name for name in _given(network) if name in network.observed_points)
-    if len(seen) != ENOUGH - 1:
+    named = sorted(name for name in network.known_places if name in network.observed_points)
+    if len(named) != ENOUGH - 1:
         return []
     return [
-        f"The points {', '.join(seen)} alone are given in X, Y and Z: if the coordinates of one of the {len(seen)} are "
-        f"wrong, nothing tells which. Check all of them, or give another point."
+        f"The points {', '.join(named)} alone are given in X, Y and Z: if the coordinates of one of the {len(named)} "
+        f"are wrong, nothing tells which. Check all of them, or give another point."
     ]
-
-
-def _given(network: Network) -> dict[str, Array]:
-    """The coordinates (3,) of the points that are given in X, Y and Z."""
-    priors = {point.id: [each for each in (point.X, point.Y, point.Z) if each] for point in network.points}
-    return {
-        id: np.array([each.value for each in three])
-        for id, three in priors.items()
-        if len(three) == 3 and all(np.isfinite(each.sigma) for each in three)
-    }
 
 
 def _given_covariance(point: ObjectPoint) -> Array:
@@ -237,16 +227,16 @@ class _Test:
 def _explanation(name: str, given: Mapping[str, Array], test: _Test) -> str:
     """The slip of the pen after which the coordinates would be the given ones, where there is one such."""
     own = given[name]
-    told = []
+    causes = []
     for i, j in combinations(range(3), 2):
         other = own.copy()
         other[[i, j]] = own[[j, i]]
         if test.passes(other):
-            told.append(f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")
+            causes.append(f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")
     for i in range(3):
         other = own.copy()
         other[i] = -own[i]
         if test.passes(other):
-            told.append(f"The sign of {'XYZ'[i]} looks wrong.")
-    told += [f"It lies where point {id} is given." for id, xyz in given.items() if id != name and test.passes(xyz)]
-    return told[0] if len(told) == 1 else ""
+            causes.append(f"The sign of {'XYZ'[i]} looks wrong.")
+    causes += [f"It lies where point {id} is given." for id, xyz in given.items() if id != name and test.passes(xyz)]
+    return causes[0] if len(causes) == 1 else ""

@@ -116,7 +116,7 @@ def group_words(hypothesis: ModelHypothesis, run: Run, _: float) -> tuple[str, s
     own = run.problem.unknowns.camera[camera][:3]
     base = values[own]
     positions = np.concatenate([hypothesis.added, own])
-    _, covariance = _estimate(run, positions)
+    covariance = _estimate(run, positions)[1]
     difference = values[hypothesis.added] - base
     by_both = np.hstack([np.eye(3), -np.eye(3)])
     spread = by_both @ covariance @ by_both.T
@@ -142,7 +142,7 @@ def group_words(hypothesis: ModelHypothesis, run: Run, _: float) -> tuple[str, s
         ),
         (np.eye(3), f"{who} have another interior orientation than the others"),
     )
-    costs = [_misfit(difference, spread, along) + 2.0 * along.shape[1] for along, _ in readings]
+    costs = [_misfit(difference, spread, along) + 2.0 * along.shape[1] for along, _cause in readings]
     fitting = [each for each, cost in zip(readings, costs, strict=True) if cost < min(costs) + ALIKE]
     special = [cause for along, cause in fitting if along.shape[1] < len(base)]
     causes = "; or ".join(special or [cause for _, cause in fitting])
@@ -160,4 +160,4 @@ def _misfit(difference: Array, covariance: Array, along: Array) -> float:
 def _estimate(run: Run, positions: NDArray[np.intp]) -> tuple[Array, Array]:
     """Values (k,) of some unknowns and their covariance (k, k), of unit weight or the larger one that was found."""
     cofactor = free_cofactor(run.numbering, run.end.state, run.factor)
-    return run.end.state.values[positions], cofactor.of(positions)
+    return run.end.state.values[positions], cofactor.part(positions)

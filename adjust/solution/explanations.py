@@ -25,7 +25,7 @@ from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.problem import Problem
-from adjust.quality.snooping import GrossError, Search, contradictions, rest_without, search
+from adjust.quality.snooping import GrossError, Search, contradictions, rest_after, search
 from adjust.rank_defect.diagnosis import singular_directions
 from adjust.solution.explanation_words import (
     board_words,
@@ -108,25 +108,25 @@ def explain(run: Run, redundancy: int, probabilities: Probabilities) -> Explaine
 
     Nothing is sought where sigma0 is at most 1, or the adjustment has no solution.
     """
-    if not run.converged or run.found is None or redundancy < CHECKED or run.end.vpv <= redundancy:
+    if not run.converged or run.misfits is None or redundancy < CHECKED or run.end.vpv <= redundancy:
         return Explained((), run)
     first = _Model(run, redundancy, probabilities)
-    found, last = _added(first)
-    if last.is_beyond(LEVEL) and not last.contradicting:
+    found, last = _add_hypotheses(first)
+    if last.exceeds(LEVEL) and not last.contradicting:
         noise = added_noise(last.run, last.redundancy)
         if noise is not None:
             found = (*found, _noise_explanation(noise, last))
             last = replace(last, run=noise.run)
-    explains = not last.is_beyond(probabilities.family)
+    explains = not last.exceeds(probabilities.family)
     explains |= last.variance - 1.0 < LEFT * (first.variance - 1.0)
     return Explained(found, last.run) if found and explains else Explained((), run)
 
 
-def _added(model: "_Model") -> tuple[tuple[Explanation, ...], "_Model"]:
+def _add_hypotheses(model: "_Model") -> tuple[tuple[Explanation, ...], "_Model"]:
     """The hypotheses that explain most, one beside the other, and the adjustment with them."""
     found: list[Explanation] = []
     for _ in range(ROUNDS):
-        if found and not model.is_beyond(model.probabilities.family):
+        if found and not model.exceeds(model.probabilities.family):
             break
         alike = _best(model)
         found += [_explanation(each, model) for each in alike]
@@ -159,7 +159,7 @@ class _Model:
     def variance(self) -> float:
         return self.vpv / self.redundancy
 
-    def is_beyond(self, level: float) -> bool:
+    def exceeds(self, level: float) -> bool:
         """Whether v'Pv is larger than chance makes it with a probability."""
         return bool(chdtrc(self.redundancy, self.vpv) < level)
 
@@ -172,7 +172,7 @@ class _Model:
         """v'Pv and redundancy without what contradicts the others."""
         if not self.contradicting:
             return self.vpv, float(self.redundancy)
-        return rest_without(self._search, [each.unit for each in self.contradicting])
+        return rest_after(self._search, [each.unit for each in self.contradicting])
 
     def criterion(self, variance: float) -> float:
         """v'Pv over a variance without gross errors, and what these and their choice cost."""
@@ -184,9 +184,9 @@ class _Model:
     @cached_property
     def _search(self) -> Search:
         run = self.run
-        if run.found is None:
+        if run.misfits is None:
             raise AdjustmentError("There is no solution whose observations could be tested.")
-        return search(run.numbering, run.end, run.factor, run.found, run.weighting, self.probabilities)
+        return search(run.numbering, run.end, run.factor, run.misfits, run.weighting, self.probabilities)
 
 
 @dataclass(frozen=True)
@@ -280,7 +280,7 @@ def _following(candidate: _Candidate) -> _Model | None:
 def _refit(run: Run, problem: Problem) -> Run | None:
     """A larger problem adjusted from where it starts, with the same weights; None where that has no solution."""
     larger = again(replace(run, problem=problem), run.weighting, STEPS, problem.start())
-    return larger if larger.converged and larger.found is not None else None
+    return larger if larger.converged and larger.misfits is not None else None
 
 
 def _explanation(candidate: _Candidate, model: _Model) -> Explanation:
@@ -289,16 +289,16 @@ def _explanation(candidate: _Candidate, model: _Model) -> Explanation:
     sigma_um = 1000.0 * float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2)) / 2.0))
     explained_um = sigma_um * float(np.sqrt(max(model.vpv - larger.vpv, 0.0) / coordinates))
     words = candidate.kind.words(candidate.hypothesis, larger.run, explained_um)
-    return _with_figures(candidate.kind.name, words, candidate.p, model.variance, larger.variance)
+    return _quantified(candidate.kind.name, words, candidate.p, model.variance, larger.variance)
 
 
 def _noise_explanation(noise: AddedNoise, model: _Model) -> Explanation:
     p = float(chdtrc(model.redundancy, model.vpv))
     variance = noise.run.end.vpv / model.redundancy
-    return _with_figures("noise", noise_words(noise, model.run), p, model.variance, variance)
+    return _quantified("noise", noise_words(noise, model.run), p, model.variance, variance)
 
 
-def _with_figures(kind: str, words: tuple[str, str], p: float, before: float, after: float) -> Explanation:
+def _quantified(kind: str, words: tuple[str, str], p: float, before: float, after: float) -> Explanation:
     """before, after: the variance factors without and with what explains it."""
     sigma0 = float(np.sqrt(before)), float(np.sqrt(after))
     chance = f"p = {p:.1g}" if p > 1e-99 else "p < 1e-99"

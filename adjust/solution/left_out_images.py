@@ -14,10 +14,10 @@ from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
 
 FITTING = 3.0  # times sigma0 of the others, up to which the standardised residuals of an image agree with them
-FEWEST_RAYS = 2  # of a point that is not known
+FEWEST_RAYS = 2  # of a point that is not adopted
 
 
-def without_images(network: Network, frames: Collection[str]) -> Network | None:
+def leave_out(network: Network, frames: Collection[str]) -> Network | None:
     """The network without some frames and what they alone show; None where no more than half of it would be left."""
     left = {image.frame for image in network.images if image.frame not in frames}
     if len(left) <= len(frames):
@@ -52,12 +52,12 @@ def without_images(network: Network, frames: Collection[str]) -> Network | None:
     )
 
 
-def with_lens(network: Network, result: Adjustment) -> Network:
+def adopt_lens(network: Network, result: Adjustment) -> Network:
     """The network with its cameras as an adjustment of a part of it found them."""
     used = {image.camera for image in result.network.images} - result.network.idle_cameras
     return replace(
         network,
-        cameras=tuple(_adjusted(camera, result) if camera.name in used else camera for camera in network.cameras),
+        cameras=tuple(_adopt_camera(camera, result) if camera.name in used else camera for camera in network.cameras),
     )
 
 
@@ -73,18 +73,18 @@ def fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[s
     return {frame for frame in frames if squares[frame] <= (FITTING * sigma0) ** 2 * weights[frame]}
 
 
-def _adjusted(camera: Camera, result: Adjustment) -> Camera:
-    def known(name: str, given: Prior | None) -> Prior:
+def _adopt_camera(camera: Camera, result: Adjustment) -> Camera:
+    def adopted(name: str, given: Prior | None) -> Prior:
         return Prior(result.value(Parameter.interior(camera.name, name)), np.inf if given is None else given.sigma)
 
     of = camera.distortion
     parameters = {
-        name: known(name, of.parameters[name]) for name in parameter_names(of.family) if name in of.parameters
+        name: adopted(name, of.parameters[name]) for name in parameter_names(of.family) if name in of.parameters
     }
     return replace(
         camera,
-        principal_distance_mm=known("c", camera.principal_distance_mm),
-        x0_mm=known("x0", camera.x0_mm),
-        y0_mm=known("y0", camera.y0_mm),
+        principal_distance_mm=adopted("c", camera.principal_distance_mm),
+        x0_mm=adopted("x0", camera.x0_mm),
+        y0_mm=adopted("y0", camera.y0_mm),
         distortion=replace(of, parameters=parameters),
     )

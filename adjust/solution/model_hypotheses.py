@@ -105,7 +105,7 @@ def second_interior_orientation(run: Run) -> Iterator[ModelHypothesis]:
 def bent_board(run: Run) -> Iterator[ModelHypothesis]:
     """All given points as a board that is bent, where they are a flat one."""
     network = run.problem.network
-    places = known_places(network)
+    places = network.known_places
     if network.boards or not places or len(places) < len(network.observed_points):
         return
     try:
@@ -161,16 +161,6 @@ def separate_lenses(run: Run) -> Problem | None:
     for name, at in old.camera.items():
         sigma[unknowns.camera[name]], start[unknowns.camera[name]] = old.sigma[at], run.end.state.values[at]
     return replace(problem, unknowns=replace(unknowns, sigma=sigma, start=start))
-
-
-def known_places(network: Network) -> dict[str, Array]:
-    """The coordinates (3,) of the points that are given in X, Y and Z, by id."""
-    given = {point.id: [each for each in (point.X, point.Y, point.Z) if each] for point in network.points}
-    return {
-        id_: np.array([each.value for each in priors])
-        for id_, priors in given.items()
-        if len(priors) == len("XYZ") and all(np.isfinite(each.sigma) for each in priors)
-    }
 
 
 def continued(run: Run, network: Network, like: dict[str, str] | None = None) -> Problem:

@@ -49,17 +49,17 @@ def added_noise(run: Run, redundancy: int) -> AddedNoise | None:
         sigma_mm = _added_sigma(run, members, redundancy)
         if sigma_mm is None:
             continue
-        noisy = _with_noise(run, members, sigma_mm)
-        if noisy.converged and noisy.found is not None and _groups_agree(noisy):
+        noisy = _add_noise(run, members, sigma_mm)
+        if noisy.converged and noisy.misfits is not None and _groups_agree(noisy):
             return AddedNoise(marks, sigma_mm, noisy)
     return None
 
 
 def _is_noise(run: Run) -> bool:
     """Whether standardised residuals are normally distributed, alike in all images and independent of neighbours."""
-    if run.found is None:
+    if run.misfits is None:
         return False
-    v = residuals(run.end.v_mm, run.found, run.weighting)
+    v = residuals(run.end.v_mm, run.misfits, run.weighting)
     checked = (v.redundancy > UNCHECKED).all(axis=1)
     if 2 * checked.sum() < FEWEST:
         return False
@@ -139,7 +139,7 @@ def _added_sigma(run: Run, members: Mask, redundancy: int) -> float | None:
     return float(np.sqrt(brentq(excess, 0.0, largest, rtol=1e-6)))
 
 
-def _with_noise(run: Run, members: Mask, sigma_mm: float) -> Run:
+def _add_noise(run: Run, members: Mask, sigma_mm: float) -> Run:
     network = run.problem.network
     covariance = network.observations.covariance_mm2 + np.where(members, sigma_mm**2, 0.0)[:, None, None] * np.eye(2)
     observations = replace(network.observations, covariance_mm2=covariance)
@@ -149,7 +149,7 @@ def _with_noise(run: Run, members: Mask, sigma_mm: float) -> Run:
 
 def _groups_agree(run: Run) -> bool:
     """Whether every group of observations agrees with its standard deviations, neither too small nor too large."""
-    units, found = TestedUnits(run.problem), run.found
+    units, found = TestedUnits(run.problem), run.misfits
     if found is None:
         return False
     for name in np.unique(units.groups):

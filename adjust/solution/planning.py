@@ -13,14 +13,14 @@ from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.condition_equations import blind_marks, computed_observations
 from adjust.problem.estimates import NullDirection
-from adjust.problem.further_observations import at_computed
+from adjust.problem.further_observations import error_free
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
 from adjust.quality.cofactor import free_cofactor
 from adjust.rank_defect.null_space import null_vectors
-from adjust.solution.adjustment import Options, adjust_problem, with_datum
+from adjust.solution.adjustment import Options, adjust_problem, settle_datum
 from adjust.solution.result import Adjustment
 from adjust.validation import validate_plan
 
@@ -68,13 +68,13 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     """
     options = options or Options()
     validate_plan(network)
-    reduction = Reduction.of(network)
+    reduction = Reduction.to_centroid(network)
     problem = _computed_problem(number(reduction.network(network), reduction.approximations(values)))
     result = adjust_problem(problem, options)
     singular = result.singular
     null = np.zeros((len(problem.unknowns), 0))
     if singular:
-        held, null = _regularised(with_datum(problem, options))
+        held, null = _regularised(settle_datum(problem, options))
         result = adjust_problem(problem, options, held)
     own = reduction.inverse.network(result.network)
     adjusted = reduction.unreduced_values(problem.unknowns, result.values, own)
@@ -88,7 +88,7 @@ def _computed_problem(problem: Problem) -> Problem:
     if xy_mm is None:
         raise AdjustmentError(_blind(problem))
     unknowns = problem.unknowns
-    network = at_computed(problem.network, unknowns, unknowns.start)
+    network = error_free(problem.network, unknowns, unknowns.start)
     network = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
     given = np.where(np.isnan(unknowns.given), np.nan, unknowns.start)
     return replace(problem, network=network, unknowns=replace(unknowns, given=given))

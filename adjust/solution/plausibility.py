@@ -17,7 +17,6 @@ from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.blunder_hypotheses import Tried, explains, mirrored_images, y_downward
-from adjust.solution.model_hypotheses import known_places
 from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -30,17 +29,17 @@ AROUND = 0.25  # of the extent of all marks that a picture of unknown size may r
 NAMED = 5
 
 
-def with_plausibility(result: Adjustment, tried: Tried, family: float) -> Adjustment:
+def check_plausibility(result: Adjustment, tried: Tried, family: float) -> Adjustment:
     """A result with sentences on what contradicts the geometry of photographs."""
     network = result.network
     if result.termination == "singular" or not network.observed_points:
         return result
     outside = _outside(network, result)
-    said = [*_marks_outside(network, outside, result, tried, family)]
+    remarks = [*_marks_outside(network, outside, result, tried, family)]
     misread = tuple(_both_sides(network, result, tried, family))
     if result.converged and not outside.any():
-        said += [told for camera in network.cameras for told in _principal_point(camera, network, result, family)]
-    return replace(result, misread=misread, remarks=(*result.remarks, *said))
+        remarks += [each for camera in network.cameras for each in _principal_point(camera, network, result, family)]
+    return replace(result, misread=misread, remarks=(*result.remarks, *remarks))
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ def _outside(network: Network, result: Adjustment) -> Mask:
         if not len(rows):
             continue
         digital = _is_digital(network, camera)
-        xy_mm = _in_camera(network, result, rows)
+        xy_mm = _camera_places(network, result, rows)
         picture = _picture(camera, xy_mm, digital)
         if picture is not None:
             outside[rows] = picture.outside(xy_mm)
@@ -104,7 +103,7 @@ def _targets(network: Network, camera: Camera) -> NDArray[np.intp]:
     return np.flatnonzero(own[network.image_numbers] & ~network.observations.is_fiducial)
 
 
-def _in_camera(network: Network, result: Adjustment, rows: NDArray[np.intp]) -> Array:
+def _camera_places(network: Network, result: Adjustment, rows: NDArray[np.intp]) -> Array:
     """Observed camera coordinates (m, 2) of some observations."""
     xy_mm = network.straight_xy_mm[rows].copy()
     numbers = network.image_numbers[rows]
@@ -186,14 +185,14 @@ def _both_sides(network: Network, result: Adjustment, tried: Tried, family: floa
 
 def _sides(network: Network, result: Adjustment) -> dict[str, float]:
     """On which side of the plane of the given points, 1 or -1, the station of every image lies; empty without one."""
-    seen = [place for id_, place in known_places(network).items() if id_ in network.observed_points]
-    if len(seen) < max(4, len(network.observed_points)):
+    places = [place for id_, place in network.known_places.items() if id_ in network.observed_points]
+    if len(places) < max(4, len(network.observed_points)):
         return {}
-    xyz = np.array(seen)
+    xyz = np.array(places)
     _, extents, axes = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
     if extents[1] < FLAT * extents[0] or extents[2] > FLAT * extents[0]:
         return {}
-    images = [image for image in network.images if image.name not in network.without_object]
+    images = [image for image in network.images if image.name not in network.objectless_images]
     stations = {image.name: adjusted_image(result, image.name).station for image in images}
     return {name: float(np.sign((station - xyz.mean(axis=0)) @ axes[2])) for name, station in stations.items()}
 
@@ -203,13 +202,13 @@ def _principal_point(camera: Camera, network: Network, result: Adjustment, famil
         return
     parameters = [Parameter.interior(camera.name, axis) for axis in ("x0", "y0")]
     found = result.values_of(parameters)
-    told = f"The principal point of camera {camera.name} is found at ({found[0]:.4g}, {found[1]:.4g}) mm"
+    words = f"The principal point of camera {camera.name} is found at ({found[0]:.4g}, {found[1]:.4g}) mm"
     far = _far_from_given(camera, found, result, parameters, family)
     if far:
-        yield f"{told}, {far}"
+        yield f"{words}, {far}"
         return
     rows = _targets(network, camera)
-    xy_mm = _in_camera(network, result, rows)
+    xy_mm = _camera_places(network, result, rows)
     digital = _is_digital(network, camera)
     picture = _picture(camera, xy_mm, digital)
     kind = "outside the picture"
@@ -221,7 +220,7 @@ def _principal_point(camera: Camera, network: Network, result: Adjustment, famil
     if not picture.outside(found[None])[0]:
         return
     yield (
-        f"{told}, {kind} ({picture.words}), where no lens has it: the images do not tell it from their tilts, or "
+        f"{words}, {kind} ({picture.words}), where no lens has it: the images do not tell it from their tilts, or "
         "points are misnamed or misplaced. Give principal_point_mm with its standard deviation (0 fixes it), or add "
         "images with other tilts; check the points' numbers and coordinates."
     )

@@ -132,11 +132,11 @@ class Adjustment(Estimates):
         """What contradicts the others, the worst first: beside what explains the residuals of all."""
         if self.misread:
             return ()
-        run, variance = self._explained.run, self.variance
+        run, variance = self._explanation_run.run, self.variance
         if run is not self.run:
             variance = _run_variance(run, _run_redundancy(run, self.cofactor))
         tested = _reliability(run, variance, self.probabilities) if run is not self.run else self.reliability
-        found = run.found if run.has_solution else None
+        found = run.misfits if run.has_solution else None
         if found is None or tested is None:
             return ()
         tests = search(run.numbering, run.end, run.factor, found, run.weighting, self.probabilities)
@@ -146,7 +146,7 @@ class Adjustment(Estimates):
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
         """Of a sigma0 that is too large; suspects are then those of an adjustment with them in the model."""
-        return () if self.misread else self._explained.explanations
+        return () if self.misread else self._explanation_run.explanations
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -163,12 +163,12 @@ class Adjustment(Estimates):
         return (*self.unused, *found)
 
     @cached_property
-    def _explained(self) -> Explained:
+    def _explanation_run(self) -> Explained:
         return explain(self.run, _run_redundancy(self.run, self.cofactor), self.probabilities)
 
     @property
     def _misfits(self) -> Misfits | None:
-        return self.run.found if self.run.has_solution else None
+        return self.run.misfits if self.run.has_solution else None
 
     def __repr__(self) -> str:
         return (
@@ -289,7 +289,7 @@ def _run_variance(run: Run, redundancy: int) -> VarianceFactor:
 
 
 def _reliability(run: Run, variance: VarianceFactor, probabilities: Probabilities) -> Reliability | None:
-    if run.found is None or not run.has_solution:
+    if run.misfits is None or not run.has_solution:
         return None
-    at, weights = (run.numbering, run.end, run.factor, run.found), run.weighting.weights
+    at, weights = (run.numbering, run.end, run.factor, run.misfits), run.weighting.weights
     return reliability(*at, weights, variance.sigma0, round(variance.redundancy), probabilities)

@@ -64,7 +64,7 @@ class Run:
     removed: tuple[GrossError, ...] = ()
 
     @cached_property
-    def found(self) -> Misfits | None:
+    def misfits(self) -> Misfits | None:
         """What everything that is tested contradicts the others by; None where something is not determined."""
         return None if self.singular else misfits(self.numbering, self.end, self.factor)
 
@@ -90,20 +90,20 @@ def _first(problem: Problem, options: Options, doubted: Collection[int]) -> Run:
     units = TestedUnits(problem)
     factors = {group: 1.0 for group in options.groups if (units.groups == group).any()}
     weights = np.ones(len(units))
-    weights[_units_of(units, doubted)] = NO_WEIGHT
+    weights[_prior_units(units, doubted)] = NO_WEIGHT
     return _run(problem, Weighting(weights, factors), problem.start(), options.iteration_limit)
 
 
-def _units_of(units: TestedUnits, quantities: Collection[int]) -> NDArray[np.intp]:
+def _prior_units(units: TestedUnits, quantities: Collection[int]) -> NDArray[np.intp]:
     """The given values that stand alone, of some quantities."""
     return len(units) - len(units.positions) + np.flatnonzero(np.isin(units.positions[:, 0], list(quantities)))
 
 
 def _weighted(problem: Problem, options: Options, doubted: Collection[int]) -> Run:
-    return _settled(_first(problem, options, doubted), options, _units_of(TestedUnits(problem), doubted))
+    return _settle(_first(problem, options, doubted), options, _prior_units(TestedUnits(problem), doubted))
 
 
-def _settled(last: Run, options: Options, doubted: Collection[int] = ()) -> Run:
+def _settle(last: Run, options: Options, doubted: Collection[int] = ()) -> Run:
     """Adjust until the weights that robust estimation and variance components ask for are those that were used.
 
     doubted: units that the redescending function is the first to weigh: the little that Huber's leaves an error of
@@ -112,7 +112,7 @@ def _settled(last: Run, options: Options, doubted: Collection[int] = ()) -> Run:
     limit = min(options.iteration_limit, ITERATIONS_A_ROUND) if options.robust else options.iteration_limit
     for function in options.weight_functions or (None,):
         for _ in range(ROUNDS):
-            refined = _reweighted(last, options, function)
+            refined = _reweight(last, options, function)
             if function in options.weight_functions[:-1]:
                 refined.weights[list(doubted)] = NO_WEIGHT
             if not refined.differs(last.weighting):
@@ -125,13 +125,13 @@ def _settled(last: Run, options: Options, doubted: Collection[int] = ()) -> Run:
     return last
 
 
-def _reweighted(last: Run, options: Options, function: WeightFunction | None) -> Weighting:
+def _reweight(last: Run, options: Options, function: WeightFunction | None) -> Weighting:
     """The weights that the residuals of a run ask for; its own where there is nothing to ask, or not to be trusted."""
-    if not (function or (last.weighting.factors and last.converged)) or last.found is None:
+    if not (function or (last.weighting.factors and last.converged)) or last.misfits is None:
         return last.weighting
-    weighting = refined_factors(last.numbering, last.found, last.weighting)
+    weighting = refined_factors(last.numbering, last.misfits, last.weighting)
     if function:
-        tests = statistics(last.found, last.weighting.weights)
+        tests = statistics(last.misfits, last.weighting.weights)
         observed = len(last.end.v_mm)
         weighting = replace(weighting, weights=robust_weights(tests.statistic, tests.sizes, observed, function))
     return weighting
@@ -149,25 +149,25 @@ def _snooping(problem: Problem, options: Options, doubted: Collection[int]) -> R
     """
     plain = replace(options, variance_components=False)
     last = _first(problem, plain, doubted)
-    if doubted and last.found is not None:
-        tests = statistics(last.found, last.weighting.weights)
-        left_out = map(int, _units_of(TestedUnits(problem), doubted))
+    if doubted and last.misfits is not None:
+        tests = statistics(last.misfits, last.weighting.weights)
+        left_out = map(int, _prior_units(TestedUnits(problem), doubted))
         removed = (GrossError(unit, float(tests.statistic[unit]), 0.0, tests.error[unit], ()) for unit in left_out)
         last = replace(last, removed=tuple(removed))
-    last = _snooped(last, plain)
+    last = _snoop_rounds(last, plain)
     if not options.groups:
         return last
     factors = {group: 1.0 for group in options.groups if (TestedUnits(problem).groups == group).any()}
-    return _snooped(_settled(replace(last, weighting=replace(last.weighting, factors=factors)), options), options)
+    return _snoop_rounds(_settle(replace(last, weighting=replace(last.weighting, factors=factors)), options), options)
 
 
-def _snooped(last: Run, options: Options) -> Run:
+def _snoop_rounds(last: Run, options: Options) -> Run:
     earlier: set[frozenset[int]] = set()
     for _ in range(ROUNDS):
-        if last.found is None:
+        if last.misfits is None:
             return last
-        tests = search(last.numbering, last.end, last.factor, last.found, last.weighting, options.probabilities)
-        statistic = statistics(last.found, last.weighting.weights).statistic
+        tests = search(last.numbering, last.end, last.factor, last.misfits, last.weighting, options.probabilities)
+        statistic = statistics(last.misfits, last.weighting.weights).statistic
         reach = limits(tests)
         confirmed = [each for each in last.removed if statistic[each.unit] > reach[each.unit]]
         removed = (*confirmed, *contradictions(tests))
@@ -180,7 +180,7 @@ def _snooped(last: Run, options: Options) -> Run:
         weights = np.ones(len(last.weighting.weights))
         weights[list(out)] = NO_WEIGHT
         last = replace(last, removed=removed)
-        last = _settled(again(last, replace(last.weighting, weights=weights), options.iteration_limit), options)
+        last = _settle(again(last, replace(last.weighting, weights=weights), options.iteration_limit), options)
     return replace(last, settled=False)
 
 
@@ -188,44 +188,44 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
     """The run from a state; where the network is singular there and nowhere else, from where it ends with some of its
     cameras' parameters held. As it is from the state where that, too, ends where the network is singular.
     """
-    last = _adjusted(problem, weighting, state, limit)
+    last = _iterate(problem, weighting, state, limit)
     alike = [at for positions in _alike_at_zero(problem, state).values() for at in positions]
     for held in (alike, _free_of_cameras(problem)):
         if held and last.singular and not last.solution.history:
             begun = _run(replace(problem, unknowns=problem.unknowns.fixed(held)), weighting, state, limit)
             if begun.converged:
-                freed = _freed(problem, weighting, begun, limit)
+                freed = _release_cameras(problem, weighting, begun, limit)
                 last = last if freed.singular else freed
     return last
 
 
-def _freed(problem: Problem, weighting: Weighting, begun: Run, limit: int) -> Run:
+def _release_cameras(problem: Problem, weighting: Weighting, begun: Run, limit: int) -> Run:
     """The run with all parameters free, from where one ended that held some; where the observations do not separate
     distortion parameters, with pseudo-observations of these, as weak as they have to be.
     """
     state, start = begun.end.state, _apart(problem, begun.end.state)
-    at = _linearised(problem, weighting, state)
+    at = _linearise(problem, weighting, state)
     motions = edge_motions(problem, at) if at is not None else {}
     for reach in REACHES if motions else ():
         held = replace(problem, pseudo_observed={i: reach * motion for i, motion in motions.items()})
         if not unresolved(held.pseudo_observed, _variances(held, weighting, start)):
             break
-        last = _adjusted(held, weighting, state, limit)
+        last = _iterate(held, weighting, state, limit)
         if last.converged and not is_contradicted(held, last.end.state):
             return last
         if last.converged:
             state = start = last.end.state
-    return _adjusted(problem, weighting, start, limit)
+    return _iterate(problem, weighting, start, limit)
 
 
-def _linearised(problem: Problem, weighting: Weighting, state: State) -> Linearised | None:
+def _linearise(problem: Problem, weighting: Weighting, state: State) -> Linearised | None:
     weighted, covariance = weighting.applied(problem)
     return linearise(Numbering(weighted), covariance, state)
 
 
 def _variances(problem: Problem, weighting: Weighting, state: State) -> NDArray[np.float64]:
     """A-priori variances (n,) of all quantities at a state; 0 where some point has no image there."""
-    at = _linearised(problem, weighting, state)
+    at = _linearise(problem, weighting, state)
     if at is None:
         return np.zeros(len(problem.unknowns))
     return free_cofactor(at.rows.numbering, state, at.factor).variances
@@ -261,12 +261,12 @@ def _free_of_cameras(problem: Problem) -> list[int]:
     return [int(at) for positions in unknowns.camera.values() for at in positions if np.isinf(unknowns.sigma[at])]
 
 
-def _adjusted(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
+def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
     weighted, covariance = weighting.applied(problem)
     numbering = Numbering(weighted)
     start = linearise(numbering, covariance, state)
     if start is None:
-        reasons = {name: f"{told}. {check}" for name, (told, check) in blind_marks(problem, state).items()}
+        reasons = {name: f"{reason}. {check}" for name, (reason, check) in blind_marks(problem, state).items()}
         of_name = problem.network.image_by_name
         raise NoImageError(
             f"The adjustment cannot start: with the approximations, {next(iter(reasons.values()), '')}",

@@ -231,7 +231,7 @@ def _point(adjustment: Adjustment, point: ObjectPoint) -> PointRecord:
         if point.id in board.places:
             unknowns = [Parameter.point(point.id, axis) for axis in "XYZ"]
             unknowns += [Parameter.board(board.name, each) for each in BOARD_NAMES]
-            by_unknowns = np.hstack([np.eye(3), board.lifted_by[point.id].T])
+            by_unknowns = np.hstack([np.eye(3), board.lift_directions[point.id].T])
             values = by_unknowns @ adjustment.values_of(unknowns)
             variances = np.diag(by_unknowns @ adjustment.cofactor_of(unknowns) @ by_unknowns.T)
             for axis, value, variance in zip("XYZ", values, variances, strict=True):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.parameter import Parameter, parameter_of, parameters_from_texts
+from adjust.problem.parameter import Parameter, as_parameter, parameters_from_texts
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
 from pipeline.provenance import of_file
@@ -40,7 +40,7 @@ class Covariance:
     def of(self, parameters: Iterable[Parameter | str]) -> Array:
         """The covariance (k, k) of some unknowns, by keys or by their texts in the file; one that is not listed was
         fixed, its row is zero."""
-        at = np.array([self._positions.get(parameter_of(each), -1) for each in parameters], dtype=int)
+        at = np.array([self._positions.get(as_parameter(each), -1) for each in parameters], dtype=int)
         block: Array = self.matrix[np.ix_(at, at)]
         block[at < 0, :] = 0.0
         block[:, at < 0] = 0.0
@@ -66,7 +66,7 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
     """
     parts = _parts(adjustment)
     whole = _named(adjustment, parts.whole)
-    arrays = whole | {"matrix": adjustment.sigma0**2 * adjustment.cofactor.of(parts.whole)}
+    arrays = whole | {"matrix": adjustment.sigma0**2 * adjustment.cofactor.part(parts.whole)}
     for kind, groups in parts.groups.items():
         padded = np.full((len(groups), max(map(len, groups))), -1, dtype=np.intp)
         for row, group in zip(padded, groups, strict=True):
@@ -74,7 +74,7 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
         matrices = np.zeros((*padded.shape, padded.shape[1]))
         lengths = (padded >= 0).sum(axis=1)
         for length in np.unique(lengths):
-            cofactors = adjustment.cofactor.of_each(padded[lengths == length, :length])
+            cofactors = adjustment.cofactor.parts(padded[lengths == length, :length])
             matrices[lengths == length, :length, :length] = adjustment.sigma0**2 * cofactors
         named = _named(adjustment, padded) | {"matrices": matrices}
         arrays |= {f"{kind}_{name}": array for name, array in named.items()}

@@ -11,4 +11,4 @@ from adjust.linear_algebra.factor import Blocks, Factor
 def row_roots(factor: Factor, blocks: Iterable[Blocks]) -> Iterator[NDArray[np.float64]]:
     """G (b, m, k) of blocks as these were factorised: G G' are the cofactor matrices of each one's adjusted rows."""
     for rows in factor.reduced_rows(blocks):
-        yield np.concatenate([rows.own, rows.through @ factor.triangle.root_of(rows.shared)], axis=2)
+        yield np.concatenate([rows.own, rows.through @ factor.triangle.group_roots(rows.shared)], axis=2)

@@ -125,8 +125,8 @@ def test_derivatives_by_the_bends_are_differences_of_the_functions() -> None:
         position = problem.unknowns.parameters.index(Parameter.board("board", name))
         step = np.zeros(len(problem.unknowns))
         step[position] = 1e-3
-        numeric = computed_observations(problem, problem.moved(state, step))
-        below = computed_observations(problem, problem.moved(state, -step))
+        numeric = computed_observations(problem, problem.step_state(state, step))
+        below = computed_observations(problem, problem.step_state(state, -step))
         assert numeric is not None
         assert below is not None
         by_bend = -(at.by_unknowns * (problem.columns == position)[:, None, :]).sum(axis=2)

@@ -233,8 +233,8 @@ def test_inner_constraints_have_the_least_trace_and_leave_the_centre() -> None:
     """The pseudo-inverse of the points' normal equations: no datum gives a smaller trace of their cofactors."""
     network, minimal, free = free_network()
     points = np.array([i for i, name in enumerate(free.names) if name.startswith("PT.")])
-    part = free.cofactor.of(points)
-    assert np.trace(part) < np.trace(minimal.cofactor.of(points))
+    part = free.cofactor.part(points)
+    assert np.trace(part) < np.trace(minimal.cofactor.part(points))
     given = np.array([[p.value for p in (point.X, point.Y, point.Z) if p is not None] for point in network.points])
     values = free.values[points].reshape(-1, 3)
     np.testing.assert_allclose(values.mean(axis=0), given.mean(axis=0), atol=1e-8)
@@ -359,8 +359,8 @@ def test_cofactors_of_each_are_parts_of_the_whole_matrix() -> None:
     for result in free_network()[1:]:
         for prefix, count in (("PT.", 3), ("EO.", 6)):
             groups = np.flatnonzero(np.char.startswith(result.names, prefix)).reshape(-1, count)
-            expected = [result.cofactor.of(at) for at in groups]
-            found = result.cofactor.of_each(groups)
+            expected = [result.cofactor.part(at) for at in groups]
+            found = result.cofactor.parts(groups)
             np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
 

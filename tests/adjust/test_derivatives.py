@@ -155,6 +155,6 @@ def step_of(name: str) -> float:
 def moved(problem: Problem, positions: list[int], sizes: Array) -> Array:
     step = np.zeros(len(problem.unknowns))
     step[positions] = sizes
-    computed = computed_observations(problem, problem.moved(problem.start(), step))
+    computed = computed_observations(problem, problem.step_state(problem.start(), step))
     assert computed is not None
     return computed

@@ -59,7 +59,7 @@ def dense(blocks: Iterable[Blocks], weight: Array, right: Array) -> tuple[Array,
 
 def whole(factor: Factor) -> Array:
     """The cofactor matrix of all unknowns."""
-    return factor.cofactor_of(eye_array(len(factor.scale), format="csr"))
+    return factor.function_cofactor(eye_array(len(factor.scale), format="csr"))
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
@@ -114,14 +114,14 @@ def test_all_shared_unknowns_fixed() -> None:
 def cost(monkeypatch: pytest.MonkeyPatch) -> Callable[[Network, Approximations], float]:
     """Of an adjustment, a step: rows times columns squared of every factorisation, counted and not timed."""
     costs: list[float] = []
-    original = multifrontal.triangle_of
+    original = multifrontal.qr_triangle
 
     def counted(rows: Array) -> Array:
         costs.append(rows.size * rows.shape[-1])
         return original(rows)
 
-    monkeypatch.setattr(elimination, "triangle_of", counted)
-    monkeypatch.setattr(multifrontal, "triangle_of", counted)
+    monkeypatch.setattr(elimination, "qr_triangle", counted)
+    monkeypatch.setattr(multifrontal, "qr_triangle", counted)
 
     def of(network: Network, start: Approximations) -> float:
         costs.clear()

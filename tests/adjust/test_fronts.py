@@ -18,7 +18,7 @@ from adjust.least_squares.rows import WhitenedRows, prior_root_weights
 from adjust.linear_algebra import elimination, fronts, sparse_factor
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
-from adjust.linear_algebra.fronts import Fronts, fronts_of
+from adjust.linear_algebra.fronts import Fronts, make_fronts
 from adjust.problem.camera import Fiducial
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.observations import Observations
@@ -101,7 +101,7 @@ def test_a_strip_in_fronts_has_the_inverse_of_its_sparse_normal_equations(
     sigma = np.sqrt(np.diag(inverse))
     tolerance = 1e-6 if summed else 1e-8  # of SuperLU's, whose condition is squared too
     np.testing.assert_allclose(np.sqrt(factor.variances()) * scale, sigma, rtol=tolerance)
-    every = factor.cofactor_of(eye_array(len(scale), format="csr"))
+    every = factor.function_cofactor(eye_array(len(scale), format="csr"))
     np.testing.assert_allclose(
         every * np.outer(scale, scale) / np.outer(sigma, sigma), inverse / np.outer(sigma, sigma), atol=tolerance
     )
@@ -160,7 +160,7 @@ def levelled(count: int, weight: float) -> tuple[Factor, list[Blocks]]:
     met = csr_array((np.ones(2 * (count - 1)), (np.repeat(pairs[:, 0], 2), pairs.ravel())))
     weights = np.zeros(count)
     weights[0] = weight
-    of_line = fronts_of(met, np.ones(count, dtype=np.intp), 0)
+    of_line = make_fronts(met, np.ones(count, dtype=np.intp), 0)
     return eliminate(blocks, count, weights, np.zeros(count), fronts=of_line), blocks
 
 
@@ -184,7 +184,7 @@ def test_fronts_hold_all_that_is_met_in_elimination() -> None:
     """A ring of ten: the first and the last meet, so that the last stays in all fronts."""
     pairs = np.stack([np.arange(10), (np.arange(10) + 1) % 10], axis=1)
     met = csr_array((np.ones(20), (np.repeat(np.arange(10), 2), pairs.ravel())))
-    of_ring = fronts_of(met, np.full(10, 50, dtype=np.intp), 3)
+    of_ring = make_fronts(met, np.full(10, 50, dtype=np.intp), 3)
     assert isinstance(of_ring, Fronts)
     assert of_ring.count == 503
     for front in of_ring:
@@ -202,7 +202,7 @@ def test_what_a_front_leaves_is_held_by_the_next_one_that_it_meets(
     for _ in range(20):
         met = csr_array((rng.random((60, 25)) < 0.12).astype(float))
         order = fronts.band_order(met)
-        of_network = fronts_of(met[:, order], rng.integers(1, 4, 25), 2)
+        of_network = make_fronts(met[:, order], rng.integers(1, 4, 25), 2)
         for front in of_network:
             if len(front.after):
                 next_one = of_network[int(of_network.home(front.after))]

@@ -90,13 +90,13 @@ def test_fixed_coordinates_come_back_as_they_were_given() -> None:
 
 def test_a_field_about_the_origin_is_left_as_it_is() -> None:
     network = small_network()[0]
-    assert Reduction.of(network).is_none
-    assert Reduction.of(network).network(network) is network
+    assert Reduction.to_centroid(network).is_none
+    assert Reduction.to_centroid(network).network(network) is network
 
 
 def test_heights_stay_where_the_line_of_sight_depends_on_them() -> None:
     network = shifted(small_network()[0], np.array([5e5, 5.4e6, 2500.0]))
-    assert Reduction.of(network).origin[2] != 0.0
+    assert Reduction.to_centroid(network).origin[2] != 0.0
     bent = replace(network, line_of_sight=LineOfSight(curvature=True))
-    assert Reduction.of(bent).origin[2] == 0.0
-    assert (Reduction.of(bent).origin[:2] != 0.0).all()
+    assert Reduction.to_centroid(bent).origin[2] == 0.0
+    assert (Reduction.to_centroid(bent).origin[:2] != 0.0).all()

@@ -114,7 +114,7 @@ def test_the_smallest_detectable_error_shifts_the_test_by_delta0_and_the_camera_
     shift = dirty.values - clean.values
     sigma = np.sqrt(clean.cofactor.variances)
     free = np.flatnonzero(sigma > 0.0)
-    inverse = np.linalg.inv(clean.cofactor.of(free) / np.outer(sigma[free], sigma[free]))
+    inverse = np.linalg.inv(clean.cofactor.part(free) / np.outer(sigma[free], sigma[free]))
     normalised = shift[free] / sigma[free]
     assert np.sqrt(normalised @ inverse @ normalised) == pytest.approx(tests.effect[unit, axis], rel=5e-3)
     for outer in tests.outer:

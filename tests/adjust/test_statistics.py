@@ -19,7 +19,7 @@ from adjust.solution.result import Adjustment
 Array = NDArray[np.float64]
 
 
-def with_rows(network: Network, xy_mm: Array | None = None, covariance_mm2: Array | None = None) -> Network:
+def append_rows(network: Network, xy_mm: Array | None = None, covariance_mm2: Array | None = None) -> Network:
     rows = network.observations
     xy_mm = rows.xy_mm if xy_mm is None else xy_mm
     covariance_mm2 = rows.covariance_mm2 if covariance_mm2 is None else covariance_mm2
@@ -85,7 +85,7 @@ def test_a_point_covariance_is_not_conditional_on_everything_else() -> None:
     result = adjust(network, start, Options(datum="minimal"))
     is_point = np.char.startswith(result.names, "PT.")
     points = np.flatnonzero(is_point & (result.cofactor.variances > 0.0))
-    weight = np.linalg.inv(result.cofactor.of(points))
+    weight = np.linalg.inv(result.cofactor.part(points))
     conditional = 1.0 / np.diag(weight)
     claimed = result.cofactor.variances[points]
     assert (claimed > conditional).all()
@@ -98,10 +98,10 @@ def test_a_weight_is_the_inverse_of_a_variance() -> None:
     row = row_of(network, "f1", "4", "target")
     xy = network.observations.xy_mm.copy()
     xy[row] += [0.02, 0.0]
-    plain = adjust(with_rows(network, xy), start)
+    plain = adjust(append_rows(network, xy), start)
     covariance = network.observations.covariance_mm2.copy()
     covariance[row] /= 4.0
-    halved = adjust(with_rows(network, xy, covariance), start)
+    halved = adjust(append_rows(network, xy, covariance), start)
     assert abs(halved.residuals.v_mm[row, 0]) < 0.95 * abs(plain.residuals.v_mm[row, 0])
     assert halved.residuals.redundancy[row, 0] < plain.residuals.redundancy[row, 0]
 
@@ -115,7 +115,7 @@ def test_redundancy_is_what_a_residual_shows_of_an_error() -> None:
     for axis in (0, 1):
         xy = network.observations.xy_mm.copy()
         xy[row, axis] += 1e-4
-        result = adjust(with_rows(network, xy, covariance), start)
+        result = adjust(append_rows(network, xy, covariance), start)
         shown = -result.residuals.v_mm[row, axis] / 1e-4
         assert shown == pytest.approx(result.residuals.redundancy[row, axis], rel=1e-4)
 
@@ -163,7 +163,7 @@ def with_gross_errors(rng: np.random.Generator) -> tuple[Adjustment, Adjustment,
     wrong = [int(i) for i in rng.choice(targets, 5, replace=False)]
     xy = network.observations.xy_mm.copy()
     xy[wrong] += rng.choice([-1.0, 1.0], (5, 2)) * rng.uniform(0.05, 0.1, (5, 2))
-    dirty = with_rows(network, xy)
+    dirty = append_rows(network, xy)
     return adjust(network, start), adjust(dirty, start), adjust(dirty, start, Options(robust=True)), wrong
 
 
@@ -197,7 +197,7 @@ def test_variance_components_find_the_variances() -> None:
     network, start = simulated(rng, points=field_points(rng, 40))
     fiducial = np.array([kind == "fiducial" for kind in network.observations.kind])
     claimed = network.observations.covariance_mm2 * np.where(fiducial, 4.0, 0.25)[:, None, None]
-    result = adjust(with_rows(network, covariance_mm2=claimed), start, Options(variance_components=True))
+    result = adjust(append_rows(network, covariance_mm2=claimed), start, Options(variance_components=True))
     assert result.converged
     assert result.variance_factors["target"] == pytest.approx(4.0, rel=0.3)
     assert result.variance_factors["fiducial"] == pytest.approx(0.25, rel=0.6)

@@ -74,10 +74,10 @@ class Dense:
     def variances(self) -> Array:
         return np.diag(self.matrix)
 
-    def of(self, at: NDArray[np.intp]) -> Array:
+    def part(self, at: NDArray[np.intp]) -> Array:
         return self.matrix[np.ix_(at, at)]
 
-    def of_each(self, groups: NDArray[np.intp]) -> Array:
+    def parts(self, groups: NDArray[np.intp]) -> Array:
         return self.matrix[groups[:, :, None], groups[:, None, :]]
 
 
