@@ -3,10 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 PLAIN := .venv-plain
 BIN := $(VENV)/bin
+DOCS := .venv-docs
 READY := $(VENV)/ready
 TESTED := $(VENV)/ready-to-test
 
-.PHONY: demo test test-all lint types suite clean
+.PHONY: demo docs test test-all lint types suite clean
 
 demo: $(READY)
 	$(BIN)/reseau demo demo
@@ -16,7 +17,7 @@ test: lint
 	$(MAKE) --no-print-directory --jobs=2 types suite
 
 # With the studies, fuzz and kills that are marked as slow: many minutes.
-test-all: lint
+test-all: lint $(DOCS)/ready
 	$(MAKE) --no-print-directory --jobs=2 types suite MARKED="slow or not slow"
 
 # One BLAS thread a worker: two on two cores make the small factorisations ten times slower. And byte code is kept, also
@@ -48,5 +49,15 @@ $(TESTED): $(READY) requirements-test.lock
 	$(BIN)/pip install --quiet --requirement requirements-test.lock
 	touch $@
 
+# The site of the documentation, in build/site: open its index.html. Nothing is fetched while it is built or read.
+docs: $(DOCS)/ready
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --quiet
+	@echo build/site/index.html
+
+$(DOCS)/ready: requirements-docs.lock
+	$(PYTHON) -m venv $(DOCS)
+	$(DOCS)/bin/pip install --quiet --requirement requirements-docs.lock
+	touch $@
+
 clean:
-	rm -rf $(VENV) $(PLAIN) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(PLAIN) $(DOCS) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache

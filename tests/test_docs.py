@@ -2,13 +2,16 @@
 
 import importlib
 import importlib.util
+import os
 import re
+import subprocess
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
+MKDOCS = DOCS.parent / ".venv-docs" / "bin" / "mkdocs"
 
 
 def test_every_name_in_the_theory_exists() -> None:
@@ -101,3 +104,20 @@ def test_what_the_map_of_the_code_says_to_enter_by_exists() -> None:
     assert len(named) > 40
     missing = [name for name in sorted(named) if not _exists(name)]
     assert not missing
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not MKDOCS.exists(), reason="there is no environment of the documentation: make docs")
+def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path: Path) -> None:
+    command = [str(MKDOCS), "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    variables = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=DOCS.parent, env=variables, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    pages = {
+        page.relative_to(tmp_path).as_posix(): page.read_text(encoding="utf-8") for page in tmp_path.rglob("*.html")
+    }
+    assert not [
+        name for name, text in pages.items() if re.search(r"<(script|link|img)[^>]+(src|href)=\"?https?:", text)
+    ]
+    assert "measure_fiducials" in pages["reference/python.html"]
+    assert "<math" in pages["theory.html"]

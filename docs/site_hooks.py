@@ -1,0 +1,54 @@
+"""What the site of the documentation has beside docs/: formulas as MathML, and pages from elsewhere in the project."""
+
+import re
+from pathlib import Path
+
+from latex2mathml.converter import convert
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[1]
+PAGES = {  # of the project, by their names in the site
+    "contributing.md": "CONTRIBUTING.md",
+    "results-of-benchmarks.md": "benchmarks/RESULTS.md",
+    "changelog.md": "CHANGELOG.md",
+    "readme.md": "README.md",
+}
+FACES = {"measure": "Scans and marks", "adjust": "Adjustment", "pipeline": "Files"}
+_CODE = re.compile(r"(```.*?```|`[^`\n]*`)", re.DOTALL)
+_FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$\n]+?)\$", re.DOTALL)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages from elsewhere."""
+    for name, source in PAGES.items():
+        text = (ROOT / source).read_text(encoding="utf-8")
+        files.append(File.generated(config, name, content=re.sub(r"\]\((?:\.\./)?docs/", "](", text)))
+    files.append(File.generated(config, "reference/python.md", content=_names_of_faces()))
+    return files
+
+
+def _names_of_faces() -> str:
+    """The page of all names that `import reseau` gives, from the stubs of its packages."""
+    lines = ["# Python\n", "`import reseau` gives every name below. [From Python](../python.md) has an example.\n"]
+    for package, title in FACES.items():
+        lines.append(f"## {title}\n")
+        stub = (ROOT / package / "__init__.pyi").read_text(encoding="utf-8")
+        for module, name in re.findall(r"^from \.([\w.]+) import (\w+) as", stub, re.MULTILINE):
+            lines.append(f"::: {package}.{module}.{name}\n")
+    return "\n".join(lines)
+
+
+def on_page_markdown(markdown: str, page: object, config: MkDocsConfig, files: Files) -> str:
+    """Write formulas as MathML, which browsers draw by themselves, and point links to the added pages."""
+    for name, source in PAGES.items():
+        markdown = re.sub(rf"\]\((?:\.\./)+{re.escape(source)}", f"]({name}", markdown)
+    parts = _CODE.split(markdown)  # every second one is code
+    parts[::2] = [_FORMULA.sub(_mathml, part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def _mathml(found: re.Match[str]) -> str:
+    if found[1]:
+        return f"\n\n{convert(' '.join(found[1].split()), display='block')}\n\n"
+    return f"<span>{convert(found[2])}</span>"  # else a line that begins with it would be a block
