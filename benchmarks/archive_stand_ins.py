@@ -24,8 +24,7 @@ from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.provenance import Identity, file_state, parts_hash
 from pipeline.publishing.made_from import measured_from
 from pipeline.results.comparator_file import write_comparator
-from pipeline.results.measured_record import record_of
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, record_of
 
 FIDUCIALS = ((-106, -106), (106, -106), (106, 106), (-106, 106), (0, -110), (110, 0), (0, 110), (-110, 0))
 _PITCH_UM = 20.0

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from adjust.functional_model.transformation import Film
-from pipeline.resampling.frame_chain import FrameChain
+from pipeline.resampling.canvas import FrameChain
 from pipeline.resampling.interpolation import Degree
 from pipeline.resampling.resample_stage import BEST, FAST, ResampleTask, resampled
 

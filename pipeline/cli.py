@@ -59,8 +59,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
     try:
         code = app(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # what typer makes of it
-            told = "interrupted; files that were complete stay as they are, and scans that were measured are kept"
-            return _message(told, INTERRUPTED)
+            message = "interrupted; files that were complete stay as they are, and scans that were measured are kept"
+            return _message(message, INTERRUPTED)
         return code if isinstance(code, int) else DONE
     except typer.TyperException as error:
         return _message(error.format_message(), WRONG_INPUT)

@@ -33,7 +33,6 @@ from pipeline.archive.measurement import (
 from pipeline.archive.merge import Merged, merge
 from pipeline.archive.results_database import Store
 from pipeline.archive.results_integrity import DamagedError
-from pipeline.archive.status import archive_summary, shard_summary
 from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
@@ -43,8 +42,8 @@ from pipeline.provenance import of_file
 from pipeline.publishing.made_from import adjusted_from, differing, measured_from
 from pipeline.publishing.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
+from pipeline.report.load import adjusted, frame_data, measured, report_data
 from pipeline.report.page import write_frame_page, write_report
-from pipeline.report_data import adjusted, frame_data, measured, report_data
 from pipeline.results.adjustment_file import read_adjustment, write_adjustment
 from pipeline.results.comparator_file import (
     ComparatorPoint,
@@ -55,15 +54,14 @@ from pipeline.results.comparator_file import (
 )
 from pipeline.results.covariance_file import covariance_path
 from pipeline.results.frames_file import for_images, write_frames
-from pipeline.results.measured_record import record_of
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, record_of
 from pipeline.results.record_json import write_record
-from pipeline.summary import Summary, summarise
+from pipeline.summary import Summary, archive_summary, shard_summary, summarise
 from pipeline.workers import NotMeasured, WorkOptions
 
 if TYPE_CHECKING:
+    from pipeline.archive.thumbnails import Thumbnails
     from pipeline.opencv_check.opencv_corners import BoardPictures
-    from pipeline.thumbnails import Thumbnails
 
 _ONE_BY_ONE = 2000  # scans: of more the summary tells totals and what needs a look, from the store
 
@@ -263,13 +261,13 @@ def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublish
 def _write_marks(project: Project, store: Store, digest: str, new: Unpublished) -> None:
     judging = judging_of(store, digest)
     assert judging is not None
-    decided = decisions_by(store, digest)
+    decisions = decisions_by(store, digest)
     for camera in project.cameras.values():
         if camera.clicks is not None and camera.clicks.who:  # one decision more: how its marks look
             who = camera.path.name, camera.clicks.who
-            decided[who] = decided.get(who, 0) + 1
+            decisions[who] = decisions.get(who, 0) + 1
     marks = judged_marks(store, judging)
-    write_comparator(new.place(project.comparator), marks, pitches(store, digest), digest, decided)
+    write_comparator(new.place(project.comparator), marks, pitches(store, digest), digest, decisions)
     if not write_frames(new.place(project.frames_path), written_scans(store, digest)):
         new.remove(project.frames_path)
 
@@ -348,7 +346,7 @@ def _reported(project: Project, new: Unpublished) -> Summary:
 
 def _thumbnails(project: Project, data: ReportData) -> "Thumbnails":
     """The pictures of the marks that data shows."""
-    from pipeline.thumbnails import Thumbnails
+    from pipeline.archive.thumbnails import Thumbnails
 
     scans, path = data.measurement or {}, project.measurement_path
     keys = fingerprints_of(path, data.made_from.get(path.name, ""), scans)

@@ -12,12 +12,15 @@ from rich.text import Text
 
 from measure.flags import Status
 from measure.results import Pose
+from pipeline.archive.status import NAMED, ArchiveStatus, archive_status, worst_named
+from pipeline.archive.verdicts import NEXT_STEP, Verdict
+from pipeline.files.project_file import Project
 from pipeline.report.camera_views import fiducial_form
-from pipeline.report.data import ReportData
+from pipeline.report.data import Problem, ReportData
 from pipeline.report.fiducials import Figure
 from pipeline.report.marks import current_scans
 from pipeline.report.numbers import value_and_sigma
-from pipeline.report.verdict import Verdict, judge
+from pipeline.report.verdict import Level, ReportVerdict, judge
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.check_file import Check
 from pipeline.results.measured_record import pose_record
@@ -31,7 +34,7 @@ class Summary:
     """The end of a command. poses: of the scans, each with its evidence, as measurement.db has them. files: what was
     written, by a word for it. forms: of the fiducials of cameras of which nothing else was adjusted."""
 
-    verdict: Verdict
+    verdict: ReportVerdict
     frames: Mapping[str, Mapping[str, int]]
     poses: Mapping[str, Pose]
     adjustment: AdjustmentRecord | None
@@ -171,3 +174,27 @@ def _camera_table(adjustment: AdjustmentRecord) -> Table:
         for word, each in camera.interior.items() if camera.is_calibrated else ():
             table.add_row(Text(name), words.get(word, word), *value_and_sigma(each.value, each.sigma))
     return table
+
+
+def archive_summary(project: Project, files: Mapping[str, Path]) -> Summary:
+    """What `measure` says of many scans."""
+    return _scan_summary(archive_status(project), files)
+
+
+def shard_summary(project: Project, path: Path, shard: tuple[int, int]) -> Summary:
+    """What `measure --shard` says: of the scans of that part."""
+    status = archive_status(project, path)
+    own = tuple(scan for scan in status.scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
+    return _scan_summary(ArchiveStatus(own), {f"part {shard[0]} of {shard[1]}": path})
+
+
+def _scan_summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in status.counts.items() if count) or "none"
+    sentence = f"Measured: {len(status.scans)} scans: {counts}."
+    named, more = worst_named(status.scans, NAMED, False)
+    problems = [Problem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
+    problems += [Problem(f"decisions.jsonl, {line}", "It does not count.") for line in status.idle_decisions]
+    if more:
+        problems.append(Problem(f"{more} more need a look.", "Run `reseau status` with --verdict or --csv."))
+    level: Level = "good" if status.all_good else "look"
+    return Summary(ReportVerdict(level, sentence, tuple(problems), ()), {}, {}, None, None, files)

@@ -109,7 +109,7 @@ def level(room: Path) -> int:
 def test_the_ground_and_the_formats_of_pipeline_know_no_project() -> None:
     text, results = (ROOT / "pipeline" / name for name in ("text", "results"))
     assert rooms_used(text, "pipeline") == {"text", "errors"}
-    assert rooms_used(results, "pipeline") == {"text", "errors", "results", "provenance"}
+    assert rooms_used(results, "pipeline") == {"text", "errors", "results", "provenance", "types"}
 
 
 def rooms_used(room: Path, package: str) -> set[str]:

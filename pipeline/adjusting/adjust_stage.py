@@ -1,29 +1,78 @@
-"""Comparator coordinates to the adjustment, disks corrected for their eccentricity on the way."""
+"""Comparator coordinates to the adjustment, with scanners' bends, disks corrected for their eccentricity on the way."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.functional_model.scanner import carriage_terms, smooth_terms
+from adjust.model_selection.scanner_choice import bent_network, choose_bends
 from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import Network
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
-from pipeline.adjusting.scanners import with_scanners
+from pipeline.errors import InputError
+from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.project_file import Project
 from pipeline.measuring.target_field import across, disk_normals, eccentricity_mm, plane_normal
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.wording import listed
+from pipeline.types import Array
 
-Array = NDArray[np.float64]
+UM_PER_MM = 1000.0
 
 _ROUNDS = 4  # the correction changes by its own relative error, so the second round is already below the noise
 _SETTLED_SIGMAS = 0.01
 _NOTICEABLE_SIGMAS = 0.2  # of the coordinate: an eccentricity that is not corrected and as large deserves a word
+
+
+def add_scanner_bends(
+    project: Project, network: Network, adjusted: Callable[[Network], Adjustment]
+) -> tuple[Network, tuple[str, ...]]:
+    """The network with its scanners' bends, and what is to be said of terms that cannot be told.
+
+    adjusted: how a network is adjusted, for tests to choose by. Raises InputError where a term is asked for that the
+    film transformations take.
+    """
+    settings = project.adjust
+    if settings.scanner == "none":
+        return network, ()
+    films = {image.transformation for image in network.images if image.scanner}
+    if not films:
+        raise InputError(
+            f"{project.path}: [adjust] scanner is {_spelt(settings)}, but no image has a film transformation, and a "
+            'digital camera no scanner. Write scanner = "none".'
+        )
+    sigma_mm = settings.scanner_sigma_um / UM_PER_MM
+    if settings.scanner == "auto":
+        choice = choose_bends(network, adjusted, sigma_mm)
+        return choice.network, choice.remarks
+    if settings.scanner == "bend":
+        return bent_network(network, None, sigma_mm), ()
+    possible = (*smooth_terms(films), *carriage_terms(films))
+    for term in settings.scanner:
+        if term not in possible:
+            raise InputError(
+                f"{project.path}: [adjust] scanner names {term!r}, which the {' or '.join(sorted(films))} "
+                f"transformation of the films takes; it leaves {', '.join(possible) or 'no term'}."
+            )
+    return bent_network(network, settings.scanner, sigma_mm), ()
+
+
+def name_scanners(project: Project, network: Network) -> Network:
+    """The network whose images say which scanner they come from, whether its bend is to be estimated or not."""
+    images = tuple(
+        image if image.transformation == "none" else replace(image, scanner=project.scanner_of(image.name))
+        for image in network.images
+    )
+    return replace(network, images=images)
+
+
+def _spelt(settings: AdjustSettings) -> str:
+    return f'"{settings.scanner}"' if isinstance(settings.scanner, str) else str(list(settings.scanner))
 
 
 def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
@@ -33,12 +82,12 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     """
     network, left_out = build_network(project, marks)
     options = adjustment_options(project)
-    network, untold = with_scanners(project, network, partial(adjust, options=options))
+    network, untold = add_scanner_bends(project, network, partial(adjust, options=options))
     adjustment = adjust(network, options=options)
     network = adjustment.network  # without images that are left out
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
-        adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
+        adjustment, uncorrected = _correct_eccentricity(project, network, adjustment, options)
     warnings = (
         *left_out,
         *untold,
@@ -60,7 +109,7 @@ def adjustment_options(project: Project) -> Options:
     )
 
 
-def _without_eccentricity(
+def _correct_eccentricity(
     project: Project, network: Network, adjustment: Adjustment, options: Options
 ) -> tuple[Adjustment, Array]:
     """The adjustment of disks taken to the images of their centres, and the eccentricities (n, 2) not known."""
@@ -69,7 +118,7 @@ def _without_eccentricity(
         if not adjustment.converged:
             break
         wanted, uncorrected = _eccentricities(project, adjustment)
-        if _in_sigmas(network, wanted - applied) < _SETTLED_SIGMAS:
+        if _largest_sigmas(network, wanted - applied) < _SETTLED_SIGMAS:
             break
         applied = wanted
         corrected = adjust(_shifted(network, -applied), options=options)
@@ -118,7 +167,7 @@ def _shifted(network: Network, shift_mm: Array) -> Network:
     return replace(network, observations=replace(observations, xy_mm=observations.xy_mm + shift_mm))
 
 
-def _in_sigmas(network: Network, change_mm: Array) -> float:
+def _largest_sigmas(network: Network, change_mm: Array) -> float:
     """The largest change of an observation, in its standard deviations."""
     sigmas = np.sqrt(np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2))
     return float(np.max(np.abs(change_mm) / sigmas, initial=0.0))
@@ -151,7 +200,7 @@ def _unmeasured(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str
 
 
 def _not_corrected(network: Network, possible_mm: Array) -> tuple[str, ...]:
-    worst = _in_sigmas(network, possible_mm)
+    worst = _largest_sigmas(network, possible_mm)
     if worst <= _NOTICEABLE_SIGMAS:
         return ()
     return (

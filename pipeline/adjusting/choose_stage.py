@@ -9,8 +9,7 @@ from rich.text import Text
 
 from adjust.model_selection.candidates import Candidate
 from adjust.model_selection.model_choice import Choice, choose
-from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
-from pipeline.adjusting.scanners import with_scanner_names
+from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options, name_scanners
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.publishing.made_from import adjusted_from
@@ -32,7 +31,7 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceReco
             half_mm = {camera.name: _half(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm}
             own = adjust_marks(project, marks)
             choice = choose(
-                replace(own, network=with_scanner_names(project, own.network)),
+                replace(own, network=name_scanners(project, own.network)),
                 adjustment_options(project),
                 half_mm,
                 lambda name, done: count(name, done, done + 1),

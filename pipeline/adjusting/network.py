@@ -1,5 +1,6 @@
-"""From the user's files and the comparator coordinates to the network that is adjusted."""
+"""From the user's files and the comparator coordinates to the network that is adjusted, with checks of both."""
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,7 +15,6 @@ from adjust.problem.camera import Camera
 from adjust.problem.network import Board, Image, LineOfSight, Network, ObjectPoint, Transformation
 from adjust.problem.observations import Calibration, Distance, Observations
 from measure.results import ON_FILM
-from pipeline.adjusting.fiducial_check import check_fiducials
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile
@@ -22,12 +22,55 @@ from pipeline.files.project_file import Project
 from pipeline.files.project_tables import UNITS_MM
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.wording import did_you_mean, listed
+from pipeline.types import Array
 
-Array = NDArray[np.float64]
+OTHER_UNIT = 5.0  # film and paper keep their size to some percent; the nearest other unit, cm, is ten times as large
 
 
 BOARD = "board"
 FEWEST_TARGETS = 3  # in an image whose exterior orientation nobody has observed
+
+
+def check_fiducials(project: Project, marks: Sequence[ComparatorPoint]) -> None:
+    """Raises InputError for a fiducial that the camera does not have, and for given coordinates that are no mm."""
+    shown: dict[str, list[ComparatorPoint]] = {}
+    for mark in marks:
+        if mark.kind == "fiducial":
+            shown.setdefault(mark.image, []).append(mark)
+    for image, own in shown.items():
+        _check_fiducial_names(project, image, own)
+        if not project.scans:
+            _check_fiducial_unit(project, image, own)
+
+
+def _check_fiducial_names(project: Project, image: str, marks: Sequence[ComparatorPoint]) -> None:
+    camera = project.camera_of(image)
+    ids = [fiducial.id for fiducial in camera.fiducials]
+    for mark in marks:
+        if mark.point not in ids:
+            raise InputError(
+                f"{project.comparator}, line {mark.line}: image {image!r}: {camera.path} has no fiducial "
+                f"{mark.point!r}. It has {', '.join(ids) or 'none'}."
+            )
+
+
+def _check_fiducial_unit(project: Project, image: str, marks: Sequence[ComparatorPoint]) -> None:
+    """In um, inches or pixels they stand farther apart than the camera's, or closer, than film could make them."""
+    camera = project.camera_of(image)
+    given = {one.id: one.xy_mm for one in camera.fiducials if max(one.sigma_mm) < math.inf}
+    known = [(mark.xy_mm, given[mark.point]) for mark in marks if mark.xy_mm is not None and mark.point in given]
+    measured_mm, given_mm = (_extent(np.array(places)) for places in zip(*known, strict=True)) if known else (0.0, 0.0)
+    if measured_mm and given_mm and not 1 / OTHER_UNIT < measured_mm / given_mm < OTHER_UNIT:
+        raise InputError(
+            f"{project.comparator}, line {marks[0].line}: the fiducials of image {image!r} stand "
+            f"{measured_mm / given_mm:.3g} times as far apart as those of {camera.path}. Give both in mm: not in um, "
+            "inches or pixels."
+        )
+
+
+def _extent(xy: NDArray[np.float64]) -> float:
+    """Diagonal of the rectangle about points (n, 2)."""
+    return float(np.hypot(*np.ptp(xy, axis=0)))
 
 
 def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[Network, tuple[str, ...]]:
@@ -43,7 +86,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         )
     check_fiducials(project, used)
     _check_points(project, used)
-    used, unjoined = _joinable(project, _with_whole_joins(project, used))
+    used, unjoined = _joinable(project, _drop_single_joins(project, used))
     used, lonely = _locatable(project, used)
     used, left_out = _orientable(project, used)
     names = dict.fromkeys(mark.image for mark in used)
@@ -72,10 +115,8 @@ def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bo
     """Whether an adjustment is asked for: of object points, or at least of the film where fiducials suffice for it."""
     observed = (mark for mark in marks if mark.kind == "fiducial" and mark.status.is_observation)
     fiducials = {(_frame(project, mark.image), mark.point): mark.image for mark in observed}
-    counts, image_of = (
-        Counter(frame for frame, _ in fiducials),
-        {frame: image for (frame, _), image in fiducials.items()},
-    )
+    counts = Counter(frame for frame, _ in fiducials)
+    image_of = {frame: image for (frame, _), image in fiducials.items()}
     return _expects_targets(project) or any(
         _has_film_transformation(_image(project, image_of[frame]), count) for frame, count in counts.items()
     )
@@ -92,7 +133,7 @@ def _frame(project: Project, image: str) -> str:
     return project.part_of(image) or image
 
 
-def _with_whole_joins(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
+def _drop_single_joins(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
     """The marks without the joins that only one scan of their frame shows."""
     shown = Counter((_frame(project, mark.image), mark.point) for mark in marks if mark.kind == "join")
     for mark in marks:
@@ -107,10 +148,10 @@ def _with_whole_joins(project: Project, marks: Sequence[ComparatorPoint]) -> lis
 def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
     """The marks of the points that can be located: of which something is given, or which two images show."""
     given = {id for id, point in project.object_points.items() if any((point.X, point.Y, point.Z))}
-    seen = {(mark.point, _frame(project, mark.image)) for mark in marks if mark.kind not in ON_FILM}
-    images = Counter(point for point, _ in seen)
+    shown_points = {(mark.point, _frame(project, mark.image)) for mark in marks if mark.kind not in ON_FILM}
+    images = Counter(point for point, _ in shown_points)
     lonely = {point for point, count in images.items() if count < 2 and point not in given}
-    image_of = {point: image for point, image in seen if point in lonely}
+    image_of = {point: image for point, image in shown_points if point in lonely}
     named = [f"{point} ({image_of[point]})" for point in sorted(lonely)]
     sentence = (
         f"Without coordinates and measured in one image only, and so left out: {listed(named)}. Two images are needed "
@@ -157,12 +198,12 @@ def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[
 
     Of a frame in pieces the one that shows most fiducials remains.
     """
-    seen: dict[str, dict[str, set[tuple[str, str]]]] = {}
+    shown_points: dict[str, dict[str, set[tuple[str, str]]]] = {}
     for mark in marks:
         if frame := project.part_of(mark.image):
-            seen.setdefault(frame, {}).setdefault(mark.image, set()).add((mark.kind, mark.point))
+            shown_points.setdefault(frame, {}).setdefault(mark.image, set()).add((mark.kind, mark.point))
     lost = dict[str, str]()
-    for frame, parts in seen.items():
+    for frame, parts in shown_points.items():
         kept = max(
             _pieces(parts), key=lambda piece: sum(kind == "fiducial" for part in piece for kind, _ in parts[part])
         )
@@ -172,7 +213,7 @@ def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[
         f"other scans of frame {frame!r}, so that nothing joins it to them. See what is said of its measurement."
         for image, frame in sorted(lost.items())
     )
-    bare = {frame: _few_fiducials(project, frame, parts, lost) for frame, parts in seen.items()}
+    bare = {frame: _few_fiducials(project, frame, parts, lost) for frame, parts in shown_points.items()}
     sentences += tuple(sentence for sentence in bare.values() if sentence)
     kept_marks = [mark for mark in marks if mark.image not in lost and not bare.get(project.part_of(mark.image))]
     if not kept_marks:

@@ -20,7 +20,7 @@ from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.target_field import Field, checked_places, measure_single_targets, target_field
 from pipeline.measuring.target_stage import with_targets
 from pipeline.progress import Reporter
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.workers import results_of
 
 _SEARCH_PX = 2.0  # an adjusted orientation predicts to far less than that
@@ -52,7 +52,7 @@ def measure_again(
     settings = project.targets
     if settings is None or settings.board is not None or not adjustment.converged:
         return None
-    field = _with_adjusted_points(target_field(project), adjustment)
+    field = _adjusted_field(target_field(project), adjustment)
     sought = {scan.frame.image: _missed(field, scan, adjustment, settings) for scan in scans}
     visits = [
         Visit(scan.frame.image, fetch_location(scan.scan), missed, settings, project.max_pixels)
@@ -81,7 +81,7 @@ def looked_again(visit: Visit) -> tuple[MarkMeasurement, ...] | str:
     return tuple(mark for mark in marks if mark.status.is_observation)
 
 
-def _with_adjusted_points(field: Field, adjustment: Adjustment) -> Field:
+def _adjusted_field(field: Field, adjustment: Adjustment) -> Field:
     """The field at its adjusted coordinates."""
     xyz = field.xyz.copy()
     known = [row for row, id in enumerate(field.ids) if id in adjustment.network.point_by_id]

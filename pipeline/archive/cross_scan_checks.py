@@ -20,8 +20,7 @@ from pipeline.measuring.camera_identification import with_plates
 from pipeline.measuring.roll import CheckedScan, checked, roll_of, with_same_frames
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.provenance import content_hash, fingerprint, shard_of
-from pipeline.results.measured_record import record_of
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, record_of
 
 _TOGETHER = 2000  # frames of a camera that are checked beside one another: more would only take memory
 OfCamera = tuple[CameraFile, Sequence[ScanTask]]

@@ -27,8 +27,7 @@ from pipeline.archive.results_integrity import DamagedError, check_judging, dama
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
 from pipeline.results.comparator_file import ComparatorPoint, DecidedBy, comparator_points, measurement_of
-from pipeline.results.measured_record import scan_of
-from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan, scan_of
 
 _PLACE = "project folder"
 Array = NDArray[np.float64]

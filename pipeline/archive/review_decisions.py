@@ -17,7 +17,7 @@ from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, put_
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import ScanTask, options_of
 from pipeline.provenance import fingerprint, options_hash
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean
 
 _MEASURED = (Choice.PLACE, Choice.POSE, Choice.UNDO)  # decisions that change what is measured

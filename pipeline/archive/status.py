@@ -28,11 +28,7 @@ from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
 from pipeline.provenance import FileStates
-from pipeline.report.data import Problem
-from pipeline.report.verdict import Level
-from pipeline.report.verdict import Verdict as ProjectVerdict
-from pipeline.results.measured_scan import FailureCode
-from pipeline.summary import Summary
+from pipeline.results.measured_record import FailureCode
 
 NAMED = 20  # scans that a summary names
 _LOOK = (Verdict.FAILED, Verdict.POOR, Verdict.LOOK)  # the worst first
@@ -212,27 +208,3 @@ def worst_named(scans: Sequence[ScanStatus], most: int, every: bool) -> tuple[li
     """The first of those that need a look, the worst first; and how many there are beside them."""
     to_name = [scan for verdict in _LOOK for scan in scans if scan.verdict is verdict] if not every else list(scans)
     return to_name[:most], max(len(to_name) - most, 0)
-
-
-def archive_summary(project: Project, files: Mapping[str, Path]) -> Summary:
-    """What `measure` says of many scans."""
-    return _summary(archive_status(project), files)
-
-
-def shard_summary(project: Project, path: Path, shard: tuple[int, int]) -> Summary:
-    """What `measure --shard` says: of the scans of that part."""
-    status = archive_status(project, path)
-    own = tuple(scan for scan in status.scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
-    return _summary(ArchiveStatus(own), {f"part {shard[0]} of {shard[1]}": path})
-
-
-def _summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
-    counts_text = ", ".join(f"{count} {verdict}" for verdict, count in status.counts.items() if count) or "none"
-    sentence = f"Measured: {len(status.scans)} scans: {counts_text}."
-    named, more = worst_named(status.scans, NAMED, False)
-    problems = [Problem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
-    problems += [Problem(f"decisions.jsonl, {line}", "It does not count.") for line in status.idle_decisions]
-    if more:
-        problems.append(Problem(f"{more} more need a look.", "Run `reseau status` with --verdict or --csv."))
-    level: Level = "good" if status.all_good else "look"
-    return Summary(ProjectVerdict(level, sentence, tuple(problems), ()), {}, {}, None, None, files)

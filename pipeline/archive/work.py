@@ -17,8 +17,7 @@ from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measur
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 from pipeline.provenance import FileState, FileStates, Identity, options_hash, parts_hash, result_key
-from pipeline.results.measured_record import record_of, scan_of
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, record_of, scan_of
 from pipeline.text.wording import counted, listed, without_file
 from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, results_of
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import angles_from_rotation
 from adjust.problem.network import Exterior
@@ -28,8 +27,7 @@ from pipeline.results.comparator_file import ComparatorPoint, pitches_of, points
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
 from pipeline.text.wording import counted
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 MOST_PX = 3000  # along a frame's side, unless the user says a pitch
 

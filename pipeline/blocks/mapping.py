@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.blocks.pictures import BlockPicture, Lattice
 from pipeline.errors import InputError
 from pipeline.exchange.colmap_format import CONVENTION, import_pycolmap
 from pipeline.files.camera_file import CameraFile
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 FEATURES = 2000  # an image: a block needs hundreds of them in common
 SEED = 0
@@ -95,9 +93,9 @@ def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> M
         sights = []
         for element in point.track.elements:
             image, row = images[element.image_id], element.point2D_idx
-            seen = image.points2D[row].xy
-            off_px = float(np.linalg.norm(seen - image.project_point(point.xyz)))
-            place = seen - CONVENTION.first_pixel_px
+            place_px = image.points2D[row].xy
+            off_px = float(np.linalg.norm(place_px - image.project_point(point.xyz)))
+            place = place_px - CONVENTION.first_pixel_px
             size_px = float(sizes_px[element.image_id][row])
             sights.append(Sight(names[image.name], float(place[0]), float(place[1]), size_px, off_px))
         tracks[int(number)], points[int(number)] = sights, np.array(point.xyz)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from measure.scans.opening import open_scan
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
-from pipeline.resampling.frame_chain import FrameChain
+from pipeline.resampling.canvas import FrameChain
 from pipeline.resampling.resample_stage import ResampleTask
 from pipeline.text.names import file_word, path_below
+from pipeline.types import Array, Mask
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 _BORDER = 0.02  # of the frame's side: vignetting, the frame's edge
@@ -69,8 +69,8 @@ class BlockPicture:
     def scan_place(self, camera_mm: Array) -> tuple[BlockScan, Array] | None:
         """The scan that shows a place (2,) of the camera frame farthest from its edges, and the pixel (2,) there; None
         where none can have it."""
-        seen = [(scan, scan.chain.scan_from_frame(camera_mm[None])) for scan in self.scans]
-        places = [(scan, pixels[0]) for scan, (pixels, found) in seen if found[0]]
+        candidates = [(scan, scan.chain.scan_from_frame(camera_mm[None])) for scan in self.scans]
+        places = [(scan, pixels[0]) for scan, (pixels, found) in candidates if found[0]]
         return max(places, key=lambda place: place[0].depths_px(place[1][None])[0], default=None)
 
 
@@ -114,7 +114,7 @@ def _scans(task: ResampleTask) -> tuple[BlockScan, ...]:
     return tuple(scans)
 
 
-def _cut(path: Path, lattice: Lattice) -> tuple[Array, NDArray[np.bool_]]:
+def _cut(path: Path, lattice: Lattice) -> tuple[Array, Mask]:
     """A resampled frame's part within the lattice in grey, and which of it the scan has."""
     with tifffile.TiffFile(path) as file:
         description = json.loads(file.pages.first.description)
@@ -133,7 +133,7 @@ def _cut(path: Path, lattice: Lattice) -> tuple[Array, NDArray[np.bool_]]:
     return picture, mask
 
 
-def _usable(camera: CameraFile, lattice: Lattice) -> NDArray[np.bool_]:
+def _usable(camera: CameraFile, lattice: Lattice) -> Mask:
     """The frame within its border, its fiducials left out."""
     assert camera.frame_mm is not None
     x = lattice.x_mm + lattice.pitch_mm * np.arange(lattice.width_px)
@@ -147,7 +147,7 @@ def _usable(camera: CameraFile, lattice: Lattice) -> NDArray[np.bool_]:
     return np.asarray(inside)
 
 
-def _eight_bits(picture: Array, mask: NDArray[np.bool_]) -> Picture:
+def _eight_bits(picture: Array, mask: Mask) -> Picture:
     if not mask.any():
         return np.zeros(picture.shape, np.uint8)
     dark, light = np.percentile(picture[mask], (_DARKEST, _LIGHTEST))

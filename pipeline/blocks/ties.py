@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from adjust.problem.network import ObjectPoint
@@ -15,8 +14,7 @@ from pipeline.blocks.pictures import BlockPicture, BlockScan
 from pipeline.errors import InputError
 from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
 from pipeline.results.comparator_file import ComparatorPoint, comparator_from_pixel
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 CELLS = 8  # a side of an image: ties are spread over these
 A_CELL = 3  # ties that are taken of one, the longest tracks first

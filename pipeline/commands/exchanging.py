@@ -42,9 +42,9 @@ def resample(
     from pipeline.resampling.resample_stage import Resampled, resample, resampled_json
 
     def line(result: Resampled) -> str:
-        told = result.problem or f"{result.width_px} x {result.height_px} px{', as it was' if result.kept else ''}"
+        outcome = result.problem or f"{result.width_px} x {result.height_px} px{', as it was' if result.kept else ''}"
         clamped = f", {result.clamped} samples clamped to what can be stored" if result.clamped else ""
-        return f"{result.image}: {told}{clamped}"
+        return f"{result.image}: {outcome}{clamped}"
 
     results = resample(read(project, max_pixels), out_dir, pitch_um, lens, fast, Reporter())
     show(as_json, lambda: resampled_json(results), lambda _: say(*map(line, results)))
@@ -71,7 +71,7 @@ def export(
     show(
         as_json,
         lambda: {"folder": str(done.folder), "files": done.files, **asdict(replace(done.written, files={}))},
-        lambda _: say(done.told, f"{out_dir}: {counted(len(done.files), 'file')}"),
+        lambda _: say(done.readme_text, f"{out_dir}: {counted(len(done.files), 'file')}"),
     )
     return LOOK if done.written.left_out else DONE
 
@@ -96,7 +96,7 @@ def import_(
         raise InputError("name at least one FILE, and then OUT_DIR: reseau import FORMAT FILE... OUT_DIR")
     *files, folder = paths
     done = run_import(format, files, folder, ImportOptions(pitch_um, sigma_px, from_middle, fiducials))
-    say(done.told, f"{folder}: {counted(len(done.files), 'file')}")
+    say(done.readme_text, f"{folder}: {counted(len(done.files), 'file')}")
     return DONE
 
 

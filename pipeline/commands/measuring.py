@@ -66,7 +66,7 @@ def init(
     return LOOK if any(cases for _, cases in new.remarks()) else DONE
 
 
-def measuring(stage: str, told: str) -> Callable[..., int]:
+def measuring(stage: str, help_text: str) -> Callable[..., int]:
     """The command that does a stage of `pipeline.stages` which measures scans."""
 
     def command(
@@ -94,7 +94,7 @@ def measuring(stage: str, told: str) -> Callable[..., int]:
         work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
         return with_project(project, partial(getattr(stages, stage), work=work), as_json, max_pixels)
 
-    command.__doc__ = told
+    command.__doc__ = help_text
     return command
 
 
@@ -165,8 +165,12 @@ def report(
             raise InputError("images are named after --frames: reseau report PROJECT.toml --frames NAME...")
         return with_project(project, run_report, as_json, max_pixels)
     pages = run_frame_pages(read(project, max_pixels), list(dict.fromkeys([*frames, *(names or ())])), Reporter())
-    told = {image: str(path) for image, path in pages.items()}
-    show(as_json, lambda: {"frames": told}, lambda _: say(*(f"{image}: {path}" for image, path in told.items())))
+    help_text = {image: str(path) for image, path in pages.items()}
+    show(
+        as_json,
+        lambda: {"frames": help_text},
+        lambda _: say(*(f"{image}: {path}" for image, path in help_text.items())),
+    )
     return DONE
 
 

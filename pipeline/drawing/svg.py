@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup, escape
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from pipeline.text.atomic import write_atomically
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 
 def style() -> str:
@@ -23,8 +22,8 @@ def style() -> str:
 def write_picture(path: Path, width: float, height: float, title: str, *content: Markup) -> None:
     """A file of its own, on white; `title` as in `picture`. Raises InputError where it cannot be written."""
     ground = tag("rect", width=width, height=height, fill="white")
-    look = tag("style", Markup(style() + "svg { font-family: sans-serif; }"))
-    drawn = picture(width, height, title, look, ground, *content, xmlns="http://www.w3.org/2000/svg")
+    css = tag("style", Markup(style() + "svg { font-family: sans-serif; }"))
+    drawn = picture(width, height, title, css, ground, *content, xmlns="http://www.w3.org/2000/svg")
     write_atomically(path, str(drawn) + "\n")
 
 

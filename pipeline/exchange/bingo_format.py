@@ -1,13 +1,11 @@
 """BINGO's image coordinates: mm, refined, that is free of film and lens."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Lens
 from pipeline.exchange.block import Block, Frame, WholeFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 CONVENTION = Convention(
     (float("nan"), float("nan")),

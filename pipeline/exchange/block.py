@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import LineOfSight
@@ -17,13 +16,12 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.project_tables import UNITS_MM
 from pipeline.publishing.made_from import adjusted_from, differing
-from pipeline.resampling.frame_chain import FrameChain, image_chain
+from pipeline.resampling.canvas import FrameChain, image_chain
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint, pitches_of, pixel_from_comparator, read_comparator
 from pipeline.results.covariance_file import Covariance, read_own_covariance
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 NO_PITCH = (1000.0, 1000.0)  # where pixels are not asked for
 
@@ -125,13 +123,15 @@ class WholeFrame:
             assert scan.model is not None  # of frames that have a part in the adjustment alone
             return scan.model.camera_from_comparator(_places_mm(own))
 
-        return self._by_scan(marks, places)
+        return self._collect_by_scan(marks, places)
 
     def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
         """The same in the resampled frame, whose lens may have been taken out."""
-        return self._by_scan(marks, lambda scan, own: scan.chain(with_lens).frame_from_scan(scan.pixels(own))[0])
+        return self._collect_by_scan(
+            marks, lambda scan, own: scan.chain(with_lens).frame_from_scan(scan.pixels(own))[0]
+        )
 
-    def _by_scan(
+    def _collect_by_scan(
         self, marks: tuple[ComparatorPoint, ...], places: Callable[[OutFrame, tuple[ComparatorPoint, ...]], Array]
     ) -> Array:
         made = np.zeros((len(marks), 2))

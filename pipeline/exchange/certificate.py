@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from adjust.functional_model.lens import Distortion, Prior
@@ -24,8 +23,7 @@ from pipeline.exchange.convention import Convention
 from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile
 from pipeline.text.tables import read_toml
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 CONVENTION = Convention(
     (float("nan"), float("nan")),

@@ -12,8 +12,7 @@ from pipeline.errors import InputError, missing_extra
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import BROWN, RATIONAL
-from pipeline.exchange.foreign_camera import foreign_pose, opencv_camera
-from pipeline.exchange.incoming import ImportOptions, Incoming
+from pipeline.exchange.incoming import ImportOptions, Incoming, foreign_pose, opencv_camera
 from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
 from pipeline.opencv_check.opencv_model import INTERIOR
 from pipeline.text.names import image_name
@@ -55,7 +54,7 @@ def import_pycolmap(user: str) -> Any:
 
 def reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> Any:
     """The frames with the marks of adjusted points, and these points with their tracks."""
-    made, seen = pycolmap.Reconstruction(), defaultdict(list)
+    made, tracks = pycolmap.Reconstruction(), defaultdict(list)
     for number, frame in enumerate(frames, 1):
         camera = colmap_camera(pycolmap, frame, number)
         made.add_camera_with_trivial_rig(camera)
@@ -65,8 +64,8 @@ def reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> A
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(frame.rotation), frame.translation)
         made.add_image_with_trivial_frame(image, pose)
         for index, mark in enumerate(marks):
-            seen[mark.point].append((number, index))
-    for point, places_of_it in sorted(seen.items()):
+            tracks[mark.point].append((number, index))
+    for point, places_of_it in sorted(tracks.items()):
         track = pycolmap.Track()
         for number, index in places_of_it:
             track.add_element(number, index)
@@ -96,9 +95,9 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
         try:
             made = pycolmap.Reconstruction(str(folder))
         except Exception as error:  # whatever pycolmap raises at a broken or missing file
-            told = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+            message = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
             raise InputError(
-                f"{folder}: is no reconstruction of COLMAP ({told}). Name its folder, as sparse/0."
+                f"{folder}: is no reconstruction of COLMAP ({message}). Name its folder, as sparse/0."
             ) from None
         for number, camera in sorted(made.cameras.items()):
             known = _parameters(camera)

@@ -8,7 +8,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.families import FAMILY_NAMES, family
 from adjust.functional_model.lens import Distortion, Lens, Prior
@@ -32,8 +31,7 @@ from pipeline.results.covariance_file import Covariance, covariance_path, read_o
 from pipeline.results.record_json import json_text, plain_json
 from pipeline.text.text_file import read_bytes
 from pipeline.text.wording import did_you_mean, listed
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class Conversion:
 
     lens: ConvertedLens
     sigmas: Array
-    told: tuple[str, ...]
+    sentences: tuple[str, ...]
     files: tuple[str, ...]
 
     @property
@@ -97,16 +95,16 @@ def _converted(
     found = convert_lens(lens, into, corners_mm, options.parameters or None, uncertain)
     size = "{:.4g} x {:.4g} mm".format(*(corners_mm[1] - corners_mm[0]))
     if found.is_same:
-        told = (
+        sentences = (
             f"{lens.distortion.family} and {options.family} mean the same here: what is left over {size} is rounding."
         )
     else:
-        told = (
+        sentences = (
             f"{options.family} does not take this lens quite: over {size} it is off by up to "
             f"{1e3 * found.largest_mm:.3g} um, rms {1e3 * found.rms_mm:.3g} um a point. "
             "The standard deviations do not count that."
         )
-    return found, (told, f"Fitted: c, x0', y0' and {listed(found.estimated) or 'no parameter'}.")
+    return found, (sentences, f"Fitted: c, x0', y0' and {listed(found.estimated) or 'no parameter'}.")
 
 
 def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
@@ -125,7 +123,7 @@ def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion
     known = np.sqrt(np.diag(covariance.of(_parameters(name, given)[3:])))
     places = observed_mm(path, content, name)
     corners_mm = np.array([places.min(axis=0), places.max(axis=0)])
-    lens, told = _converted(given, known, corners_mm, options)
+    lens, sentences = _converted(given, known, corners_mm, options)
     moved = _moved_covariance(covariance, name, given, lens)
     sigmas = np.sqrt(np.diag(moved.of(_parameters(name, lens.lens))))
     entry = _camera_entry(camera, given.distortion, lens, sigmas)
@@ -144,7 +142,7 @@ def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion
     kept["fingerprint"] = np.array(of_content(text.encode("utf-8")))
     np.savez_compressed(arrays, allow_pickle=False, **kept)
     files: dict[str, str | bytes] = {"adjustment.json": text, "adjustment.npz": arrays.getvalue()}
-    return _written(path, folder, files, Conversion(lens, sigmas, told, tuple(files)))
+    return _written(path, folder, files, Conversion(lens, sigmas, sentences, tuple(files)))
 
 
 def _parameters(camera: str, lens: Lens) -> tuple[Parameter, ...]:
@@ -195,14 +193,14 @@ def _camera_file(path: Path, folder: Path, options: ConvertOptions) -> Conversio
     corners_mm = np.array([middle - half, middle + half])
     given = np.array([camera.principal_distance_sigma_mm, *camera.principal_point_sigma_mm, *(p.sigma for p in priors)])
     source = replace(source, covariance=np.diag(np.where(np.isinf(given), 0.0, given) ** 2))
-    found, told = _converted(source, given[3:], corners_mm, options)
+    found, sentences = _converted(source, given[3:], corners_mm, options)
     lens, sigmas = found.lens, _sigmas(given, source, found)
     if np.count_nonzero(np.isfinite(sigmas) & (sigmas > 0.0)) > 1:
-        told += (
+        sentences += (
             "A camera file holds no correlations: to keep them convert adjustment.json, and name the result there.",
         )
     if camera.calibration is not None:
-        told += (f"The earlier calibration {camera.calibration.path} is left out: convert it by itself.",)
+        sentences += (f"The earlier calibration {camera.calibration.path} is left out: convert it by itself.",)
     sigma = dict(zip(lens.quantities[3:], sigmas[3:].tolist(), strict=True))
     value = dict(zip(sigma, lens.parameters.tolist(), strict=True))
     estimated = {name: Prior(value[name], sigma[name]) for name in found.estimated}
@@ -223,7 +221,7 @@ def _camera_file(path: Path, folder: Path, options: ConvertOptions) -> Conversio
         return f"{name}.tif"
 
     files["camera.toml"] = camera_text(converted, save)
-    return _written(path, folder, files, Conversion(found, sigmas, told, tuple(files)))
+    return _written(path, folder, files, Conversion(found, sigmas, sentences, tuple(files)))
 
 
 def _sigmas(given: Array, source: Lens, found: ConvertedLens) -> Array:
@@ -241,7 +239,7 @@ def _sigmas(given: Array, source: Lens, found: ConvertedLens) -> Array:
 
 def _written(path: Path, folder: Path, files: dict[str, str | bytes], conversion: Conversion) -> Conversion:
     head = [f"Written by reseau {version('reseau')}: a lens converted", "", f"From: {path.name}", ""]
-    publish(folder, {**files, README: "\n".join([*head, *(f"- {line}" for line in conversion.told)]) + "\n"})
+    publish(folder, {**files, README: "\n".join([*head, *(f"- {line}" for line in conversion.sentences)]) + "\n"})
     return conversion
 
 
@@ -266,4 +264,4 @@ def conversion_lines(conversion: Conversion) -> Sequence[str]:
         for name, (value, sigma) in conversion.values.items()
         if value != 0.0 or sigma != 0.0
     ]
-    return (*conversion.told, *numbers)
+    return (*conversion.sentences, *numbers)

@@ -28,7 +28,7 @@ class Exported:
     folder: Path
     files: tuple[str, ...]
     written: Written
-    told: str
+    readme_text: str
 
 
 def run_export(project: Project, format: str, folder: Path, options: ExportOptions) -> Exported:
@@ -46,11 +46,11 @@ def run_export(project: Project, format: str, folder: Path, options: ExportOptio
     write: Callable[[Block, ExportOptions], Written] = module.write
     convention: Convention = module.CONVENTION
     written = write(block, options)
-    decided = decisions_told(decisions_of(project.comparator))
-    written = replace(written, notes=tuple(filter(None, [*written.notes, *block.lens_reach.values(), decided])))
-    told = readme(format, convention, written)
-    publish(folder, {**written.files, README: told})
-    return Exported(folder, tuple(written.files), written, told)
+    decisions = decisions_told(decisions_of(project.comparator))
+    written = replace(written, notes=tuple(filter(None, [*written.notes, *block.lens_reach.values(), decisions])))
+    readme_text = readme(format, convention, written)
+    publish(folder, {**written.files, README: readme_text})
+    return Exported(folder, tuple(written.files), written, readme_text)
 
 
 def readme(format: str, convention: Convention, written: Written) -> str:
@@ -103,9 +103,9 @@ def publish(folder: Path, files: Mapping[str, str | bytes]) -> None:
 
 def _check_names(block: Block) -> None:
     """Files of other programs are named after the scans' own files, without their folders."""
-    seen: dict[str, str] = {}
+    images: dict[str, str] = {}
     for frame in block.frames:
-        other = seen.setdefault(frame.file_name, frame.image)
+        other = images.setdefault(frame.file_name, frame.image)
         if other != frame.image:
             raise InputError(
                 f"images {other!r} and {frame.image!r} have files of the same name {frame.file_name!r}, and other "

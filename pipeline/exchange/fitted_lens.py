@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
@@ -13,8 +12,7 @@ from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
 from pipeline.exchange.block import Block, Frame
 from pipeline.exchange.convention import ExportOptions
 from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, fixed, opencv_values
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 BROWN = ("k1", "k2", "p1", "p2", "k3")
 RATIONAL = (*BROWN, "k4", "k5", "k6")
@@ -47,10 +45,10 @@ def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], op
     if options.with_lens or lens.distortion.family == "none":
         return FittedLens(_pinhole(lens), 0.0)
     for names in models:
-        if _is_of(lens, (*names, "b1")):
+        if _has_only(lens, (*names, "b1")):
             return _opencv(lens)
     for names in models:
-        fitted = _fitted(block, frame, names)
+        fitted = _fit_opencv(block, frame, names)
         if fitted.largest_mm <= options.largest_misfit_px * min(frame.known_pitch_um) / 1000.0:
             break
     return fitted
@@ -78,10 +76,10 @@ def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
     family = lens.distortion.family
     if family == "none":
         return FittedLens(_pinhole(lens), 0.0)
-    if _is_of(lens, BROWN if at_ideal else (*BROWN, *_AFFINE)):
+    if _has_only(lens, BROWN if at_ideal else (*BROWN, *_AFFINE)):
         return _opencv(lens)
     if family in _ONE_SCALE or not at_ideal:
-        return _fitted(block, frame, (*BROWN, *_AFFINE))
+        return _fit_opencv(block, frame, (*BROWN, *_AFFINE))
     rays, observed_mm = _over_frame(block, frame)
     fitted, shear = _sheared_step(rays, observed_mm)
     return FittedLens(fitted, _largest(_sheared(fitted, shear, rays) - observed_mm), shear=shear)
@@ -98,8 +96,8 @@ def frame_corners_mm(block: Block, frame: Frame) -> Array:
         for each in block.frames
         if each.camera == frame.camera and each.model is not None and each.marks
     ]
-    seen = np.concatenate(places)
-    return np.array([seen.min(axis=0), seen.max(axis=0)])
+    observed = np.concatenate(places)
+    return np.array([observed.min(axis=0), observed.max(axis=0)])
 
 
 def _pinhole(lens: Lens) -> Array:
@@ -109,7 +107,7 @@ def _pinhole(lens: Lens) -> Array:
     return values
 
 
-def _is_of(lens: Lens, names: Sequence[str]) -> bool:
+def _has_only(lens: Lens, names: Sequence[str]) -> bool:
     """Whether a lens is of OpenCV's family, and has no parameters but these."""
     family = lens.distortion.family
     known = zip(parameter_names(family), lens.parameters, strict=True)
@@ -133,7 +131,7 @@ def _over_frame(block: Block, frame: Frame) -> tuple[Array, Array]:
     return rays[found], grid_mm[found]
 
 
-def _fitted(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
+def _fit_opencv(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
     """The nearest lens by parameters of these names."""
     lens = frame.lens
     assert lens is not None
@@ -158,8 +156,8 @@ def _sheared_step(rays: Array, observed_mm: Array) -> tuple[Array, float]:
     down = [b, b * r2, b * r2**2, r2 + 2 * b * b, 2 * a * b, b * r2**3, none, none, none, -one]
     design = np.concatenate([np.stack(across, axis=1), np.stack(down, axis=1)])
     scale = np.linalg.norm(design, axis=0)
-    seen = np.concatenate([observed_mm[:, 0], -observed_mm[:, 1]])
-    c, k1, k2, p1, p2, k3, b1, b2, x0, y0 = (np.linalg.lstsq(design / scale, seen)[0] / scale).tolist()
+    observed = np.concatenate([observed_mm[:, 0], -observed_mm[:, 1]])
+    c, k1, k2, p1, p2, k3, b1, b2, x0, y0 = (np.linalg.lstsq(design / scale, observed)[0] / scale).tolist()
     values = np.zeros(len(NAMES))
     values[:9] = c + b1, c, x0, y0, k1 / c, k2 / c, p1 / c, p2 / c, k3 / c
     return values, b2 / c

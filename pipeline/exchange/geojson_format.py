@@ -4,15 +4,13 @@ import json
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, WholeFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import frame_corners_mm
 from pipeline.exchange.map_projection import lon_lat
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 CONVENTION = Convention(
     (float("nan"), float("nan")),

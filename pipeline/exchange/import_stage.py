@@ -27,7 +27,7 @@ class Imported:
     """What was written; told: the lines of its README."""
 
     files: tuple[str, ...]
-    told: str
+    readme_text: str
 
 
 def run_import(format: str, paths: Sequence[Path], folder: Path, options: ImportOptions) -> Imported:
@@ -50,9 +50,9 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
     if not files:
         raise InputError(f"{', '.join(map(str, paths))}: there is nothing to import in it.")
     incoming = replace(incoming, notes=(*incoming.notes, *_unknown_notes(incoming.cameras)))
-    told = _readme(format, paths, files, incoming)
-    publish(folder, {**files, README: told})
-    return Imported(tuple(files), told)
+    readme_text = _readme(format, paths, files, incoming)
+    publish(folder, {**files, README: readme_text})
+    return Imported(tuple(files), readme_text)
 
 
 def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:
@@ -91,13 +91,16 @@ def _comparator(incoming: Incoming, options: ImportOptions) -> str:
         f"# comparator coordinates, reseau {version('reseau')}, imported",
         "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas",
         "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)",
-        *(f"# pitch of {image}: {pitch[0]:.10g} um across, {pitch[1]:.10g} um down" for image in _images_of(incoming)),
+        *(
+            f"# pitch of {image}: {pitch[0]:.10g} um across, {pitch[1]:.10g} um down"
+            for image in _image_names(incoming)
+        ),
         ",".join(COLUMNS),
     ]
     return "\n".join([*lines, *(_mark_line(mark, options, pitch) for mark in incoming.marks)]) + "\n"
 
 
-def _images_of(incoming: Incoming) -> list[str]:
+def _image_names(incoming: Incoming) -> list[str]:
     return sorted({mark.image for mark in incoming.marks})
 
 

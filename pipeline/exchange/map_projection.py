@@ -3,11 +3,9 @@
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 # Semi-major axis in m and flattening. ETRS89 (GRS 80) and WGS 84 differ by less than a metre, and by plate motion.
 _AXIS_M, _FLATTENING = 6378137.0, 1.0 / 298.257222101

@@ -10,8 +10,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import BROWN, FittedLens, sheared_lens
-from pipeline.exchange.foreign_camera import opencv_camera
-from pipeline.exchange.incoming import ImportOptions, Incoming
+from pipeline.exchange.incoming import ImportOptions, Incoming, opencv_camera
 from pipeline.exchange.micmac_format import box_of
 from pipeline.exchange.pinhole import check_misfit, sight_misfit_mm
 from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, xml_lines, xml_text

@@ -7,21 +7,18 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import BROWN, FittedLens, frame_corners_mm, sheared_lens
-from pipeline.exchange.foreign_camera import fiducial_camera
-from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming
+from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming, fiducial_camera
 from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD, check_misfit, sight_misfit_mm
 from pipeline.exchange.xml_tree import Element, numbers_of, plain_number, read_xml, text_of, xml_lines, xml_text
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.names import file_word, image_name
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 CONVENTION = Convention(
     (0.0, 0.0),
@@ -211,11 +208,11 @@ def _notes(
     fitted = f"{camera}: the lens was fitted over the frame: it is off by {misfit_px:.2g} px at most."
     if not fiducials:
         return (fitted,)
-    beside = {frame.image: affine_misfit_px(frame, fiducials, box) for frame in frames}
-    worst = max(beside, key=lambda image: beside[image])
+    misfits = {frame.image: affine_misfit_px(frame, fiducials, box) for frame in frames}
+    worst = max(misfits, key=lambda image: misfits[image])
     own = (
-        f"MicMac fits its affine transformation without weights: in image {worst} it lies up to {beside[worst]:.2g} px "
-        "beside the adjusted one."
+        f"MicMac fits its affine transformation without weights: in image {worst} it lies up to "
+        f"{misfits[worst]:.2g} px beside the adjusted one."
     )
     return (_resampling(camera, box), fitted, own)
 

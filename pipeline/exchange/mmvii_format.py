@@ -5,7 +5,6 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
@@ -14,8 +13,6 @@ from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming
 from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, text_of, xml_lines, xml_text
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.names import image_name
-
-Array = NDArray[np.float64]
 
 CONVENTION = Convention(
     (0.0, 0.0),

@@ -12,8 +12,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import BROWN, PRISMS
-from pipeline.exchange.foreign_camera import foreign_pose, opencv_camera
-from pipeline.exchange.incoming import ForeignPose, ImportOptions, Incoming
+from pipeline.exchange.incoming import ForeignPose, ImportOptions, Incoming, foreign_pose, opencv_camera
 from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
 from pipeline.files.camera_file import CameraFile
 from pipeline.opencv_check.opencv_model import NAMES
@@ -79,8 +78,8 @@ def _read(path: Path, options: ImportOptions) -> tuple[CameraFile, ForeignPose |
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: there is no such file.") from None
     except (UnicodeDecodeError, cv2.error, SystemError) as error:
-        told = str(error).splitlines()[0][:80]
-        raise InputError(f"{path}: is no file of cv2.FileStorage with a camera in it ({told}).") from None
+        message = str(error).splitlines()[0][:80]
+        raise InputError(f"{path}: is no file of cv2.FileStorage with a camera in it ({message}).") from None
 
 
 def _camera_and_pose(path: Path, options: ImportOptions) -> tuple[CameraFile, ForeignPose | None]:

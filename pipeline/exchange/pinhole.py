@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.line_of_sight import STRAIGHT
 from measure.errors import MeasurementError
@@ -15,8 +14,7 @@ from pipeline.exchange.fitted_lens import FittedLens, fisheye_lens, nearest_lens
 from pipeline.opencv_check.opencv_model import INTERIOR
 from pipeline.resampling.canvas import Canvas, canvas_of
 from pipeline.results.comparator_file import ComparatorPoint
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 Y_DOWN_Z_FORWARD = np.diag([1.0, -1.0, -1.0])  # from the camera's axes (y up, looking along -z) to these programs'
 

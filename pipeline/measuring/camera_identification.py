@@ -16,7 +16,7 @@ from measure.flags import Code, Reason
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon
 from pipeline.files.camera_file import CameraFile
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 _OTHER_CONE = 0.02  # of the principal distance: cameras of one cone differ by less
 _MAKERS = ("Wild", "Zeiss", "Jena", "Fairchild")

@@ -22,7 +22,7 @@ from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.target_field import Field, checked_places
 from pipeline.measuring.target_identification import NamedField, camera_model, name_field
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean, listed
 
 Array = NDArray[np.float64]

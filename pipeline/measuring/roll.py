@@ -22,7 +22,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, few_of
 from pipeline.progress import Reporter
 from pipeline.results.frames_file import said
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 _ONE_QUESTION = (
     "the frames are named so that what is written lies alike in all of the camera whose writing was read; nothing says "

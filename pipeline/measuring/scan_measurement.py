@@ -27,7 +27,7 @@ from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.measuring.target_stage import measure_targets
 from pipeline.measuring.tone_stage import tone_before
 from pipeline.provenance import parts_hash
-from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails
 from pipeline.workers import Submits, results_of
 

@@ -18,7 +18,7 @@ from measure.tone.curve import ToneInformation
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.provenance import canonical_json
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 Json = dict[str, Any]
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from measure.results import MarkMeasurement
 from measure.targets.consistency import FLAT, ImagePoints, SheetImage, along_plane, compared_together, sheet_points
 from pipeline.files.project_file import Project
 from pipeline.measuring.coded_targets import CodedPoints
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]
 

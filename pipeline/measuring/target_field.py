@@ -19,7 +19,7 @@ from measure.targets.identification import TargetOptions, TargetPrediction, meas
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.results.comparator_file import pixel_from_comparator
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from pipeline.measuring.target_field import (
     Field,
 )
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

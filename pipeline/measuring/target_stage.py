@@ -39,7 +39,7 @@ from pipeline.measuring.target_identification import (
     recognise,
 )
 from pipeline.results.comparator_file import comparator_from_pixel
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 LEAST_PAIRS = 4  # of points and marks that name an image's targets
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from pipeline.files.project_file import Project
 from pipeline.files.target_table import TieSettings
 from pipeline.measuring.sheet_check import with_checked_sheet
 from pipeline.progress import Count, Reporter
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import Measure, Memory, few_of, scan_tasks
 from pipeline.progress import Reporter
 from pipeline.provenance import fingerprint
-from pipeline.results.measured_record import said_of, said_record
+from pipeline.results.measured_record import read_tone_information, tone_information_record
 
 _SAMPLES = 8  # scans of a scanner that tell its curve to the others
 _SET = "it is set in the project"
@@ -44,14 +44,14 @@ def said_of_tones(
     before = {kind: memory.told(key) for kind, key in keys.items()}
     samples = {kind: few_of(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
-    said = {name: said_of(one) for kept in before.values() for name, one in (kept or {}).items()}
+    said = {name: read_tone_information(one) for kept in before.values() for name, one in (kept or {}).items()}
     with reporter.stage("tone curve looked for in") as tell:
         for done, scan in enumerate(measure(tasks), 1):
             tell(scan.frame.image, done, len(tasks))
             if scan.frame.tone is not None and scan.frame.tone.information is not None:
                 said[scan.frame.image] = scan.frame.tone.information
     for kind, names_of in samples.items():
-        memory.tell(keys[kind], {name: said_record(said[name]) for name in names_of if name in said})
+        memory.tell(keys[kind], {name: tone_information_record(said[name]) for name in names_of if name in said})
     by_image = dict[str, tuple[ToneInformation, ...]]()
     for kind, kept in before.items():
         of_kind = samples[kind] if kept is None else list(kept)

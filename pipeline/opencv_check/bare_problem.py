@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Prior
@@ -16,8 +15,7 @@ from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
 from pipeline.opencv_check.opencv_calibration import ImagePoints, can_begin
 from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, Freedom
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 GROSS_WEIGHT = 0.5  # observations that robust estimation left less of their weight are no observations here
 

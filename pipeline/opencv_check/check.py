@@ -21,9 +21,8 @@ from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate, calibrate_fisheye
-from pipeline.opencv_check.opencv_conversion import Converted, converted
 from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners
-from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, Freedom, model_names
+from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, Converted, Freedom, converted, model_names
 from pipeline.results.check_file import CameraCheck, Check, Estimate, Row, Verdict
 
 LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, for the two models are not quite the same
@@ -56,7 +55,7 @@ def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None 
 
 def _check_camera(adjustment: Adjustment, name: str, pictures: BoardPictures | None) -> CameraCheck:
     if not adjustment.converged:
-        return CameraCheck("not possible", f"The adjustment itself has no solution: {_without_stop(adjustment)}.")
+        return CameraCheck("not possible", f"The adjustment itself has no solution: {_stop_reason(adjustment)}.")
     camera = adjustment.network.camera_by_name[name]
     if name in adjustment.network.idle_cameras:
         return CameraCheck("not possible", "No image shows object points: the camera is not calibrated.")
@@ -100,7 +99,7 @@ def _undetermined(solved: Adjustment, name: str) -> str:
         causes = " ".join(f"{description(direction.parameters)}: {direction.cause}" for direction in solved.singular)
         return f"Priors carried the solution; the observations of the points alone do not determine it. {causes}"
     if not solved.converged:
-        return f"Without priors the adjustment finds no solution: {_without_stop(solved)}."
+        return f"Without priors the adjustment finds no solution: {_stop_reason(solved)}."
     distance = Parameter.interior(name, "c")
     c, sigma = solved.value(distance), solved.sigma(distance)
     if sigma > UNDETERMINED * c:
@@ -111,7 +110,7 @@ def _undetermined(solved: Adjustment, name: str) -> str:
     return ""
 
 
-def _without_stop(adjustment: Adjustment) -> str:
+def _stop_reason(adjustment: Adjustment) -> str:
     causes = [direction.cause for direction in adjustment.singular] or [adjustment.termination]
     return " ".join(causes).rstrip(".")
 
@@ -167,7 +166,7 @@ def _compared(
             ),
         )
     if verdict == "agrees" and sigmas_tell:
-        verdict, reason = _with_departure(reason, _departures(adjustment, solved, problem.network.cameras[0]))
+        verdict, reason = _judge_departure(reason, _departures(adjustment, solved, problem.network.cameras[0]))
     rms = f"The residuals are {opencv.rms_um:.2f} um rms a point in OpenCV, {rms_um:.2f} um here."
     return CameraCheck(verdict, f"{reason} {rms} {_notes(problem, opencv, sigmas_tell)}", **known)
 
@@ -241,7 +240,7 @@ def _departures(adjustment: Adjustment, solved: Adjustment, camera: Camera) -> d
     }
 
 
-def _with_departure(reason: str, departures: Mapping[str, float]) -> tuple[Verdict, str]:
+def _judge_departure(reason: str, departures: Mapping[str, float]) -> tuple[Verdict, str]:
     """The agreement on the bare problem, seen with what separates the adjustment from that problem."""
     farthest = max(departures, key=lambda name: departures[name])
     sigmas = departures[farthest]

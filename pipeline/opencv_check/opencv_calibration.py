@@ -5,12 +5,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.scans.parallel import one_opencv_thread
 from pipeline.opencv_check.opencv_model import FISHEYE_NAMES, NAMES, Y_UP, Freedom, camera_matrix
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 PICTURE_PX = 4000.0  # the frame's longer side, in the pixels in which OpenCV is given the observations
 OBJECT_EXTENT = (

@@ -15,8 +15,8 @@ from measure.scans.scan import Scan
 from pipeline.opencv_check.opencv_calibration import ImagePoints, OpenCvCalibration, can_begin
 from pipeline.results.check_file import CornersCheck, PixelCalibration
 from pipeline.results.comparator_file import comparator_from_pixel
+from pipeline.types import Array
 
-Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Calibrate = Callable[[Sequence[ImagePoints]], OpenCvCalibration]
 
@@ -101,8 +101,8 @@ def compare_corners(
         len(both),
         sum(len(image.xyz) for image, _ in both),
         tuple(image.image for image in images if image.image not in found),
-        _in_pixels(measured, pitch_mm),
-        _in_pixels(own, pitch_mm),
+        _pixel_calibration(measured, pitch_mm),
+        _pixel_calibration(own, pitch_mm),
     )
 
 
@@ -120,6 +120,6 @@ def _paired(image: ImagePoints, pictures: BoardPictures) -> tuple[ImagePoints, I
     return ImagePoints(image.image, xyz, image.xy_mm[rows]), ImagePoints(image.image, xyz, own_mm[nearest[rows]])
 
 
-def _in_pixels(calibration: OpenCvCalibration, pitch_mm: Array) -> PixelCalibration:
+def _pixel_calibration(calibration: OpenCvCalibration, pitch_mm: Array) -> PixelCalibration:
     fx, fy, cx, cy = (calibration.parameters[:4] / np.tile(pitch_mm, 2) * (1.0, 1.0, 1.0, -1.0)).tolist()
     return PixelCalibration(fx, fy, cx, cy, calibration.rms_um / 1000.0 / float(np.sqrt(pitch_mm.prod())))

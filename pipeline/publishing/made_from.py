@@ -51,7 +51,7 @@ def measured_from(project: Project) -> MadeFrom:
         coordinates,
         project.given_points and project.given_points.normals,
         project.given_images and project.given_images.exterior,
-        {camera.name: {name: _of(camera)[name] for name in _LENS} for camera in project.cameras.values()},
+        {camera.name: {name: _field_values(camera)[name] for name in _LENS} for camera in project.cameras.values()},
         project.film,
         *([project.given_images.part_of] if project.given_images and project.has_parts else []),
     ]
@@ -105,12 +105,12 @@ def _numbers(mark: ComparatorPoint) -> tuple[Any, ...]:
 
 
 def _settings(project: Project) -> dict[str, Any]:
-    return {name: value for name, value in _of(project).items() if name not in _FILES | _NO_MATTER}
+    return {name: value for name, value in _field_values(project).items() if name not in _FILES | _NO_MATTER}
 
 
 def _sought(camera: CameraFile) -> dict[str, Any]:
-    return {name: value for name, value in _of(camera).items() if name not in _LENS | _ORIGIN}
+    return {name: value for name, value in _field_values(camera).items() if name not in _LENS | _ORIGIN}
 
 
-def _of(value: Any) -> dict[str, Any]:
+def _field_values(value: Any) -> dict[str, Any]:
     return {field.name: getattr(value, field.name) for field in fields(value)}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from measure.flags import Status
 from pipeline.archive.measurement import read_measurement
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

@@ -2,7 +2,7 @@
 
 from pipeline.report.data import Problem, ReportData
 from pipeline.report.page import render_report, write_report
-from pipeline.report.verdict import Verdict, judge
+from pipeline.report.verdict import ReportVerdict, judge
 from pipeline.results.thumbnail import Thumbnail
 
-__all__ = ["Problem", "ReportData", "Thumbnail", "Verdict", "judge", "render_report", "write_report"]
+__all__ = ["Problem", "ReportData", "ReportVerdict", "Thumbnail", "judge", "render_report", "write_report"]

@@ -110,7 +110,7 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
         parameters=parameter_rows(name, camera, _prior_scale(name, stored), radius_mm) if calibrated else [],
         groups=group_sentences(camera.significance),
         axes=axes_sentence(camera),
-        in_given_figure=_in_given_figure(form) if form and calibrated else [],
+        in_given_figure=_interior_in_given_datum(form) if form and calibrated else [],
         distances=form.distances if form else (),
         correlations=high_correlations(name, camera, covariance) if covariance else [],
         trade_offs=_trade_offs(name, stored),
@@ -160,7 +160,7 @@ def fiducial_form(name: str, stored: AdjustmentRecord, covariance: Covariance) -
     return fiducials.figure_of_films(name, camera.fiducials, covariance, stored.films(stored.images_of(name)))
 
 
-def _in_given_figure(form: fiducials.Figure) -> list[tuple[str, str, str]]:
+def _interior_in_given_datum(form: fiducials.Figure) -> list[tuple[str, str, str]]:
     """c, x0' and y0' with their sigmas when the fiducials stand where they were given."""
     rows = zip(("c", "x₀′", "y₀′"), form.interior_mm.tolist(), form.interior_sigma_mm.tolist(), strict=True)
     return [(symbol, *value_and_sigma(value, sigma)) for symbol, value, sigma in rows]

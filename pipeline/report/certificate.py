@@ -4,13 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Lens
 from pipeline.report.lens import curves, displacement_covariance
 from pipeline.report.numbers import fixed, value_and_sigma
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 # Of the U.S. Geological Survey's reports, as far as the frame reaches.
 ANGLES_DEG = (7.5, 15.0, 22.7, 30.0, 35.0, 40.0)
@@ -44,7 +42,7 @@ class CertificateView:
 def certificate_view(of: Lens, largest_radius_mm: float) -> CertificateView:
     """Of a lens, out to a radius, with standard deviations from the full covariance."""
     angles = _angles_deg(of, largest_radius_mm)
-    values, sigmas = _with_sigmas(of, lambda moved: _quantities(moved, angles, largest_radius_mm))
+    values, sigmas = _propagate(of, lambda moved: _quantities(moved, angles, largest_radius_mm))
     radii = np.interp(np.tan(np.radians(angles)), *_tangents(of, largest_radius_mm)[::-1])
     asymmetric = curves(of, largest_radius_mm)
     rows = [
@@ -109,19 +107,19 @@ def _tangents(of: Lens, largest_radius_mm: float) -> tuple[Array, Array]:
     return radius, np.asarray(along / of.interior[0])
 
 
-def _with_sigmas(of: Lens, quantities: Callable[[Lens], Array]) -> tuple[Array, Array]:
+def _propagate(of: Lens, quantities: Callable[[Lens], Array]) -> tuple[Array, Array]:
     """Quantities (n,) of a lens and their standard deviations, by central differences."""
     cofactor = displacement_covariance(of)
     columns = []
     for number, sigma in enumerate(np.sqrt(np.maximum(np.diag(cofactor), 0.0)).tolist()):
         step = _STEP_SIGMAS * sigma
-        sides = [quantities(_moved(of, number, sign * step)) for sign in (1.0, -1.0)] if step > 0.0 else None
+        sides = [quantities(_changed_lens(of, number, sign * step)) for sign in (1.0, -1.0)] if step > 0.0 else None
         columns.append(np.zeros_like(quantities(of)) if sides is None else (sides[0] - sides[1]) / (2.0 * step))
     by = np.column_stack(columns)
     return quantities(of), np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", by, cofactor, by), 0.0))
 
 
-def _moved(of: Lens, number: int, step: float) -> Lens:
+def _changed_lens(of: Lens, number: int, step: float) -> Lens:
     """c is the first of the unknowns."""
     values = of.values
     values[number + 2 if number else 0] += step

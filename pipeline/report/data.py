@@ -10,7 +10,7 @@ from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.check_file import Check
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.covariance_file import Covariance
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.thumbnail import Thumbnail
 
 

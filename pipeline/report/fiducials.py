@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.parameter import Parameter
@@ -13,8 +12,7 @@ from adjust.quality.fiducial_corrections import KEEPS_DISTANCES, corrections_to_
 from pipeline.drawing import svg
 from pipeline.results.adjustment_record import CameraRecord, FiducialRecord
 from pipeline.results.covariance_file import Covariance
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 LONGEST_PX = 46.0
 WIDTH_PX = 400.0
@@ -191,10 +189,10 @@ def _similarities(marks: Array, c: float, principal_point: tuple[float, float]) 
     x, y = (np.vstack([marks, principal_point]) - marks.mean(axis=0)).T
     ones, zeros = np.ones(len(x)), np.zeros(len(x))
     moved = [(ones, zeros, 0.0), (zeros, ones, 0.0), (-y, x, 0.0), (x, y, c)]
-    return np.stack([_in_order(dx, dy, dc) for dx, dy, dc in moved], axis=1)
+    return np.stack([_ordered_changes(dx, dy, dc) for dx, dy, dc in moved], axis=1)
 
 
-def _in_order(dx: Array, dy: Array, dc: float) -> Array:
+def _ordered_changes(dx: Array, dy: Array, dc: float) -> Array:
     """Changes of the marks and, last, of the principal point, in the order of the covariance."""
     changes = np.stack([dx, dy], axis=1)
     return np.concatenate([changes[:-1].ravel(), [dc], changes[-1]])

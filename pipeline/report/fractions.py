@@ -1,21 +1,27 @@
-"""Fractional parts of measured pixel positions: marks prefer no place within a pixel, biased methods do."""
+"""Fractional parts of measured pixel positions, histograms of these and of residuals, totals of very many frames."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtrik, chdtrc
 
+from pipeline.drawing import svg
+from pipeline.report.data import ReportData
 from pipeline.report.marks import Frame
-
-Array = NDArray[np.float64]
+from pipeline.text.wording import counted
+from pipeline.types import Array
 
 BINS = 10
 LEAST_MARKS = 50  # five a bin, below which the chi-square test means nothing
 LEAST_PROBABILITY = 1e-4  # grids of targets that lie nearly along the pixels are a little uneven by themselves
 LEAST_BIAS_PX = 0.01  # with very many marks even a bias that harms nobody is beyond chance
 SAME_PLACE_PX = 0.5  # marks that lie at random are seldom so near to another one's column or row
+COLUMNS = 40
+TAIL = 0.002  # of the values, on either side: the rest make the scale
+ROWS = 200  # cameras and kinds of file at most
 
 
 @dataclass(frozen=True)
@@ -82,3 +88,92 @@ def expected_range(total: int) -> tuple[float, float]:
         return 0.0, 0.0
     low, high = np.ceil(bdtrik((0.005, 0.995), total, 1.0 / BINS))
     return float(low), float(high)
+
+
+def fraction_plot(axis: str, test: FractionTest) -> Markup:
+    """Counts over the pixel, with the range in which chance leaves 99 of 100 of them."""
+    total = int(test.counts.sum())
+    low, high = expected_range(total)
+    axes = svg.Axes((-0.5, 0.5), (0.0, 1.15 * max(float(test.counts.max()), high, 1.0)), width=330.0, height=220.0)
+    edges = np.linspace(-0.5, 0.5, BINS + 1)
+    band = svg.tag(
+        "rect",
+        x=axes.left,
+        y=float(axes.y(high)),
+        width=axes.width - axes.left - axes.right,
+        height=float(axes.y(low) - axes.y(high)),
+        class_="expected",
+    )
+    bars = _columns(axes, edges, test.counts)
+    label = f"{axis} position less the pixel's centre (px)"
+    title = f"Histogram of the fractional parts of the {axis} positions"
+    return svg.picture(axes.width, axes.height, title, *bars, band, axes.drawn(label, "marks"))
+
+
+def histogram(label: str, values: Array) -> Markup:
+    """How values (n,) are spread; the few of each side that lie far out are counted in the last column there."""
+    low, high = np.quantile(values, (TAIL, 1.0 - TAIL))
+    margin = max(0.05 * (high - low), 1e-3 * max(abs(low), abs(high)), 1e-9)
+    edges = np.linspace(low - margin, high + margin, COLUMNS + 1)
+    counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
+    axes = svg.Axes((edges[0], edges[-1]), (0.0, 1.1 * float(counts.max())), width=330.0, height=220.0)
+    title = f"Histogram of the {label}"
+    return svg.picture(axes.width, axes.height, title, *_columns(axes, edges, counts), axes.drawn(label, "marks"))
+
+
+def _columns(axes: svg.Axes, edges: Array, counts: NDArray[np.int64]) -> Iterator[Markup]:
+    total = int(counts.sum())
+    for left, right, count in zip(edges[:-1], edges[1:], counts.tolist(), strict=True):
+        yield svg.tag(
+            "rect",
+            svg.tag("title", f"{count} of {total}"),
+            x=float(axes.x(left)) + 1.0,
+            y=float(axes.y(count)),
+            width=float(axes.x(right) - axes.x(left)) - 2.0,
+            height=float(axes.y(0.0) - axes.y(count)),
+            class_="column",
+        )
+
+
+@dataclass(frozen=True)
+class TotalsView:
+    """Ready to print. verdicts: those that occur; rows: of cameras and kinds of file, with a number for each of them;
+    left_out: further rows; all: of all frames. histograms: with what each shows."""
+
+    frames: int
+    needs_look: int
+    shown: int
+    verdicts: tuple[str, ...]
+    rows: tuple[tuple[str, str, tuple[int, ...]], ...]
+    left_out: int
+    all: tuple[int, ...]
+    histograms: tuple[tuple[str, Markup], ...]
+
+
+def totals_view(data: ReportData) -> TotalsView:
+    """Of data that has totals."""
+    assert data.totals is not None
+    counts = data.totals.verdicts
+    named = dict.fromkeys(verdict for each in counts.values() for verdict in each)
+    verdicts = tuple(verdict for verdict in named if any(each[verdict] for each in counts.values()))
+    rows = tuple((*kind, tuple(each[verdict] for verdict in verdicts)) for kind, each in counts.items())
+    residuals = data.adjustment.residuals if data.adjustment else ()
+    v_um = dict(zip("xy", np.array([row.v_um for row in residuals]).reshape(-1, 2).T, strict=True))
+    return TotalsView(
+        frames=len(data.totals.marks),
+        needs_look=data.totals.needs_look,
+        shown=len({*(data.measurement or {}), *(row.image for row in data.comparator)}),
+        verdicts=verdicts,
+        rows=rows[:ROWS],
+        left_out=max(len(rows) - ROWS, 0),
+        all=tuple(sum(each[verdict] for each in counts.values()) for verdict in verdicts),
+        histograms=(*_histograms("residual", v_um), *_histograms("σ", data.totals.sigmas_um)),
+    )
+
+
+def _histograms(what: str, by_axis: Mapping[str, Array]) -> Iterator[tuple[str, Markup]]:
+    for axis, values in by_axis.items():
+        if len(values):
+            rms, largest = np.sqrt(np.mean(values**2)), np.abs(values).max()
+            told = f"{counted(len(values), 'mark')}, rms {rms:.2f} µm, at most {largest:.2f} µm"
+            yield told, histogram(f"{what} in {axis} (µm)", values)

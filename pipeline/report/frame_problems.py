@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TypeVar
 
 from pipeline.report.data import Problem
-from pipeline.report.fractions import Array, fraction_test
+from pipeline.report.fractions import fraction_test
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
 from pipeline.text.wording import LISTED, counted, listed, without_file
+from pipeline.types import Array
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -23,7 +24,7 @@ Sentence = TypeVar("Sentence", Problem, str)
 def problems_of(frame: Frame, with_pose: bool) -> Iterator[Problem]:
     """What one frame has to say. with_pose: also of a pose that nothing decides."""
     yield from _assumed(frame) if with_pose else ()
-    yield from _problems_of(frame)
+    yield from _measurement_problems(frame)
 
 
 def masked_text(sentence: str) -> str:
@@ -33,7 +34,7 @@ def masked_text(sentence: str) -> str:
 
 def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
     """What the frames have to say, said once where several frames say the same."""
-    for problem, images in said_by(shots, _problems_of).items():
+    for problem, images in said_by(shots, _measurement_problems).items():
         yield Problem(f"{listed(images)}: {problem.what}", problem.next_step)
 
 
@@ -43,11 +44,11 @@ def assumed_poses(shots: list[Frame]) -> Iterator[Problem]:
         yield Problem(f"{listed(images)}: {problem.what}", problem.next_step)
 
 
-def said_by(shots: list[Frame], said: Callable[[Frame], Iterable[Sentence]]) -> dict[Sentence, list[str]]:
+def said_by(shots: list[Frame], evidence: Callable[[Frame], Iterable[Sentence]]) -> dict[Sentence, list[str]]:
     """The frames' names by what they say."""
     images: dict[Sentence, list[str]] = {}
     for frame in shots:
-        for sentence in said(frame):
+        for sentence in evidence(frame):
             images.setdefault(sentence, []).append(frame.image)
     return images
 
@@ -65,12 +66,12 @@ def _assumed(frame: Frame) -> Iterator[Problem]:
         )
 
 
-def _problems_of(frame: Frame) -> Iterator[Problem]:
+def _measurement_problems(frame: Frame) -> Iterator[Problem]:
     measured = frame.scan.frame if frame.scan else None
     pose = measured.pose if measured else None
-    said = pose.evidence if pose and not pose.decided else ()
+    evidence = pose.evidence if pose and not pose.decided else ()
     for problem in measured.problems if measured else ():
-        if problem not in said:
+        if problem not in evidence:
             yield Problem(without_file(problem, frame.scan.scan) if frame.scan else problem)
     lost = [mark for mark in frame.marks if mark.is_fiducial and mark.is_open]
     found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
@@ -95,10 +96,10 @@ def _reasons(lost: list[Mark]) -> str:
     alike: dict[str, list[Mark]] = {}
     for mark in lost:
         alike.setdefault(f"{mark.status}: {masked_text(mark.reason)}", []).append(mark)
-    return "; ".join(_told(marks) for marks in list(alike.values())[:LISTED])
+    return "; ".join(_lost_marks(marks) for marks in list(alike.values())[:LISTED])
 
 
-def _told(marks: list[Mark]) -> str:
+def _lost_marks(marks: list[Mark]) -> str:
     first, names = marks[0], listed([mark.point for mark in marks])
     like = f", such as {first.point}" if len({mark.reason for mark in marks}) > 1 else ""
     return f"{names} {first.status}{like}: {first.reason.rstrip('.')}"

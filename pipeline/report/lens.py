@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Lens
@@ -12,8 +11,7 @@ from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
 from pipeline.results.adjustment_record import CameraRecord
 from pipeline.results.covariance_file import Covariance
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 RADII = 80
 DIRECTIONS = 36

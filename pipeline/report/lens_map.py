@@ -4,15 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Lens
 from pipeline.drawing import svg
 from pipeline.report.lens import displacement_covariance
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.vectors import Plane, strokes_and_dots
-
-Array = NDArray[np.float64]
+from pipeline.types import Array, Mask
 
 GRID = 15  # vectors along the longer side
 LONGEST = 1.5  # of the grid's mesh
@@ -41,7 +39,7 @@ def lens_map(of: Lens, on: Plane, observed_radius_mm: float = np.inf) -> LensMap
     sigma = float(np.sqrt(max(by @ displacement_covariance(of) @ by, 0.0)))
     beyond = np.hypot(*(xy - of.interior[1:]).T) > observed_radius_mm
     edge = _circle(of.interior[1:], observed_radius_mm, on) if beyond.any() else Markup("")
-    drawn = _drawn(xy, moved.value_um, beyond, edge, on)
+    drawn = _map_picture(xy, moved.value_um, beyond, edge, on)
     return LensMap(drawn, bool(beyond.any()), value_and_sigma(float(size[at]), sigma))
 
 
@@ -67,7 +65,7 @@ def _grid(on: Plane) -> Array:
     return np.stack([each.ravel() for each in np.meshgrid(x, y)], axis=1)
 
 
-def _drawn(xy_mm: Array, value_um: Array, beyond: NDArray[np.bool_], edge: Markup, on: Plane) -> Markup:
+def _map_picture(xy_mm: Array, value_um: Array, beyond: Mask, edge: Markup, on: Plane) -> Markup:
     longest_um = float(np.hypot(*value_um.T).max())
     mesh_px = on.px_per_mm * float((on.corners_mm[1] - on.corners_mm[0]).max()) / GRID
     px_per_um = svg.round_step(LONGEST * mesh_px / longest_um) if longest_um > 0.0 else 1.0

@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.flags import Code, Reason, Status
 from measure.results import Covariance, MarkMeasurement
 from pipeline.report.data import ReportData
 from pipeline.results.adjustment_record import ResidualRecord
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.measured_scan import MeasuredScan
-
-Array = NDArray[np.float64]
+from pipeline.results.measured_record import MeasuredScan
+from pipeline.types import Array
 
 
 @dataclass(frozen=True)

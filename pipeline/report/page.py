@@ -13,19 +13,25 @@ from markupsafe import Markup
 from measure import flags
 from pipeline.drawing import svg
 from pipeline.report.camera_views import camera_views
-from pipeline.report.charts import fraction_plot
 from pipeline.report.data import ReportData
-from pipeline.report.fractions import LEAST_MARKS, Array, FractionTest, fraction_test, places_px
+from pipeline.report.fractions import (
+    LEAST_MARKS,
+    FractionTest,
+    fraction_plot,
+    fraction_test,
+    places_px,
+    totals_view,
+)
 from pipeline.report.frame_views import frame_views, thumbnail_scale
-from pipeline.report.joined_views import joined_views
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.parameters import spoken_name
 from pipeline.report.scanner_views import scanner_views
-from pipeline.report.totals import totals_view
+from pipeline.report.vectors import joined_views
 from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, judge, sigma0_bounds
 from pipeline.results.adjustment_record import AdjustmentRecord, PointRecord
 from pipeline.text.atomic import write_atomically
+from pipeline.types import Array
 
 LIST_LIMIT = 200  # rows of a long table
 
@@ -43,7 +49,7 @@ def write_frame_page(data: ReportData, image: str, path: Path) -> None:
 def render_frame_page(data: ReportData, image: str) -> str:
     """All that data has of one image, as HTML."""
     shots = [frame for frame in frames(data) if frame.image == image]
-    context = _common(data) | _of_frames(data, shots, every_mark=True)
+    context = _common(data) | _frame_context(data, shots, every_mark=True)
     up = "../" * (image.count("/") + 1)
     return _environment().get_template("frame.html.j2").render({**context, "image": image, "up": up})
 
@@ -77,7 +83,7 @@ def _context(data: ReportData) -> dict[str, object]:
     places = data.totals.places_px if data.totals else places_px(shots)
     return {
         **_common(data),
-        **_of_frames(data, shots),
+        **_frame_context(data, shots),
         "title": "Calibration report" if calibrated or not adjustment else "Film report",
         "calibrated": calibrated,
         "verdict": judge(data),
@@ -114,7 +120,7 @@ def _common(data: ReportData) -> dict[str, object]:
     }
 
 
-def _of_frames(data: ReportData, shots: list[Frame], every_mark: bool = False) -> dict[str, object]:
+def _frame_context(data: ReportData, shots: list[Frame], every_mark: bool = False) -> dict[str, object]:
     return {
         "frames": frame_views(data, shots, every_mark),
         "points_word": _points_word(shots),

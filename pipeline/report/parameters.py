@@ -52,10 +52,10 @@ def parameter_rows(name: str, camera: CameraRecord, prior_scale: float, radius_m
 
 def term_rows(terms: Mapping[str, Quantity]) -> list[ParameterRow]:
     """The terms of a scanner's bend, in um."""
-    return [_row(name, "µm", _in_um(quantity), "", _significance(quantity)) for name, quantity in terms.items()]
+    return [_row(name, "µm", _scale_to_um(quantity), "", _significance(quantity)) for name, quantity in terms.items()]
 
 
-def _in_um(quantity: Quantity) -> Quantity:
+def _scale_to_um(quantity: Quantity) -> Quantity:
     given = quantity.given and GivenQuantity(1e3 * quantity.given.value, 1e3 * quantity.given.sigma)
     return replace(quantity, value=1e3 * quantity.value, sigma=1e3 * quantity.sigma, given=given)
 
@@ -110,10 +110,10 @@ def spoken_name(text: str, cameras: Collection[str]) -> str:
 
 def _row(symbol: str, unit: str, quantity: Quantity, effect: str, meaning: str) -> ParameterRow:
     value, sigma = value_and_sigma(quantity.value, quantity.sigma)
-    return ParameterRow(symbol, unit, value, sigma, _given(quantity), effect, meaning)
+    return ParameterRow(symbol, unit, value, sigma, _given_text(quantity), effect, meaning)
 
 
-def _given(quantity: Quantity) -> str:
+def _given_text(quantity: Quantity) -> str:
     given = quantity.given
     if given is None:
         return "nothing"

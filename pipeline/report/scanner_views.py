@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
@@ -14,8 +13,7 @@ from pipeline.report.parameters import ParameterRow, group_sentences, term_rows
 from pipeline.report.vectors import Plane, strokes_and_dots
 from pipeline.results.adjustment_record import AdjustmentRecord, ScannerRecord
 from pipeline.results.covariance_file import Covariance
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 PLOT_PX = 560.0
 GRID = 9  # vectors along the longer side
@@ -63,7 +61,7 @@ def _view(stored: AdjustmentRecord, covariance: Covariance | None, name: str, sc
     at = int(size.argmax())
     along = field.value_um[at] / max(float(size[at]), 1e-12)
     sigma_um = float(np.sqrt(max(along @ field.covariance_um2[at] @ along, 0.0)))
-    return ScannerView(name, images, rows, groups, _drawn(field, on), value_and_sigma(float(size[at]), sigma_um))
+    return ScannerView(name, images, rows, groups, _bend_picture(field, on), value_and_sigma(float(size[at]), sigma_um))
 
 
 def bend_field(name: str, scanner: ScannerRecord, covariance: Covariance, xy_mm: Array) -> BendField:
@@ -89,7 +87,7 @@ def _grid(scanner: ScannerRecord) -> Array:
     return np.stack([each.ravel() for each in np.meshgrid(x, y)], axis=1)
 
 
-def _drawn(field: BendField, on: Plane) -> Markup:
+def _bend_picture(field: BendField, on: Plane) -> Markup:
     radii_um, angles = svg.ellipse_axes(field.covariance_um2)
     reach_um = float((np.hypot(*field.value_um.T) + radii_um.max(axis=1)).max())
     mesh_px = on.px_per_mm * float(np.ptp(field.xy_mm, axis=0).max()) / (GRID - 1)

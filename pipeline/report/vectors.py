@@ -5,17 +5,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from pipeline.drawing import svg
+from pipeline.report import vectors
+from pipeline.report.data import ReportData
 from pipeline.report.numbers import fixed
-from pipeline.results.adjustment_record import JoinRecord, ResidualRecord
-
-Array = NDArray[np.float64]
+from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord, ResidualRecord
+from pipeline.types import Array, Mask
 
 MARGIN_PX = 26.0
 FOOT_PX = 30.0
 LEAST_UM = 0.01  # a residual drawn at full length: without redundancy they are rounding errors
+JOINED_PLOT_PX = 420.0
+LONGEST_JOIN_PX = 40.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class VectorField:
 
     places_mm: Array
     vectors_um: Array
-    is_fiducial: NDArray[np.bool_]
+    is_fiducial: Mask
 
     @classmethod
     def of_residuals(cls, rows: Sequence[ResidualRecord]) -> "VectorField":
@@ -153,3 +155,41 @@ def _stroke(start: Array, end: Array, row: ResidualRecord, suspects: Collection[
 def _hint(row: ResidualRecord) -> str:
     vx, vy = (fixed(v, 1, sign=True) for v in row.v_um)
     return f"{row.kind} {row.point}: v = ({vx}, {vy}) µm in the scan, w = {fixed(row.w, 1)}"
+
+
+@dataclass(frozen=True)
+class JoinedView:
+    """A frame, ready to print. rms_um: of what is between both sights of a join, in x' and y'; largest: of them, with
+    its name. parts: the scans, with the standard deviation of each one's film transformation at its corners."""
+
+    frame: str
+    parts: list[tuple[str, str]]
+    joins: int
+    rms_um: tuple[str, str]
+    largest: str
+    plot: Markup | None
+
+
+def joined_views(data: ReportData) -> list[JoinedView]:
+    """All frames that were scanned in parts; none where there is no solution."""
+    frames = data.adjustment.frames if data.adjustment else {}
+    return [_joined_view(name, frame) for name, frame in sorted(frames.items())]
+
+
+def _joined_view(name: str, frame: JoinedFrameRecord) -> JoinedView:
+    parts = [(part, fixed(known.corner_sigma_um, 1)) for part, known in frame.parts.items()]
+    joins = frame.joins
+    if not joins:
+        return JoinedView(name, parts, 0, ("–", "–"), "–", None)
+    apart = vectors.VectorField.of_joins(joins)
+    lengths_um = np.hypot(*apart.vectors_um.T)
+    rms = np.sqrt(np.mean(apart.vectors_um**2, axis=0))
+    on = vectors.plane(apart.places_mm, None, JOINED_PLOT_PX)
+    return JoinedView(
+        name,
+        parts,
+        len(joins),
+        (fixed(float(rms[0]), 2), fixed(float(rms[1]), 2)),
+        f"{joins[int(lengths_um.argmax())].point}: {fixed(float(lengths_um.max()), 1)} µm",
+        vectors.all_images_plot(apart, on, apart.scale(LONGEST_JOIN_PX)),
+    )

@@ -65,7 +65,7 @@ FURTHER = (
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ReportVerdict:
     """One sentence, and the problems behind it. good: exit code 0; look: 1; failed: 1, there is no usable result."""
 
     level: Level
@@ -78,13 +78,13 @@ class Verdict:
         return 0 if self.level == "good" else 1
 
 
-def judge(data: ReportData) -> Verdict:
+def judge(data: ReportData) -> ReportVerdict:
     """Judge what is there: the measurement, the adjustment, the check against OpenCV."""
     shots = frames(data)
-    problems = tuple(problem for look in NEEDS_A_LOOK.values() for problem in look(data, shots))
+    problems = tuple(problem for check_rows in NEEDS_A_LOOK.values() for problem in check_rows(data, shots))
     is_fatal = data.adjustment is not None and any(_no_solution(data.adjustment))
     level: Level = "failed" if is_fatal or not _observed(data, shots) else "look" if problems else "good"
-    return Verdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
+    return ReportVerdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
 
 
 def sigma0_bounds(redundancy: float) -> tuple[float, float]:
@@ -170,7 +170,7 @@ def _further_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
             for test in whole:
                 yield Problem(f"{one}: {contradiction(test, adjustment.cameras)}.", remedy)
             continue
-        bad = _beyond_chance(adjustment, further[group])
+        bad = _outlying(adjustment, further[group])
         if bad:
             heading = (one if len(bad) == 1 else many).format(len(bad))
             names = [spoken_name(row.name, adjustment.cameras) if group == "calibrations" else row.name for row in bad]
@@ -190,7 +190,7 @@ def contradiction(test: ContradictionRecord, cameras: Mapping[str, CameraRecord]
     )
 
 
-def _beyond_chance(
+def _outlying(
     adjustment: AdjustmentRecord, rows: Sequence[DistanceRecord | ObservedQuantity]
 ) -> list[DistanceRecord | ObservedQuantity]:
     limit = critical_w(len(rows)) * (adjustment.sigma0 if adjustment.sigma0 > 1.0 else 1.0)
@@ -210,7 +210,7 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         yield from explained[1:]
         return
     yield Problem(
-        f"{size} ({_by_group(adjustment)}).",
+        f"{size} ({_group_sigmas(adjustment)}).",
         "Reject gross errors first; then the film or lens has deformation that the model lacks: state it by "
         "film_sigma_um or add distortion parameters. All sigmas of the result are already multiplied by σ₀.",
     )
@@ -222,13 +222,13 @@ def _too_small(adjustment: AdjustmentRecord) -> Iterator[str]:
     if adjustment.sigma0 < low:
         yield (
             f"{_sigma0_and('below', low, adjustment.sigma0)}: the marks fit better than the sigmas given "
-            f"({_by_group(adjustment)}). Lower the sigmas of the group that is below 1 (sigma_target_um, "
+            f"({_group_sigmas(adjustment)}). Lower the sigmas of the group that is below 1 (sigma_target_um, "
             "sigma_fiducial_um, film_sigma_um, or comparator.csv; datum: sigma_mm of the fiducials); all sigmas of the "
             "result are already multiplied by σ₀."
         )
 
 
-def _by_group(adjustment: AdjustmentRecord) -> str:
+def _group_sigmas(adjustment: AdjustmentRecord) -> str:
     groups = {name: group for name, group in adjustment.groups.items() if group.redundancy >= 1.0}
     return ", ".join(f"{name} {fixed(group.sigma0)}" for name, group in groups.items())
 
@@ -290,17 +290,17 @@ def is_film_alone(data: ReportData) -> bool:
     return data.adjustment is not None and not any(camera.is_calibrated for camera in data.adjustment.cameras.values())
 
 
-def _of_solution(look: Callable[[AdjustmentRecord], Iterator[Problem]], checked: bool = False) -> Look:
+def _solution_check(check_rows: Callable[[AdjustmentRecord], Iterator[Problem]], checked: bool = False) -> Look:
     """What an adjustment needs a look at where it has a solution, and redundancy if that is asked for."""
 
     def of(data: ReportData, _: list[Frame]) -> Iterator[Problem]:
         if data.adjustment is not None and _is_solved(data) and (not checked or data.adjustment.has_sigma0):
-            yield from look(data.adjustment)
+            yield from check_rows(data.adjustment)
 
     return of
 
 
-def _of_frames(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
+def _frame_check(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
     if data.totals:
         yield from data.totals.problems
         return
@@ -313,14 +313,14 @@ def _of_frames(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
 NEEDS_A_LOOK: dict[str, Look] = {
     "solution": lambda data, _: _no_solution(data.adjustment) if data.adjustment else (),
     "made from": lambda data, _: data.problems,
-    "frames": _of_frames,
+    "frames": _frame_check,
     "pixel locking": lambda data, shots: pixel_locking(data.totals.places_px if data.totals else places_px(shots)),
     "warnings": lambda data, _: map(Problem, data.adjustment.warnings if data.adjustment else ()),
-    "σ₀": _of_solution(_too_large, checked=True),
-    "redundancy": _of_solution(_unchecked),
-    "reach of the lens": _of_solution(_lens_problems),
-    "distances, calibrations, antennas": _of_solution(_further_problems),
-    "gross errors": _of_solution(lambda adjustment: _suspects(adjustment.suspects)),
+    "σ₀": _solution_check(_too_large, checked=True),
+    "redundancy": _solution_check(_unchecked),
+    "reach of the lens": _solution_check(_lens_problems),
+    "distances, calibrations, antennas": _solution_check(_further_problems),
+    "gross errors": _solution_check(lambda adjustment: _suspects(adjustment.suspects)),
     "OpenCV": lambda data, _: _check_problems(data.check) if data.check else (),
 }
 

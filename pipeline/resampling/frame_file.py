@@ -14,8 +14,7 @@ from tifffile import TiffFile, TiffFileError, TiffWriter
 from pipeline.resampling.canvas import Canvas
 from pipeline.resampling.interpolation import Tile
 from pipeline.text.atomic import atomic_path
-
-Samples = NDArray[np.uint8 | np.uint16]
+from pipeline.types import Mask, Samples
 
 TILE_PX = 512
 _REDUCTION = 4  # between a page and the next smaller one
@@ -91,7 +90,7 @@ def write_frame(
                 masks[row0, col0] = inside if is_even else np.packbits(tile.is_inside, axis=1)
                 yield tile.samples if channels > 1 else tile.samples[..., 0]
 
-    def masked() -> Iterator[NDArray[np.bool_]]:
+    def masked() -> Iterator[Mask]:
         for (row0, col0), mask in masks.items():  # in the order of the tiles
             tile = np.unpackbits(mask, axis=1) if isinstance(mask, np.ndarray) else np.full((TILE_PX,) * 2, mask)
             yield _filled(tile[: canvas.height_px - row0, : canvas.width_px - col0].astype(bool), TILE_PX)
@@ -155,6 +154,6 @@ def _averaged(samples: Samples, factor: int) -> Samples:
     return np.asarray(np.rint(means).astype(samples.dtype))
 
 
-def _filled(part: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+def _filled(part: Mask, side: int) -> Mask:
     """A tile at the frame's end, filled up."""
     return np.pad(part, ((0, side - part.shape[0]), (0, side - part.shape[1])))

@@ -19,15 +19,13 @@ from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.provenance import file_state
-from pipeline.resampling.canvas import canvas_of
-from pipeline.resampling.frame_chain import FrameChain, adjusted_chain, measured_chain
+from pipeline.resampling.canvas import FrameChain, adjusted_chain, canvas_of, measured_chain
 from pipeline.resampling.frame_file import TILE_PX, Description, read_description, write_frame
-from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile
-from pipeline.resampling.seam import Part, beside_one_another, joined_tile, seams_mm
-from pipeline.resampling.source import source_of
+from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile, source_of
+from pipeline.resampling.seam import Part, find_inner_edges, joined_tile, seams_mm
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.adjustment_record import AdjustmentRecord
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.atomic import check_writable
 from pipeline.text.names import path_below
 from pipeline.workers import worker_pool
@@ -65,11 +63,11 @@ class ResampleTask:
     @property
     def fingerprint(self) -> str:
         """Of the scans' files and everything that the result depends on: what has it need not be made again."""
-        own = self._fingerprint_of(self.scan, self.chain)
-        others = [self._fingerprint_of(other.scan, other.chain) for other in self.others]
+        own = self._scan_fingerprint(self.scan, self.chain)
+        others = [self._scan_fingerprint(other.scan, other.chain) for other in self.others]
         return hashlib.sha256("".join([own, *others]).encode()).hexdigest() if others else own
 
-    def _fingerprint_of(self, scan: Path, chain: FrameChain) -> str:
+    def _scan_fingerprint(self, scan: Path, chain: FrameChain) -> str:
         numbers = [*chain.film.parameters, *chain.bend_parameters, *chain.pitch_um, self.pitch_mm, float(self.degree)]
         words: list[Any] = [self.image, self.camera, self.pose, chain.film.transformation, chain.film.mirrored]
         words += [chain.bend.terms, chain.bend.center_mm, chain.bend.half_mm]
@@ -189,7 +187,7 @@ def _resampled(task: ResampleTask) -> Resampled:
         for scan, chain in scans:
             rows = _rows_at_a_time(chain, task.pitch_mm, canvas.width_px)
             parts.append(Part(opened.enter_context(source_of(scan, rows, task.target.parent)), chain))
-        parts = beside_one_another(parts)
+        parts = find_inner_edges(parts)
         names = (task.part, *(other.image for other in task.others)) if task.part else ()
         has_lens = task.chain.lens is not None
         seams = seams_mm(parts, canvas) if task.others else ()

@@ -4,16 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from skimage.measure import find_contours
 
 from measure.errors import MeasurementError
-from pipeline.resampling.canvas import Canvas, scan_places
-from pipeline.resampling.frame_chain import FrameChain
-from pipeline.resampling.interpolation import Degree, Tile, interpolated
-from pipeline.resampling.source import Source
-
-Array = NDArray[np.float64]
+from pipeline.resampling.canvas import Canvas, FrameChain, scan_places
+from pipeline.resampling.interpolation import Degree, Source, Tile, interpolated
+from pipeline.types import Array
 
 _NODES = 129  # along the longer side of the frame, between which the seam is straight
 _SHOWN = 33  # places of a seam that are told
@@ -29,12 +25,14 @@ class Part:
     inner: tuple[bool, ...] = (False,) * 4
 
 
-def beside_one_another(parts: Sequence[Part]) -> list[Part]:
+def find_inner_edges(parts: Sequence[Part]) -> list[Part]:
     """The scans, knowing of their inner edges. Raises MeasurementError for scans whose pixels are not stored alike."""
     kinds = {(part.source.channels, np.dtype(part.source.dtype).name) for part in parts}
     if len(kinds) > 1:
-        told = " and ".join(f"{channels} channel{'s' * (channels > 1)} of {dtype}" for channels, dtype in sorted(kinds))
-        raise MeasurementError(f"its scans store their pixels unlike each other: {told}. Scan both alike.")
+        kinds_text = " and ".join(
+            f"{channels} channel{'s' * (channels > 1)} of {dtype}" for channels, dtype in sorted(kinds)
+        )
+        raise MeasurementError(f"its scans store their pixels unlike each other: {kinds_text}. Scan both alike.")
     return [replace(part, inner=_inner_edges(part, [each for each in parts if each is not part])) for part in parts]
 
 

@@ -6,7 +6,6 @@ from dataclasses import asdict, replace
 from importlib.metadata import version
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
@@ -54,8 +53,7 @@ from pipeline.results.adjustment_record import (
 )
 from pipeline.results.covariance_file import covariance_note
 from pipeline.results.joined_frames import joined_frames
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 ANGLES = ("omega", "phi", "kappa", "angle")
 DEG_PER_RAD = 180.0 / math.pi
@@ -261,7 +259,7 @@ def _has_solution(adjustment: Adjustment) -> bool:
 
 def _residuals(adjustment: Adjustment) -> tuple[ResidualRecord, ...]:
     observations, residuals = adjustment.network.observations, adjustment.residuals
-    camera_mm = _in_camera(adjustment, observations.xy_mm)
+    camera_mm = _camera_places(adjustment, observations.xy_mm)
     columns = [
         UM_PER_MM * residuals.v_mm,
         residuals.redundancy,
@@ -270,7 +268,7 @@ def _residuals(adjustment: Adjustment) -> tuple[ResidualRecord, ...]:
         UM_PER_MM * np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2)),
         observations.xy_mm,
         camera_mm,
-        UM_PER_MM * (_in_camera(adjustment, observations.xy_mm + residuals.v_mm) - camera_mm),
+        UM_PER_MM * (_camera_places(adjustment, observations.xy_mm + residuals.v_mm) - camera_mm),
     ]
     if (result := adjustment.reliability) is not None:
         rows = slice(len(observations))
@@ -280,7 +278,7 @@ def _residuals(adjustment: Adjustment) -> tuple[ResidualRecord, ...]:
     return tuple(ResidualRecord(*name, *row) for name, row in zip(names, np.hstack(columns).tolist(), strict=True))
 
 
-def _in_camera(adjustment: Adjustment, xy_mm: Array) -> Array:
+def _camera_places(adjustment: Adjustment, xy_mm: Array) -> Array:
     """Every observation's comparator coordinates (n, 2) in its own camera, mm."""
     images = np.array(adjustment.network.observations.image)
     camera_mm = np.empty_like(xy_mm)

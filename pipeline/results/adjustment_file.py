@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
@@ -14,8 +13,7 @@ from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.covariance_file import AGAIN, covariance_arrays, covariance_path
 from pipeline.results.record_json import json_text, read_record
 from pipeline.text.atomic import atomic_path
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 
 def write_adjustment(

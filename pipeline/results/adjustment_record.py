@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Lens
@@ -23,8 +22,7 @@ from adjust.problem.parameter import parameter_from_text
 from adjust.quality.residuals import Group
 from adjust.solution.explanations import Explanation
 from pipeline.results.record_json import KEY, REST, Finite
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 ParameterText = Annotated[str, parameter_from_text]  # as `Parameter.text`
 

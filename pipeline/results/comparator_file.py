@@ -14,7 +14,6 @@ from types import MappingProxyType
 from typing import NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.problem.observations import ObservationKind
 from measure.flags import Status
@@ -24,12 +23,12 @@ from pipeline.text.atomic import atomic_path
 from pipeline.text.csv_table import Row, csv_line, csv_rows
 from pipeline.text.names import image_name
 from pipeline.text.text_file import read_bytes
+from pipeline.types import Array
 
 COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",
 )  # fmt: skip
 _KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
-Array = NDArray[np.float64]
 
 DecidedBy = tuple[str, str]  # camera, and who
 _NOBODY: Mapping[DecidedBy, int] = MappingProxyType({})
@@ -119,7 +118,10 @@ def _head(
     return [
         f"# comparator coordinates, reseau {version('reseau')}",
         *([f"# measurement {measurement}"] if measurement else []),
-        *(f"# {count} decisions of {_line_of(who)}, camera {_line_of(by)}" for (by, who), count in decided.items()),
+        *(
+            f"# {count} decisions of {_single_line(who)}, camera {_single_line(by)}"
+            for (by, who), count in decided.items()
+        ),
         "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas",
         "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)",
         *(f"# pitch of {image}: {x:.10g} um across, {y:.10g} um down" for image, (x, y) in known_pitches),
@@ -128,7 +130,7 @@ def _head(
     ]
 
 
-def _line_of(name: str) -> str:
+def _single_line(name: str) -> str:
     return " ".join(name.split())
 
 

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, sigmas
 from pipeline.results.record_json import read_record
+from pipeline.types import Array
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 DRIFT, NO_DRIFT = "drift", "no drift"

@@ -17,9 +17,7 @@ from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
 from pipeline.provenance import of_file
 from pipeline.text.text_file import MOST_MB, read_bytes
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from pipeline.types import Array, Indices
 
 AGAIN = "Run `reseau adjust` again; it writes both files."
 AFFORDABLE = 3000  # quantities whose covariance is written as one matrix

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from measure.annotations.fields import Field, Line, find_fields
 from measure.results import FrameMeasurement
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
 

@@ -4,7 +4,6 @@ scans in the one camera frame."""
 from collections import defaultdict
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.images import adjusted_image
@@ -12,9 +11,7 @@ from adjust.problem.network import Image, Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
 from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord, PartMarkRecord, PartRecord
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from pipeline.types import Array, Indices
 
 _UM_PER_MM = 1000.0
 _STEP = 1e-6  # of a parameter, for derivatives by it: films are linear in theirs, or nearly

@@ -1,27 +1,91 @@
-"""What one scan gave as JSON, without loss: one writer and one reader, whatever file it stands in.
+"""What one scan gave: the value that measuring hands on, and that files keep."""
 
-Numbers that are not finite, which JSON has not, stand there by their names, as `float` reads them.
-"""
-
+import math
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.annotations.fields import Line, Reading
 from measure.flags import Cause, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, srgb
 from measure.tone.estimate import FrameTone
-from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+from pipeline.types import Array
 
 Json = dict[str, Any]
-Array = NDArray[np.float64]
 
 _SRGB = "srgb"
+
+
+class FailureCode(StrEnum):
+    """Why a scan could not be measured at all, in a word that one can filter by."""
+
+    MISSING = "missing"
+    UNREACHABLE = "unreachable"
+    UNREADABLE = "unreadable"
+    TOO_LARGE = "too-large"
+    PITCH = "pitch"
+    MEMORY = "memory"
+    ENDED = "ended"
+    DAMAGED = "damaged"
+    FAULT = "fault"
+
+
+MEANING = {
+    FailureCode.MISSING: "There is no such file.",
+    FailureCode.UNREACHABLE: "A store or a server did not give it, after some tries. It may be whole: `--retry`.",
+    FailureCode.UNREADABLE: "The file is damaged, or no picture that is read, or the system refused it.",
+    FailureCode.TOO_LARGE: "The file claims more pixels than are read without `--max-pixels`.",
+    FailureCode.PITCH: "Neither the project nor the file says what a pixel measures, and no marks tell it.",
+    FailureCode.MEMORY: "The memory was full.",
+    FailureCode.ENDED: "The process that measured it was ended, most likely because the memory was full.",
+    FailureCode.DAMAGED: "What is stored of it was changed or is damaged, and is not used: `--retry`.",
+    FailureCode.FAULT: "A fault of the program itself.",
+}
+
+
+@dataclass(frozen=True)
+class Failure:
+    """code: from the table above; sentence: what happened, and what to do."""
+
+    code: FailureCode
+    sentence: str
+
+
+@dataclass(frozen=True)
+class MeasuredScan:
+    """A scan and what was measured in it.
+
+    scan: the path or the address of its file. pitch_um: what a pixel measures, across and down. notes: what is worth
+    knowing of the file, and needs no action. failure: why nothing was measured; then every mark of the frame is absent,
+    size and pitch are not known (0 and NaN), and the sentence is the frame's problem. seconds: that measuring took; no
+    part of what was measured, and of no record. decided_by: how many decisions of whom stand behind it.
+    """
+
+    scan: str
+    width_px: int
+    height_px: int
+    pitch_um: tuple[float, float]
+    frame: FrameMeasurement
+    notes: tuple[str, ...] = ()
+    failure: Failure | None = None
+    seconds: float = field(default=0.0, compare=False)
+    decided_by: Mapping[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def failed(cls, scan: str, frame: FrameMeasurement, failure: Failure) -> "MeasuredScan":
+        """frame: its marks, none of them measured."""
+        return cls(scan, 0, 0, (math.nan, math.nan), frame, failure=failure)
+
+
+# What one scan gave as JSON, without loss: one writer and one reader, whatever file it stands in.
+#
+# Numbers that are not finite, which JSON has not, stand there by their names, as `float` reads them.
 
 
 def record_of(measured: MeasuredScan, folder: Path) -> Json:
@@ -168,7 +232,7 @@ def _frame_tone(tone: FrameTone) -> Json:
         "covariance": _numbers(believed.covariance),
         "source": believed.source,
         "is_declared": believed.is_declared,
-        "said": tone.information and said_record(tone.information),
+        "said": tone.information and tone_information_record(tone.information),
         "least": _numbers(tone.least),
         "greatest": _numbers(tone.greatest),
         "scatter": _numbers(tone.scatter),
@@ -179,7 +243,7 @@ def _frame_tone(tone: FrameTone) -> Json:
 def _read_frame_tone(tone: Mapping[str, Any]) -> FrameTone:
     mean, covariance = _some(tone["mean"]), _some(tone["covariance"])
     believed = Tone(_read_base(tone["base"]), mean, covariance, tone["source"], tone["is_declared"])
-    said = tone["said"] and said_of(tone["said"])
+    said = tone["said"] and read_tone_information(tone["said"])
     numbers = (float(tone[name]) for name in ("least", "greatest", "scatter", "apart"))
     return FrameTone(believed, said, *numbers)
 
@@ -199,7 +263,7 @@ def _read_base(base: Any) -> Array:
     return _some(base) if isinstance(base, list) else power(float(base))
 
 
-def said_record(said: ToneInformation) -> Json:
+def tone_information_record(said: ToneInformation) -> Json:
     return {
         "information": _numbers(said.matrix),
         "right": _numbers(said.right_side),
@@ -209,6 +273,6 @@ def said_record(said: ToneInformation) -> Json:
     }
 
 
-def said_of(said: Mapping[str, Any]) -> ToneInformation:
+def read_tone_information(said: Mapping[str, Any]) -> ToneInformation:
     information, right = _some(said["information"]), _some(said["right"])
     return ToneInformation(information, right, float(said["square"]), int(said["count"]), float(said["alike"]))

@@ -139,10 +139,10 @@ def _reader(kind: Any) -> Read:
         return lambda value: value
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return _mapping(_reader(arguments[1]))
-    return _of_plain(kind) if kind in _NAMES else _of_record(kind)
+    return _plain_reader(kind) if kind in _NAMES else _record_reader(kind)
 
 
-def _of_plain(kind: type, is_finite: bool = False) -> Read:
+def _plain_reader(kind: type, is_finite: bool = False) -> Read:
     if kind is float:
         return _finite if is_finite else _number
 
@@ -173,17 +173,17 @@ def _finite(value: Any, others: str = "") -> float:
 def _annotated(kind: Any, note: Any) -> Read:
     """FINITE, or a function that raises ValueError at what it cannot take."""
     if note == FINITE:
-        return _of_plain(kind, is_finite=True)
+        return _plain_reader(kind, is_finite=True)
     read = _reader(kind)
 
-    def checked(value: Any) -> Any:
+    def read_checked(value: Any) -> Any:
         try:
             note(read(value))
         except ValueError as error:
             raise WrongForm(f"is not what it should be: {error}") from None
         return value
 
-    return checked
+    return read_checked
 
 
 def _optional(read: Read) -> Read:
@@ -235,7 +235,7 @@ def _mapping(read: Read) -> Read:
     return of
 
 
-def _of_record(kind: type) -> Read:
+def _record_reader(kind: type) -> Read:
     hints, known = get_type_hints(kind, include_extras=True), _fields(kind)
     readers = [(name, key, _reader(hints[name])) for name, key, _ in known]
     keys = {key for _, key, _ in known}

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 _FIDUCIAL_PX, _TARGET_PX = 81, 41  # the least width of a window
 _SHOWN_PX = 96  # a larger window is reduced to about this many pixels
@@ -109,9 +109,9 @@ def _half_px(mark: MarkMeasurement) -> int:
 
 
 def _whole(scan: Scan) -> Iterator[Thumbnail]:
-    seen = scan.last_reduction
-    if seen is not None:
-        factor, grey = seen
+    reduction = scan.last_reduction
+    if reduction is not None:
+        factor, grey = reduction
         step = max(1, -(-max(grey.shape) // _WHOLE_PX))
         size = grey.shape[1] // step, grey.shape[0] // step
         pixels = cv2.resize(grey[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA)

@@ -23,8 +23,7 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.first_pictures import first_pictures
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
-from pipeline.results.measured_record import scan_of
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, scan_of
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from pipeline.errors import InputError
 from pipeline.files.decisions_file import KINDS, LEARNED, MEANING, OF_SCANS, Choice, Decision
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import few_of
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.review.frame_view import mark_json, measured_as_shown, measured_from_clicks
 from pipeline.review.pictures import Pictures
 from pipeline.review.safety import Guard

@@ -8,8 +8,7 @@ from pipeline.archive.measurement import tell_place
 from pipeline.archive.results_database import Kept, Store
 from pipeline.provenance import Identity, file_state, parts_hash
 from pipeline.results.comparator_file import measurement_of
-from pipeline.results.measured_record import record_of
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, record_of
 
 
 def keep_scans(path: Path, scans: Sequence[MeasuredScan], made_from: Mapping[str, str] | None = None) -> str:

@@ -28,7 +28,7 @@ from pipeline.results.adjustment_file import read_adjustment, write_adjustment
 from pipeline.results.check_file import CameraCheck, Check, Estimate, Row
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.covariance_file import read_covariance
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]
 

@@ -3,7 +3,7 @@
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 
 def measure_scan(project: Project, name: str) -> MeasuredScan:

@@ -32,7 +32,7 @@ from pipeline.measuring.roll import CheckedScan, checked
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
 from pipeline.results.comparator_file import measurement_of
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 SAID = pytest.CaptureFixture[str]
 

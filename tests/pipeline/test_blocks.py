@@ -20,11 +20,11 @@ from pipeline.blocks.mapping import Mapped, Sight, camera_params
 from pipeline.blocks.pictures import BlockPicture, BlockScan, lattice_of, write_pictures
 from pipeline.blocks.ties import A_CELL, CELLS, feature_precision, oriented_by_control, similarity, tie_marks
 from pipeline.errors import InputError
-from pipeline.exchange.foreign_camera import fiducial_camera
+from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.images_file import read_images
 from pipeline.files.project_file import read_project
-from pipeline.resampling.frame_chain import FrameChain
+from pipeline.resampling.canvas import FrameChain
 from pipeline.resampling.resample_stage import BEST, ResampleTask, resampled
 from pipeline.results.comparator_file import ComparatorPoint, points_text, read_comparator
 

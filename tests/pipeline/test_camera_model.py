@@ -7,7 +7,7 @@ import pytest
 from measure.results import FrameMeasurement
 from pipeline.files.camera_file import read_camera
 from pipeline.measuring.target_identification import misplaced_principal_point
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 MEASURED = MeasuredScan("v.tif", 2001, 1801, (20.0, 20.0), FrameMeasurement("v", ()))
 FIDUCIALS = '[[fiducial]]\nid = "1"\nxy_mm = [18.0, -16.0]\nmark = "dot"\n[mark.dot]\nkind = "dot"\nradius_mm = 0.2\n'

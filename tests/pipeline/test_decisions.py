@@ -23,7 +23,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.results.comparator_file import decisions_of, decisions_told, mark_rows, read_comparator, write_comparator
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 TASK = ScanTask("a", "a.tif", ScanOptions(cast(CameraFile, SimpleNamespace()), None, FiducialOptions()))
 

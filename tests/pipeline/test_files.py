@@ -31,7 +31,7 @@ from pipeline.results.comparator_file import (
     read_comparator,
     write_comparator,
 )
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.atomic import atomic_path, check_writable, write_atomically
 from pipeline.text.names import image_name
 from pipeline.text.tables import read_toml

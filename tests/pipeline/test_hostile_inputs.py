@@ -32,8 +32,7 @@ from pipeline.exchange.import_stage import run_import
 from pipeline.exchange.incoming import ImportOptions
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions
 from pipeline.files.project_file import read_project
-from pipeline.results.measured_record import record_of
-from pipeline.results.measured_scan import FailureCode
+from pipeline.results.measured_record import FailureCode, record_of
 from pipeline.review.queue import queue_of
 from pipeline.text.names import names_below
 

@@ -17,12 +17,12 @@ from pipeline.archive.checked_statuses import tell_written
 from pipeline.archive.results_database import Store
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
-from pipeline.many_frames import MOST_FRAMES, reduced
 from pipeline.report import ReportData, Thumbnail, judge, render_report
+from pipeline.report.load import report_data
+from pipeline.report.many_frames import MOST_FRAMES, reduced
 from pipeline.report.page import render_frame_page
-from pipeline.report_data import report_data
 from pipeline.results.comparator_file import ComparatorPoint, mark_rows, measurement_of, write_comparator
-from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 
 pytestmark = pytest.mark.xdist_group("many frames")  # made up once for all
 FRAMES, MARKS = 2100, 8  # more of them are bad than a report shows
@@ -233,7 +233,7 @@ def test_frames_that_need_no_look_are_counted_as_if_each_were_read(tmp_path: Pat
     project = read_project(stored(tmp_path)[0])
     every = report_data(project, lambda path: path)
     as_written(tmp_path)
-    monkeypatch.setattr("pipeline.report_data.read_comparator", None)  # nobody reads all of it
+    monkeypatch.setattr("pipeline.report.load.read_comparator", None)  # nobody reads all of it
     few = report_data(project, lambda path: path)
     assert every.totals is not None
     assert few.totals is not None

@@ -17,8 +17,7 @@ from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone
 from pipeline.files.project_file import read_project
-from pipeline.results.measured_record import record_of, scan_of
-from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan, record_of, scan_of
 
 RNG = np.random.default_rng(5)
 SAID = ToneInformation(RNG.normal(size=(5, 5)), RNG.normal(size=5), 3.3, 17, 0.2)

@@ -24,7 +24,7 @@ from pipeline.files.images_file import read_images
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.tie_stage import with_joins
 from pipeline.results.comparator_file import read_comparator
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 pytestmark = pytest.mark.xdist_group("parts")  # measured once for all
 

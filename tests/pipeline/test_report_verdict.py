@@ -18,7 +18,7 @@ from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
 from pipeline.results.adjustment_record import Quantity, SuspectRecord
 from pipeline.results.check_file import Check
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 
 @pytest.fixture

@@ -18,10 +18,9 @@ from adjust.functional_model.transformation import Film
 from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from pipeline.cli import run
-from pipeline.resampling.canvas import canvas_of, scan_places
-from pipeline.resampling.frame_chain import FrameChain
+from pipeline.resampling.canvas import FrameChain, canvas_of, scan_places
+from pipeline.resampling.interpolation import source_of
 from pipeline.resampling.resample_stage import BEST, FAST, OtherScan, ResampleTask, resampled
-from pipeline.resampling.source import source_of
 
 Array = NDArray[np.float64]
 

@@ -27,9 +27,9 @@ from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.provenance import fingerprint, of_scan
 from pipeline.publishing.made_from import measured_from
-from pipeline.report_data import adjusted
+from pipeline.report.load import adjusted
 from pipeline.results.comparator_file import mark_rows, read_comparator, write_comparator
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.summary import summarise
 
 SAID = pytest.CaptureFixture[str]

@@ -14,7 +14,7 @@ from pipeline.files.project_file import read_project
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.results.comparator_file import read_comparator
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene
 

@@ -24,7 +24,7 @@ from pipeline.measuring import scan_measurement
 from pipeline.measuring.scan_measurement import measure_scans, measured_scan
 from pipeline.measuring.scan_task import ScanTask, few_of, scan_tasks
 from pipeline.results.comparator_file import read_comparator
-from pipeline.results.measured_scan import FailureCode, MeasuredScan
+from pipeline.results.measured_record import FailureCode, MeasuredScan
 
 Changed = Callable[[str, str], tuple[str, str]]  # of project.toml and camera.toml
 SAID = pytest.CaptureFixture[str]

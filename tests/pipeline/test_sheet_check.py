@@ -13,7 +13,7 @@ from measure.flags import Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.sheet_check import with_checked_sheet
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]
 COLUMNS, ROWS, WIDTH, HEIGHT, NOISE_PX = 9, 8, 2200, 1700, 0.05

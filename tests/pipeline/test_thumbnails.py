@@ -12,11 +12,10 @@ from drawn_project import write_project
 from measure.scans.opening import open_scan
 from pipeline.archive.measurement import fingerprints_of, read_measurement
 from pipeline.archive.results_database import Store
-from pipeline.archive.thumbnails import ThumbnailStore, thumbnails_path
+from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore, thumbnails_path
 from pipeline.cli import run
 from pipeline.results.comparator_file import measurement_of
 from pipeline.results.thumbnail import cut
-from pipeline.thumbnails import Thumbnails
 
 pytestmark = pytest.mark.xdist_group("thumbnails")  # measured once for all
 

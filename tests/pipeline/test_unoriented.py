@@ -17,7 +17,7 @@ from pipeline.files.project_file import read_project
 from pipeline.files.target_table import read_targets
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.rendered.scene_file import render_project
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.tables import read_toml
 
 Array = NDArray[np.float64]

@@ -28,9 +28,9 @@ from pipeline.measuring.roll import known_lines, poses_of_roll, with_known_lines
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
-from pipeline.report.writing import written
+from pipeline.report.frame_views import written
 from pipeline.results.frames_file import for_images, write_frames
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.tables import Table
 
 WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))

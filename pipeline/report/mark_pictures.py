@@ -19,8 +19,6 @@ LEAST_TARGETS = 4
 PICTURES = 1200  # of full size; with more of them they are stored half as fine, so that the file stays readable
 ARROW_PX = 34.0  # the longest arrow
 
-Array = NDArray[np.float64]
-
 
 def shown_marks(shots: list[Frame]) -> dict[str, list[Mark]]:
     """Which marks of each frame get a picture: all fiducials, and all targets or the worst of them."""

@@ -17,8 +17,7 @@ from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.marks import Frame, frames
 from pipeline.report.verdict import is_film_alone, suspect_rows
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.measured_record import pose_record
-from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, pose_record
 from pipeline.text.wording import counted, listed
 
 MOST_FRAMES = 200  # that a report shows with their marks

@@ -10,7 +10,6 @@ from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import inapplicable
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
-from pipeline.many_frames import MOST_FRAMES, reduced
 from pipeline.provenance import of_file
 from pipeline.publishing.made_from import (
     CAMERA,
@@ -24,6 +23,7 @@ from pipeline.publishing.made_from import (
 )
 from pipeline.publishing.publishing import outside_note
 from pipeline.report.data import Problem, ReportData
+from pipeline.report.many_frames import MOST_FRAMES, reduced
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.check_file import read_check
 from pipeline.results.comparator_file import (
@@ -34,7 +34,7 @@ from pipeline.results.comparator_file import (
     read_comparator,
 )
 from pipeline.results.covariance_file import read_covariance
-from pipeline.results.measured_scan import FailureCode, MeasuredScan
+from pipeline.results.measured_record import FailureCode, MeasuredScan
 from pipeline.text.wording import did_you_mean, listed
 
 At = Callable[[Path], Path]

@@ -1,0 +1,9 @@
+"""Types of arrays that the modules share."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+Samples = NDArray[np.uint8 | np.uint16]
