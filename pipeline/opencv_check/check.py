@@ -19,10 +19,18 @@ from adjust.problem.camera import Camera
 from adjust.problem.parameter import Parameter, description
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
-from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model
+from pipeline.opencv_check.bare_problem import (
+    COUNTERPARTS,
+    BareProblem,
+    Converted,
+    bare_problem,
+    converted,
+    free_parameters,
+    in_opencv_model,
+)
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate, calibrate_fisheye
 from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners
-from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, Converted, Freedom, converted, model_names
+from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, Freedom, model_names
 from pipeline.results.check_file import CameraCheck, Check, Estimate, Row, Verdict
 
 LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, for the two models are not quite the same

@@ -6,17 +6,13 @@ tilt tau_x, tau_y in rad, in OpenCV's own signs.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
-from adjust.problem.images import adjusted_lens
-from adjust.problem.parameter import Parameter
-from adjust.solution.result import Adjustment
-from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem
 from pipeline.types import Array
 
 INTERIOR = ("fx", "fy", "cx", "cy")
@@ -89,40 +85,3 @@ def camera_matrix(values: Array) -> Array:
     """OpenCV's camera matrix (3, 3), in mm with y down."""
     fx, fy, cx, cy = values[:4]
     return np.array([[fx, 0.0, cx], [0.0, fy, -cy], [0.0, 0.0, 1.0]])
-
-
-@dataclass(frozen=True)
-class Converted:
-    """A solution in OpenCV's model: parameters (n,) and a-priori standard deviations (n,) in the order of
-    `opencv_model.model_names`; residual_mm: what is left between the two lenses over the image, rms a point."""
-
-    parameters: Array
-    sigmas: Array
-    residual_mm: float
-
-
-def converted(problem: BareProblem, solved: Adjustment) -> Converted:
-    """Raises AdjustmentError where the lens cannot be brought to OpenCV's model."""
-    camera = problem.network.cameras[0]
-    family = camera.distortion.family
-    lens = adjusted_lens(solved, camera.name)
-    own = [Parameter.interior(camera.name, each) for each in lens.quantities]
-    observed = problem.network.observations.xy_mm
-    corners_mm = np.array([observed.min(axis=0), observed.max(axis=0)])
-    whole = to_opencv_model(lens, corners_mm, _whole(family))
-    # What OpenCV does not estimate it holds at these values, and so they are for its standard deviations.
-    held = dict(zip(whole.lens.quantities[3:], whole.lens.parameters.tolist(), strict=True))
-    model = fixed(whole.lens.distortion.family, held)
-    known = replace(lens, covariance=solved.cofactor_of(own))
-    free = convert_lens(known, model, corners_mm, problem.freedom.distortion, held=problem.freedom.held)
-    parameters, _ = opencv_values(whole.lens)
-    _, by_lens = opencv_values(free.lens)
-    covariance = by_lens @ free.lens.covariance @ by_lens.T
-    return Converted(parameters, np.sqrt(np.maximum(np.diag(covariance), 0.0)), whole.rms_mm)
-
-
-def _whole(family: str) -> tuple[str, ...]:
-    """All parameters that a family can need in OpenCV's model."""
-    if family in ("opencv", FISHEYE):
-        return ("b1",)
-    return ("k1", "k2", "p1", "p2", "k3", *(["b1"] if "fy" in COUNTERPARTS[family].values() else []))
