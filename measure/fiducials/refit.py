@@ -42,6 +42,7 @@ _STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
 _TONE_ROUNDS = 5  # of fitting by a better curve
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # powers; how unsettled a curve is that needs none of them
 _MOVED = 0.3  # of its standard deviation that a mark may still move
+_UNCHECKED = 3  # marks, which an affine transformation fits without residuals
 _REFIT_PX = 1.5  # about a mark that was fitted already
 
 
@@ -242,11 +243,16 @@ def clear_fits(frame: Frame) -> dict[int, MarkFit]:
 
 def _linear_sigma(frame: Frame) -> float:
     """The standard deviation of rotation (rad), scale, stretch and shear at a mark: of the frame by its marks, and by
-    as much as film bends between them."""
+    as much as film bends between them. Three marks show no gross error: a mark under a wrong name, or off its place,
+    makes stretch and shear of its own, so that what they show of these counts as unknown."""
     places = frame.camera_mm[frame.inliers]
     radius_mm = float(np.hypot(*(places - places.mean(axis=0)).T).mean())
     bend = float(np.hypot(frame.options.film_sigma_mm, frame.scatter_mm)) / radius_mm
-    return float(np.hypot(frame.linear_sigma, bend))
+    unchecked = 0.0
+    if frame.inliers.sum() <= _UNCHECKED:
+        greater, less = np.linalg.svd(frame.pixel_from_camera[:, :2] * frame.pitch_mm[:, None], compute_uv=False)
+        unchecked = (greater - less) / (greater + less)
+    return float(np.linalg.norm([frame.linear_sigma, bend, unchecked]))
 
 
 def _refit(frame: Frame, options: Mapping[int, MatchOptions], orient: bool = True) -> Frame:

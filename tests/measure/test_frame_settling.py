@@ -118,3 +118,25 @@ def test_a_frame_in_which_marks_lie_as_they_should_but_look_unlike_their_drawing
     assert refused.misfit("12345678").startswith(
         "8 of 8 marks were found where the others put them, but only 2 of them look"
     )
+
+
+def test_wings_of_three_marks_under_wrong_names_claim_no_more_than_the_stretch_that_these_make() -> None:
+    """Given coordinates are stretched by 1 % and the marks are not: three marks cannot tell it from film."""
+    rng, kind, linear = np.random.default_rng(5), KIND["wing"], PX_PER_MM * np.diag([1.0, -1.0])
+    places, middle = np.array([(-AT_MM, -AT_MM), (AT_MM, -AT_MM), (AT_MM, AT_MM)]), np.full(2, SIDE_PX / 2)
+    given = places * (1.01, 0.99)
+    layout = tuple(LayoutMark(str(n), (x, y), (0.005, 0.005), kind.shape) for n, (x, y) in enumerate(given.tolist()))
+    grey, true_px = GROUND + NOISE / 4 * rng.standard_normal((SIDE_PX, SIDE_PX)), []
+    for place in places:
+        some = some_mark(kind, 1.0, rng)
+        corner = np.rint(linear @ place + middle).astype(int) - some.size // 2
+        mark = replace(some, place=np.column_stack([linear, linear @ place + middle - corner]))
+        grey[corner[1] :, corner[0] :][: mark.size, : mark.size] += CONTRAST * mark.picture
+        true_px.append(linear @ place + middle)
+    scan = Scan(Path("three.tif"), WholePicture(np.rint(grey).astype(np.uint16)[..., None]), NO_TAGS)
+    placement = Placement("0", np.column_stack([linear, middle]), 8.0, 3, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
+    frame = measure_frame(scan, FiducialLayout(layout, (50.0, 50.0)), placement, FiducialOptions())
+    for fit, place in zip(frame.fits, true_px, strict=True):
+        assert fit is not None
+        error = fit.center_px - place
+        assert error @ np.linalg.solve(fit.covariance_px2, error) < 16.0
