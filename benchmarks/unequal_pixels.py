@@ -8,7 +8,7 @@ pad of 0.06 of full scale; as the pads have half of that, it is 3.1, 4.4 and 6.2
 scanner's, before the blur. Pixels differ by 0.4 to 1 % either way, and the pitch given for both is off by up to 0.4 %.
 One line a frame: how many marks were found where they are, how many elsewhere, how many are with both pitches given
 right, and what was said; then a table by contrast. best: in standard deviations, what a filter matched to the marks and
-to the noise, were both known, would answer to all marks together; what it has to pass is in docs/marks-found.md.
+to the noise, were both known, would answer to all marks together; what it has to pass is in docs/method/search.md.
 """
 
 import argparse
