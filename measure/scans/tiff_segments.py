@@ -12,7 +12,7 @@ from tifffile import TIFF, TiffFile, TiffPage
 from tifffile.tifffile import jpeg_decode_colorspace
 
 from measure.scans.cache import LostPart, Place
-from measure.scans.jpeg import stream_damage
+from measure.scans.jpeg import decode_checked
 from measure.scans.metadata import (
     DECODING_ERRORS,
     JPEG_COMPRESSIONS,
@@ -131,19 +131,22 @@ class TiffSegments:
         page = self._page
         colours = jpeg_decode_colorspace(page.photometric, page.planarconfig, page.extrasamples, page.is_jfif)
 
-        if damage := stream_damage(data, page.jpegtables):
-            raise ValueError(damage)
-        samples = np.asarray(
-            imagecodecs.jpeg_decode(
-                data,
-                bitspersample=page.bitspersample,
-                tables=page.jpegtables,
-                header=page.jpegheader,
-                colorspace=colours[0],
-                outcolorspace=colours[1],
-                shape=(self.segment_height_px, self.segment_width_px),
+        def decode(stream: bytes) -> NDArray[np.generic]:
+            return np.asarray(
+                imagecodecs.jpeg_decode(
+                    stream,
+                    bitspersample=page.bitspersample,
+                    tables=page.jpegtables,
+                    header=page.jpegheader,
+                    colorspace=colours[0],
+                    outcolorspace=colours[1],
+                    shape=(self.segment_height_px, self.segment_width_px),
+                )
             )
-        )
+
+        samples, damage = decode_checked(data, decode, page.jpegtables)
+        if damage:
+            raise ValueError(damage)
         right = (height_px, width_px), (self.segment_height_px, self.segment_width_px)
         if samples.shape[:2] not in ((tall, wide) for tall, _ in right for _, wide in right):
             raise ValueError(f"it holds {samples.shape[1]} x {samples.shape[0]} px")
