@@ -10,7 +10,7 @@ the rms error over the rms claim of all quantities of a kind, in brackets how fa
 """
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
@@ -29,6 +29,7 @@ from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.report.fiducials import figure_of_films
 from pipeline.results.adjustment_record import FiducialRecord, GivenQuantity, Quantity
+from pipeline.results.covariance_file import Covariance
 
 Array = NDArray[np.float64]
 Figures = dict[str, tuple[Array, Array]]  # by kind of quantity: errors and claims (trials, quantities)
@@ -294,21 +295,12 @@ def largest_difference(batch: Batch) -> float:
     return float(max(different))
 
 
-@dataclass(frozen=True)
-class Known:
-    """The covariance of an adjustment, as the report has it from its file."""
-
-    adjustment: Adjustment
-
-    def of(self, names: Sequence[str]) -> Array:
-        return self.adjustment.sigma0**2 * self.adjustment.cofactor_of(list(names))
-
-
 def _printed(result: Adjustment, given: Array) -> tuple[Array, Array] | None:
     """Corrections and their standard deviations (2m,) in mm as the report prints them."""
     marks = dict(_marks(result, given))
     films = {image.name: adjusted_image(result, image.name).film for image in result.network.images}
-    form = figure_of_films(CAMERA, marks, Known(result), films)  # type: ignore[arg-type]
+    matrix = result.sigma0**2 * result.cofactor_of(result.parameters)
+    form = figure_of_films(CAMERA, marks, Covariance(tuple(result.parameters), result.values, matrix), films)
     if form is None:
         return None
     return 1e-3 * form.change_um.ravel(), 1e-3 * np.sqrt(np.maximum(np.diag(form.covariance_um2), 0.0))

@@ -431,7 +431,8 @@ def _check_window(key: str, value: Any) -> tuple[float, float, float, float] | N
         return None
     if value.__class__ is not list or len(value) != 4 or not all(map(_is_pixel, value)):
         raise _LineError("must be four numbers of pixels: first column, first row, width, height.", key)
-    return tuple(map(float, value))  # type: ignore[return-value]  # they are four
+    col, row, width, height = map(float, value)
+    return col, row, width, height
 
 
 _KINDS_OR_NONE = ("", *KINDS, LEARNED)

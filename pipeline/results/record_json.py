@@ -113,8 +113,8 @@ def _plain(value: Any) -> Any:
 @cache
 def _fields(kind: type) -> tuple[Field, ...]:
     if not is_dataclass(kind):  # a named tuple
-        defaults: Mapping[str, Any] = kind._field_defaults  # type: ignore[attr-defined]
-        return tuple((name, name, defaults.get(name, MISSING)) for name in kind._fields)  # type: ignore[attr-defined]
+        named: Any = kind
+        return tuple((name, name, named._field_defaults.get(name, MISSING)) for name in named._fields)
     made = []
     for each in fields(kind):
         default = each.default if each.default_factory is MISSING else each.default_factory
@@ -209,12 +209,12 @@ def _list(read: Read, length: int | None) -> Read:
     def of(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, list) or (length is not None and len(value) != length):
             raise _wrong(value, "a list" if length is None else f"a list of {length}")
-        made, number = [], 0
+        made: list[Any] = []
         try:
-            for number, item in enumerate(value):  # noqa: B007
-                made.append(read(item))
+            for item in value:
+                made.append(read(item))  # noqa: PERF401  # as many are made as were right
         except WrongForm as wrong:
-            raise wrong.within(f"[{number}]") from None
+            raise wrong.within(f"[{len(made)}]") from None
         return tuple(made)
 
     return of
