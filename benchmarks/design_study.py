@@ -1,4 +1,4 @@
-"""The tables and figures of docs/design-study.md.
+"""The tables and figures of docs/how-to/plan-a-network.md.
 
 python -m benchmarks design_study [FOLDER]
 

@@ -44,7 +44,7 @@ direction, a change of the network ends those that it is advised for.
 Every network is simulated without errors. There are four images (or as many as are said) from 1500 m by a camera of
 c = 153 mm with five fiducial marks, film transformations are affine, and nothing is given of fiducials, c, x0', y0'
 (F5 to F9 are dropped). A minimal datum holds the object space where too little of it is known. What moves
-together stands in parentheses. [The theory](theory.md) says why the directions are there.
+together stands in parentheses. [The theory](method/theory.md) says why the directions are there.
 
 ![The networks](failure-gallery.png)
 

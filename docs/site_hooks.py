@@ -30,7 +30,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def _names_of_faces() -> str:
     """The page of all names that `import reseau` gives, from the stubs of its packages."""
-    lines = ["# Python\n", "`import reseau` gives every name below. [From Python](../python.md) has an example.\n"]
+    lines = ["# Python\n", "`import reseau` gives every name below: [an example](../how-to/python.md).\n"]
     for package, title in FACES.items():
         lines.append(f"## {title}\n")
         stub = (ROOT / package / "__init__.pyi").read_text(encoding="utf-8")

@@ -1,6 +1,6 @@
 """A folder of scans in, everything out: the only package that knows the other three.
 
-The names below read and write the files that docs/python.md works with; they are loaded when they are first used.
+The names below read and write the files that docs/how-to/python.md works with. They are loaded when first used.
 docs/code.md lists the modules stage by stage.
 """
 

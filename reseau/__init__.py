@@ -1,6 +1,6 @@
 """The names of `measure`, `adjust` and `pipeline` under one import: `import reseau`.
 
-The packages are loaded when one of their names is first used. docs/python.md has an example.
+The packages are loaded when one of their names is first used. docs/how-to/python.md has an example.
 """
 
 from importlib import import_module

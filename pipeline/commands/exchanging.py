@@ -102,7 +102,7 @@ def import_(
 
 def convert(
     file: Annotated[Path, typer.Argument(metavar="CAMERA.toml|adjustment.json", show_default=False)],
-    family: Annotated[str, typer.Argument(metavar="FAMILY", help="See docs/distortion.md.", show_default=False)],
+    family: Annotated[str, typer.Argument(metavar="FAMILY", help="See docs/reference/lenses.md.", show_default=False)],
     out_dir: OutDir,
     r0_mm: Annotated[float, typer.Option("--r0-mm", metavar="MM", min=0.0, help="Of torlegard, aicon, juhl.")] = 0.0,
     parameters: Annotated[

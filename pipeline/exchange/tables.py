@@ -11,7 +11,7 @@ from pipeline.results.comparator_file import ComparatorPoint
 CONVENTION = Convention(
     (0.0, 0.0),
     "column right, row down; comparator and camera mm with x right and y up; rotation R3(kappa) R2(phi) R1(omega)",
-    "this program's own, docs/theory.md",
+    "this program's own, docs/method/theory.md",
 )
 
 Cell = str | float | bool | None

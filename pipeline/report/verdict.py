@@ -309,7 +309,7 @@ def _frame_check(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
     yield from frame_problems(shots)
 
 
-# All that makes exit code 1, with the names that docs/reading-the-report.md tells them by.
+# All that makes exit code 1, with the names that docs/how-to/read-the-report.md tells them by.
 NEEDS_A_LOOK: dict[str, Look] = {
     "solution": lambda data, _: _no_solution(data.adjustment) if data.adjustment else (),
     "made from": lambda data, _: data.problems,

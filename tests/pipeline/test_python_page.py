@@ -1,4 +1,4 @@
-"""docs/python.md: its example runs as it stands, in a folder with the demonstration in it."""
+"""docs/how-to/python.md: its example runs as it stands, in a folder with the demonstration in it."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ import adjust
 import measure
 import pipeline
 
-PAGE = Path(__file__).parents[2] / "docs" / "python.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "python.md"
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""docs/tutorial.md: its project file is read, and its example runs as it stands beside the demonstration."""
+"""docs/start/film-scan.md: its project file is read, and its example runs as it stands beside the demonstration."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.files.project_file import read_project
 
-PAGE = (Path(__file__).parents[2] / "docs" / "tutorial.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "start" / "film-scan.md").read_text(encoding="utf-8")
 
 
 def block(language: str) -> str:
