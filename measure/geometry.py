@@ -1,10 +1,11 @@
-"""Geometry of a scan: the eight scan orientations, four quarter turns with and without mirror."""
+"""Geometry of a scan: affine transformations, and the eight scan orientations, four turns with and without mirror."""
 
+from dataclasses import dataclass
 from functools import cache
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
 
@@ -13,14 +14,57 @@ Array = NDArray[np.float64]
 POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
 
 
+@dataclass(frozen=True, eq=False)
+class Affine:
+    """An affine transformation of the plane: matrix (2, 3), its linear part (2, 2) and its shift (2,)."""
+
+    matrix: Array
+
+    @classmethod
+    def from_linear(cls, linear: Array, shift: ArrayLike = (0.0, 0.0)) -> "Affine":
+        """The transformation with a linear part (2, 2) and a shift (2,)."""
+        return cls(np.column_stack([linear, np.asarray(shift, dtype=float)]))
+
+    @property
+    def linear(self) -> Array:
+        """(2, 2)."""
+        return self.matrix[:, :2]
+
+    @property
+    def shift(self) -> Array:
+        """(2,) where the origin comes to lie."""
+        return self.matrix[:, 2]
+
+    @property
+    def inverse(self) -> "Affine":
+        """The transformation back."""
+        back: Array = np.asarray(np.linalg.inv(self.linear), float)
+        return Affine.from_linear(back, -back @ self.shift)
+
+    @property
+    def scale(self) -> float:
+        """The mean of both directions: the root of the determinant's absolute value."""
+        return linear_scale(self.matrix)
+
+    def apply(self, points: Array) -> Array:
+        """Points (..., 2) transformed."""
+        return np.asarray(points @ self.linear.T + self.shift)
+
+    def compose(self, first: "Affine") -> "Affine":
+        """This transformation after another one."""
+        return Affine.from_linear(self.linear @ first.linear, self.apply(first.shift))
+
+
+def linear_scale(matrix: Array) -> float:
+    """The scale of a linear part, (2, 2) or the first columns of (2, 3), as `Affine.scale` is."""
+    return float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+
+
 @cache
 def up_from_camera(pose: str) -> Array:
     """(2, 2) turn, after a mirror if there is one, from the camera's (x', y') to the scan's (right, up)."""
-    quarter = int(pose.removesuffix("m")) // 90
-    c, s = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[quarter]
-    turn = np.array([[c, -s], [s, c]])
-    mirror = np.diag([-1.0 if pose.endswith("m") else 1.0, 1.0])
-    up = np.asarray(turn @ mirror)
+    c, s = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(pose.removesuffix("m")) // 90]
+    up = np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if pose.endswith("m") else 1.0, 1.0])
     up.flags.writeable = False  # it is everybody's
     return up
 
@@ -37,8 +81,3 @@ def turn_by_quarters(image: Grid, turn: Array) -> Grid:
     turned = image if whole[0, 0] else image.T
     across, down = whole.sum(axis=1)
     return np.ascontiguousarray(turned[:: int(down), :: int(across)])
-
-
-def linear_scale(matrix: Array) -> float:
-    """The scale of a transformation (2, 2) or (2, 3), the mean of both directions: the root of its determinant."""
-    return float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))

@@ -262,17 +262,17 @@ class MarkFit:
     center_px: Array
     place_covariance: Covariance
     pixel_from_mark: Array
-    contrast_dn: float
-    stored_contrast_dn: float
-    noise_dn: float
-    blur_px: float
-    damaged_fraction: float
-    lost_fraction: float
-    redundancy: int
-    neighbour_correlation: float
-    covariance_is_white: bool
-    likeness: float
-    significance: float
+    contrast_dn: float = 0.0
+    stored_contrast_dn: float = 0.0
+    noise_dn: float = 0.0
+    blur_px: float = 0.0
+    damaged_fraction: float = 0.0
+    lost_fraction: float = 0.0
+    redundancy: int = 0
+    neighbour_correlation: float = 0.0
+    covariance_is_white: bool = False
+    likeness: float = 0.0
+    significance: float = 0.0
     blur_sigma: float = np.inf
     size_sigma: float = np.inf
     edges: SecondPlace | None = None

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
 
-from measure.geometry import linear_scale
+from measure.geometry import Affine, linear_scale
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
 from measure.marks.shared_picture import SMOOTHED_PX2
@@ -25,14 +25,12 @@ _LEAST_SLOPE = 1e-3  # of a clipped grey value: what tells less tells nothing
 _LEAST_PX = 400  # of the frame beside the notch: fewer do not tell how uneven it is
 # Of the contrast and the logarithm of its change, how much half tones are off: anything between nothing and what a glow
 # makes that stays as it is while the light changes, which is a half.
-_BENT = 0.5 / np.sqrt(3)
+_HALF_TONES = 0.5 / np.sqrt(3)
 _MOST = 1.0  # of that logarithm: more is another scanner's scale
 _SMOOTHING = 1.5  # times the scan's blur: noise of about 1.3 times the match's, while a line's two edges stay apart
 _LEAST_SMOOTHING_PX = 1.0  # below it pixels sample the derivative too coarsely
 _WORST_CONDITION = 1e6  # of a normal matrix: beyond it double precision leaves no figure of a place in small windows
 _OWN = 0.9  # of what is known of rotation and scale: where the picture gives so much, little is the frame's
-
-
 _LEAST_SQUARES = 0.1  # of the slopes' squares: less would tell nothing
 
 
@@ -110,36 +108,28 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
 # leaves next to nothing else.
 
 
-def covariance_of_landscape(light: Array, frame_pixels: Mask, moved: Array) -> Array:
-    """(n, n) of figures, column and row of a place for example, for a landscape in the mark that varies as beside it.
-
-    light (height, width): grey values, and frame_pixels, alike, which of them show the frame; moved (n, height, width)
-    of the mark's window: derivatives of the figures by the grey values, as much of them as its light has part in.
-    """
-    if frame_pixels.sum() < _LEAST_PX:
-        return np.zeros((len(moved),) * 2)
-    reach = max(moved.shape[1:])
-    lags = autocovariance(np.where(frame_pixels, light - light[frame_pixels].mean(), 0.0), frame_pixels, reach)
-    # The noise of single pixels counts already; what neighbours have in common is the landscape.
-    lags[reach, reach] = max(lags[reach, reach + 1], 0.0)
-    landscape = NoiseModel(float(lags[reach, reach]), lags, 1.0)
-    covariance = products(moved, correlated(moved, landscape))
-    sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
-    return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)  # far lags are chance, and may leave less than nothing
-
-
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """Where a mark shows one. light, frame_pixels: as of `covariance_of_landscape`; share (height, width): of it
-    in the light of the mark's window."""
+    """A landscape in a mark that varies as beside it. light (height, width): grey values, and frame_pixels, which of
+    them show the frame; share (height, width): of the landscape in the light of the mark's own window."""
 
     light: Array
     frame_pixels: Mask
     share: Array
 
     def covariance(self, by_grey: Array) -> Array:
-        """(n, n) of figures whose derivatives by the grey values are by_grey (n, height, width)."""
-        return covariance_of_landscape(self.light, self.frame_pixels, by_grey * self.share)
+        """(n, n) of figures, column and row of a place for example, whose derivatives by the grey values of the mark's
+        window are by_grey (n, height, width)."""
+        if self.frame_pixels.sum() < _LEAST_PX:
+            return np.zeros((len(by_grey),) * 2)
+        moved, reach = by_grey * self.share, max(self.share.shape)
+        uneven = np.where(self.frame_pixels, self.light - self.light[self.frame_pixels].mean(), 0.0)
+        lags = autocovariance(uneven, self.frame_pixels, reach)
+        # The noise of single pixels counts already; what neighbours have in common is the landscape.
+        lags[reach, reach] = max(lags[reach, reach + 1], 0.0)
+        covariance = products(moved, correlated(moved, NoiseModel(float(lags[reach, reach]), lags, 1.0)))
+        sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
+        return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)  # far lags are chance, and may leave less than none
 
 
 def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_change: float) -> Array:
@@ -149,7 +139,7 @@ def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_chang
     ends; by_grey (unknowns, height, width): the unknowns' derivatives by the grey values, column and row first.
     contrast_change: the contrast over that of the pictures that the chip was learned from.
     """
-    bent = _BENT * min(abs(float(np.log(contrast_change))), _MOST)
+    bent = _HALF_TONES * min(abs(float(np.log(contrast_change))), _MOST)
     moved = bent * products(by_grey[:2], half_tones[None])
     return np.asarray(moved @ moved.T)
 
@@ -170,13 +160,8 @@ def edge_place(fit: LinearFit, blur_px: float) -> SecondPlace | None:
     """
     weights = across_edges(fit.design[:2] * fit.used, max(_SMOOTHING * blur_px, _LEAST_SMOOTHING_PX)) * fit.used
     response = products(weights, fit.design)
-    by_place = response[:, :2]
-    if not np.linalg.cond(by_place) < _WORST_CONDITION:
-        return None
     # What noise the match has taken up already has left the residuals.
-    left = weights - combined(response, fit.by_grey)
-    offset = np.asarray(np.linalg.solve(by_place, products(weights, fit.residuals[None])[:, 0]), float)
-    return _second_place(offset, fit.covariance(combined(np.asarray(np.linalg.inv(by_place)), left)))
+    return _second_place(fit, np.eye(2), response[:, :2], weights, weights - combined(response, fit.by_grey))
 
 
 def sloping_place(fit: LinearFit) -> SecondPlace | None:
@@ -188,18 +173,20 @@ def sloping_place(fit: LinearFit) -> SecondPlace | None:
     """
     sloping = fit.design[-GREY] * fit.design[-2:] * fit.used
     left = (sloping - combined(products(sloping, fit.design), fit.by_grey)) * fit.used  # by what the match has taken up
-    normal = products(left, sloping)
+    return _second_place(fit, -products(fit.by_grey[:2], sloping), products(left, sloping), left, left)
+
+
+def _second_place(fit: LinearFit, by_unknown: Array, normal: Array, weights: Array, left: Array) -> SecondPlace | None:
+    """The place by sums of residuals by weights (2, height, width), which change by two unknowns as normal (2, 2) says;
+    by_unknown (2, 2): the place's derivatives by these; left: the sums' derivatives by the noise. None where nothing
+    determines it, or the noise's lags, which are noise themselves, make no covariance."""
     if not np.linalg.cond(normal) < _WORST_CONDITION:
         return None
-    by_noise = combined(-products(fit.by_grey[:2], sloping) @ np.linalg.inv(normal), left)
-    return _second_place(products(by_noise, fit.residuals[None])[:, 0], fit.covariance(by_noise))
-
-
-def _second_place(offset_px: Array, covariance_px2: Array) -> SecondPlace | None:
-    """None where the noise's lags, which are noise themselves, make no covariance."""
+    by_sums = np.asarray(by_unknown @ np.linalg.inv(normal), float)
+    covariance_px2 = fit.covariance(combined(by_sums, left))
     if not np.all(np.linalg.eigvalsh(covariance_px2) > 0):
         return None
-    return SecondPlace(offset_px, covariance_px2)
+    return SecondPlace(by_sums @ products(weights, fit.residuals[None])[:, 0], covariance_px2)
 
 
 def across_edges(slopes: Array, smoothing_px: float) -> Array:
@@ -211,14 +198,13 @@ def across_edges(slopes: Array, smoothing_px: float) -> Array:
     along = ((bend, smooth), (slope, slope), (smooth, bend))
     return np.stack(
         [
-            np.sum([_filtered(part * each, *pair) for each, pair in zip(across, along, strict=True)], axis=0)
+            sum(
+                cv2.sepFilter2D(part * share, cv2.CV_64F, *kernels, borderType=cv2.BORDER_CONSTANT)
+                for share, kernels in zip(across, along, strict=True)
+            )
             for part in slopes
         ]
     )
-
-
-def _filtered(image: Array, along_cols: Array, along_rows: Array) -> Array:
-    return np.asarray(cv2.sepFilter2D(image, cv2.CV_64F, along_cols, along_rows, borderType=cv2.BORDER_CONSTANT))
 
 
 def _kernels(sigma_px: float) -> tuple[Array, Array, Array]:
@@ -270,8 +256,7 @@ def honest_covariance(template: MarkTemplate, scan: str, fit: MarkFit) -> Covari
     share = template.shares.get(scan, 0.0)
     if share == 1.0:
         return Covariance.from_noise(_covariance_of_noise(template, fit))
-    widened = _slope_noise_factor(template, fit)
-    return fit.place_covariance.through(widened / np.sqrt(1.0 - share))
+    return fit.place_covariance.through(_slope_noise_factor(template, fit) / np.sqrt(1.0 - share))
 
 
 def _slope_noise_factor(template: MarkTemplate, fit: MarkFit) -> Array:
@@ -280,12 +265,12 @@ def _slope_noise_factor(template: MarkTemplate, fit: MarkFit) -> Array:
     linear, blur_px2 = fit.pixel_from_mark[:, :2], SMOOTHED_PX2 + fit.blur_px**2
     px_per_sample = linear_scale(linear) * template.pitch_um / 1000
     side = int(np.ceil(len(template.image) * px_per_sample))
-    place = np.column_stack([linear, np.full(2, (side - 1) / 2)])
+    place = Affine.from_linear(linear, np.full(2, (side - 1) / 2)).matrix
     shown = render(template, place, side, side, float(np.sqrt(blur_px2)))
-    slopes = np.stack([shown.by_col.ravel(), shown.by_row.ravel()]).astype(float)
+    slopes = np.stack([shown.by_col, shown.by_row]).astype(float)
     noise = template.slope_noise_dn / max(float(np.ptp(template.image)), 1e-9) / px_per_sample
     noise *= SMOOTHED_PX2 / blur_px2  # more blur takes as much of the slopes of white noise
-    squares, axes = np.linalg.eigh(slopes @ slopes.T)
+    squares, axes = np.linalg.eigh(products(slopes, slopes))
     marks = np.maximum(squares - noise**2 * side**2, _LEAST_SQUARES * squares)
     return np.asarray(axes * (squares / marks) @ axes.T)
 
@@ -293,11 +278,11 @@ def _slope_noise_factor(template: MarkTemplate, fit: MarkFit) -> Array:
 def _covariance_of_noise(template: MarkTemplate, fit: MarkFit) -> Array:
     """Of a shift, gain and offset, from the picture's slopes and its noise, as grain of GRAIN_PX correlates it."""
     side = template.image.shape[0]
-    linear = fit.pixel_from_mark[:, :2]
-    shown = render(template, np.column_stack([linear, np.full(2, side / 2)]), side, side, 0.0)
+    place = Affine.from_linear(fit.pixel_from_mark[:, :2], np.full(2, side / 2)).matrix
+    shown = render(template, place, side, side, 0.0)
     columns = [fit.contrast_dn * shown.by_col, fit.contrast_dn * shown.by_row, shown.value, np.ones_like(shown.value)]
-    design = np.stack([column.ravel() for column in columns], axis=1)
-    size = np.linalg.norm(design, axis=0)
-    inverse = np.linalg.pinv((design / size).T @ (design / size)) / np.outer(size, size)
+    normal = products(np.stack(columns), np.stack(columns))
+    size = np.sqrt(np.diag(normal))
+    inverse = np.linalg.pinv(normal / np.outer(size, size)) / np.outer(size, size)
     # As many pixels as such grain is wide are one observation: the sum of its correlations.
     return np.asarray(4 * np.pi * GRAIN_PX**2 * max(template.noise_dn, 1e-3) ** 2 * inverse[:2, :2])

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,18 +14,14 @@ from measure.matching.saturation import Sides, clipped_sides
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR, Tone
 
-Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 _BESIDE_PX = 6.0  # about the drawing: the mark's own ground
 _FAR = 5.0  # standard deviations of the mark's side, the mark being part of it: so far off is no ground of this mark
 _EDGE_PX = 4.0  # an edge's blur: of 1.4 px it leaves a five hundredth of the edge so far off
 _DRAWN, _SHOWN = 0.05, 0.5  # of the mark's contrast: all of it, and what is plainly its own
-
-
-FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +33,14 @@ class Coding:
     tone: Tone = LINEAR
     full_scale_dn: float = 65535.0
 
-    def part(self, rows: slice, cols: slice) -> "Coding":
-        return self if self.stored is None else replace(self, stored=self.stored[rows, cols])
-
     def steps_dn(self, used: Mask) -> Array | None:
         """(height, width) the light between the limits from which each value was rounded; None where the values used
         are no multiples of one step, or not known."""
-        step = 0.0 if self.stored is None else _common_step(np.asarray(self.stored[used], float))
-        if self.stored is None or not step:
+        if self.stored is None:
+            return None
+        gaps = np.diff(np.unique(np.asarray(self.stored[used], float)))
+        step = float(gaps.min(initial=np.inf))
+        if not np.isfinite(step) or np.any(gaps % step):
             return None
         if self.tone.is_identity:
             return np.full(self.stored.shape, step)
@@ -57,8 +52,8 @@ class Coding:
         if self.tone.is_identity:
             return np.full(light.shape, step_dn)
         code = self.tone.code(light, self.full_scale_dn)
-        above, at = (self.tone.light(code + more, self.full_scale_dn) for more in (step_dn, 0.0))
-        return np.asarray(above - at, float)
+        above, here = (self.tone.light(code + more, self.full_scale_dn) for more in (step_dn, 0.0))
+        return np.asarray(above - here, float)
 
     def stored_contrast_dn(self, ground: float, contrast: float) -> float:
         """The difference of grey values that a contrast in light is, on ground of such light. Of a line finer than a
@@ -102,6 +97,19 @@ class ScanWindow:
         """The same, some of its pixels (height, width) no longer being true ones."""
         return replace(self, valid=self.usable & ~lost)
 
+    def part(self, rows: slice, cols: slice) -> "ScanWindow":
+        """Some of its rows and columns."""
+        coding, (col0, row0) = self.coding, self.origin_px
+        stored = None if coding.stored is None else coding.stored[rows, cols]
+        return ScanWindow(
+            self.grey[rows, cols],
+            (col0 + cols.start, row0 + rows.start),
+            self.usable[rows, cols],
+            self.sides[rows, cols],
+            self.is_lossy,
+            replace(coding, stored=stored),
+        )
+
 
 def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequence[float] | None = None) -> ScanWindow:
     """The window at col0, row0, width, height of the scan, in light. weights: what each channel counts, as for
@@ -109,14 +117,9 @@ def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequen
     col0, row0, _, _ = place_px
     grey = scan.light(*place_px, weights).astype(float)
     stored = grey if scan.tone.is_identity else scan.window(*place_px, weights) if scan.channels == 1 else None
-    return ScanWindow(
-        grey,
-        (col0, row0),
-        scan.inside(*place_px),
-        clipped_sides(scan, *place_px, weights),
-        scan.is_lossy,
-        Coding(stored, scan.tone, scan.full_scale_dn),
-    )
+    coding = Coding(stored, scan.tone, scan.full_scale_dn)
+    sides = clipped_sides(scan, *place_px, weights)
+    return ScanWindow(grey, (col0, row0), scan.inside(*place_px), sides, scan.is_lossy, coding)
 
 
 def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array) -> Mask:
@@ -132,10 +135,3 @@ def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark
     if not len(beyond) or here[shown].mean() <= 0.5 or abs(own.mean() - beyond.mean()) < _FAR * own.std():
         return np.zeros(window.shape, dtype=bool)
     return np.asarray(cv2.distanceTransform(here.astype(np.uint8), cv2.DIST_L2, 5) <= _EDGE_PX)
-
-
-def _common_step(grey: Array) -> float:
-    """The step that all grey values are multiples of, from one another; 0 where there is none."""
-    gaps = np.diff(np.unique(grey))
-    step = float(gaps.min(initial=np.inf))
-    return step if np.isfinite(step) and not np.any(gaps % step) else 0.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from measure.noise.damage import damage, damage_where_lossy
+from measure.noise.damage import damage
 
 
 def test_damage_lies_about_its_speck_on_all_sides_alike() -> None:
@@ -25,7 +25,7 @@ def test_where_compression_is_lossy_a_thin_tail_is_none_of_the_speck_and_its_nei
     residuals[18:23, 18:23] += 60
     residuals[20, 23:35] += 6
     area = np.ones_like(residuals, dtype=bool)
-    cut, cut_lossy = damage(residuals, area, 6.0, 0.4), damage_where_lossy(residuals, area, 6.0, 0.4)
+    cut, cut_lossy = damage(residuals, area, 6.0, 0.4), damage(residuals, area, 6.0, 0.4, is_lossy=True)
     assert cut[20, 23:34].all()
     assert not cut_lossy[20, 28:].any()
     assert cut_lossy[18:23, 16:25].all()

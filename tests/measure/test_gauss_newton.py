@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from measure.flags import NO_REASON, Code, Reason
-from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED, gauss_newton, gauss_newton_halving
+from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED, gauss_newton
 
 FAR = Reason("too far", Code.NO_FIT)
 
@@ -41,7 +41,7 @@ def test_a_model_is_stepped_until_it_stands_still() -> None:
 def test_steps_that_do_not_lessen_the_cost_are_halved() -> None:
     assert gauss_newton(Arctangent(3.0), 1e-6, 30).reason == FAR
     model = Arctangent(3.0)
-    assert not gauss_newton_halving(model, 1e-6, 30, 4).reason
+    assert not gauss_newton(model, 1e-6, 30, 4).reason
     assert model.state == pytest.approx(0.0, abs=1e-12)
 
 
