@@ -55,7 +55,7 @@ def of_opencv(rotation: Array, shift: Array) -> Pose:
 
 
 def resected(xyz: Array, xy_mm: Array, rng: np.random.Generator) -> Found:
-    found = resect(xyz, xy_mm, C_MM, rng)
+    found = resect(xyz, xy_mm, C_MM)
     return [] if found is None else [found.pose]
 
 

@@ -139,7 +139,7 @@ def reseau(scene: Scene) -> Figures:
     cameras = [name for name in result.names if name.startswith("IO.")]
     starts = {first: [i for i, name in enumerate(result.names) if name.endswith(first)] for first in (".X0", ".X")}
     images, points = (np.add.outer(starts[first], np.arange(size)) for first, size in ((".X0", 6), (".X", 3)))
-    of_each = result.cofactor.of_each
+    of_each = result.cofactor.parts
     _, more = _timed(lambda: (result.cofactor.variances, result.cofactor_of(cameras), of_each(images), of_each(points)))
     figures = {"seconds": seconds + more, "mib": _peak_mib(), "vpv": result.vpv, "says": "everything"}
     _, tests = _timed(lambda: (result.residuals, result.groups, result.reliability, result.suspects, result.warnings))

@@ -16,14 +16,12 @@ from adjust.initial_values.frames import Frames, camera_frames
 from adjust.initial_values.joined_frames import Film, joined_frames, whole_frames
 from adjust.initial_values.orientation import orient
 from adjust.initial_values.pose import KnownField, Pose
-from adjust.initial_values.principal_distance import find_principal_distance, find_wide_distance, taper
+from adjust.initial_values.principal_distance import FEWEST, find_principal_distance, find_wide_distance
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Image, Network
 from adjust.problem.reduction import Reduction
 from adjust.validation import validate
 
-FEWEST_KNOWN = 4  # points of an image that tell a principal distance together with others
-STRAIGHT = 0.1  # change of scale across the image of a flat field that is hardly any
 MOST_FOLDED = 0.05  # part of an image's points that gross errors may put where the distortion has no image
 
 
@@ -124,23 +122,15 @@ def _interior(camera: Camera, frames: Frames) -> Array:
 
 def _why_no_distance(fields: Sequence[KnownField]) -> str:
     """Why images of known points do not tell the principal distance, and what would."""
-    enough = [field for field in fields if len(field.xyz) >= FEWEST_KNOWN]
-    if not enough:
+    if not any(len(field.xyz) >= FEWEST for field in fields):
         return (
-            f"none shows {FEWEST_KNOWN} points whose X, Y and Z are known. Give an approximate principal_distance_mm, "
-            "or the coordinates of more points."
-        )
-    tapers = [taper(field) for field in enough]
-    largest = max((each for each in tapers if each is not None), default=np.inf)
-    if None in tapers or largest > STRAIGHT:
-        return (
-            "they see too few known points, or only a plane parallel to the image. Give an approximate "
-            "principal_distance_mm."
+            f"none shows {FEWEST} points whose X, Y and Z are known. Give an approximate principal_distance_mm, or the "
+            "coordinates of more points."
         )
     return (
-        f"all {len(enough)} look straight at a flat field (its scale changes by {100.0 * largest:.2g} % at most across "
-        "an image), where a longer principal distance is a larger distance from the field. Take images tilted by 20 to "
-        "40 degrees in different directions, or give principal_distance_mm with its standard deviation (0 fixes it)."
+        "they see too few known points, or look straight at a flat field, where a longer principal distance is a "
+        "larger distance from the field. Take images tilted by 20 to 40 degrees in different directions, or give "
+        "principal_distance_mm with its standard deviation (0 fixes it)."
     )
 
 

@@ -46,7 +46,7 @@ def _resected(block: Block, images: Sequence[str], fewest: int) -> dict[str, Pos
     for coordinates in (block.firm, {**block.rough, **block.points}):
         fields = {name: known_field(block.sights[name], coordinates) for name in images if name not in poses}
         enough = {name: field for name, field in fields.items() if len(field.xyz) >= fewest}
-        found = resect_images(enough.values(), [block.sights[name].principal_distance_mm for name in enough])
+        found = resect_images(list(enough.values()), [block.sights[name].principal_distance_mm for name in enough])
         poses |= {name: pose for name, pose in zip(enough, found, strict=True) if pose is not None}
     return poses
 

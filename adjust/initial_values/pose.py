@@ -1,16 +1,21 @@
-"""Poses from known points: what an image shows of them, how well a pose explains it, and robust statistics of that."""
+"""Poses, what images show of known points, and the refinement of many poses at once by least squares.
+
+Object points are in units of their extent about their mean, image coordinates are tangents: over c.
+Arrays (k, n) hold n points of k images; those that an image does not have are there with the weight 0.
+"""
 
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
-from adjust.array_types import Array, Indices
-from adjust.initial_values.pose_refinement import BEHIND, squared_residuals
+from adjust.array_types import Array
+from adjust.functional_model.rotation import rotation_from_vector
 
-Count = TypeVar("Count", int, Indices)
-
-REJECTION = 13.8  # 0.1 % point of the squared residual's chi-square (2) distribution, in sigma²
+LM_ITERATIONS = 12
+SETTLED = 1e-6  # relative change of a sum of squares that is none
+BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
+LARGEST_CHANGE = 0.5  # of a principal distance's logarithm in a step
+USUAL_BEND = 0.3  # standard deviation of a lens's third-degree distortion, at an angle of 45 degrees
 
 
 @dataclass(frozen=True)
@@ -34,26 +39,107 @@ def image_distances(pose: Pose, xyz: Array, xy_mm: Array, principal_distance_mm:
     """Distances (n,) in mm from observed to projected points; inf behind the camera."""
     shift = -pose.rotation @ pose.center
     squared = squared_residuals(pose.rotation[None], shift[None], xyz, xy_mm / principal_distance_mm)[0]
-    return residual_distances(squared, principal_distance_mm)
-
-
-def residual_distances(squared: Array, principal_distance_mm: float) -> Array:
     return np.where(squared < BEHIND, principal_distance_mm * np.sqrt(squared), np.inf)
 
 
-def trimmed_count(n: Count) -> Count:
-    """The number of residuals that least trimmed squares keeps, for poses of three points."""
-    return (n + 4) // 2
+def refined_poses(
+    rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
+) -> tuple[Array, Array]:
+    """Rotations (k, 3, 3) and shifts (k, 3), camera = R X + t, of least weighted squares (Levenberg and Marquardt).
 
-
-def robust_sigmas(squared: Array, counts: Indices) -> Array:
-    """Standard deviations (k,) of a coordinate from the smallest half of chi-square (2) distributed squares (k, n).
-
-    Of these, counts (k,) are there, the others are infinite.
+    points (k, n, 3), tangents (k, n, 2), weights (k, n).
     """
-    half = trimmed_count(counts)
-    left_out = 1 - half / counts
-    with np.errstate(divide="ignore", invalid="ignore"):
-        truncation = 1 + np.where(left_out > 0, left_out * np.log(left_out) / (1 - left_out), 0.0)
-    sums = np.take_along_axis(np.cumsum(np.sort(squared, axis=1), axis=1), half[:, None] - 1, axis=1)[:, 0]
-    return np.asarray(np.sqrt(sums / np.maximum(2 * half - 6, 1) / truncation))
+    rotations, shifts, damping = rotations.copy(), shifts.copy(), np.full(len(rotations), 1e-4)
+    cost = (weights * squared_residuals(rotations, shifts, points, tangents)).sum(axis=1)
+    going = np.arange(len(rotations))
+    for _ in range(LM_ITERATIONS):
+        fields = points[going], tangents[going]
+        normal, right = _normal_equations(rotations[going], shifts[going], *fields, weights[going])
+        diagonal = np.einsum("kii->ki", normal)
+        diagonal += damping[going, None] * diagonal + 1e-14  # the constant keeps a pose without a solution harmless
+        step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
+        moved = _stepped(rotations[going], shifts[going], step)
+        new_cost = (weights[going] * squared_residuals(*moved, *fields)).sum(axis=1)
+        better, moves = new_cost < cost[going], np.abs(cost[going] - new_cost) > SETTLED * cost[going]
+        taken = going[better]
+        rotations[taken], shifts[taken] = (each[better] for each in moved)
+        damping[going] *= np.where(better, 0.1, 10.0)
+        cost[taken] = new_cost[better]
+        going = going[moves]
+        if not len(going):
+            break
+    return rotations, shifts
+
+
+def refined_distance(
+    rotations: Array, shifts: Array, points: Array, xy_mm: Array, weights: Array, distance_mm: float, sigma_mm: float
+) -> tuple[float, float]:
+    """The principal distance in mm of all images together, and the standard deviation of its logarithm, infinite where
+    the points do not determine it.
+
+    points (k, n, 3), image coordinates xy_mm (k, n, 2) of standard deviation sigma_mm at least. Gauss-Newton steps from
+    nearby, with the poses eliminated. A radial distortion of the third degree, about 0, is estimated besides and
+    forgotten: without it a principal distance would take its place. Raises numpy.linalg.LinAlgError where points come
+    behind the camera, for gross errors.
+    """
+    c, bend, noise = distance_mm, 0.0, sigma_mm / distance_mm
+    by_bend_mm = xy_mm * ((xy_mm / c) ** 2).sum(axis=2, keepdims=True)
+    prior = np.array([1e-14, (noise / USUAL_BEND) ** 2])
+    for _ in range(LM_ITERATIONS):
+        lens = xy_mm / c, by_bend_mm / c
+        normal, right = _normal_equations(rotations, shifts, points, lens[0] - bend * lens[1], weights, lens[1])
+        both = np.concatenate([normal[:, :6, 6:], right[:, :6, None]], axis=2)
+        through = np.linalg.solve(normal[:, :6, :6] + 1e-14 * np.eye(6), both)
+        left = (normal[:, 6:, :] @ np.concatenate([through, np.zeros((len(normal), 2, 3))], axis=1)).sum(axis=0)
+        reduced = normal[:, 6:, 6:].sum(axis=0) - left[:, :2] + np.diag(prior)
+        change = np.linalg.solve(reduced, right[:, 6:].sum(axis=0) - left[:, 2] - prior * [0.0, bend])
+        change = np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
+        rotations, shifts = _stepped(rotations, shifts, through[..., 2] - through[..., :2] @ change)
+        c, bend = c * float(np.exp(change[0])), bend + float(change[1])
+        if abs(change[0]) < np.sqrt(SETTLED):
+            break
+    tangents = (xy_mm - bend * by_bend_mm) / c
+    squares = float((weights * squared_residuals(rotations, shifts, points, tangents)).sum())
+    variance = max(squares / max(2.0 * float(weights.sum()) - 6 * len(points) - 2, 1.0), noise**2)
+    cofactor = float(np.linalg.inv(reduced)[0, 0])
+    return c, float(np.sqrt(variance * cofactor)) if cofactor > 0 else np.inf
+
+
+def squared_residuals(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
+    """Squared residuals (k, n), in squared principal distances, of points (n, 3) or (k, n, 3)."""
+    u, v, w = _camera_coordinates(rotations, shifts, points)
+    in_front = w < 0.0
+    depth = np.where(in_front, w, -1.0)
+    squared = (u / depth + tangents[..., 0]) ** 2 + (v / depth + tangents[..., 1]) ** 2
+    return np.asarray(np.where(in_front & (squared < BEHIND), squared, BEHIND))
+
+
+def _stepped(rotations: Array, shifts: Array, step: Array) -> tuple[Array, Array]:
+    turn = rotation_from_vector(step[:, :3])
+    return turn @ rotations, np.einsum("kij,kj->ki", turn, shifts) + step[:, 3:]
+
+
+def _camera_coordinates(rotations: Array, shifts: Array, points: Array) -> Array:
+    """U, V, W (3, k, n) of points (n, 3), or (k, n, 3), in the axes of k cameras."""
+    return np.asarray((rotations @ points.swapaxes(-1, -2) + shifts[..., None]).swapaxes(0, 1))
+
+
+def _normal_equations(
+    rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array, by_bend: Array | None = None
+) -> tuple[Array, Array]:
+    """J'WJ (k, 6, 6) and J'Wr (k, 6) for a small turn of the camera and a shift in its frame; by_bend (k, n, 2): and
+    two more, for the logarithm of the principal distance and for what these tangents are multiplied with."""
+    u, v, w = _camera_coordinates(rotations, shifts, points)
+    inverse = -1.0 / np.minimum(w, -1e-9)
+    p, q = u * inverse, v * inverse
+    x, y, n = tangents[..., 0], tangents[..., 1], w.shape[1]
+    columns = [(p * q, 1 + q * q), (-1 - p * p, -p * q), (-q, p), (inverse, 0.0), (0.0, inverse)]
+    columns.append((p * inverse, q * inverse))
+    if by_bend is not None:
+        columns += [(p, q), (by_bend[..., 0], by_bend[..., 1])]
+    jacobian = np.zeros((len(w), len(columns), 2 * n))  # first all x, then all y
+    for k, (by_p, by_q) in enumerate(columns):
+        jacobian[:, k, :n], jacobian[:, k, n:] = by_p, by_q
+    residual = np.concatenate([x - p, y - q], axis=1)[..., None]
+    weighted = jacobian * np.concatenate([weights, weights], axis=1)[:, None]
+    return weighted @ jacobian.swapaxes(1, 2), (weighted @ residual)[..., 0]

@@ -132,7 +132,7 @@ def _grown_from_codes(
     """What the pose that most codes agree with grows to, and how likely the codes would agree by chance; None where
     they are on one line."""
     coded, points = np.array(list(codes)), np.array(list(codes.values()))
-    resection = resect(xyz[points], marks.places[coded], 1.0, np.random.default_rng(1), marks.sigma)
+    resection = resect(xyz[points], marks.places[coded], 1.0, marks.sigma)
     if resection is None:
         return None
     shift = -resection.pose.rotation @ ((resection.pose.center - unit.origin) / unit.size)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.initial_values.p3p import triple_poses
-from adjust.initial_values.pose_refinement import refined_poses
+from adjust.initial_values.pose import refined_poses
 from adjust.target_identification.unnamed_marks import Marks
 
 _DIRECTIONS = 24  # from which the field is looked at to learn how near in a picture its clusters stay

@@ -44,7 +44,6 @@ from pipeline.results.measured_record import MeasuredScan
 LEAST_PAIRS = 4  # of points and marks that name an image's targets
 Array = NDArray[np.float64]
 
-_SEED = 1  # of the resection's random triples: a result must not depend on the run
 _GATE_SHARE = 0.01  # of the scan's size: what tilt and relief leave between the pattern laid on and its marks
 _SLACK_PX = 3.0  # beyond what the resection's residuals say, within which a mark is the target predicted there
 _SLACK_SIGMAS = 6.0
@@ -248,7 +247,7 @@ def _resected(
     comparator = comparator_from_pixel(np.array([place for _, place in named]), measured.pitch_um)
     ideal, _ = model.lens.ideal_from_observed(model.camera_from_comparator(comparator))
     c = float(model.lens.interior[0])
-    resection = resect(xyz, ideal - model.lens.interior[1:], c, np.random.default_rng(_SEED))
+    resection = resect(xyz, ideal - model.lens.interior[1:], c)
     if resection is None or resection.inliers.sum() < LEAST_PAIRS:
         return None
     sigma_px = 1000.0 * resection.sigma_mm / min(measured.pitch_um)
