@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Indices
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Prior
@@ -313,7 +313,7 @@ def _check_parts(network: Network) -> None:
             )
 
 
-def _mark_counts(network: Network) -> NDArray[np.intp]:
+def _mark_counts(network: Network) -> Indices:
     """(frames, 2) how many object points, and how many fiducials, every frame shows, those in several parts once."""
     observations, frames = network.observations, network.frame_numbers[network.image_numbers]
     names, points = observations.numbered_points

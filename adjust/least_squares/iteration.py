@@ -5,8 +5,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import WhitenedRows, camera_mask, prior_differences, prior_root_weights, whitened_rows
 from adjust.linear_algebra.elimination import eliminate
@@ -15,10 +15,6 @@ from adjust.problem.condition_equations import compute, computed_observations, d
 from adjust.problem.estimates import Termination
 from adjust.problem.further_observations import square_sum
 from adjust.problem.problem import Problem, State
-
-Indices = NDArray[np.intp]
-
-Array = NDArray[np.float64]
 
 STANDSTILL_SIGMAS = 1e-8  # a step below this, in standard deviations, is none
 FORESEEN = 0.1  # of that: a next step that would be smaller if it shrank as the last two did need not be taken

@@ -5,14 +5,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from adjust.array_types import Indices, Mask
 from adjust.linear_algebra.fronts import Fronts, band_order, make_fronts
 from adjust.linear_algebra.schur_complement import Pattern
 from adjust.problem.problem import ABSENT, Problem, side_by_side
-
-Indices = NDArray[np.intp]
 
 ELEMENTS_AT_ONCE = 2_000_000  # of the matrices of blocks that are handled together
 
@@ -164,7 +162,7 @@ class Numbering:
         return bool(free[self._point_blocks.owned].sum() > free[self._frame_blocks.owned].sum())
 
     @cached_property
-    def _is_tied(self) -> NDArray[np.bool_]:
+    def _is_tied(self) -> Mask:
         """By position: what further observations tie to other unknowns; the last stands for ABSENT."""
         tied = np.zeros(len(self.problem.unknowns) + 1, dtype=bool)
         for further in self.problem.further:

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.numbering import Numbering, Touched
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.schur_complement import SparseRows
@@ -14,9 +14,6 @@ from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, p
 from adjust.problem.condition_equations import Derivatives
 from adjust.problem.further_observations import FurtherObservation
 from adjust.problem.problem import ABSENT, Problem, State
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -129,7 +126,7 @@ def prior_root_weights(numbering: Numbering) -> Array:
     return np.asarray(1.0 / numbering.problem.prior_sigma[numbering.free])
 
 
-def camera_mask(numbering: Numbering) -> NDArray[np.bool_]:
+def camera_mask(numbering: Numbering) -> Mask:
     """Which free unknowns (f,) are those of cameras and scanners: fiducials, interior orientation, distortion (F5 to
     F9), and the terms of bends."""
     unknowns = numbering.problem.unknowns

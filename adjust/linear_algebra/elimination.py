@@ -12,17 +12,14 @@ Rows that connect what no single block owns are blocks without own unknowns: wha
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
+from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, column_values
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.multifrontal import factorise_normal_equations, qr_triangle, reflected, reflections_cost
 from adjust.linear_algebra.schur_complement import SparseRows, eliminated
 from adjust.linear_algebra.sparse_factor import TEN_DIGITS
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 CHEAP = 1e7  # rows times columns squared in the shared unknowns up to which these rows are always reflected
 REFLECTED = 1e9  # the same, up to which they are wherever their normal equations would cost digits

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
 
+from adjust.array_types import Array, Indices
 from adjust.linear_algebra.sparse_factor import Triangle
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Number = TypeVar("Number", bound=np.generic)
 
 

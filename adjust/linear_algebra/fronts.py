@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-Indices = NDArray[np.intp]
+from adjust.array_types import Indices
 
 FRONT_COST = 1e6  # of handling a front, in unknowns times columns squared: what dense algebra does in that time
 

@@ -7,15 +7,13 @@ that are handed on to the front that owns the first of these. Or normal equation
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
 
+from adjust.array_types import Array, Indices
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.sparse_factor import Triangle
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Rows = tuple[Indices, Array]  # unknowns (b, s) and rows (b, k, s + 1) in them, the right side behind
 
 ROWS_PER_COLUMN = 4  # rows are condensed when there are more of them than this

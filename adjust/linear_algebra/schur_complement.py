@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import bsr_array, coo_array, csr_array
 
+from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import BlockFactors, Blocks
 from adjust.linear_algebra.sparse_factor import Triangle
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 Arranged = Callable[[], Iterable[tuple[Indices, Blocks]]]  # pairs of rows (b, m) of blocks of equal shape, laid out
 ROWS_AT_ONCE = 20_000  # pairs of rows that are handled together, so that they stay in the processor's cache

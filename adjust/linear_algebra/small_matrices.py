@@ -8,11 +8,9 @@ next than for its arithmetic. Everything may be complex, and works, only slower,
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
+from adjust.array_types import Array, Indices, Mask
 
 
 def zeros(count: int, *shape: int, dtype: DTypeLike = np.float64) -> Array:

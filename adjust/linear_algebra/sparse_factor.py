@@ -10,14 +10,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import rq, solve_triangular
 from scipy.linalg.lapack import dtrcon, dtrtrs
 
+from adjust.array_types import Array, Indices
 from adjust.linear_algebra.fronts import Front, Fronts
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 WIDE = 500  # unknowns of a front up to which roots of cofactors run over all of them
 SAFE = 1e-6  # reciprocal condition of a root down to which its square will do in a large network

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.correction import Imaged
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import SightVectors, sight_vectors
@@ -20,9 +20,6 @@ from adjust.functional_model.projection import rays
 from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, product, take_members, zeros
 from adjust.problem.problem import Films, Part, Problem, State
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 Rows = Indices | slice
 
 

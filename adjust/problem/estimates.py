@@ -6,13 +6,10 @@ from functools import cached_property
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter, as_parameter
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 Termination = Literal["converged", "singular", "iteration limit", "diverged"]
 

@@ -9,15 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.functional_model.rotation import cross_matrix, rotation_from_angles, vector_by_angles
 from adjust.problem.network import Exterior, Network
 from adjust.problem.parameter import Parameter
 from adjust.problem.unknowns import Unknowns
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 class FurtherObservation(Protocol):

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import INTERIOR_NAMES, Lens
@@ -15,8 +15,6 @@ from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.estimates import Estimates
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network
 from adjust.problem.parameter import Kind, Parameter
-
-Array = NDArray[np.float64]
 
 
 def adjusted_image(estimates: Estimates, name: str) -> ImageModel:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.functional_model.board import board_form
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.line_of_sight import STRAIGHT as STRAIGHT
@@ -19,9 +19,6 @@ from adjust.functional_model.scanner import NO_BEND, Bend, is_term
 from adjust.functional_model.transformation import film_kind
 from adjust.problem.camera import Camera
 from adjust.problem.observations import Calibration, Distance, Observations
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 Transformation = str  # as `adjust.functional_model.transformation` spells it
 

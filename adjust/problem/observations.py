@@ -5,12 +5,9 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.problem.parameter import Parameter
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 ObservationKind = Literal["target", "fiducial", "tie", "join"]
 
@@ -37,7 +34,7 @@ class Observations:
         return f"Observations({len(self)} of {len(set(self.point))} marks in {len(set(self.image))} images)"
 
     @cached_property
-    def is_fiducial(self) -> NDArray[np.bool_]:
+    def is_fiducial(self) -> Mask:
         """(n,) whether it is a place in the camera frame that is observed, fiducial or join, and no object point."""
         return np.array([kind in ("fiducial", "join") for kind in self.kind], dtype=bool)
 

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from adjust.array_types import Array, Indices
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Probabilities:
 
         return float(np.sqrt(special.chndtrinc(special.chdtri(size, self.alpha), size, 1.0 - self.power)))
 
-    def critical(self, sizes: NDArray[np.intp], tests: int) -> Array:
+    def critical(self, sizes: Indices, tests: int) -> Array:
         """What the squared test statistic of each of so many tests may reach, chi-square of `sizes` coordinates.
 
         The probability `family` is shared out evenly (Sidak).

@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.film_kinds import FilmKind
 from adjust.functional_model.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.functional_model.scanner import Bend
@@ -15,9 +16,6 @@ from adjust.functional_model.transformation import film_kind
 from adjust.problem.further_observations import FurtherObservation, further_observations
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.unknowns import Unknowns, list_unknowns
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 Number = TypeVar("Number", np.float64, np.intp)
 
@@ -241,7 +239,7 @@ class Problem:
         return self.network.image_numbers
 
     @cached_property
-    def is_fiducial(self) -> NDArray[np.bool_]:
+    def is_fiducial(self) -> Mask:
         """(n,) whether it is a place in the camera frame that is observed, and not an object point."""
         return self.network.observations.is_fiducial
 
@@ -257,7 +255,7 @@ class Problem:
         return np.array([self.unknowns.exterior[image.name] for image in self.network.images])
 
     @cached_property
-    def keeps_angles(self) -> NDArray[np.bool_]:
+    def keeps_angles(self) -> Mask:
         """(images,) whether the attitude is moved by its angles and not by a rotation vector."""
         return np.array([self.unknowns.keeps_angles(image.name) for image in self.network.images])
 

@@ -7,13 +7,11 @@ from standing still. All that is computed is therefore computed about the middle
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import Approximations, Board, Image, Network, ObjectPoint
 from adjust.problem.unknowns import Unknowns
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.array_types import Indices
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import ABSENT, Problem
-
-Indices = NDArray[np.intp]
 
 PRIOR_GROUPS = ("datum", "control", "interior", "scanner", "board", "exterior")
 

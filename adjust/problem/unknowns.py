@@ -4,8 +4,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.errors import AdjustmentError
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
@@ -14,9 +14,6 @@ from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.camera import Camera
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 Quantity = tuple[str, Prior | None, float | None]  # name, what is given, approximation
 
@@ -48,7 +45,7 @@ class Unknowns:
         return len(self.parameters)
 
     @property
-    def has_prior(self) -> NDArray[np.bool_]:
+    def has_prior(self) -> Mask:
         """Which quantities are pseudo-observed: F5 to F9 and their like."""
         return np.asarray((self.sigma > 0) & np.isfinite(self.sigma))
 
