@@ -4,12 +4,19 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from typing import Any, Protocol, TypeVar
@@ -19,8 +26,7 @@ import cv2
 from adjust.least_squares.malloc_tuning import keep_freed_memory
 
 KILLS = 2  # of its process, after which a task is given up: once may be chance, or another program's doing
-STARTS = 5  # of processes that are killed before they stand, one after another: then none will
-
+STARTS = 6  # of processes that are killed before they stand, one after another: then none will
 TASKS_A_CORE = 4  # handed out ahead: enough that no process waits, few enough that little is lost
 
 Task = TypeVar("Task")
@@ -56,125 +62,52 @@ def worker_pool(scans: int, workers: int | None = None) -> Iterator[Executor]:
         pool.shutdown(cancel_futures=True)
 
 
-@dataclass(eq=False)
-class _Task:
-    call: Callable[[], Any]
-    future: Future[Any] = field(default_factory=Future)
-    kills: int = 0
-
-
-class LocalPool(Executor):
-    """Processes with one task each at a time. Each is a pool of its own, so that it is known in whose hand a task was
-    whose process was killed: that one alone is begun again, in a new process, and given up when it kills that too."""
+class LocalPool(ThreadPoolExecutor):
+    """Threads that hand their own process one task at a time, so that it is known whose process was killed: that task
+    alone is begun again, in a new process, and given up when it kills that too."""
 
     def __init__(self, workers: int) -> None:
-        self._lock = threading.Lock()
-        self._waiting: deque[_Task] = deque()
-        self._idle = [_process() for _ in range(workers)]
-        self._pools = set(self._idle)
+        super().__init__(workers)
+        self._own = threading.local()
+        self._all: list[ProcessPoolExecutor] = []
         self._ended = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        task = _Task(partial(fn, *args, **kwargs))
-        with self._lock:
-            if self._ended:
-                raise RuntimeError("the pool has been shut down")
-            self._waiting.append(task)
-        self._feed()
-        return task.future
+        return super().submit(self._call, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        with self._lock:
-            self._ended = self._ended or cancel_futures
-            left = list(self._waiting) if cancel_futures else []
-            self._waiting = self._waiting if not cancel_futures else deque()
-        for task in left:
-            task.future.cancel()
-        for pool in list(self._pools):
-            pool.shutdown(wait, cancel_futures=cancel_futures)
+        super().shutdown(wait, cancel_futures=cancel_futures)
+        for process in self._all:
+            process.shutdown(wait, cancel_futures=cancel_futures)
 
     def end(self) -> None:
         """End the processes, whatever they have in hand."""
-        with self._lock:
-            self._ended = True
+        self._ended = True
         for process in multiprocessing.active_children():
             process.terminate()
 
-    def _feed(self) -> None:
-        """Give waiting tasks to idle processes."""
-        while True:
-            with self._lock:
-                if not (self._waiting and self._idle):
-                    return
-                task, pool = self._waiting.popleft(), self._idle.pop()
-            if task.future.set_running_or_notify_cancel():
-                self._start(pool, task)
-            else:
-                self._is_idle(pool)
+    def _call(self, call: Callable[[], Any]) -> Any:
+        for _ in range(KILLS):
+            process = self._process()
+            with suppress(BrokenProcessPool):
+                return process.submit(call).result()
+        raise WorkerKilled
 
-    def _start(self, pool: ProcessPoolExecutor, task: _Task) -> None:
-        try:
-            working = pool.submit(task.call)
-        except BrokenProcessPool:  # killed while it had nothing in hand
-            self._start_anew(pool, task)
-        except RuntimeError as error:  # shut down meanwhile
-            task.future.set_exception(error)
-        else:
-            working.add_done_callback(partial(self._done, pool, task))
+    def _process(self) -> ProcessPoolExecutor:
+        """This thread's process, once it stands: one that is killed on its way there says nothing of the task."""
+        for _ in range(STARTS if not self._ended else 0):
+            process = getattr(self._own, "process", None) or self._start()
+            with suppress(BrokenProcessPool):
+                process.submit(os.getpid).result()
+                return process
+            self._own.process = None
+        raise WorkerKilled
 
-    def _start_anew(self, broken: ProcessPoolExecutor, task: _Task, starts: int = STARTS) -> None:
-        """In a new process, once that stands: one that is killed on its way there says nothing of the task."""
-        pool = self._replaced(broken)
-
-        def stands(ready: Future[int]) -> None:
-            if ready.cancelled() or not isinstance(ready.exception(), BrokenProcessPool):
-                self._start(pool, task)
-            elif starts and not self._ended:
-                self._start_anew(pool, task, starts - 1)
-            else:
-                self._give_up(pool, task)
-
-        pool.submit(os.getpid).add_done_callback(stands)
-
-    def _done(self, pool: ProcessPoolExecutor, task: _Task, done: Future[Any]) -> None:
-        error = CancelledBeforeStart() if done.cancelled() else done.exception()
-        if isinstance(error, BrokenProcessPool):
-            task.kills += 1
-            if not self._ended and task.kills < KILLS:
-                self._start_anew(pool, task)
-            else:
-                self._give_up(pool, task)
-            return
-        self._is_idle(pool)
-        if error is None:
-            task.future.set_result(done.result())
-        else:
-            task.future.set_exception(error)
-        self._feed()
-
-    def _give_up(self, broken: ProcessPoolExecutor, task: _Task) -> None:
-        self._is_idle(self._replaced(broken))
-        task.future.set_exception(WorkerKilled())
-        self._feed()
-
-    def _is_idle(self, pool: ProcessPoolExecutor) -> None:
-        with self._lock:
-            self._idle.append(pool)
-
-    def _replaced(self, broken: ProcessPoolExecutor) -> ProcessPoolExecutor:
-        pool = _process()  # a broken one has ended itself, and may hold its lock while it tells of that
-        with self._lock:
-            self._pools.discard(broken)
-            self._pools.add(pool)
-        return pool
-
-
-class CancelledBeforeStart(Exception):
-    """The pool was shut down before the task was begun."""
-
-
-def _process() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=prepare)
+    def _start(self) -> ProcessPoolExecutor:
+        process = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=prepare)
+        self._own.process = process
+        self._all.append(process)
+        return process
 
 
 def prepare() -> None:

@@ -17,7 +17,7 @@ from typing import Any
 from unittest.mock import patch
 
 from pipeline.cli import run
-from pipeline.exchange.convention import FORMATS
+from pipeline.exchange.formats import FORMATS
 from pipeline.files.library import read_library
 
 SCENE = Path(__file__).with_suffix(".toml")

@@ -22,7 +22,7 @@ from pipeline.commands.shared import (
     show,
 )
 from pipeline.errors import InputError
-from pipeline.exchange.convention import FORMATS, IMPORTED, LARGEST_MISFIT_PX, ExportOptions
+from pipeline.exchange.formats import FORMATS, IMPORTED, LARGEST_MISFIT_PX, ExportOptions
 from pipeline.text.wording import counted
 
 TEMPLATES = ("project", "camera", "scene", "keys")
@@ -70,7 +70,7 @@ def export(
     done = run_export(read(project, max_pixels), format, out_dir, ExportOptions(pitch_um, lens, misfit_px))
     show(
         as_json,
-        lambda: {"folder": str(done.folder), "files": done.files, **asdict(replace(done.written, files={}))},
+        lambda: {"folder": str(out_dir), **asdict(replace(done.written, files={})), "files": done.files},
         lambda _: say(done.readme_text, f"{out_dir}: {counted(len(done.files), 'file')}"),
     )
     return LOOK if done.written.left_out else DONE
@@ -116,12 +116,12 @@ def convert(
     as_json: AsJson = False,
 ) -> int:
     """A camera's lens in the words of another distortion family, with its covariance."""
-    from pipeline.exchange.convert_stage import ConvertOptions, conversion_json, conversion_lines, run_convert
+    from pipeline.exchange.convert_stage import ConvertOptions, run_convert
 
     named = tuple(name.strip() for name in parameters.split(",") if name.strip())
     done = run_convert(file, out_dir, ConvertOptions(family, r0_mm, named, camera))
     files = f"{out_dir}: {counted(len(done.files), 'file')}"
-    show(as_json, lambda: conversion_json(done), lambda _: say(*conversion_lines(done), files))
+    show(as_json, done.as_json, lambda _: say(*done.lines(), files))
     return LOOK if done.misfit_um > misfit_um else DONE
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from adjust.functional_model.lens import Lens
 from pipeline.exchange.block import Block, Frame, WholeFrame
-from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.types import Array
 
 CONVENTION = Convention(

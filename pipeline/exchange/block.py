@@ -49,6 +49,15 @@ class OutFrame:
         """Column and row (n, 2) of marks in the scan. Raises InputError where the pitch is not known."""
         return pixel_from_comparator(_places_mm(marks), self.known_pitch_um)
 
+    def camera_mm(self, marks: tuple[ComparatorPoint, ...]) -> Array:
+        """Observed places (n, 2) of its marks in the camera's frame."""
+        assert self.model is not None  # of frames that have a part in the adjustment alone
+        return self.model.camera_from_comparator(_places_mm(marks))
+
+    def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
+        """The same in the resampled frame, whose lens may have been taken out."""
+        return self.chain(with_lens).frame_from_scan(self.pixels(marks))[0]
+
     @property
     def known_pitch_um(self) -> tuple[float, float]:
         """Raises InputError where it is not known."""
@@ -77,11 +86,6 @@ class OutFrame:
     def file_name(self) -> str:
         """Of its scan; its name where there is none."""
         return self.scan.name if self.scan else f"{self.image}.tif"
-
-    @property
-    def label(self) -> str:
-        """Its name as part of a file's name."""
-        return self.image.replace("/", "_")
 
 
 @dataclass(frozen=True)
@@ -118,28 +122,19 @@ class WholeFrame:
 
     def camera_mm(self, marks: tuple[ComparatorPoint, ...]) -> Array:
         """Observed places (n, 2) of its marks in the camera's frame."""
-
-        def places(scan: OutFrame, own: tuple[ComparatorPoint, ...]) -> Array:
-            assert scan.model is not None  # of frames that have a part in the adjustment alone
-            return scan.model.camera_from_comparator(_places_mm(own))
-
-        return self._collect_by_scan(marks, places)
+        return self._by_scan(marks, OutFrame.camera_mm)
 
     def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
         """The same in the resampled frame, whose lens may have been taken out."""
-        return self._collect_by_scan(
-            marks, lambda scan, own: scan.chain(with_lens).frame_from_scan(scan.pixels(own))[0]
-        )
+        return self._by_scan(marks, lambda scan, own: scan.frame_mm(own, with_lens))
 
-    def _collect_by_scan(
+    def _by_scan(
         self, marks: tuple[ComparatorPoint, ...], places: Callable[[OutFrame, tuple[ComparatorPoint, ...]], Array]
     ) -> Array:
-        made = np.zeros((len(marks), 2))
+        images, found = np.array([mark.image for mark in marks]), np.zeros((len(marks), 2))
         for scan in self.scans:
-            rows = [row for row, mark in enumerate(marks) if mark.image == scan.image]
-            if rows:
-                made[rows] = places(scan, tuple(marks[row] for row in rows))
-        return made
+            found[images == scan.image] = places(scan, tuple(mark for mark in marks if mark.image == scan.image))
+        return found
 
 
 Frame = OutFrame | WholeFrame
@@ -259,36 +254,25 @@ def _frame(
     pitch_um: tuple[float, float] | None,
 ) -> OutFrame:
     known = adjustment.images.get(image) if adjustment else None
-    camera = project.camera_of(image).name
+    camera, scan = project.camera_of(image).name, project.scans.get(image)
     if adjustment is None or known is None:
-        return OutFrame(image, camera, project.scans.get(image), pitch_um, marks, None, None, False)
+        return OutFrame(image, camera, scan, pitch_um, marks, None, None, False)
     lens = adjustment.cameras[adjustment.camera_of(image)].lens()
-    model = _model(project, adjustment, image, marks, lens)
-    return OutFrame(image, camera, project.scans.get(image), pitch_um, marks, model, lens, known.exterior.is_oriented)
-
-
-def _model(
-    project: Project, adjustment: AdjustmentRecord, image: str, marks: tuple[ComparatorPoint, ...], lens: Lens
-) -> ImageModel:
-    """The image as `adjust` has it, from what it wrote."""
     places = _places_mm(marks)
     middle_mm = (places.min(axis=0) + places.max(axis=0)) / 2.0 if len(places) else np.zeros(2)
     chain = image_chain(image, adjustment, NO_PITCH, middle_mm, False)
-    elements = adjustment.images[image].exterior.elements.values()
-    exterior = np.array([element.value for element in elements])
-    return ImageModel(
+    exterior = np.array([element.value for element in known.exterior.elements.values()])
+    unit_m = project.unit_mm / UNITS_MM["m"]
+    model = ImageModel(
         lens,
         rotation_from_angles(np.radians(exterior[3:])),
         exterior[:3],
         chain.film,
-        LineOfSight(
-            adjustment.earth_curvature,
-            adjustment.refraction,
-            project.unit_mm / UNITS_MM["m"],
-        ),
+        LineOfSight(adjustment.earth_curvature, adjustment.refraction, unit_m),
         chain.bend,
         chain.bend_parameters,
     )
+    return OutFrame(image, camera, scan, pitch_um, marks, model, lens, known.exterior.is_oriented)
 
 
 def _variance(mark: ComparatorPoint) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from adjust.functional_model.lens import Distortion, Prior
-from pipeline.exchange.convention import Convention
+from pipeline.exchange.formats import Convention
 from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile
 from pipeline.text.tables import read_toml

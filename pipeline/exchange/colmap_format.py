@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pipeline.errors import InputError, missing_extra
 from pipeline.exchange.block import Block
-from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import BROWN, RATIONAL
+from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ImportOptions, Incoming, foreign_pose, opencv_camera
-from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
+from pipeline.exchange.pinhole import PinholeFrame, pinhole_frames, pinholes_written
 from pipeline.opencv_check.opencv_model import INTERIOR
 from pipeline.text.names import image_name
 
@@ -25,22 +23,25 @@ CONVENTION = Convention(
 _OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _FULL = ("k3", "k4", "k5", "k6")
 _FISHEYE = "OPENCV_FISHEYE"
+_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {  # focal lengths, and the distortion's parameters
+    "SIMPLE_PINHOLE": (1, ()),
+    "PINHOLE": (2, ()),
+    "SIMPLE_RADIAL": (1, ("k1",)),
+    "RADIAL": (1, ("k1", "k2")),
+    "OPENCV": (2, _OPENCV[4:]),
+    "FULL_OPENCV": (2, (*_OPENCV[4:], *_FULL)),
+    _FISHEYE: (2, ("k1", "k2", "k3", "k4")),
+}
 
 
 def write(block: Block, options: ExportOptions) -> Written:
     """sparse/*.bin; a camera an image, for every resampled frame has its own first pixel."""
     pycolmap = import_pycolmap("the format colmap")
-    frames, left_out = pinhole_frames(block, options, (BROWN, RATIONAL), "colmap", knows_fisheye=True)
-    made = reconstruction(pycolmap, block, frames)
+    frames, left_out = pinhole_frames(block, options, (BROWN, RATIONAL), "colmap")
     with tempfile.TemporaryDirectory() as folder:
-        made.write_binary(folder)
+        _reconstruction(pycolmap, block, frames).write_binary(folder)
         files = {f"sparse/{path.name}": path.read_bytes() for path in sorted(Path(folder).iterdir())}
-    return Written(
-        files,
-        ("the film transformation (it is that of the resampled frames)", "all standard deviations", "fiducial marks"),
-        (misfit_note(frames),) if frames else (),
-        tuple(left_out),
-    )
+    return pinholes_written(files, frames, left_out, lost="fiducial marks")
 
 
 def import_pycolmap(user: str) -> Any:
@@ -52,11 +53,11 @@ def import_pycolmap(user: str) -> Any:
     return pycolmap
 
 
-def reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> Any:
+def _reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> Any:
     """The frames with the marks of adjusted points, and these points with their tracks."""
     made, tracks = pycolmap.Reconstruction(), defaultdict(list)
     for number, frame in enumerate(frames, 1):
-        camera = colmap_camera(pycolmap, frame, number)
+        camera = _colmap_camera(pycolmap, frame, number)
         made.add_camera_with_trivial_rig(camera)
         marks = tuple(mark for mark in frame.frame.observed(fiducials=False) if mark.point in block.points)
         places = frame.pixels(marks) + CONVENTION.first_pixel_px
@@ -73,9 +74,9 @@ def reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> A
     return made
 
 
-def colmap_camera(pycolmap: Any, frame: PinholeFrame, number: int) -> Any:
+def _colmap_camera(pycolmap: Any, frame: PinholeFrame, number: int) -> Any:
     """OPENCV, or FULL_OPENCV where the lens has a third radial term; OPENCV_FISHEYE of a fisheye."""
-    interior = frame.interior_px + np.array([0.0, 0.0, *CONVENTION.first_pixel_px])
+    interior = frame.interior_px(CONVENTION)
     rest = frame.lens.named(_FULL)
     model = "FULL_OPENCV" if rest.any() else "OPENCV"
     params = [*interior, *frame.lens.named(_OPENCV[len(INTERIOR) :]), *(rest if model == "FULL_OPENCV" else ())]
@@ -105,10 +106,10 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
                 notes.append(f"Camera {number} is of the model {camera.model_name}, which is not read.")
                 continue
             interior, lens = known
-            pixels = tuple(np.array(interior) - np.array([0.0, 0.0, *CONVENTION.first_pixel_px]))
             size = (camera.width, camera.height)
             family = "opencv_fisheye" if camera.model_name == _FISHEYE else "opencv"
-            cameras.append(opencv_camera(folder, f"camera{number}", pixels, lens, size, options, family))
+            name = f"camera{number}"
+            cameras.append(opencv_camera(folder, name, interior, lens, size, options, CONVENTION, family))
         for image in made.images.values():
             if image.has_pose:
                 pose = image.cam_from_world()
@@ -121,17 +122,8 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
 def _parameters(camera: Any) -> tuple[list[float], dict[str, float]] | None:
     """fx, fy, cx, cy in px and the distortion by OpenCV's names."""
     values = [float(value) for value in camera.params]
-    names: dict[str, tuple[int, tuple[str, ...]]] = {
-        "SIMPLE_PINHOLE": (1, ()),
-        "PINHOLE": (2, ()),
-        "SIMPLE_RADIAL": (1, ("k1",)),
-        "RADIAL": (1, ("k1", "k2")),
-        "OPENCV": (2, _OPENCV[4:]),
-        "FULL_OPENCV": (2, (*_OPENCV[4:], *_FULL)),
-        _FISHEYE: (2, ("k1", "k2", "k3", "k4")),
-    }
-    if camera.model_name not in names:
+    if camera.model_name not in _MODELS:
         return None
-    focals, lens = names[camera.model_name]
+    focals, lens = _MODELS[camera.model_name]
     fx, fy = values[0], values[focals - 1]
     return [fx, fy, *values[focals : focals + 2]], dict(zip(lens, values[focals + 2 :], strict=True))

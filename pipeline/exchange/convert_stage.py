@@ -4,7 +4,6 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
 from adjust.problem.parameter import Parameter
 from pipeline.errors import InputError
-from pipeline.exchange.export_stage import README, check_folder, publish
+from pipeline.exchange.export_stage import check_folder, publish, readme
 from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.mark_table import Picture, picture_file
@@ -46,8 +45,8 @@ class ConvertOptions:
 
 @dataclass(frozen=True)
 class Conversion:
-    """sigmas (3 + k,): of c, x0', y0' and the parameters; inf free. told: the lines of the README; misfit_um: the
-    largest over the frame."""
+    """sigmas (3 + k,): of c, x0', y0' and the parameters; inf free. sentences: the lines of the README; files: the
+    names of what was written."""
 
     lens: ConvertedLens
     sigmas: Array
@@ -56,6 +55,7 @@ class Conversion:
 
     @property
     def misfit_um(self) -> float:
+        """The largest over the frame."""
         return 1e3 * self.lens.largest_mm
 
     @property
@@ -63,6 +63,28 @@ class Conversion:
         """c, x0, y0 and the parameters with their standard deviations."""
         names, pairs = self.lens.lens.quantities, zip(self.lens.lens.values.tolist(), self.sigmas.tolist(), strict=True)
         return dict(zip(names, pairs, strict=True))
+
+    def as_json(self) -> dict[str, object]:
+        """As `--json` prints it."""
+        return {
+            **plain_json(DistortionRecord.of(self.lens.lens.distortion, {})),
+            "same": self.lens.is_same,
+            "largest_um": self.misfit_um,
+            "rms_um": 1e3 * self.lens.rms_mm,
+            "values": {
+                name: {"value": value, "sigma": sigma if math.isfinite(sigma) else "free"}
+                for name, (value, sigma) in self.values.items()
+            },
+        }
+
+    def lines(self) -> Sequence[str]:
+        """As it is printed: what holds, and the parameters."""
+        numbers = [
+            f"  {name:6s} {value:>16.9g}  {format(sigma, '.2g') if math.isfinite(sigma) else 'free'}"
+            for name, (value, sigma) in self.values.items()
+            if value != 0.0 or sigma != 0.0
+        ]
+        return (*self.sentences, *numbers)
 
 
 def run_convert(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
@@ -72,20 +94,26 @@ def run_convert(path: Path, folder: Path, options: ConvertOptions) -> Conversion
     for a folder that holds anything else.
     """
     try:
-        of = family(options.family)
+        target = family(options.family)
     except ValueError as error:
         raise InputError(f"{error}.{did_you_mean(options.family, FAMILY_NAMES)}") from None
-    unknown = sorted(set(options.parameters) - set(of.parameters))
+    unknown = sorted(set(options.parameters) - set(target.parameters))
     if unknown:
-        raise InputError(f"{options.family} has no parameter {listed(unknown)}; it has {listed(of.parameters)}.")
-    if of.needs == "r0_mm" and not options.r0_mm > 0.0:
+        raise InputError(f"{options.family} has no parameter {listed(unknown)}; it has {listed(target.parameters)}.")
+    if target.needs == "r0_mm" and not options.r0_mm > 0.0:
         raise InputError(f"{options.family} needs a radius r0: say with --r0-mm which.")
     check_folder(folder)
-    convert = _adjustment if path.suffix == ".json" else _camera_file
-    return convert(path, folder, options)
+    convert = _converted_adjustment if path.suffix == ".json" else _converted_camera
+    lens, sigmas, sentences, files = convert(path, folder, options)
+    readme_text = readme("a lens converted", [f"From: {path.name}", "", *(f"- {line}" for line in sentences)], {})
+    publish(folder, files, readme_text)
+    return Conversion(lens, sigmas, sentences, tuple(files))
 
 
-def _converted(
+Converted = tuple[ConvertedLens, Array, tuple[str, ...], dict[str, str | bytes]]
+
+
+def _convert(
     lens: Lens, sigmas: Array, corners_mm: Array, options: ConvertOptions
 ) -> tuple[ConvertedLens, tuple[str, ...]]:
     """The lens, and what is to be said of it; sigmas (k,): of its parameters."""
@@ -94,20 +122,17 @@ def _converted(
     into = Distortion(options.family, r0_mm=options.r0_mm, half_mm=(float(half[0]), float(half[1])))
     found = convert_lens(lens, into, corners_mm, options.parameters or None, uncertain)
     size = "{:.4g} x {:.4g} mm".format(*(corners_mm[1] - corners_mm[0]))
-    if found.is_same:
-        sentences = (
-            f"{lens.distortion.family} and {options.family} mean the same here: what is left over {size} is rounding."
-        )
-    else:
-        sentences = (
-            f"{options.family} does not take this lens quite: over {size} it is off by up to "
-            f"{1e3 * found.largest_mm:.3g} um, rms {1e3 * found.rms_mm:.3g} um a point. "
-            "The standard deviations do not count that."
-        )
-    return found, (sentences, f"Fitted: c, x0', y0' and {listed(found.estimated) or 'no parameter'}.")
+    sentence = (
+        f"{lens.distortion.family} and {options.family} mean the same here: what is left over {size} is rounding."
+        if found.is_same
+        else f"{options.family} does not take this lens quite: over {size} it is off by up to "
+        f"{1e3 * found.largest_mm:.3g} um, rms {1e3 * found.rms_mm:.3g} um a point. "
+        "The standard deviations do not count that."
+    )
+    return found, (sentence, f"Fitted: c, x0', y0' and {listed(found.estimated) or 'no parameter'}.")
 
 
-def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
+def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> Converted:
     """The whole adjustment.json and adjustment.npz, with one camera's lens converted."""
     content, covariance = read_adjustment(path), read_own_covariance(path)
     if not content.converged:
@@ -123,7 +148,7 @@ def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion
     known = np.sqrt(np.diag(covariance.of(_parameters(name, given)[3:])))
     places = observed_mm(path, content, name)
     corners_mm = np.array([places.min(axis=0), places.max(axis=0)])
-    lens, sentences = _converted(given, known, corners_mm, options)
+    lens, sentences = _convert(given, known, corners_mm, options)
     moved = _moved_covariance(covariance, name, given, lens)
     sigmas = np.sqrt(np.diag(moved.of(_parameters(name, lens.lens))))
     entry = _camera_entry(camera, given.distortion, lens, sigmas)
@@ -141,8 +166,7 @@ def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion
     }
     kept["fingerprint"] = np.array(of_content(text.encode("utf-8")))
     np.savez_compressed(arrays, allow_pickle=False, **kept)
-    files: dict[str, str | bytes] = {"adjustment.json": text, "adjustment.npz": arrays.getvalue()}
-    return _written(path, folder, files, Conversion(lens, sigmas, sentences, tuple(files)))
+    return lens, sigmas, sentences, {"adjustment.json": text, "adjustment.npz": arrays.getvalue()}
 
 
 def _parameters(camera: str, lens: Lens) -> tuple[Parameter, ...]:
@@ -179,7 +203,7 @@ def _camera_entry(camera: CameraRecord, source: Distortion, lens: ConvertedLens,
     )
 
 
-def _camera_file(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
+def _converted_camera(path: Path, folder: Path, options: ConvertOptions) -> Converted:
     """camera.toml with the values and standard deviations of its lens converted."""
     camera = read_camera(path)
     distance, point = camera.principal_distance_mm, camera.principal_point_mm
@@ -193,7 +217,7 @@ def _camera_file(path: Path, folder: Path, options: ConvertOptions) -> Conversio
     corners_mm = np.array([middle - half, middle + half])
     given = np.array([camera.principal_distance_sigma_mm, *camera.principal_point_sigma_mm, *(p.sigma for p in priors)])
     source = replace(source, covariance=np.diag(np.where(np.isinf(given), 0.0, given) ** 2))
-    found, sentences = _converted(source, given[3:], corners_mm, options)
+    found, sentences = _convert(source, given[3:], corners_mm, options)
     lens, sigmas = found.lens, _sigmas(given, source, found)
     if np.count_nonzero(np.isfinite(sigmas) & (sigmas > 0.0)) > 1:
         sentences += (
@@ -221,7 +245,7 @@ def _camera_file(path: Path, folder: Path, options: ConvertOptions) -> Conversio
         return f"{name}.tif"
 
     files["camera.toml"] = camera_text(converted, save)
-    return _written(path, folder, files, Conversion(found, sigmas, sentences, tuple(files)))
+    return found, sigmas, sentences, files
 
 
 def _sigmas(given: Array, source: Lens, found: ConvertedLens) -> Array:
@@ -235,33 +259,3 @@ def _sigmas(given: Array, source: Lens, found: ConvertedLens) -> Array:
         is_free[0] |= source.distortion.r0_mm != lens.distortion.r0_mm
     sigmas[is_free] = math.inf
     return np.asarray(sigmas)
-
-
-def _written(path: Path, folder: Path, files: dict[str, str | bytes], conversion: Conversion) -> Conversion:
-    head = [f"Written by reseau {version('reseau')}: a lens converted", "", f"From: {path.name}", ""]
-    publish(folder, {**files, README: "\n".join([*head, *(f"- {line}" for line in conversion.sentences)]) + "\n"})
-    return conversion
-
-
-def conversion_json(conversion: Conversion) -> dict[str, object]:
-    """As `--json` prints it."""
-    return {
-        **plain_json(DistortionRecord.of(conversion.lens.lens.distortion, {})),
-        "same": conversion.lens.is_same,
-        "largest_um": conversion.misfit_um,
-        "rms_um": 1e3 * conversion.lens.rms_mm,
-        "values": {
-            name: {"value": value, "sigma": sigma if math.isfinite(sigma) else "free"}
-            for name, (value, sigma) in conversion.values.items()
-        },
-    }
-
-
-def conversion_lines(conversion: Conversion) -> Sequence[str]:
-    """As it is printed: what holds, and the parameters."""
-    numbers = [
-        f"  {name:6s} {value:>16.9g}  {format(sigma, '.2g') if math.isfinite(sigma) else 'free'}"
-        for name, (value, sigma) in conversion.values.items()
-        if value != 0.0 or sigma != 0.0
-    ]
-    return (*conversion.sentences, *numbers)

@@ -3,15 +3,14 @@
 import os
 import re
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, read_block
-from pipeline.exchange.convention import FORMATS, Convention, ExportOptions, Written
+from pipeline.exchange.formats import Convention, ExportOptions, Written, format_writer
 from pipeline.files.project_file import Project
 from pipeline.results.comparator_file import decisions_of, decisions_told
 from pipeline.text.atomic import write_atomically, writing
@@ -22,54 +21,50 @@ _HEAD = "Written by reseau"
 
 
 @dataclass(frozen=True)
-class Exported:
-    """What was written where; told: the lines of its README."""
+class Exchanged:
+    """The names of the files that were written, and the text of their README. written: of an export."""
 
-    folder: Path
     files: tuple[str, ...]
-    written: Written
     readme_text: str
+    written: Written
 
 
-def run_export(project: Project, format: str, folder: Path, options: ExportOptions) -> Exported:
+def run_export(project: Project, format: str, folder: Path, options: ExportOptions) -> Exchanged:
     """Write a format's files into a folder, in the place of an earlier export.
 
     Raises InputError for a format that there is not, a folder that holds anything else, and whatever the format itself
     cannot take.
     """
-    if format not in FORMATS:
-        raise InputError(f"there is no format {format!r}; possible are {', '.join(FORMATS)}.")
+    write, convention = format_writer(format)
     check_folder(folder)
     block = read_block(project)
     _check_names(block)
-    module = import_module(f"pipeline.exchange.{format}_format")
-    write: Callable[[Block, ExportOptions], Written] = module.write
-    convention: Convention = module.CONVENTION
     written = write(block, options)
     decisions = decisions_told(decisions_of(project.comparator))
     written = replace(written, notes=tuple(filter(None, [*written.notes, *block.lens_reach.values(), decisions])))
-    readme_text = readme(format, convention, written)
-    publish(folder, {**written.files, README: readme_text})
-    return Exported(folder, tuple(written.files), written, readme_text)
+    parts = {"Lost": written.lost, "Notes": written.notes, "Left out": written.left_out}
+    readme_text = readme(format, _convention_lines(convention), parts)
+    publish(folder, written.files, readme_text)
+    return Exchanged(tuple(written.files), readme_text, written)
 
 
-def readme(format: str, convention: Convention, written: Written) -> str:
-    """What stands beside the files."""
+def _convention_lines(convention: Convention) -> list[str]:
     col, row = convention.first_pixel_px
     pixel = [] if col != col else [f"The centre of the first pixel is ({col:g}, {row:g})."]
-    lines = [f"{_HEAD} {version('reseau')}: {format}", "", *pixel, f"Axes: {convention.axes}."]
-    lines += [f"Source: {convention.source}."]
-    for title, sentences in (("Lost", written.lost), ("Notes", written.notes), ("Left out", written.left_out)):
+    return [*pixel, f"Axes: {convention.axes}.", f"Source: {convention.source}."]
+
+
+def readme(what: str, head: Sequence[str], parts: Mapping[str, Sequence[str]]) -> str:
+    """What stands beside the files: a head, and lists by their titles."""
+    lines = [f"{_HEAD} {version('reseau')}: {what}", "", *head]
+    for title, sentences in parts.items():
         lines += ["", f"{title}:", *(f"- {sentence}" for sentence in sentences or ("nothing",))]
     return "\n".join(lines) + "\n"
 
 
 def check_folder(folder: Path) -> None:
     """Raises InputError for a folder that holds something that is no earlier export: nothing of it is overwritten."""
-    if not folder.exists():
-        return
-    earlier = folder / README
-    if not folder.is_dir() or (any(folder.iterdir()) and not _is_own(earlier)):
+    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not _is_own(folder / README))):
         raise InputError(
             f"{folder}: holds something that is no export of reseau. Name another folder, or an empty one."
         )
@@ -79,13 +74,14 @@ def _is_own(path: Path) -> bool:
     return path.is_file() and re.match(_HEAD.encode(), path.read_bytes()[: len(_HEAD)]) is not None
 
 
-def publish(folder: Path, files: Mapping[str, str | bytes]) -> None:
+def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) -> None:
     """All files into a folder of their own, which then takes the place of the earlier one. Raises InputError for the
     name of a file that would lead out of it."""
     new = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     old = folder.with_name(f".{folder.name}.{os.getpid()}.old")
     try:
-        places = {path_below(folder, name).relative_to(folder): content for name, content in files.items()}
+        all_files = {**files, README: readme_text}
+        places = {path_below(folder, name).relative_to(folder): content for name, content in all_files.items()}
         for place, content in places.items():
             write_atomically(new / place, content)
         with writing(folder):

@@ -10,7 +10,7 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
 from pipeline.exchange.block import Block, Frame
-from pipeline.exchange.convention import ExportOptions
+from pipeline.exchange.formats import ExportOptions
 from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, fixed, opencv_values
 from pipeline.types import Array
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, WholeFrame
-from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import frame_corners_mm
+from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.map_projection import lon_lat
 from pipeline.types import Array
 

@@ -1,58 +1,47 @@
 """`reseau import`: marks, cameras and poses of other programs, and certificates, as files of this one."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from importlib import import_module
-from importlib.metadata import version
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from adjust.functional_model.rotation import angles_from_rotation
+from measure.flags import Status
 from pipeline.errors import InputError
-from pipeline.exchange.convention import IMPORTED
-from pipeline.exchange.export_stage import README, check_folder, publish
+from pipeline.exchange.export_stage import Exchanged, check_folder, publish, readme
+from pipeline.exchange.formats import Written, format_reader
 from pipeline.exchange.incoming import ForeignMark, ForeignPose, ImportOptions, Incoming
 from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import ELEMENTS
-from pipeline.results.comparator_file import COLUMNS, comparator_from_pixel
+from pipeline.results.comparator_file import ComparatorPoint, comparator_from_pixel, points_text
 from pipeline.text.csv_table import csv_line
 from pipeline.text.names import file_word
 
 
-@dataclass(frozen=True)
-class Imported:
-    """What was written; told: the lines of its README."""
-
-    files: tuple[str, ...]
-    readme_text: str
-
-
-def run_import(format: str, paths: Sequence[Path], folder: Path, options: ImportOptions) -> Imported:
+def run_import(format: str, paths: Sequence[Path], folder: Path, options: ImportOptions) -> Exchanged:
     """Write what another program's files hold into a folder, in the place of an earlier import.
 
     Raises InputError for a format that there is not, and for files that are not of it.
     """
-    if format not in IMPORTED:
-        raise InputError(f"there is no format {format!r} to import; possible are {', '.join(IMPORTED)}.")
+    read = format_reader(format)
     check_folder(folder)
-    module = "certificate" if format == "certificate" else f"{format}_format"
-    read: Callable[[Sequence[Path], ImportOptions], Incoming] = import_module(f"pipeline.exchange.{module}").read
-    incoming = read(paths, options)
+    incoming: Incoming = read(paths, options)
     files: dict[str, str | bytes] = dict(incoming.tables)
     if incoming.marks:
-        files["comparator.csv"] = _comparator(incoming, options)
+        files["comparator.csv"] = _comparator(incoming.marks, options)
     if incoming.poses:
         files["images.csv"] = _images(incoming.poses)
     files |= _cameras(incoming.cameras)
     if not files:
         raise InputError(f"{', '.join(map(str, paths))}: there is nothing to import in it.")
-    incoming = replace(incoming, notes=(*incoming.notes, *_unknown_notes(incoming.cameras)))
-    readme_text = _readme(format, paths, files, incoming)
-    publish(folder, {**files, README: readme_text})
-    return Imported(tuple(files), readme_text)
+    notes = (*incoming.notes, *_unknown_notes(incoming.cameras))
+    parts = {"Files": tuple(files), "Notes": notes}
+    readme_text = readme(f"import of {format}", ["From:", *(f"- {path.name}" for path in paths)], parts)
+    publish(folder, files, readme_text)
+    return Exchanged(tuple(files), readme_text, Written(files, notes=notes))
 
 
 def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:
@@ -72,39 +61,19 @@ def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:
             )
 
 
-def _readme(format: str, paths: Sequence[Path], files: dict[str, str | bytes], incoming: Incoming) -> str:
-    lines = [f"Written by reseau {version('reseau')}: import of {format}", "", "From:"]
-    lines += [f"- {path.name}" for path in paths]
-    lines += ["", "Files:", *(f"- {name}" for name in files)]
-    return "\n".join([*lines, "", "Notes:", *(f"- {note}" for note in incoming.notes or ("nothing",))]) + "\n"
-
-
-def _comparator(incoming: Incoming, options: ImportOptions) -> str:
+def _comparator(marks: Sequence[ForeignMark], options: ImportOptions) -> str:
     if options.pitch_um is None:
         raise InputError("marks in pixels become mm: say with --pitch-um how many um a pixel has.")
     pitch = (options.pitch_um, options.pitch_um)
-    times = Counter((mark.image, mark.kind, mark.point) for mark in incoming.marks)
+    times = Counter((mark.image, mark.kind, mark.point) for mark in marks)
     (image, kind, point), most = times.most_common(1)[0]
     if most > 1:
         raise InputError(f"{kind} {point!r} of image {image!r} is given twice in the files. Name one of them.")
-    lines = [
-        f"# comparator coordinates, reseau {version('reseau')}, imported",
-        "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas",
-        "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)",
-        *(
-            f"# pitch of {image}: {pitch[0]:.10g} um across, {pitch[1]:.10g} um down"
-            for image in _image_names(incoming)
-        ),
-        ",".join(COLUMNS),
-    ]
-    return "\n".join([*lines, *(_mark_line(mark, options, pitch) for mark in incoming.marks)]) + "\n"
+    pitches = dict.fromkeys(sorted({mark.image for mark in marks}), pitch)
+    return points_text([_mark(mark, options, pitch) for mark in marks], pitches)
 
 
-def _image_names(incoming: Incoming) -> list[str]:
-    return sorted({mark.image for mark in incoming.marks})
-
-
-def _mark_line(mark: ForeignMark, options: ImportOptions, pitch_um: tuple[float, float]) -> str:
+def _mark(mark: ForeignMark, options: ImportOptions, pitch_um: tuple[float, float]) -> ComparatorPoint:
     covariance = mark.covariance_px2
     if covariance is None:
         if options.sigma_px is None:
@@ -113,11 +82,11 @@ def _mark_line(mark: ForeignMark, options: ImportOptions, pitch_um: tuple[float,
                 "marks have that bring none."
             )
         covariance = options.sigma_px**2 * np.eye(2)
-    x, y = comparator_from_pixel(mark.place, pitch_um)
+    place = comparator_from_pixel(mark.place, pitch_um)
     mm2 = comparator_from_pixel(comparator_from_pixel(covariance, pitch_um).T, pitch_um)
-    sx, sy = np.sqrt(np.diag(mm2))
-    numbers = [x, y, sx, sy, mm2[0, 1] / (sx * sy), *mark.place]
-    return csv_line([mark.image, mark.point, mark.kind, *(repr(float(number)) for number in numbers), "measured", ""])
+    sigma = np.sqrt(np.diag(mm2))
+    rho = float(mm2[0, 1] / sigma.prod())
+    return ComparatorPoint(mark.image, mark.point, mark.kind, place, sigma, rho, Status.MEASURED, "")
 
 
 def _images(poses: Sequence[ForeignPose]) -> str:

@@ -1,7 +1,7 @@
 """What comes in from other programs, before it is written as this one's."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -10,6 +10,7 @@ import numpy as np
 
 from adjust.functional_model.lens import Distortion, Prior
 from pipeline.errors import InputError
+from pipeline.exchange.formats import Convention
 from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
 from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile, GivenFiducial
 from pipeline.types import Array
@@ -61,14 +62,14 @@ class Incoming:
 def opencv_camera(
     path: Path,
     name: str,
-    interior_px: tuple[float, ...],
+    interior_px: Sequence[float],
     lens: Mapping[str, float],
     size_px: tuple[float, float] | None,
     options: ImportOptions,
+    convention: Convention,
     family: str = "opencv",
 ) -> CameraFile:
-    """A camera in OpenCV's model, or its fisheye's, everything fixed; fx, fy, cx, cy (4,) in px from the first pixel's
-    centre.
+    """A camera in OpenCV's model, or its fisheye's, everything fixed; fx, fy, cx, cy (4,) in px of a convention.
 
     Its principal point is in comparator coordinates of the picture, or from the picture's middle. Raises InputError
     where the pitch, or the size that the middle needs, is not known.
@@ -77,13 +78,13 @@ def opencv_camera(
         raise InputError(f"{path}: counts in pixels: say with --pitch-um how many um one has.")
     fx, fy, cx, cy = interior_px
     pitch = options.pitch_um / 1000.0
-    first = np.zeros(2)
+    first = np.array(convention.first_pixel_px)
     if options.from_middle:
         if size_px is None:
             raise InputError(
                 f"{path}: does not say the picture's size, so its middle is not known. Leave --from-middle out."
             )
-        first = (np.array(size_px) - 1.0) / 2.0
+        first += (np.array(size_px) - 1.0) / 2.0
     x0, y0 = (np.array([cx, cy]) - first) * (pitch, -pitch)
     given = {key: Prior(float(value)) for key, value in {"b1": fx / fy - 1.0, **lens}.items() if value != 0.0}
     return CameraFile(

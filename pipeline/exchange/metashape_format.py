@@ -4,16 +4,14 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
-from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import BROWN, FittedLens, sheared_lens
+from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ImportOptions, Incoming, opencv_camera
 from pipeline.exchange.micmac_format import box_of
-from pipeline.exchange.pinhole import check_misfit, sight_misfit_mm
-from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, xml_lines, xml_text
+from pipeline.exchange.pinhole import checked_misfits
+from pipeline.exchange.xml_tree import numbers_of, read_xml, xml_text
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.canvas import Canvas
 from pipeline.text.names import file_word
@@ -25,30 +23,25 @@ CONVENTION = Convention(
     "y'f, x' = x(...) + P1 (r2 + 2x2) + 2 P2 xy; Python reference: Sensor.film_camera, pixel_size, "
     "calibrateFiducials(resolution in mm), Marker.Type.Fiducial",
 )
-_TOLD = 3  # images whose reason a message tells
+_MOST_REASONS = 3  # in a message
 NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2")
 
 
 def write(block: Block, options: ExportOptions) -> Written:
     """reseau_to_metashape.py with its data, and CAMERA.xml where there is an adjustment."""
-    frames, left_out = [], []
-    for frame in block.frames:
-        reason = _hindrance(frame)
-        if reason:
-            left_out.append(f"{frame.image}: {reason}")
-        else:
-            frames.append(frame)
+    reasons = {frame.image: _hindrance(frame) for frame in block.frames}
+    frames = [frame for frame in block.frames if not reasons[frame.image]]
+    left_out = tuple(f"{image}: {reason}" for image, reason in reasons.items() if reason)
     if not frames:
-        raise InputError(f"metashape: no image can go out. {' '.join(left_out[:_TOLD])}")
+        raise InputError(f"metashape: no image can go out. {' '.join(left_out[:_MOST_REASONS])}")
     files: dict[str, str | bytes] = {}
     notes = []
     for camera in dict.fromkeys(frame.camera for frame in frames if frame.is_oriented):
         own = [frame for frame in frames if frame.camera == camera and frame.is_oriented]
         lens, box = sheared_lens(block, own[0], at_ideal=False), box_of(block, own[0], options)
-        misfit = {frame.image: (lens.largest_mm + sight_misfit_mm(block, frame)) / box.pitch_mm for frame in own}
-        check_misfit(misfit, options, "metashape")
+        misfit_px = checked_misfits(block, own, lens, box, options, "metashape")
         files[f"{file_word(camera)}.xml"] = _calibration(lens, box)
-        notes.append(f"{camera}: the lens was fitted over the frame: off by {max(misfit.values()):.2g} px at most.")
+        notes.append(f"{camera}: the lens was fitted over the frame: off by {misfit_px:.2g} px at most.")
     data = {
         "cameras": {camera: _camera(block, camera, files) for camera in dict.fromkeys(f.camera for f in frames)},
         "images": [_image(frame) for frame in frames],
@@ -61,7 +54,7 @@ def write(block: Block, options: ExportOptions) -> Written:
         "Look at its picture after calibrateFiducials: the frame must stand upright."
     )
     lost = ("the standard deviations of marks", "the poses but for their stations", "what is not affine in the film")
-    return Written(files, lost, tuple(notes), tuple(left_out))
+    return Written(files, lost, tuple(notes), left_out)
 
 
 def _hindrance(frame: OutFrame) -> str:
@@ -113,22 +106,16 @@ def _calibration(lens: FittedLens, box: Canvas) -> str:
     k1, k2, p1, p2, k3 = lens.named(BROWN)
     middle = box.x_mm + box.width_px * box.pitch_mm / 2.0, box.y_mm - box.height_px * box.pitch_mm / 2.0
     values = {
-        "f": fy / box.pitch_mm,
-        "cx": (x0 - middle[0]) / box.pitch_mm,
-        "cy": (middle[1] - y0) / box.pitch_mm,
-        "k1": k1,
-        "k2": k2,
-        "k3": k3,
-        "p1": p2,
-        "p2": p1,
-        "b1": (fx - fy) / box.pitch_mm,
-        "b2": lens.shear * fy / box.pitch_mm,
+        "f": fy,
+        "cx": x0 - middle[0],
+        "cy": middle[1] - y0,
+        "b1": fx - fy,
+        "b2": lens.shear * fy,
     }
-    head = [*xml_lines("projection", "frame"), *xml_lines("width", str(box.width_px))]
-    content = [*head, *xml_lines("height", str(box.height_px))]
-    for name, value in values.items():
-        content += xml_lines(name, plain_number(value))
-    return xml_text(xml_lines("calibration", content))
+    in_px = {name: float(value / box.pitch_mm) for name, value in values.items()}
+    terms = {"k1": k1, "k2": k2, "k3": k3, "p1": p2, "p2": p1}
+    size = {"projection": "frame", "width": str(box.width_px), "height": str(box.height_px)}
+    return xml_text("calibration", {**size, **in_px, **{name: float(value) for name, value in terms.items()}})
 
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
@@ -154,9 +141,8 @@ def _read_camera(path: Path, options: ImportOptions) -> CameraFile:
             f"{path}: k4 is {given['k4']:g}, and no family of distortion here has it. Calibrate again with it held at "
             "0."
         )
-    of = {name: given.get(name, 0.0) for name in NAMES}
-    size = (given["width"], given["height"])
-    interior = (of["f"] + of["b1"], of["f"], size[0] / 2 + of["cx"], size[1] / 2 + of["cy"])
-    pixels = tuple(np.array(interior) - np.array([0.0, 0.0, *CONVENTION.first_pixel_px]))
-    lens = {name: of[name] for name in ("k1", "k2", "k3")} | {"p1": of["p2"], "p2": of["p1"], "b2": of["b2"] / of["f"]}
-    return opencv_camera(path, path.stem, pixels, lens, size, options)
+    values = {name: given.get(name, 0.0) for name in NAMES}
+    f, b1, b2, size = values["f"], values["b1"], values["b2"], (given["width"], given["height"])
+    interior = (f + b1, f, size[0] / 2 + values["cx"], size[1] / 2 + values["cy"])
+    lens = {name: values[name] for name in ("k1", "k2", "k3")} | {"p1": values["p2"], "p2": values["p1"], "b2": b2 / f}
+    return opencv_camera(path, path.stem, interior, lens, size, options, CONVENTION)

@@ -1,16 +1,15 @@
 """MMVII: the marks of unresampled scans with their whole covariances, which it alone of these programs takes."""
 
-from collections.abc import Sequence
-from itertools import chain
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
-from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming
-from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, text_of, xml_lines, xml_text
+from pipeline.exchange.xml_tree import Content, numbers_of, read_xml, text_of, xml_text
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.names import image_name
 
@@ -24,33 +23,26 @@ _FOLDERS = {True: "Fiducials", False: "Targets"}
 
 def write(block: Block, options: ExportOptions) -> Written:
     """MMVII-PhgrProj/PointsMeasure/{Fiducials, Targets}/MesIm-IMAGE.xml."""
-    files: dict[str, str | bytes] = {}
-    unsaid = 0
-    for frame in block.frames:
-        for fiducials, folder in _FOLDERS.items():
-            marks = frame.observed(fiducials)
-            unsaid += sum(mark.sigma_mm is None for mark in marks)
-            if marks:
-                place = f"MMVII-PhgrProj/PointsMeasure/{folder}/MesIm-{frame.file_name}.xml"
-                files[place] = _measures(frame, marks)
+    kinds = [(frame, folder, frame.observed(is_f)) for frame in block.frames for is_f, folder in _FOLDERS.items()]
+    files = {
+        f"MMVII-PhgrProj/PointsMeasure/{folder}/MesIm-{frame.file_name}.xml": _measures(frame, marks)
+        for frame, folder, marks in kinds
+        if marks
+    }
+    without_sigma = sum(mark.sigma_mm is None for *_, marks in kinds for mark in marks)
     lost = ("of the marks nothing; camera, poses and points do not go out",)
-    notes = (f"{unsaid} marks have no standard deviation of their own: Sigma2 is 1 0 1 px.",) if unsaid else ()
-    return Written(files, lost, notes)
+    note = f"{without_sigma} marks have no standard deviation of their own: Sigma2 is 1 0 1 px."
+    return Written(files, lost, (note,) if without_sigma else ())
 
 
 def _measures(frame: OutFrame, marks: tuple[ComparatorPoint, ...]) -> str:
-    elements = []
-    for mark, place in zip(marks, frame.pixels(marks) + CONVENTION.first_pixel_px, strict=True):
-        xx, xy, yy = _sigma2(mark, frame.known_pitch_um)
-        content = [
-            *xml_lines("Name", f'"{mark.point}"'),
-            *xml_lines("Pt", " ".join(plain_number(value) for value in place)),
-            *xml_lines("Sigma2", f"{xx!r} {xy!r} {yy!r}"),
-        ]
-        elements.append(xml_lines("el", content))
-    measures = [*xml_lines("NameIm", f'"{frame.file_name}"'), *xml_lines("Measures", list(chain(*elements)))]
-    head = [*xml_lines("Type", '"MMVII_Serialization"'), *xml_lines("Version", '"0.0.0"')]
-    return xml_text(xml_lines("Root", [*head, *xml_lines("Data", xml_lines("SetMesIm", measures))]))
+    places = frame.pixels(marks) + CONVENTION.first_pixel_px
+    measures: list[tuple[str, Content]] = [
+        ("el", {"Name": f'"{mark.point}"', "Pt": place, "Sigma2": np.array(_sigma2(mark, frame.known_pitch_um))})
+        for mark, place in zip(marks, places, strict=True)
+    ]
+    data: Content = {"SetMesIm": {"NameIm": f'"{frame.file_name}"', "Measures": measures}}
+    return xml_text("Root", {"Type": '"MMVII_Serialization"', "Version": '"0.0.0"', "Data": data})
 
 
 def _sigma2(mark: ComparatorPoint, pitch_um: tuple[float, float]) -> tuple[float, float, float]:
@@ -63,28 +55,23 @@ def _sigma2(mark: ComparatorPoint, pitch_um: tuple[float, float]) -> tuple[float
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Files MesIm-*.xml: marks with their covariances. Those in a folder Fiducials are fiducials."""
-    marks: list[ForeignMark] = []
-    for path in paths:
-        marks += _marks(path, options.fiducials or path.resolve().parent.name == _FOLDERS[True])
-    return Incoming(tuple(marks))
+    return Incoming(tuple(mark for path in paths for mark in _marks(path, options)))
 
 
-def _marks(path: Path, fiducials: bool) -> list[ForeignMark]:
+def _marks(path: Path, options: ImportOptions) -> Iterator[ForeignMark]:
+    is_fiducial = options.fiducials or path.resolve().parent.name == _FOLDERS[True]
     measures = read_xml(path).find("Data/SetMesIm")
     if measures is None:
         raise InputError(f"{path}: has no <SetMesIm>. Files MesIm-*.xml are read.")
-    image = image_name(_word(text_of(measures, "NameIm", path)))
-    marks = []
+    image = image_name(_unquoted(text_of(measures, "NameIm", path)))
     for element in measures.iterfind("Measures/el"):
         place = np.array(numbers_of(element, "Pt", 2, path)) - CONVENTION.first_pixel_px
         xx, xy, yy = numbers_of(element, "Sigma2", 3, path)
         known = xx > 0.0 and yy > 0.0 and xx * yy > xy * xy
         covariance = np.array([[xx, xy], [xy, yy]]) if known else None
-        name = _word(text_of(element, "Name", path))
-        marks.append(ForeignMark(image, name, "fiducial" if fiducials else "target", place, covariance))
-    return marks
+        name = _unquoted(text_of(element, "Name", path))
+        yield ForeignMark(image, name, "fiducial" if is_fiducial else "target", place, covariance)
 
 
-def _word(text: str) -> str:
-    """Text stands within quotation marks."""
+def _unquoted(text: str) -> str:
     return text[1:-1] if len(text) > 1 and text[0] == text[-1] == '"' else text

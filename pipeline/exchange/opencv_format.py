@@ -10,10 +10,10 @@ import numpy as np
 from adjust.functional_model.families import parameter_names
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block
-from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import BROWN, PRISMS
+from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ForeignPose, ImportOptions, Incoming, foreign_pose, opencv_camera
-from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
+from pipeline.exchange.pinhole import PinholeFrame, pinhole_frames, pinholes_written
 from pipeline.files.camera_file import CameraFile
 from pipeline.opencv_check.opencv_model import NAMES
 from pipeline.text.names import image_name
@@ -33,18 +33,14 @@ _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height
 
 def write(block: Block, options: ExportOptions) -> Written:
     """NAME.yml an image, for cv2.FileStorage."""
-    frames, left_out = pinhole_frames(block, options, (BROWN, PRISMS, NAMES[4:]), "opencv", knows_fisheye=True)
-    return Written(
-        {f"{frame.frame.image}.yml": _yaml(frame, block.lens_reach.get(frame.frame.camera)) for frame in frames},
-        ("the film transformation (it is that of the resampled frames)", "all standard deviations", "the marks"),
-        (misfit_note(frames),) if frames else (),
-        tuple(left_out),
-    )
+    frames, left_out = pinhole_frames(block, options, (BROWN, PRISMS, NAMES[4:]), "opencv")
+    files = {f"{frame.frame.image}.yml": _yaml(frame, block.lens_reach.get(frame.frame.camera)) for frame in frames}
+    return pinholes_written(files, frames, left_out, lost="the marks")
 
 
 def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
     """lens_reach: a comment on how far out the lens is known."""
-    fx, fy, cx, cy = frame.interior_px + np.array([0.0, 0.0, *CONVENTION.first_pixel_px])
+    fx, fy, cx, cy = frame.interior_px(CONVENTION)
     used = np.flatnonzero(frame.lens.values[4:])
     count = next(size for size in (5, 8, 12, 14) if size > (used.max() if used.size else 0))
     storage = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
@@ -107,7 +103,8 @@ def _camera_and_pose(path: Path, options: ImportOptions) -> tuple[CameraFile, Fo
     if is_fisheye and values.size > len(names):
         raise InputError(f"{path}: a fisheye has {len(names)} distortion values, not {values.size}.")
     given = dict(zip(names, values.tolist(), strict=False)) | {"b2": k[0, 1] / k[1, 1]}
-    camera = opencv_camera(path, name, pixels, given, extent, options, "opencv_fisheye" if is_fisheye else "opencv")
+    family = "opencv_fisheye" if is_fisheye else "opencv"
+    camera = opencv_camera(path, name, pixels, given, extent, options, CONVENTION, family)
     turn, shift = storage.getNode("R").mat(), storage.getNode("t").mat()
     if turn is None or shift is None:
         return camera, None

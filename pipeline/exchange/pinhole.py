@@ -1,6 +1,6 @@
 """A resampled frame as programs know cameras that have no film: a pinhole with OpenCV's distortion, and a pose."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,8 +9,8 @@ from adjust.functional_model.line_of_sight import STRAIGHT
 from measure.errors import MeasurementError
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, Frame, WholeFrame
-from pipeline.exchange.convention import ExportOptions
 from pipeline.exchange.fitted_lens import FittedLens, fisheye_lens, nearest_lens
+from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.opencv_check.opencv_model import INTERIOR
 from pipeline.resampling.canvas import Canvas, canvas_of
 from pipeline.results.comparator_file import ComparatorPoint
@@ -35,12 +35,11 @@ class PinholeFrame:
         """The file that `reseau resample` writes."""
         return f"{self.frame.image}.tif"
 
-    @property
-    def interior_px(self) -> Array:
+    def interior_px(self, convention: Convention) -> Array:
         """fx, fy, cx, cy (4,)."""
         fx, fy, x0, y0 = self.lens.named(INTERIOR)
-        pitch = self.canvas.pitch_mm
-        return np.array([fx, fy, x0 - self.canvas.x_mm, self.canvas.y_mm - y0]) / pitch
+        in_px = np.array([fx, fy, x0 - self.canvas.x_mm, self.canvas.y_mm - y0]) / self.canvas.pitch_mm
+        return np.asarray(in_px + np.array([0.0, 0.0, *convention.first_pixel_px]))
 
     @property
     def rotation(self) -> Array:
@@ -66,10 +65,10 @@ class PinholeFrame:
 
 
 def pinhole_frames(
-    block: Block, options: ExportOptions, models: Sequence[Sequence[str]], format: str, knows_fisheye: bool = False
+    block: Block, options: ExportOptions, models: Sequence[Sequence[str]], format: str
 ) -> tuple[list[PinholeFrame], list[str]]:
     """Every oriented image with its lens in the first of the models, each given by its parameters' names, that is near
-    enough; and why the other images are not among them. knows_fisheye: whether the program has OpenCV's fisheye.
+    enough, or as OpenCV's fisheye; and why the other images are not among them.
 
     Raises InputError where no image is oriented, or where the last model, too, is off by more than the options allow.
     """
@@ -78,17 +77,25 @@ def pinhole_frames(
     frames, left_out = [], list(block.unoriented_note())
     for frame in block.whole(block.oriented()):
         if frame.camera not in lenses:
-            fisheye = fisheye_lens(block, frame, options) if knows_fisheye else None
-            lenses[frame.camera] = fisheye or nearest_lens(block, frame, models, options)
+            lenses[frame.camera] = fisheye_lens(block, frame, options) or nearest_lens(block, frame, models, options)
         try:
             frames.append(_pinhole(block, frame, lenses[frame.camera], options))
         except MeasurementError as error:
             left_out.append(f"{frame.image}: {error}")
-    check_misfit({frame.frame.image: frame.misfit_px for frame in frames}, options, format)
+    _check_misfit({frame.frame.image: frame.misfit_px for frame in frames}, options, format)
     return frames, left_out
 
 
-def check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: str) -> None:
+def checked_misfits(
+    block: Block, frames: Sequence[Frame], lens: FittedLens, box: Canvas, options: ExportOptions, format: str
+) -> float:
+    """The largest misfit, px, of a camera's images by a lens. Raises InputError as `pinhole_frames` does."""
+    misfits = {each.image: (lens.largest_mm + sight_misfit_mm(block, each)) / box.pitch_mm for each in frames}
+    _check_misfit(misfits, options, format)
+    return max(misfits.values())
+
+
+def _check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: str) -> None:
     """Raises InputError where the worst image is off by more than the options allow."""
     worst = max(misfit_px, key=lambda image: misfit_px[image], default=None)
     if worst is not None and not misfit_px[worst] <= options.largest_misfit_px:
@@ -121,9 +128,14 @@ def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportO
     return PinholeFrame(frame, canvas, lens, misfit_mm / canvas.pitch_mm, options.with_lens)
 
 
-def misfit_note(frames: Sequence[PinholeFrame]) -> str:
-    """How well the cameras could be handed on."""
-    worst = max(frames, key=lambda frame: frame.misfit_px)
-    if worst.misfit_px == 0.0:
-        return "The camera's model is the very same: nothing was fitted."
-    return f"The camera's model was fitted over the frame: it is off by {worst.misfit_px:.2g} px at most."
+def pinholes_written(
+    files: Mapping[str, str | bytes], frames: Sequence[PinholeFrame], left_out: Sequence[str], *notes: str, lost: str
+) -> Written:
+    """What a format of pinholes has written, with how well the cameras could be handed on. lost: of the marks."""
+    worst = max((frame.misfit_px for frame in frames), default=-1.0)
+    if worst == 0.0:
+        notes = ("The camera's model is the very same: nothing was fitted.", *notes)
+    elif worst > 0.0:
+        notes = (f"The camera's model was fitted over the frame: it is off by {worst:.2g} px at most.", *notes)
+    film = "the film transformation (it is that of the resampled frames)"
+    return Written(files, (film, "all standard deviations", lost), notes, tuple(left_out))

@@ -1,12 +1,16 @@
-"""Everything that goes out, as tables in this program's own conventions: csv and parquet write the same ones."""
+"""Everything that goes out, as tables in this program's own conventions, in CSV and Parquet."""
 
+import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from adjust.problem.parameter import Parameter
+from pipeline.errors import missing_extra
 from pipeline.exchange.block import Block, OutFrame
-from pipeline.exchange.convention import Convention
+from pipeline.exchange.formats import Convention, ExportOptions, Written
+from pipeline.results.adjustment_record import AdjustmentRecord, Quantity
 from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.text.csv_table import csv_line
 
 CONVENTION = Convention(
     (0.0, 0.0),
@@ -15,31 +19,40 @@ CONVENTION = Convention(
 )
 
 Cell = str | float | bool | None
+Row = dict[str, Cell]
 Table = dict[str, list[Cell]]
+
+
+def write_csv(block: Block, options: ExportOptions) -> Written:
+    """A file a table; numbers with all their digits."""
+    return Written({f"{name}.csv": _csv_text(table) for name, table in tables(block).items()})
+
+
+def write_parquet(block: Block, options: ExportOptions) -> Written:
+    """A file a table. Raises InputError where pyarrow is not installed."""
+    return Written({f"{name}.parquet": _parquet_bytes(table) for name, table in tables(block).items()})
 
 
 def tables(block: Block) -> Mapping[str, Table]:
     """By name; a cell that has no value is None. Angles in degrees, their covariances in rad as in adjustment.npz."""
-    made = {"marks": _marks(block)}
-    if block.adjustment is not None:
-        made |= {
-            "images": _images(block),
-            "transformations": _transformations(block),
+    rows: dict[str, Iterable[Row]] = {"marks": (_mark(frame, mark) for frame in block.frames for mark in frame.marks)}
+    if adjustment := block.adjustment:
+        rows |= {
+            "images": (_image(adjustment, frame) for frame in block.oriented()),
+            "transformations": _transformations(adjustment, block),
             "covariances": _covariances(block),
-            "points": _points(block),
-            "cameras": _cameras(block),
+            "points": (
+                {"point": id, **_values_and_sigmas(dict(zip("XYZ", point.axes, strict=True)))}
+                for id, point in adjustment.points.items()
+            ),
+            "cameras": _cameras(adjustment),
         }
-    return made
+    return {name: _table(list(each)) for name, each in rows.items()}
 
 
-def _marks(block: Block) -> Table:
-    rows = [_mark(frame, mark) for frame in block.frames for mark in frame.marks]
-    return _table(rows)
-
-
-def _mark(frame: OutFrame, mark: ComparatorPoint) -> dict[str, Cell]:
+def _mark(frame: OutFrame, mark: ComparatorPoint) -> Row:
     assert mark.xy_mm is not None
-    place, sigma = mark.xy_mm, mark.sigma_mm
+    place, sigma = mark.xy_mm, (None, None) if mark.sigma_mm is None else mark.sigma_mm.tolist()
     col, row = frame.pixels((mark,))[0].tolist() if frame.pitch_um else (None, None)
     camera = (None, None) if frame.model is None else frame.model.camera_from_comparator(place[None])[0].tolist()
     return {
@@ -50,8 +63,8 @@ def _mark(frame: OutFrame, mark: ComparatorPoint) -> dict[str, Cell]:
         "status": str(mark.status),
         "x_mm": float(place[0]),
         "y_mm": float(place[1]),
-        "sx_mm": None if sigma is None else float(sigma[0]),
-        "sy_mm": None if sigma is None else float(sigma[1]),
+        "sx_mm": sigma[0],
+        "sy_mm": sigma[1],
         "rho": mark.rho,
         "col_px": col,
         "row_px": row,
@@ -61,80 +74,80 @@ def _mark(frame: OutFrame, mark: ComparatorPoint) -> dict[str, Cell]:
     }
 
 
-def _images(block: Block) -> Table:
-    assert block.adjustment is not None
-    rows: list[Mapping[str, Cell]] = []
-    for frame in block.oriented():
-        elements = block.adjustment.images[frame.image].exterior.elements
-        values = {name: element.value for name, element in elements.items()}
-        sigmas = {f"s{name}": _number(element.sigma) for name, element in elements.items()}
-        rows.append({"image": frame.image, "camera": frame.camera, **values, **sigmas})
-    return _table(rows)
+def _image(adjustment: AdjustmentRecord, frame: OutFrame) -> Row:
+    elements = adjustment.images[frame.image].exterior.elements
+    return {"image": frame.image, "camera": frame.camera, **_values_and_sigmas(elements)}
 
 
-def _transformations(block: Block) -> Table:
-    assert block.adjustment is not None
-    rows: list[Mapping[str, Cell]] = []
+def _transformations(adjustment: AdjustmentRecord, block: Block) -> Iterable[Row]:
     for frame in block.frames:
-        if frame.model is None:
-            continue
-        film = block.adjustment.images[frame.image].transformation
-        known: dict[str, Cell] = {"image": frame.image, "kind": film.kind, "mirrored": film.mirrored}
-        rows += [
-            {**known, "parameter": name, "value": each.value, "sigma": _number(each.sigma)}
-            for name, each in film.parameters.items()
-        ]
-    return _table(rows)
+        if frame.model is not None:
+            film = adjustment.images[frame.image].transformation
+            known: Row = {"image": frame.image, "kind": film.kind, "mirrored": film.mirrored}
+            yield from _parameters(known, film.parameters)
 
 
-def _covariances(block: Block) -> Table:
+def _covariances(block: Block) -> Iterable[Row]:
     """Of each image's orientation and film transformation: the lower triangle, mm, object units and rad."""
     of_image: dict[str, list[Parameter]] = {}
     for each in block.covariance.parameters:
         if each.kind in ("exterior", "film"):
             of_image.setdefault(each.owner, []).append(each)
-    rows: list[Mapping[str, Cell]] = []
     for frame in block.frames:
         own = of_image.get(frame.image, [])
         matrix = block.covariance.of(own)
-        rows += [
-            {"image": frame.image, "first": first.text, "second": second.text, "covariance": float(matrix[i, j])}
-            for i, first in enumerate(own)
-            for j, second in enumerate(own[: i + 1])
-        ]
-    return _table(rows)
+        for i, first in enumerate(own):
+            for j, second in enumerate(own[: i + 1]):
+                covariance = float(matrix[i, j])
+                yield {"image": frame.image, "first": first.text, "second": second.text, "covariance": covariance}
 
 
-def _points(block: Block) -> Table:
-    assert block.adjustment is not None
-    rows: list[Mapping[str, Cell]] = []
-    for id, point in block.adjustment.points.items():
-        values = {axis: each.value for axis, each in zip("XYZ", point.axes, strict=True)}
-        sigmas = {f"s{axis}": _number(each.sigma) for axis, each in zip("XYZ", point.axes, strict=True)}
-        rows.append({"point": id, **values, **sigmas})
-    return _table(rows)
-
-
-def _cameras(block: Block) -> Table:
-    assert block.adjustment is not None
-    rows: list[Mapping[str, Cell]] = []
-    for name, camera in block.adjustment.cameras.items():
+def _cameras(adjustment: AdjustmentRecord) -> Iterable[Row]:
+    for name, camera in adjustment.cameras.items():
         point, distortion = camera.principal_point_mm, camera.distortion
-        quantities = {"c_mm": camera.principal_distance_mm, "x0_mm": point.x, "y0_mm": point.y}
-        quantities |= distortion.parameters
+        quantities = {"c_mm": camera.principal_distance_mm, "x0_mm": point.x, "y0_mm": point.y, **distortion.parameters}
         for id, fiducial in camera.fiducials.items():
             quantities |= {f"fiducial {id} x_mm": fiducial.x_mm, f"fiducial {id} y_mm": fiducial.y_mm}
-        known = {"camera": name, "distortion": distortion.family}
-        rows += [
-            {**known, "parameter": key, "value": _number(each.value), "sigma": _number(each.sigma)}
-            for key, each in quantities.items()
-        ]
-    return _table(rows)
+        yield from _parameters({"camera": name, "distortion": distortion.family}, quantities)
 
 
-def _number(value: float) -> Cell:
+def _parameters(known: Row, quantities: Mapping[str, Quantity]) -> Iterable[Row]:
+    for name, each in quantities.items():
+        yield {**known, "parameter": name, "value": _finite(each.value), "sigma": _finite(each.sigma)}
+
+
+def _values_and_sigmas(quantities: Mapping[str, Quantity]) -> Row:
+    values: Row = {name: each.value for name, each in quantities.items()}
+    return values | {f"s{name}": _finite(each.sigma) for name, each in quantities.items()}
+
+
+def _finite(value: float) -> Cell:
     return value if math.isfinite(value) else None
 
 
-def _table(rows: Sequence[Mapping[str, Cell]]) -> Table:
+def _table(rows: list[Row]) -> Table:
     return {column: [row[column] for row in rows] for column in (rows[0] if rows else ())}
+
+
+def _csv_text(table: Table) -> str:
+    head = f"# {CONVENTION.axes}; the CENTRE of the top-left pixel is (0, 0)"
+    rows = zip(*table.values(), strict=True)
+    return "\n".join([head, csv_line(list(table)), *(csv_line([_cell(value) for value in row]) for row in rows)]) + "\n"
+
+
+def _cell(value: Cell) -> str:
+    if value is None:
+        return ""
+    return str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, float) else str(value)
+
+
+def _parquet_bytes(table: Table) -> bytes:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise missing_extra("the format parquet", "pyarrow", "parquet") from None
+    made = pyarrow.table(table).replace_schema_metadata({"conventions": CONVENTION.axes})
+    written = io.BytesIO()
+    pyarrow.parquet.write_table(made, written)
+    return written.getvalue()

@@ -1,15 +1,20 @@
 """XML of other programs: read by a parser that expands no entities, written with two blanks a level."""
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeAlias
 from xml.etree import ElementTree
 from xml.parsers import expat
-from xml.sax.saxutils import escape
+
+import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.text.text_file import read_bytes
+from pipeline.types import Array
 
 Element = ElementTree.Element
+Content: TypeAlias = "str | float | Array | Mapping[str, Content] | Sequence[tuple[str, Content]]"
 
 DEEPEST = 100  # elements within one another: no format here has ten
 
@@ -17,19 +22,6 @@ DEEPEST = 100  # elements within one another: no format here has ten
 def read_xml(path: Path) -> Element:
     """The root element of a file. Raises InputError for a missing file, broken XML, and any document type, for with it
     come entities."""
-    try:
-        data = read_bytes(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file.") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a folder; an XML file is needed here.") from None
-    try:
-        return _parsed(data, path)
-    except expat.ExpatError as error:
-        raise InputError(f"{path}: is not valid XML ({error}). Export it again from the other program.") from None
-
-
-def _parsed(data: bytes, path: Path) -> Element:
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
     depth = 0
 
@@ -37,9 +29,7 @@ def _parsed(data: bytes, path: Path) -> Element:
         nonlocal depth
         depth += 1
         if depth > DEEPEST:
-            raise InputError(
-                f"{path}: its elements stand in one another more than {DEEPEST} deep; no such file is read."
-            )
+            raise InputError(f"{path}: its elements are nested more than {DEEPEST} deep; no such file is read.")
         builder.start(name, attributes)
 
     def end(name: str) -> None:
@@ -56,7 +46,14 @@ def _parsed(data: bytes, path: Path) -> Element:
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.CharacterDataHandler = builder.data
     parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
-    parser.Parse(data, True)
+    try:
+        parser.Parse(read_bytes(path), True)
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; an XML file is needed here.") from None
+    except expat.ExpatError as error:
+        raise InputError(f"{path}: is not valid XML ({error}). Export it again from the other program.") from None
     return builder.close()
 
 
@@ -80,16 +77,21 @@ def numbers_of(element: Element, name: str, count: int, path: Path) -> list[floa
     return values
 
 
-def xml_lines(name: str, content: str | list[str]) -> list[str]:
-    """An element with text, or around other lines."""
+def xml_text(name: str, content: Content) -> str:
+    """A document of one element: with text, numbers, or elements by their names (pairs, where a name recurs)."""
+    root = _element(name, content)
+    ElementTree.indent(root)
+    text = ElementTree.tostring(root, encoding="unicode", short_empty_elements=False)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'
+
+
+def _element(name: str, content: Content) -> Element:
+    element = Element(name)
     if isinstance(content, str):
-        return [f"<{name}>{escape(content)}</{name}>"]
-    return [f"<{name}>", *(f"  {line}" for line in content), f"</{name}>"]
-
-
-def xml_text(lines: list[str]) -> str:
-    return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', *lines]) + "\n"
-
-
-def plain_number(value: float) -> str:
-    return repr(float(value))
+        element.text = content
+    elif isinstance(content, float | np.ndarray):
+        element.text = " ".join(repr(float(value)) for value in np.ravel(content))
+    else:
+        children = content.items() if isinstance(content, Mapping) else content
+        element.extend(_element(*child) for child in children)
+    return element

@@ -36,7 +36,7 @@ from adjust.functional_model.line_of_sight import LineOfSight
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.exchange import asp_format, colmap_format, micmac_format, mmvii_format, opencv_format, pinhole
 from pipeline.exchange.block import read_block
-from pipeline.exchange.convention import FORMATS
+from pipeline.exchange.formats import FORMATS
 from pipeline.exchange.map_projection import lon_lat
 from pipeline.files.project_file import read_project
 

@@ -16,7 +16,7 @@ from simulated import affine, comparator_point, simulated
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
-from pipeline.exchange.convention import IMPORTED
+from pipeline.exchange.formats import IMPORTED
 from pipeline.files.camera_file import CameraFile, read_camera
 from synthetic_images.projection import camera_from_object, object_rotation
 from synthetic_images.scene import Distortion as SceneDistortion

@@ -7,7 +7,7 @@ from exported_project import adjusted_project
 
 from pipeline.cli import WRONG_INPUT, run
 from pipeline.errors import InputError
-from pipeline.exchange.convention import FORMATS
+from pipeline.exchange.formats import FORMATS
 from pipeline.text.names import file_word, path_below
 
 ELSEWHERE = (
