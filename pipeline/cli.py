@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
@@ -16,37 +17,50 @@ from pipeline.terminal import plain, spell_out_missing_letters
 __all__ = ["DONE", "INTERNAL_ERROR", "INTERRUPTED", "LOOK", "WRONG_INPUT", "app", "run"]
 
 LONGEST_LINE = 2000  # of a message: what a file has of any length may stand in it
-COMMANDS: dict[str, Callable[..., int]] = {
-    "demo": measuring.demo,
-    "init": measuring.init,
-    "run": measuring.run,
-    "measure": measuring.measure,
-    "status": measuring.status,
-    "merge": measuring.merge,
-    "adjust": adjusting.adjust,
-    "check": adjusting.check,
-    "choose": adjusting.choose,
-    "resample": exchanging.resample,
-    "export": exchanging.export,
-    "import": exchanging.import_,
-    "convert": exchanging.convert,
-    "block": adjusting.block,
-    "compare": adjusting.compare,
-    "report": measuring.report,
-    "review": measuring.review,
-    "render": exchanging.render,
-    "design": adjusting.design,
-    "template": exchanging.template,
-    "cameras": measuring.cameras,
+GROUPS: dict[str, dict[str, Callable[..., int]]] = {  # by what they are for, as the help lists them
+    "Measure": {
+        "run": measuring.run,
+        "measure": measuring.measure,
+        "review": measuring.review,
+        "report": measuring.report,
+    },
+    "Calibrate": {
+        "adjust": adjusting.adjust,
+        "check": adjusting.check,
+        "choose": adjusting.choose,
+        "compare": adjusting.compare,
+    },
+    "Archive": {"init": measuring.init, "status": measuring.status, "merge": measuring.merge},
+    "Exchange": {
+        "export": exchanging.export,
+        "import": exchanging.import_,
+        "convert": exchanging.convert,
+        "resample": exchanging.resample,
+        "block": adjusting.block,
+    },
+    "Plan": {"design": adjusting.design, "render": exchanging.render},
+    "Tools": {"demo": measuring.demo, "cameras": measuring.cameras, "template": exchanging.template},
 }
 
+
+class GroupedCommands(TyperGroup):
+    """Lists the commands of the help by what they are for."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        for title, commands in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(80)) for name in commands])
+
+
 app = typer.Typer(
+    cls=GroupedCommands,
     help="From scanned film photographs to comparator coordinates and a calibrated camera.",
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for name, command in COMMANDS.items():
-    app.command(name)(command)
+for group in GROUPS.values():
+    for name, command in group.items():
+        app.command(name)(command)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -25,21 +25,21 @@ from pipeline.errors import InputError
 
 
 def adjust(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
-    """Comparator coordinates to the adjusted camera, in adjustment.json."""
+    """Adjust: orientations, camera, film and fiducials at once."""
     from pipeline.stages import run_adjust
 
     return with_project(project, run_adjust, as_json, max_pixels)
 
 
 def check(project: ProjectFile, as_json: AsJson = False) -> int:
-    """The adjustment against OpenCV's calibration, in check.json."""
+    """Compare the adjustment with OpenCV's calibration."""
     from pipeline.stages import run_check
 
     return with_project(project, run_check, as_json)
 
 
 def choose(project: ProjectFile, as_json: AsJson = False) -> int:
-    """Which transformation and distortion the observations ask for, in choose.json."""
+    """Select lens and film models by tests and cross-validation."""
     from pipeline.adjusting.choose_stage import print_choice, run_choose
     from pipeline.progress import Reporter
 
@@ -56,7 +56,7 @@ def block(
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
-    """Overlapping frames without any orientation: oriented by COLMAP, then adjusted with films, lens and control."""
+    """Orient overlapping frames by COLMAP, and adjust them."""
     from pipeline.blocks.block_stage import block_lines, run_block
     from pipeline.progress import Reporter
     from pipeline.stages import run_adjust
@@ -85,7 +85,7 @@ def compare(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write compare.json and compare.svg there.")] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Calibrations of a camera: where and by how much they differ over the frame; `drift` or `no drift`."""
+    """Compare calibrations of a camera: `drift` or `no drift`."""
     from pipeline.adjusting.compare_stage import print_comparison, run_compare
     from pipeline.results.comparison_file import DRIFT
 
@@ -102,7 +102,7 @@ def design(
     ] = None,
     as_json: AsJson = False,
 ) -> int:
-    """The precision to be expected of a scene's photographs, without any picture, and what would improve it."""
+    """Expected precision of planned photographs."""
     from pipeline.design.run import run_design
     from pipeline.progress import Reporter
 

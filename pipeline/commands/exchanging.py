@@ -23,7 +23,7 @@ from pipeline.commands.shared import (
 )
 from pipeline.errors import InputError
 from pipeline.exchange.formats import FORMATS, IMPORTED, LARGEST_MISFIT_PX, ExportOptions
-from pipeline.text.wording import counted
+from pipeline.text.wording import counted, did_you_mean
 
 TEMPLATES = ("project", "camera", "scene", "keys")
 
@@ -37,7 +37,7 @@ def resample(
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
-    """The scans in their camera's frame: film transformation and pose taken out."""
+    """Rectify scans into the camera frame."""
     from pipeline.progress import Reporter
     from pipeline.resampling.resample_stage import Resampled, resample, resampled_json
 
@@ -64,7 +64,7 @@ def export(
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
-    """Marks, camera and poses as the files of another program."""
+    """Write files for another program."""
     from pipeline.exchange.export_stage import run_export
 
     done = run_export(read(project, max_pixels), format, out_dir, ExportOptions(pitch_um, lens, misfit_px))
@@ -88,7 +88,7 @@ def import_(
     ] = False,
     fiducials: Annotated[bool, typer.Option("--fiducials", help="The marks are fiducials.")] = False,
 ) -> int:
-    """Marks, cameras, poses and certificates of other programs as files of this one."""
+    """Read files of another program, or a certificate."""
     from pipeline.exchange.import_stage import run_import
     from pipeline.exchange.incoming import ImportOptions
 
@@ -115,7 +115,7 @@ def convert(
     ] = 0.1,
     as_json: AsJson = False,
 ) -> int:
-    """A camera's lens in the words of another distortion family, with its covariance."""
+    """Convert a lens into another distortion family."""
     from pipeline.exchange.convert_stage import ConvertOptions, run_convert
 
     named = tuple(name.strip() for name in parameters.split(",") if name.strip())
@@ -126,7 +126,7 @@ def convert(
 
 
 def render(scene: SceneFile, out_dir: OutDir) -> int:
-    """Synthetic scans with their truth, as a project that can be run."""
+    """Render synthetic scans with their truth."""
     from pipeline.progress import Reporter
     from pipeline.rendered.scene_file import render_project
 
@@ -139,9 +139,10 @@ def render(scene: SceneFile, out_dir: OutDir) -> int:
 def template(
     kind: Annotated[str, typer.Argument(metavar="KIND", help=one_of(TEMPLATES), show_default=False)],
 ) -> int:
-    """Print a commented file to start from; keys: a table of all keys of project.toml."""
+    """Print a commented file to start from, or all keys."""
     if kind not in TEMPLATES:
-        raise InputError(f"there is no template {kind!r}; possible are {', '.join(TEMPLATES)}.")
+        possible = f"{', '.join(TEMPLATES)}.{did_you_mean(kind, TEMPLATES)}"
+        raise InputError(f"there is no template {kind!r}; possible are {possible}")
     if kind == "keys":
         from pipeline.files.project_tables import keys_text
 

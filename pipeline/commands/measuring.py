@@ -36,7 +36,7 @@ def demo(
     ),
     as_json: AsJson = False,
 ) -> int:
-    """Render a small scan folder with its truth, run everything on it, print the summary and the report's path."""
+    """Render five film frames and run everything on them."""
     from pipeline.demo import run_demo
     from pipeline.progress import Reporter
 
@@ -56,7 +56,7 @@ def init(
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
-    """Look at the scans; write a project of them, with each one's camera, and say what could not be told."""
+    """Write a project for a folder of scans, cameras named."""
     from measure.scans.remote import scan_path
     from pipeline.archive.new_project import init_project, print_new_project
     from pipeline.progress import Reporter
@@ -98,10 +98,9 @@ def measuring(stage: str, help_text: str) -> Callable[..., int]:
     return command
 
 
-run = measuring("run_all", "The whole chain: measure, adjust, check, report. What is measured already stays.")
+run = measuring("run_all", "Measure, adjust, check and report.\n\nGoes on where an earlier call stopped.")
 measure = measuring(
-    "run_measure",
-    "Scans to comparator coordinates. What is measured already stays: it goes on where an earlier call stopped.",
+    "run_measure", "Measure marks in the scans: comparator.csv.\n\nGoes on where an earlier call stopped."
 )
 
 
@@ -113,7 +112,7 @@ def status(
     as_csv: Annotated[bool, typer.Option("--csv", help="A line a scan, on stdout.")] = False,
     as_json: AsJson = False,
 ) -> int:
-    """How many scans stand where, what that means, and what to do next."""
+    """Count scans by verdict, with the next step for each."""
     from pipeline.archive.status import archive_status, print_status, status_csv, status_json
 
     def printed(console: PlainConsole) -> None:
@@ -133,7 +132,7 @@ def merge(
     stores: Annotated[list[Path], typer.Argument(metavar="DB...", help="Stores of shards.", show_default=False)],
     as_json: AsJson = False,
 ) -> int:
-    """Join the measurement stores of shards into that of the project."""
+    """Join the results of several machines."""
     from pipeline.progress import Reporter
     from pipeline.stages import run_merge
 
@@ -156,7 +155,7 @@ def report(
     as_json: AsJson = False,
     max_pixels: MaxPixels = None,
 ) -> int:
-    """What the earlier stages found, in report.html; or all of some images, each in a page of its own."""
+    """Write report.html, or a page of single frames."""
     from pipeline.progress import Reporter
     from pipeline.stages import run_frame_pages, run_report
 
@@ -181,7 +180,7 @@ def review(
     who: Annotated[str | None, typer.Option(metavar="NAME", help="Who decides; by default who is logged in.")] = None,
     max_pixels: MaxPixels = None,
 ) -> int:
-    """A page on this machine to go through what needs a look; decisions stand in decisions.jsonl."""
+    """Settle doubtful marks in the browser."""
     try:
         from pipeline.review.server import serve
     except ModuleNotFoundError:
@@ -209,7 +208,7 @@ def cameras(
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
-    """The camera library: its list, one of its files, or which of its cameras scans are of."""
+    """List film cameras, print one, or name a scan's camera."""
     if own is not None or scan is not None:
         project = None if own is None else read(own)
         given = [*(scan or ()), *(Path(name) for name in names or ())] or (project.scans.values() if project else ())

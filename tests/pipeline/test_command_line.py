@@ -338,6 +338,15 @@ def test_unknown_command_and_option_have_code_2(capsys: SAID) -> None:
     assert "Traceback" not in capsys.readouterr().err
 
 
+def test_the_help_groups_all_commands_and_cuts_no_line_short(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--help"]) == 0
+    text = capsys.readouterr().out
+    titles = re.findall(r"^(\w+):$", text, flags=re.MULTILINE)
+    assert titles == ["Options", "Measure", "Calibrate", "Archive", "Exchange", "Plan", "Tools"]
+    assert "..." not in text.split("Measure:")[1]
+    assert len(re.findall(r"^  [a-z]+  +\S", text, flags=re.MULTILINE)) == 21
+
+
 def test_the_help_does_not_wait_for_what_commands_need() -> None:
     heavy = ("numpy", "scipy", "cv2", "pipeline.stages", "pipeline.files.project_file")
     program = f"import sys, pipeline.cli; print(*set(sys.modules) & set({heavy}))"
