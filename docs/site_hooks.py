@@ -6,13 +6,13 @@ from pathlib import Path
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
 PAGES = {  # of the project, by their names in the site
     "contributing.md": "CONTRIBUTING.md",
     "results-of-benchmarks.md": "benchmarks/RESULTS.md",
     "changelog.md": "CHANGELOG.md",
-    "readme.md": "README.md",
 }
 FACES = {"measure": "Scans and marks", "adjust": "Adjustment", "pipeline": "Files"}
 _CODE = re.compile(r"(```.*?```|`[^`\n]*`)", re.DOTALL)
@@ -39,10 +39,11 @@ def _names_of_faces() -> str:
     return "\n".join(lines)
 
 
-def on_page_markdown(markdown: str, page: object, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Write formulas as MathML, which browsers draw by themselves, and point links to the added pages."""
+    root = "../" * page.file.src_uri.count("/")
     for name, source in PAGES.items():
-        markdown = re.sub(rf"\]\((?:\.\./)+{re.escape(source)}", f"]({name}", markdown)
+        markdown = re.sub(rf"\]\((?:\.\./)+{re.escape(source)}", f"]({root}{name}", markdown)
     parts = _CODE.split(markdown)  # every second one is code
     parts[::2] = [_FORMULA.sub(_mathml, part) for part in parts[::2]]
     return "".join(parts)
