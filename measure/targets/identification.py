@@ -3,7 +3,6 @@ checked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,6 +19,7 @@ from measure.scans.scan import Scan
 from measure.targets.disks import SMALLEST_RADIUS_PX, UNIT_DISK, FittedDisk, doubts, fit_disk
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 _SEARCHED_RADIUS_PX = 4.0  # windows are reduced until the shorter half axis has about this length...
 _THINNEST_PX = 1.5  # ...or the thinnest line this width
@@ -32,256 +32,6 @@ _AFFINE_FROM = 8  # targets that agree: from so many on the shared shift may var
 _VOTE_SHARE = 0.2  # of the farthest link: how far shifts may differ and still count as one
 _ROUNDS = 5  # of the shared shift and the gate, each by the other
 _FORBIDDEN = 1e9  # px: the cost of a link that there is not
-
-
-class Prediction(Protocol):
-    """What of a prediction matters here."""
-
-    @property
-    def center_px(self) -> Array: ...
-    @property
-    def pixel_from_disk(self) -> Array: ...
-    @property
-    def search_px(self) -> float: ...
-    @property
-    def perspective(self) -> Array: ...
-
-
-@dataclass
-class SearchResult:
-    """disks: all that were fitted, each once; near: for each prediction the indices of the disks that may be its
-    target; why_none: why there are none, empty otherwise."""
-
-    disks: list[FittedDisk] = field(default_factory=list)
-    near: list[list[int]] = field(default_factory=list)
-    why_none: list[Reason] = field(default_factory=list)
-
-
-def search_targets(
-    scan: Scan, predictions: Sequence[Prediction], polarity: str, size_tolerance: float, shape: MarkShape
-) -> SearchResult:
-    """Fit what looks like the target near each prediction; with polarity "auto" what most of them are, light or dark,
-    is kept."""
-    result = SearchResult()
-    for prediction in predictions:
-        near, why = [], NO_REASON
-        for spot in _spots(scan, prediction, polarity, shape):
-            index, reason = _fit_spot(scan, spot, prediction, size_tolerance, shape, result)
-            if index is None:
-                why = why or reason
-            elif index not in near:
-                near.append(index)
-        result.near.append(near)
-        none = Reason(f"nothing like it within {prediction.search_px:.0f} px of its place", Code.NOT_FOUND)
-        result.why_none.append(NO_REASON if near else Reason.combine((none, why)))
-    if polarity == "auto":
-        _keep_common_polarity(result)
-    return result
-
-
-def _spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -> list[Array]:
-    """(2,) places within the search distance where the predicted picture correlates best, the best first."""
-    shorter = float(np.linalg.svd(prediction.pixel_from_disk, compute_uv=False)[1])
-    factor = max(1, int(shorter * min(1.0 / _SEARCHED_RADIUS_PX, thinnest_mm(shape) / _THINNEST_PX)))
-    template = _predicted_picture(prediction.pixel_from_disk / factor, shape)
-    half = np.array(template.shape[::-1]) // 2
-    reach = int(np.ceil(prediction.search_px / factor)) + 1
-    corner = np.round(prediction.center_px).astype(int) - (reach + half) * factor - factor // 2
-    width, height = 2 * (reach + half) + 1
-    window = scan.window(int(corner[0]), int(corner[1]), int(width) * factor, int(height) * factor)
-    small = cv2.resize(window, (int(width), int(height)), interpolation=cv2.INTER_AREA)
-    if float(small.max() - small.min()) <= 0.0:
-        return []
-    small = small - small.mean()  # the correlation's sums are of single precision
-    compared = _compared_part(prediction.pixel_from_disk / factor, half, shape)
-    score = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED, mask=compared)
-    score = np.asarray(np.nan_to_num(score, posinf=0.0, neginf=0.0), np.float32)
-    signed = np.asarray({"light": score, "dark": -score}.get(polarity, np.abs(score)), np.float32)
-    peaks, _ = local_maxima(signed, signed.size, _LEAST_CORRELATION, 1)
-    places = (peaks + half) * factor + (factor - 1) / 2 + corner
-    within = np.hypot(*(places - prediction.center_px).T) <= prediction.search_px + factor
-    return list(places[within][:_MOST_SPOTS])
-
-
-def _predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> NDArray[np.float32]:
-    """The target as it should look, with some of its surroundings; its centre is that of the middle pixel."""
-    _, greatest = extent_px(shape, np.column_stack([pixel_from_disk, (0.0, 0.0)]))
-    half = np.ceil(greatest * (1 + _GROUND) + _GROUND_PX).astype(int)
-    width, height = 2 * half + 1
-    placed = np.column_stack([pixel_from_disk, half])
-    return picture(shape, placed, int(width), int(height), _EXPECTED_BLUR_PX).astype(np.float32)
-
-
-def _compared_part(pixel_from_disk: Array, half: NDArray[np.intp], shape: MarkShape) -> NDArray[np.float32]:
-    """1 where the predicted picture, of half (2,) px about its middle, is to be found, 0 elsewhere: a disk with what is
-    next to it, for a ring may begin where the picture's corners are."""
-    width, height = 2 * half + 1
-    if shape is not UNIT_DISK:
-        return np.ones((height, width), np.float32)
-    left, size, right = np.linalg.svd(pixel_from_disk)
-    grown = left @ np.diag(size * (1 + _GROUND) + _GROUND_PX) @ right
-    places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - half
-    return np.asarray(np.linalg.norm(places @ np.linalg.inv(grown).T, axis=-1) <= 1, np.float32)
-
-
-def _fit_spot(
-    scan: Scan, spot: Array, prediction: Prediction, size_tolerance: float, shape: MarkShape, result: SearchResult
-) -> tuple[int | None, Reason]:
-    """The index of the disk at a spot, fitted now or before; None, and why, if there is none of the right size."""
-    index = _known_disk(result.disks, spot)
-    if index is not None:
-        disk = result.disks[index]
-    else:
-        disk = fit_disk(scan, spot, prediction.pixel_from_disk, shape=_perspective_shape(shape, prediction))
-        if disk.reason:
-            return None, disk.reason
-        if np.hypot(*(disk.center_px - prediction.center_px)) > prediction.search_px + 1:
-            return None, Reason("what was found lies farther off", Code.OFF_PLACE)
-        index = len(result.disks)
-        result.disks.append(disk)
-    ratio = float(np.sqrt(abs(np.linalg.det(disk.pixel_from_disk) / np.linalg.det(prediction.pixel_from_disk))))
-    if not 1 / size_tolerance < ratio < size_tolerance:
-        return None, Reason(f"what was found there has {ratio:.2f} times its radius", Code.SIZE)
-    return index, NO_REASON
-
-
-def _perspective_shape(shape: MarkShape, prediction: Prediction) -> MarkShape:
-    """The shape as it is seen but for an affinity. A disk is an ellipse all the same."""
-    if shape is UNIT_DISK:
-        return shape
-    x, y = (prediction.perspective @ prediction.pixel_from_disk).tolist()
-    return replace(shape, perspective=(x, y))
-
-
-def _known_disk(disks: list[FittedDisk], spot: Array) -> int | None:
-    """The disk that was already fitted at a spot."""
-    for index, disk in enumerate(disks):
-        if np.hypot(*(disk.center_px - spot)) < _SAME_DISK * disk.half_axes_px[1]:
-            return index
-    return None
-
-
-def _keep_common_polarity(result: SearchResult) -> None:
-    """Leave out the disks, light or dark, of which there are fewer among the predictions that found one disk only."""
-    lone = [near[0] for near in result.near if len(near) == 1] or [index for near in result.near for index in near]
-    sign = np.sign(sum(np.sign(result.disks[index].contrast_dn) for index in lone)) or 1.0
-    name = "light" if sign > 0 else "dark"
-    for number, near in enumerate(result.near):
-        kept = [index for index in near if result.disks[index].contrast_dn * sign > 0]
-        if near and not kept:
-            message = f"what was found there is not {name} as the other targets are"
-            result.why_none[number] = Reason(message, Code.POLARITY)
-        result.near[number] = kept
-
-
-@dataclass(frozen=True, eq=False)
-class Links:
-    """places (n, 2): predicted; centers (m, 2): of the disks; near: for each place the indices of the disks that may be
-    its target."""
-
-    places: Array
-    centers: Array
-    near: list[list[int]]
-
-    def pairs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Indices of place and disk of every link."""
-        pairs = [(place, disk) for place, disks in enumerate(self.near) for disk in disks]
-        place, disk = np.array(pairs, int).reshape(-1, 2).T
-        return place, disk
-
-
-@dataclass(frozen=True)
-class Assignment:
-    """For each place: chosen, the disk, or None; nearest: the disk that was refused, or None; why_not: the reason."""
-
-    chosen: list[int | None]
-    nearest: list[int | None]
-    why_not: list[Reason]
-
-
-def assign(links: Links, gate_sigmas: float, least_gate_px: float) -> Assignment:
-    """One disk a place at most, and one place a disk; a place with two disks in its gate gets none."""
-    count = len(links.places)
-    chosen: list[int | None] = [None] * count
-    nearest: list[int | None] = [None] * count
-    why_not = [NO_REASON] * count
-    place, disk = links.pairs()
-    if not len(place):
-        return Assignment(chosen, nearest, why_not)
-    residuals, gate = _shared_shift_residuals(links, place, disk, gate_sigmas, least_gate_px)
-    cost = np.full((count, len(links.centers)), _FORBIDDEN)
-    cost[place, disk] = residuals
-    gated = np.where(cost <= gate, cost, _FORBIDDEN)
-    for one_place, one_disk in zip(*linear_sum_assignment(gated), strict=True):
-        if gated[one_place, one_disk] < _FORBIDDEN:
-            chosen[int(one_place)] = int(one_disk)
-    taken = {index for index in chosen if index is not None}
-    for row, own in enumerate(chosen.copy()):
-        rivals = [index for index in np.flatnonzero(gated[row] < _FORBIDDEN) if index not in taken]
-        if own is not None and rivals:
-            chosen[row], nearest[row] = None, own
-            why_not[row] = Reason(f"{len(rivals) + 1} disks lie within {gate:.1f} px of its place", Code.AMBIGUOUS)
-        elif own is None and links.near[row]:
-            best = links.near[row][int(np.argmin(cost[row, links.near[row]]))]
-            off = float(cost[row, best])
-            nearest[row] = best
-            why_not[row] = (
-                Reason("the disk at its place is another target", Code.AMBIGUOUS)
-                if best in taken and off <= gate
-                else Reason(f"what was found lies {off:.1f} px from where the other targets put it", Code.OFF_PLACE)
-            )
-    return Assignment(chosen, nearest, why_not)
-
-
-def _shared_shift_residuals(
-    links: Links, place: NDArray[np.int64], disk: NDArray[np.int64], gate_sigmas: float, least_gate_px: float
-) -> tuple[Array, float]:
-    """Lengths of all links less the shift that most of them share, and the gate: a few robust standard deviations of
-    the links that share it."""
-    shifts = links.centers[disk] - links.places[place]
-    tolerance = max(least_gate_px, _VOTE_SHARE * float(np.hypot(*shifts.T).max()))
-    common = _most_voted(shifts, place, tolerance)
-    residuals = np.hypot(*(shifts - common).T)
-    gate = tolerance
-    for _ in range(_ROUNDS):
-        agreeing = _best_of_each_place(place, residuals) & (residuals <= gate)
-        if agreeing.sum() < 3:
-            break
-        model = _shift_model(links.places[place], shifts, agreeing)
-        left = shifts - model
-        residuals = np.hypot(*left.T)
-        sigma = robust_scale(left[agreeing].ravel())
-        gate = float(np.clip(gate_sigmas * sigma, least_gate_px, tolerance))
-    return residuals, gate
-
-
-def _most_voted(shifts: Array, place: NDArray[np.int64], tolerance: float) -> Array:
-    """(2,) the shift that the links of most places agree with, each place counted once; of equals the shortest."""
-    best, best_votes = shifts[0], (-1, 0.0)
-    for shift in shifts:
-        agree = np.hypot(*(shifts - shift).T) <= tolerance
-        votes = (len(np.unique(place[agree])), -float(np.hypot(*shift)))
-        if votes > best_votes:
-            best, best_votes = shifts[agree].mean(axis=0), votes
-    return np.asarray(best)
-
-
-def _best_of_each_place(place: NDArray[np.int64], residuals: Array) -> NDArray[np.bool_]:
-    """Which links are the shortest of their place."""
-    order = np.lexsort((residuals, place))
-    first = np.zeros(len(place), bool)
-    first[order[np.unique(place[order], return_index=True)[1]]] = True
-    return first
-
-
-def _shift_model(places: Array, shifts: Array, agreeing: NDArray[np.bool_]) -> Array:
-    """(n, 2) the shared shift at all places: their median, or an affine function where there are enough."""
-    if agreeing.sum() < _AFFINE_FROM:
-        return np.broadcast_to(np.median(shifts[agreeing], axis=0), shifts.shape)
-    middle, spread = places[agreeing].mean(axis=0), np.maximum(places[agreeing].std(axis=0), 1.0)
-    design = np.column_stack([np.ones(len(places)), (places - middle) / spread])
-    coefficients = np.linalg.lstsq(design[agreeing], shifts[agreeing], rcond=None)[0]
-    return np.asarray(design @ coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,16 +84,6 @@ class TargetOptions:
             raise ValueError("gate_sigmas and least_gate_px are positive")
 
 
-@dataclass(frozen=True)
-class _Row:
-    """A prediction and what was made of it: the disk that is its target, or why there is none."""
-
-    prediction: TargetPrediction
-    disk: FittedDisk | None = None
-    status: Status = Status.PREDICTED
-    reason: Reason = NO_REASON
-
-
 def measure_disks(
     scan: Scan, predictions: Sequence[TargetPrediction], options: TargetOptions | None = None
 ) -> tuple[MarkMeasurement, ...]:
@@ -387,69 +127,225 @@ def _measure_predicted(
     if len(set(names)) < len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"{scan.name}: predicted twice: {', '.join(twice)}; each point is right once")
-    refused = {prediction.point: _refusal(prediction, scan) for prediction in predictions}
-    sought = [prediction for prediction in predictions if refused[prediction.point] is None]
+    marks = {prediction.point: _unsearchable_mark(prediction, scan) for prediction in predictions}
     # A disk near several places is fitted from the first: in what order they are given must not matter.
-    sought.sort(key=lambda prediction: prediction.point)
-    found = {row.prediction.point: row for row in _identified(scan, sought, options, shape)}
-    return tuple(_mark(refused[prediction.point] or found[prediction.point]) for prediction in predictions)
+    sought = sorted((one for one in predictions if marks[one.point] is None), key=lambda prediction: prediction.point)
+    found = {mark.point: mark for mark in _identified_marks(scan, sought, options, shape)}
+    return tuple(marks[name] or found[name] for name in names)
 
 
-def _refusal(prediction: TargetPrediction, scan: Scan) -> _Row | None:
-    """Why a target is not even looked for."""
-    col, row = prediction.center_px
+def _unsearchable_mark(prediction: TargetPrediction, scan: Scan) -> MarkMeasurement | None:
+    """The row of a target that is not even looked for."""
+    point, (col, row), shorter = prediction.point, prediction.center_px, prediction.half_axes_px[1]
     if not (-0.5 <= col < scan.width_px - 0.5 and -0.5 <= row < scan.height_px - 0.5):
-        return _Row(prediction, None, Status.ABSENT, Reason("outside of the scan", Code.OUTSIDE))
-    shorter = prediction.half_axes_px[1]
+        return MarkMeasurement(point, "target", None, None, Status.ABSENT, Reason("outside of the scan", Code.OUTSIDE))
     if shorter < SMALLEST_RADIUS_PX:
         reason = Reason(f"too small to be measured: half axis {shorter:.1f} px", Code.SMALL)
-        return _Row(prediction, None, Status.PREDICTED, reason)
+        return _predicted_mark(prediction, reason)
     return None
 
 
-def _identified(
+def _predicted_mark(prediction: TargetPrediction, reason: Reason) -> MarkMeasurement:
+    center_px = np.asarray(prediction.center_px, float)
+    return MarkMeasurement(prediction.point, "target", center_px, None, Status.PREDICTED, reason)
+
+
+def _identified_marks(
     scan: Scan, predictions: Sequence[TargetPrediction], options: TargetOptions, shape: MarkShape
-) -> list[_Row]:
-    """The disk of each prediction: fitted near it, of the right kind, and alone at its place."""
-    search = search_targets(scan, predictions, options.polarity, options.size_tolerance, shape)
+) -> list[MarkMeasurement]:
+    """The disk of each prediction: fitted near it, of the right kind, and alone at its place. Those that are unlike the
+    others of the frame are weak."""
+    search = _DiskSearch(scan, options, shape)
+    near = [search.find_near(prediction) for prediction in predictions]
+    if options.polarity == "auto":
+        near = search.keep_common_polarity(near)
     places = np.array([prediction.center_px for prediction in predictions]).reshape(-1, 2)
     centers = np.array([disk.center_px for disk in search.disks]).reshape(-1, 2)
-    links = Links(places, centers, search.near)
-    assignment = assign(links, options.gate_sigmas, options.least_gate_px)
-    rows = []
-    for index, prediction in enumerate(predictions):
-        disk_index = assignment.chosen[index]
-        disk = None if disk_index is None else search.disks[disk_index]
-        if disk is None:
-            reason = search.why_none[index] or assignment.why_not[index]
-            rejected = assignment.nearest[index]
-            if rejected is None:
-                rows.append(_Row(prediction, None, Status.PREDICTED, reason))
-            else:
-                rows.append(_Row(prediction, search.disks[rejected], Status.REJECTED, reason))
-        else:
-            status = Status.WEAK if disk.weakness else Status.MEASURED
-            rows.append(_Row(prediction, disk, status, disk.weakness))
-    return _compared(rows)
-
-
-def _compared(rows: list[_Row]) -> list[_Row]:
-    """Those that are unlike the others of the frame are weak."""
-    observed = [(row, row.disk) for row in rows if row.disk is not None and row.status.is_observation]
-    reasons = doubts([disk for _, disk in observed], [row.prediction.pixel_from_disk for row, _ in observed])
-    doubt = {id(row): reason for (row, _), reason in zip(observed, reasons, strict=True) if reason}
-    return [
-        replace(row, status=Status.WEAK, reason=Reason.combine((row.reason, doubt[id(row)])))
-        if id(row) in doubt
-        else row
-        for row in rows
+    assigned = _assign(places, centers, [indices for indices, _ in near], options)
+    targets = [
+        (search.disks[index], prediction.pixel_from_disk)
+        for (index, reason), prediction in zip(assigned, predictions, strict=True)
+        if index is not None and not reason
     ]
+    unlike = iter(doubts([disk for disk, _ in targets], [shape for _, shape in targets]))
+    marks = []
+    for prediction, (index, refusal), (_, missing) in zip(predictions, assigned, near, strict=True):
+        if index is None:
+            marks.append(_predicted_mark(prediction, missing or refusal))
+            continue
+        disk, status, reason = search.disks[index], Status.REJECTED, refusal
+        if not refusal:
+            reason = Reason.combine([one for one in (disk.weakness, next(unlike)) if one])
+            status = Status.WEAK if reason else Status.MEASURED
+        marks.append(
+            MarkMeasurement(prediction.point, "target", disk.center_px, disk.covariance, status, reason, disk.quality)
+        )
+    return marks
 
 
-def _mark(row: _Row) -> MarkMeasurement:
-    point = row.prediction.point
-    if row.disk is None:
-        center = None if row.status is Status.ABSENT else np.asarray(row.prediction.center_px, float)
-        return MarkMeasurement(point, "target", center, None, row.status, row.reason)
-    disk = row.disk
-    return MarkMeasurement(point, "target", disk.center_px, disk.covariance, row.status, row.reason, disk.quality)
+class _DiskSearch:
+    """The disks fitted in a scan so far, each once: what looks like the target near the predictions."""
+
+    def __init__(self, scan: Scan, options: TargetOptions, shape: MarkShape) -> None:
+        self.scan, self.options, self.shape = scan, options, shape
+        self.disks: list[FittedDisk] = []
+
+    def find_near(self, prediction: TargetPrediction) -> tuple[list[int], Reason]:
+        """The indices of the disks that may be a prediction's target; and why there are none."""
+        found, why = list[int](), NO_REASON
+        for spot in _spots(self.scan, prediction, self.options.polarity, self.shape):
+            index = self._fit_spot(spot, prediction)
+            if isinstance(index, Reason):
+                why = why or index
+            elif index not in found:
+                found.append(index)
+        none = Reason(f"nothing like it within {prediction.search_px:.0f} px of its place", Code.NOT_FOUND)
+        return found, NO_REASON if found else Reason.combine((none, why))
+
+    def _fit_spot(self, spot: Array, prediction: TargetPrediction) -> int | Reason:
+        """The index of the disk at a spot, fitted now or before; or why there is none of the right size."""
+        near = (np.hypot(*(disk.center_px - spot)) < _SAME_DISK * disk.half_axes_px[1] for disk in self.disks)
+        index = next((index for index, is_near in enumerate(near) if is_near), len(self.disks))
+        if index == len(self.disks):
+            shape = self.shape
+            if shape is not UNIT_DISK:  # a disk is an ellipse in perspective, too
+                x, y = (prediction.perspective @ prediction.pixel_from_disk).tolist()
+                shape = replace(shape, perspective=(x, y))
+            disk = fit_disk(self.scan, spot, prediction.pixel_from_disk, shape=shape)
+            if disk.reason:
+                return disk.reason
+            if np.hypot(*(disk.center_px - prediction.center_px)) > prediction.search_px + 1:
+                return Reason("what was found lies farther off", Code.OFF_PLACE)
+            self.disks.append(disk)
+        areas = np.linalg.det([self.disks[index].pixel_from_disk, prediction.pixel_from_disk])
+        ratio = float(np.sqrt(abs(areas[0] / areas[1])))
+        if not 1 / self.options.size_tolerance < ratio < self.options.size_tolerance:
+            return Reason(f"what was found there has {ratio:.2f} times its radius", Code.SIZE)
+        return index
+
+    def keep_common_polarity(self, near: Sequence[tuple[list[int], Reason]]) -> list[tuple[list[int], Reason]]:
+        """Leave out the disks, light or dark, of which there are fewer among the predictions that found one only."""
+        lone = [found[0] for found, _ in near if len(found) == 1] or [index for found, _ in near for index in found]
+        signs = [np.sign(disk.contrast_dn) for disk in self.disks]
+        common = np.sign(sum(signs[index] for index in lone)) or 1.0
+        name = "light" if common > 0 else "dark"
+        other = Reason(f"what was found there is not {name} as the other targets are", Code.POLARITY)
+        kept = [[index for index in found if signs[index] == common] for found, _ in near]
+        return [(own, other if found and not own else why) for own, (found, why) in zip(kept, near, strict=True)]
+
+
+def _spots(scan: Scan, prediction: TargetPrediction, polarity: str, shape: MarkShape) -> list[Array]:
+    """(2,) places within the search distance where the predicted picture correlates best, the best first."""
+    shorter = prediction.half_axes_px[1]
+    factor = max(1, int(shorter * min(1.0 / _SEARCHED_RADIUS_PX, thinnest_mm(shape) / _THINNEST_PX)))
+    template, compared = _predicted_picture(prediction.pixel_from_disk / factor, shape)
+    half = np.array(template.shape[::-1]) // 2
+    reach = int(np.ceil(prediction.search_px / factor)) + 1
+    corner = np.round(prediction.center_px).astype(int) - (reach + half) * factor - factor // 2
+    size = 2 * (reach + half) + 1
+    window = scan.window(*corner.tolist(), *(size * factor).tolist())
+    small = cv2.resize(window, size.tolist(), interpolation=cv2.INTER_AREA)
+    if float(small.max() - small.min()) <= 0.0:
+        return []
+    small = small - small.mean()  # the correlation's sums are of single precision
+    score = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED, mask=compared)
+    score = np.asarray(np.nan_to_num(score, posinf=0.0, neginf=0.0), np.float32)
+    signed = np.asarray({"light": score, "dark": -score}.get(polarity, np.abs(score)), np.float32)
+    peaks, _ = local_maxima(signed, signed.size, _LEAST_CORRELATION, 1)
+    places = (peaks + half) * factor + (factor - 1) / 2 + corner
+    within = np.hypot(*(places - prediction.center_px).T) <= prediction.search_px + factor
+    return list(places[within][:_MOST_SPOTS])
+
+
+def _predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The target as it should look, its centre that of the middle pixel, with some of its surroundings; and 1 where
+    these count. Of a disk it is what is next to it, for a ring may begin where the picture's corners are."""
+    _, greatest = extent_px(shape, np.column_stack([pixel_from_disk, (0.0, 0.0)]))
+    half = np.ceil(greatest * (1 + _GROUND) + _GROUND_PX).astype(int)
+    width, height = (2 * half + 1).tolist()
+    drawn = picture(shape, np.column_stack([pixel_from_disk, half]), width, height, _EXPECTED_BLUR_PX)
+    compared = np.ones((height, width), np.float32)
+    if shape is UNIT_DISK:
+        left, size, right = np.linalg.svd(pixel_from_disk)
+        grown = left @ np.diag(size * (1 + _GROUND) + _GROUND_PX) @ right
+        places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - half
+        compared = np.asarray(np.linalg.norm(places @ np.linalg.inv(grown).T, axis=-1) <= 1, np.float32)
+    return drawn.astype(np.float32), compared
+
+
+def _assign(
+    places: Array, centers: Array, near: list[list[int]], options: TargetOptions
+) -> list[tuple[int | None, Reason]]:
+    """The disk, of centers (m, 2), at each of places (n, 2): one of those near it; with a reason where that is refused.
+
+    One disk a place at most, and one place a disk; a place with two disks in its gate gets none.
+    """
+    links = np.array([(place, disk) for place, disks in enumerate(near) for disk in disks], int).reshape(-1, 2)
+    if not len(links):
+        return [(None, NO_REASON)] * len(places)
+    place, disk = links.T
+    off_px, gate_px = _residuals_and_gate(places[place], centers[disk] - places[place], place, options)
+    cost = np.full((len(places), len(centers)), _FORBIDDEN)
+    cost[place, disk] = off_px
+    is_in_gate = cost <= gate_px
+    best = zip(*linear_sum_assignment(np.where(is_in_gate, cost, _FORBIDDEN)), strict=True)
+    chosen = {int(row): int(column) for row, column in best if is_in_gate[row, column]}
+    taken = set(chosen.values())
+    assigned = list[tuple[int | None, Reason]]()
+    for row, own_near in enumerate(near):
+        own, reason = chosen.get(row), NO_REASON
+        rivals = [index for index in np.flatnonzero(is_in_gate[row]) if index not in taken]
+        if own is not None and rivals:
+            reason = Reason(f"{len(rivals) + 1} disks lie within {gate_px:.1f} px of its place", Code.AMBIGUOUS)
+        elif own is None and own_near:
+            own = min(own_near, key=lambda index: cost[row, index])
+            reason = (
+                Reason("the disk at its place is another target", Code.AMBIGUOUS)
+                if own in taken and is_in_gate[row, own]
+                else Reason(
+                    f"what was found lies {cost[row, own]:.1f} px from where the other targets put it", Code.OFF_PLACE
+                )
+            )
+        assigned.append((own, reason))
+    return assigned
+
+
+def _residuals_and_gate(places: Array, shifts: Array, place: Integers, options: TargetOptions) -> tuple[Array, float]:
+    """(n,) px of links' shifts (n, 2) from places (n, 2) less the shift that most of them share; and the gate, a few
+    robust standard deviations of those that share it. place (n,): the number of each."""
+    tolerance = max(options.least_gate_px, _VOTE_SHARE * float(np.hypot(*shifts.T).max()))
+    residuals, gate = np.hypot(*(shifts - _most_voted(shifts, place, tolerance)).T), tolerance
+    for _ in range(_ROUNDS):
+        order = np.lexsort((residuals, place))
+        agreeing = np.zeros(len(place), bool)
+        agreeing[order[np.unique(place[order], return_index=True)[1]]] = True  # the shortest link of each place
+        agreeing &= residuals <= gate
+        if agreeing.sum() < 3:
+            break
+        left = shifts - _shift_model(places, shifts, agreeing)
+        residuals = np.hypot(*left.T)
+        gate = float(
+            np.clip(options.gate_sigmas * robust_scale(left[agreeing].ravel()), options.least_gate_px, tolerance)
+        )
+    return residuals, gate
+
+
+def _most_voted(shifts: Array, place: Integers, tolerance: float) -> Array:
+    """(2,) the shift that the links of most places agree with, each place counted once; of equals the shortest."""
+    best, best_votes = shifts[0], (-1, 0.0)
+    for shift in shifts:
+        agree = np.hypot(*(shifts - shift).T) <= tolerance
+        votes = (len(np.unique(place[agree])), -float(np.hypot(*shift)))
+        if votes > best_votes:
+            best, best_votes = shifts[agree].mean(axis=0), votes
+    return np.asarray(best)
+
+
+def _shift_model(places: Array, shifts: Array, agreeing: NDArray[np.bool_]) -> Array:
+    """(n, 2) the shared shift at all places: their median, or an affine function where there are enough."""
+    if agreeing.sum() < _AFFINE_FROM:
+        return np.broadcast_to(np.median(shifts[agreeing], axis=0), shifts.shape)
+    middle, spread = places[agreeing].mean(axis=0), np.maximum(places[agreeing].std(axis=0), 1.0)
+    design = np.column_stack([np.ones(len(places)), (places - middle) / spread])
+    coefficients = np.linalg.lstsq(design[agreeing], shifts[agreeing], rcond=None)[0]
+    return np.asarray(design @ coefficients)
