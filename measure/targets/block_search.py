@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
 from math import lcm
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 import numpy as np
@@ -30,19 +30,13 @@ ROW_BYTES, BLOCK_BYTES = 1 << 14, 1 << 24  # of a block at most, but that strips
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """col0, row0: the scan's place of its first pixel; samples (height, width, channels), margin_px of them on every
-    side being the neighbours', or repeating the scan's edge."""
+    """place_px: column and row of the scan of its first pixel; samples (height, width, channels), margin_px of them on
+    every side being the neighbours', or repeating the scan's edge."""
 
     scan: Scan
-    col0: int
-    row0: int
+    place_px: tuple[int, int]
     margin_px: int
     samples: Samples
-
-    @property
-    def place_px(self) -> tuple[int, int]:
-        """Column and row of the scan where it begins, its margin included."""
-        return self.col0, self.row0
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -143,18 +137,20 @@ class Patches:
 Confirmed = Callable[[Block, Patches], Patches]
 
 
-class Octave(Protocol):
-    """What is looked for in one reduction of the scan, by factor; margin_px: of the scan, a multiple of the factor,
-    about a part that is looked at; widest_px: of the scan, that a part may be at most."""
+@dataclass(frozen=True)
+class Octave:
+    """What is looked for in one reduction of the scan, by factor. margin: reduced px about a part that is looked at;
+    widest_px: of the scan, that a part may be at most; find: the patches in a reduced picture, in its pixels, within
+    its margin."""
+
+    factor: int
+    margin: int
+    widest_px: int
+    find: Callable[[Image], Patches]
 
     @property
-    def factor(self) -> int: ...
-    @property
-    def margin_px(self) -> int: ...
-    @property
-    def widest_px(self) -> int: ...
-    def patches(self, small: Image) -> Patches:
-        """In a reduced picture, in its pixels, those within its margin."""
+    def margin_px(self) -> int:
+        return self.margin * self.factor
 
 
 def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | None = None) -> list[Candidate]:
@@ -172,7 +168,7 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | 
     def block_patches(corner: tuple[int, int]) -> Patches:
         row0, col0 = (place - margin for place in corner)
         memory = spare.pop() if spare else np.empty((rows, cols, scan.channels), scan.samples_dtype)
-        block = Block(scan, col0, row0, margin, scan.samples(col0, row0, cols, rows, memory))
+        block = Block(scan, (col0, row0), margin, scan.samples(col0, row0, cols, rows, memory))
         found = _separate(concatenate(Patches.collect(()), *_octave_patches(block, octaves)))
         found = confirmed(block, found) if confirmed else found
         spare.append(memory)
@@ -210,13 +206,13 @@ def _octave_patches(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches
     width, height = (size - 2 * block.margin_px for size in block.size_px)
     for octave in octaves:
         factor, small = octave.factor, reductions[octave.factor]
-        margin, spare = octave.margin_px // factor, (block.margin_px - octave.margin_px) // factor
+        margin, spare = octave.margin, block.margin_px // factor - octave.margin
         rows = slice(spare, spare + height // factor + 2 * margin)
         part = _even_part(width, octave.widest_px, factor) // factor
         for col0 in range(0, width // factor, part):
             first, last = spare + col0, spare + min(col0 + part, width // factor) + 2 * margin
-            place = np.array([block.col0, block.row0]) + factor * np.array([first, spare]) + (factor - 1) / 2
-            found = octave.patches(small[rows, first:last])
+            place = np.array(block.place_px) + factor * np.array([first, spare]) + (factor - 1) / 2
+            found = octave.find(small[rows, first:last])
             found = Patches(found.centers * factor + place, found.shapes * factor, found.contrasts)
             edge = np.array([block.scan.width_px, block.scan.height_px]) - 0.5
             yield found.part(np.all(found.centers < edge, axis=1))

@@ -2,6 +2,7 @@
 two bars through its middle explain it."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from measure.marks.shapes import Polarity
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
-from measure.targets.block_search import Candidate, Patches, search_blocks
+from measure.targets.block_search import Candidate, Octave, Patches, search_blocks
 from measure.targets.disk_detection import DiskSearch
 
 Array = NDArray[np.float64]
@@ -54,54 +55,29 @@ def cross_candidates(scan: Scan, search: CrossSearch) -> list[Candidate]:
     return search_blocks(scan, _octaves(search, scan.full_scale_dn))
 
 
-def _octaves(search: CrossSearch, full_scale_dn: float) -> list["CrossOctave"]:
+def _octaves(search: CrossSearch, full_scale_dn: float) -> list[Octave]:
+    """Half crosses from the shortest to the longest, each in the reduction that leaves their lines wide enough. That is
+    a power of two, for blocks are whole numbers of every octave's pixels."""
     octaves = []
     shortest, longest = search.half_px
-    while True:
+    upper = 0.0
+    while upper < longest:
         upper = min(shortest * _OCTAVE, longest)
-        factor = _reduction(shortest, search.line)
-        octaves.append(CrossOctave(factor, (shortest / factor, upper / factor), search, full_scale_dn))
-        if upper >= longest:
-            return octaves
+        finest = max(min(shortest / _SEARCHED_ARM_PX, search.line * shortest / _THINNEST_PX), 1.0)
+        factor = int(2 ** np.floor(np.log2(finest)))
+        half, margin = (shortest / factor, upper / factor), int(np.ceil(2.0 * upper / factor + 4))
+        octaves.append(Octave(factor, margin, _WIDEST_PX, partial(_patches, half, margin, search, full_scale_dn)))
         shortest = upper
+    return octaves
 
 
-def _reduction(half_px: float, line: float) -> int:
-    """A power of two: blocks are whole numbers of every octave's pixels."""
-    most = max(min(half_px / _SEARCHED_ARM_PX, line * half_px / _THINNEST_PX), 1.0)
-    return int(2 ** np.floor(np.log2(most)))
-
-
-@dataclass(frozen=True)
-class CrossOctave:
-    """A reduction of the scan and the shortest and longest half of a cross, reduced px, in it."""
-
-    factor: int
-    half: tuple[float, float]
-    search: CrossSearch
-    full_scale_dn: float
-    widest_px = _WIDEST_PX
-
-    @property
-    def margin_px(self) -> int:
-        return self._margin * self.factor
-
-    @property
-    def _margin(self) -> int:
-        return int(np.ceil(2.0 * self.half[1] + 4))
-
-    def patches(self, small: Image) -> Patches:
-        found = Patches.collect(_patches(small, self.half, self.search, self.full_scale_dn))
-        first = self._margin - 0.5
-        last = np.array(small.shape[::-1]) - self._margin - 0.5
-        return found.part(np.all((found.centers >= first) & (found.centers < last), axis=1))
-
-
-def _patches(small: Image, half: tuple[float, float], search: CrossSearch, full_scale_dn: float) -> list[Candidate]:
-    """Crosses with halves of these lengths in a reduced picture."""
+def _patches(
+    half: tuple[float, float], margin: int, search: CrossSearch, full_scale_dn: float, small: Image
+) -> Patches:
+    """Crosses with halves of these lengths in a reduced picture, within its margin."""
     wide = 2 * int(np.ceil(search.line * half[1]) + 1) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
-    found = []
+    crosses = []
     for sign, polarity, operation in ((1.0, "light", cv2.MORPH_TOPHAT), (-1.0, "dark", cv2.MORPH_BLACKHAT)):
         if search.polarity not in (polarity, "auto"):
             continue
@@ -109,8 +85,10 @@ def _patches(small: Image, half: tuple[float, float], search: CrossSearch, full_
         middle = float(np.median(thin[::3, ::3]))
         noise = robust_scale(thin[::3, ::3].astype(np.float64) - middle)
         level = max(0.5 * search.least_contrast * full_scale_dn, middle + _NOISE_SIGMAS * noise)
-        found += _crosses(thin, level, half, search, sign)
-    return found
+        crosses += _crosses(thin, level, half, search, sign)
+    found = Patches.collect(crosses)
+    last = np.array(small.shape[::-1]) - margin - 0.5
+    return found.part(np.all((found.centers >= margin - 0.5) & (found.centers < last), axis=1))
 
 
 def _crosses(thin: Image, level: float, half: tuple[float, float], search: CrossSearch, sign: float) -> list[Candidate]:

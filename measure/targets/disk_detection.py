@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from measure.marks.shapes import Polarity
 from measure.noise.robust_estimation import robust_scales
 from measure.scans.scan import Scan
-from measure.targets.block_search import Block, Candidate, Patches, concatenate, search_blocks
+from measure.targets.block_search import Block, Candidate, Octave, Patches, concatenate, search_blocks
 from measure.targets.disk_fit_batch import disks_among
 
 Array = NDArray[np.float64]
@@ -164,10 +164,6 @@ def _outlines(places: NDArray[np.intp], profiles: _Profiles) -> Outlines:
     return Outlines(places + center.astype(float), moments.astype(float), misfit.astype(float), height.astype(float))
 
 
-# Patches of a disk's shape in a picture: blobs by their Laplacian at several scales, then by the outline at half of
-# their height.
-
-
 @dataclass(frozen=True)
 class DiskSearch:
     """What is looked for.
@@ -190,12 +186,12 @@ class DiskSearch:
             raise ValueError(f"least_contrast is {self.least_contrast}; a share between 0 and 1 is right")
 
 
-def margin_px(radii: list[float]) -> int:
+def _margin(radii: list[float]) -> int:
     """How far beyond a part of the picture its patches are looked at."""
     return int(np.ceil(REACH * radii[-1])) + 3
 
 
-def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int) -> Patches:
+def _patches(radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int, small: Image) -> Patches:
     """Patches of a disk's shape in a picture reduced by a factor that lie within its margin."""
     small, scan_px2 = np.ascontiguousarray(small), small.size * factor**2
     cells = Cells.divide(small.shape[1], round(scan_px2 / _CELL_PX**2))
@@ -257,7 +253,7 @@ def _blobs(
         textures = cells.scales(contrasts[-1][::_EVERY, ::_EVERY]) if is_textured else np.zeros(len(cells.ends))
         levels.append(np.maximum(_RESPONSE_SIGMAS * textures, search.least_contrast * full_scale_dn))
     neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * max(int(radii[0]), 1) + 1,))
-    margin, width = margin_px(radii), small.shape[1] - 2 * margin_px(radii)
+    margin = _margin(radii)
     for sign, polarity in ((-1, "dark"), (1, "light")):  # which may use the contrasts up
         if search.polarity in (polarity, "auto"):
             standing = [
@@ -266,9 +262,7 @@ def _blobs(
             ]
             strongest = reduce(np.maximum, standing)
             peaks = (strongest > 0) & (strongest >= cv2.dilate(strongest, neighbourhood))
-            rows, cols = (
-                place + margin for place in divmod(np.flatnonzero(peaks[margin:-margin, margin:-margin]), width)
-            )
+            rows, cols = margin + np.array(np.nonzero(peaks[margin:-margin, margin:-margin]))
             by_radius = np.stack([contrast[rows, cols] for contrast in standing])
             radius, contrast = np.array(radii)[by_radius.argmax(axis=0)], by_radius.max(axis=0).astype(float)
             yield sign, Blobs(np.stack([cols, rows], axis=1), radius, contrast)
@@ -306,38 +300,15 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
     smallest, largest = search.diameter_px[0] / _SIZE_TOLERANCE, search.diameter_px[1] * _SIZE_TOLERANCE
 
     def disks(block: Block, patches: Patches) -> Patches:
+        """Those whose diameters can be those of disks seen obliquely."""
         found = disks_among(block, patches)
-        return found.part(_have_diameters(smallest, largest, found))
+        longer, shorter = 2 * np.linalg.svd(found.shapes, compute_uv=False).T
+        return found.part((longer >= smallest) & (shorter <= largest))
 
     return search_blocks(scan, disk_octaves(search, scan.full_scale_dn), disks)
 
 
-def _have_diameters(smallest_px: float, largest_px: float, disks: Patches) -> NDArray[np.bool_]:
-    """(n,) whether the diameters of ellipses can be those of disks seen obliquely."""
-    longer, shorter = 2 * np.linalg.svd(disks.shapes, compute_uv=False).T
-    return np.asarray((longer >= smallest_px) & (shorter <= largest_px))
-
-
-@dataclass(frozen=True)
-class DiskOctave:
-    """A reduction of the scan and the radii, reduced px, that are looked for in it."""
-
-    factor: int
-    radii: list[float]
-    search: DiskSearch
-    full_scale_dn: float
-
-    widest_px = _WIDEST_PX
-
-    @property
-    def margin_px(self) -> int:
-        return margin_px(self.radii) * self.factor
-
-    def patches(self, small: Image) -> Patches:
-        return patches(small, self.radii, self.search, self.full_scale_dn, self.factor)
-
-
-def disk_octaves(search: DiskSearch, full_scale_dn: float) -> list[DiskOctave]:
+def disk_octaves(search: DiskSearch, full_scale_dn: float) -> list[Octave]:
     """Radii from the smallest to the largest, each in the reduction that leaves it a few pixels."""
     smallest, largest = search.diameter_px[0] / 2, search.diameter_px[1] / 2
     count = int(np.ceil(np.log(largest / smallest) / np.log(_SCALE_STEP))) + 1
@@ -345,4 +316,7 @@ def disk_octaves(search: DiskSearch, full_scale_dn: float) -> list[DiskOctave]:
     for radius in np.geomspace(smallest, largest, count).tolist():
         factor = max(1, int(2 ** np.floor(np.log2(max(radius / _SEARCH_RADIUS_PX, 1.0)))))
         by_factor.setdefault(factor, []).append(radius / factor)
-    return [DiskOctave(factor, radii, search, full_scale_dn) for factor, radii in by_factor.items()]
+    return [
+        Octave(factor, _margin(radii), _WIDEST_PX, partial(_patches, radii, search, full_scale_dn, factor))
+        for factor, radii in by_factor.items()
+    ]

@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from numpy.typing import NDArray
 from stored_picture import HEIGHT, WIDTH, picture
 
 from measure.scans.cache import SegmentCache
 from measure.scans.opening import open_scan
 from measure.scans.parallel import map_in_threads
-from measure.targets.block_search import Block, Patches, search_blocks
+from measure.targets.block_search import Block, Octave, Patches, search_blocks
 
 
 def test_parts_outside_of_the_scan_repeat_its_edge(tmp_path: Path) -> None:
@@ -113,7 +112,7 @@ def test_the_cache_keeps_to_its_limit_and_holds_two_rows_of_tiles(
 def test_a_block_is_a_part_of_the_scan_and_of_its_reductions(tmp_path: Path, channels: int) -> None:
     tifffile.imwrite(tmp_path / "s.tif", picture(np.uint16, channels), tile=(32, 48), compression="lzw")
     with open_scan(tmp_path / "s.tif") as scan:
-        block = Block(scan, 12, 0, 12, scan.samples(12, 0, 72, 60))
+        block = Block(scan, (12, 0), 12, scan.samples(12, 0, 72, 60))
         rows, cols = np.indices((40, 40)).reshape(2, 1, -1)
         for col0, row0 in ((20, 3), (31, 4)):
             grey = block.grey_values(np.array([[col0, row0]]), cols, rows)
@@ -123,15 +122,6 @@ def test_a_block_is_a_part_of_the_scan_and_of_its_reductions(tmp_path: Path, cha
             part = scan.reduced(factor)[row : row + height, col : col + width]
             rounding = 0.5 if factor % 2 == 0 else 0.0
             np.testing.assert_allclose(small, part, rtol=2e-6, atol=rounding)
-
-
-class Watched:
-    """An octave that finds nothing."""
-
-    factor, margin_px, widest_px = 4, 8, 100
-
-    def patches(self, small: NDArray[np.float32]) -> Patches:
-        return Patches.collect(())
 
 
 @pytest.mark.parametrize("layout", [{"tile": (32, 48)}, {"rowsperstrip": 7}, {"rowsperstrip": HEIGHT}])
@@ -150,6 +140,6 @@ def test_a_search_by_blocks_decodes_each_segment_once(
             return original(*key)
 
         monkeypatch.setattr(scan._segments, "read", read)
-        search_blocks(scan, [Watched()])
+        search_blocks(scan, [Octave(4, 2, 100, lambda _: Patches.collect(()))])
         tall, wide = scan.segment_px
         assert len(reads) == len(set(reads)) == -(-HEIGHT // tall) * -(-WIDTH // wide)
