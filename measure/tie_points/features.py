@@ -1,15 +1,21 @@
 """Scans in which tie points are sought, their natural features (SIFT), and which of them two scans share."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.errors import MeasurementError
+from measure.flags import Code, Reason
 from measure.geometry import linear_scale
 from measure.scans.opening import open_scan
+from measure.scans.parallel import map_or_replace
 from measure.scans.scan import Scan
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Piece
 
@@ -93,25 +99,41 @@ class Features:
     size_px: tuple[int, int] = (0, 0)
     reduction: int = 1
 
-    def chosen(self, rows: Indices) -> "Features":
-        return replace(
-            self,
-            places_px=self.places_px[rows],
-            descriptors=self.descriptors[rows],
-            strengths=self.strengths[rows],
-            textures=self.textures[rows],
-        )
+    def part(self, rows: Indices) -> "Features":
+        arrays = ("places_px", "descriptors", "strengths", "textures")
+        return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
 
 
-def find_features(scan: Scan, usable: Callable[[Array], Mask], mirrored: bool, count: int) -> Features:
-    """At most `count` features, evenly over the scan, the strongest first in every part of it.
+def find_all_features(
+    frames: Sequence[TieFrame], count: int, are_alike: bool, what_fails: str, workers: Executor | None
+) -> Iterator[Features | Reason]:
+    """The features of every scan, so many at most; or why it has none, after the words for what fails so. are_alike:
+    whether the scans show one film, so that none is mirrored against another."""
+    find = partial(_features_or_reason, count, are_alike, what_fails)
+    return map_or_replace(workers, find, frames, lambda _, why: unreachable(what_fails, why))
 
-    usable: which places (n, 2) in px may hold one. mirrored: whether the scan shows the field as a mirror does; a turn
-    needs no word, for descriptors turn with the picture.
-    """
-    size_px = scan.width_px, scan.height_px
-    factor = -(-max(size_px) // _LONGEST_PX)
-    picture = _eight_bit(scan.reduced(factor))
+
+def unreachable(what_fails: str, why: str) -> Reason:
+    """Of a scan that cannot be read."""
+    return Reason(f"{what_fails}: {why}", Code.UNREACHABLE)
+
+
+def _features_or_reason(count: int, are_alike: bool, what_fails: str, frame: TieFrame) -> Features | Reason:
+    try:
+        return _features(frame, count, frame.mirrored and not are_alike)
+    except MeasurementError as error:
+        return unreachable(what_fails, str(error))
+
+
+def _features(frame: TieFrame, count: int, mirrored: bool) -> Features:
+    """Features evenly over the scan, the strongest first in every part of it. mirrored: whether it is to be seen as in
+    a mirror; a turn needs no word, for descriptors turn with the picture."""
+    with frame.open() as scan:
+        size_px = scan.width_px, scan.height_px
+        factor = -(-max(size_px) // _LONGEST_PX)
+        grey = scan.reduced(factor)
+    black, white = np.percentile(grey[::4, ::4], _STRETCH)
+    picture = np.clip((grey - black) * (255.0 / max(white - black, 1e-9)), 0.0, 255.0).astype(np.uint8)
     if mirrored:
         picture = np.ascontiguousarray(picture[:, ::-1])
     found = _tiled(picture, _SURPLUS * count, 2 * (RADIUS_PX // factor) + 1)
@@ -119,15 +141,9 @@ def find_features(scan: Scan, usable: Callable[[Array], Mask], mirrored: bool, c
     if mirrored:
         places = np.array([picture.shape[1] - 1, 0]) + places * np.array([-1, 1])
     found = replace(found, places_px=places * factor + (factor - 1) / 2, size_px=size_px, reduction=factor)
-    found = found.chosen(np.flatnonzero(usable(found.places_px)))
-    return found.chosen(_spread(found, np.array(size_px), count))
-
-
-def find_frame_features(frame: TieFrame, mirrored: bool, count: int) -> Features:
-    """As `find_features` gives them. Raises MeasurementError where the scan cannot be read."""
-    with frame.open() as scan:
-        size_px = scan.width_px, scan.height_px
-        return find_features(scan, lambda places: frame.usable(places, size_px), mirrored, count)
+    found = found.part(np.flatnonzero(frame.usable(found.places_px, size_px)))
+    cell = np.floor(found.places_px / size_px * _CELLS).astype(np.intp) @ np.array([1, _CELLS])
+    return found.part(interleave_groups(cell, found.strengths)[:count])
 
 
 def read_pieces(frame: TieFrame, patches: Sequence[tuple[Array, int]]) -> list[Piece]:
@@ -135,8 +151,7 @@ def read_pieces(frame: TieFrame, patches: Sequence[tuple[Array, int]]) -> list[P
     Raises MeasurementError where the scan cannot be read."""
     pieces: dict[int, Piece] = {}
     with frame.open() as scan:
-        for k in sorted(range(len(patches)), key=lambda k: float(patches[k][0][1, 2])):
-            matrix, radius_px = patches[k]
+        for k, (matrix, radius_px) in sorted(enumerate(patches), key=lambda patch: float(patch[1][0][1, 2])):
             half = int(np.ceil(radius_px * np.linalg.norm(matrix[:, :2], 2))) + SPARE_PX
             col0, row0 = (int(value) - half for value in np.round(matrix[:, 2]))
             pieces[k] = Piece(scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0), matrix)
@@ -147,62 +162,45 @@ def shared_features(first: Features, second: Features) -> Indices:
     """(n, 2) indices of features that are each other's nearest by far."""
     if min(len(first.places_px), len(second.places_px)) < 2:
         return np.zeros((0, 2), np.intp)
-    there = _nearest(first, second)
-    back = _nearest(second, first)
-    pairs = [(i, j) for i, j in enumerate(there) if j >= 0 and back[j] == i]
-    return np.array(pairs, np.intp).reshape(-1, 2)
+    there, back = _nearest(first, second), _nearest(second, first)
+    mutual = np.flatnonzero((there >= 0) & (back[there] == np.arange(len(there))))
+    return np.column_stack([mutual, there[mutual]])
 
 
-def _eight_bit(grey: NDArray[np.float32]) -> NDArray[np.uint8]:
-    black, white = np.percentile(grey[::4, ::4], _STRETCH)
-    return np.asarray(np.clip((grey - black) * (255.0 / max(white - black, 1e-9)), 0.0, 255.0), np.uint8)
+def _nearest(first: Features, second: Features) -> Indices:
+    """For each feature the nearest of the second scan, -1 where another is nearly as near."""
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
+    return np.array(
+        [best.trainIdx if best.distance < _RATIO * other.distance else -1 for best, other in pairs], np.intp
+    )
 
 
 def _tiled(picture: NDArray[np.uint8], count: int, patch_px: int) -> Features:
-    """About `count` features of a picture, found tile by tile, the strongest of each.
+    """About `count` features of a picture, found tile by tile, the strongest of each; one where there are two
+    directions at a place.
 
     Texture is what the matching of a patch has to go by: the lesser eigenvalue of the grey values' gradients over it
     (Förstner and Gülch 1987).
     """
-    places: list[Array] = [np.empty((0, 2))]
-    descriptors, strengths, textures = [np.empty((0, 128), np.float32)], [np.empty(0)], [np.empty(0)]
-    height, width = picture.shape
-    for row0 in range(0, height, _TILE_PX):
-        for col0 in range(0, width, _TILE_PX):
-            top, left = max(row0 - _OVERLAP_PX, 0), max(col0 - _OVERLAP_PX, 0)
-            tile = picture[top : row0 + _TILE_PX + _OVERLAP_PX, left : col0 + _TILE_PX + _OVERLAP_PX]
-            share = int(np.ceil(count * tile.size / picture.size))
-            points, described = cv2.SIFT.create(nfeatures=share, contrastThreshold=_CONTRAST).detectAndCompute(
-                tile, None
-            )
-            if not points:
-                continue
-            found = np.array([point.pt for point in points]) + np.array([left, top])
-            own = np.all(
-                (found >= (col0 - 0.5, row0 - 0.5)) & (found < (col0 + _TILE_PX - 0.5, row0 + _TILE_PX - 0.5)), 1
-            )
-            own &= _first_of_place(found)
-            places.append(found[own])
-            descriptors.append(np.asarray(described, np.float32)[own])
-            strengths.append(np.array([point.response for point in points])[own])
-            col, row = np.round(found[own] - (left, top)).astype(np.intp).T
-            textures.append(cv2.cornerMinEigenVal(tile, patch_px)[row, col].astype(np.float64))
-    return Features(
-        np.concatenate(places), np.concatenate(descriptors), np.concatenate(strengths), np.concatenate(textures)
-    )
-
-
-def _first_of_place(places: Array) -> Mask:
-    """A feature with two directions is found twice; one of them is enough."""
-    first = np.zeros(len(places), dtype=bool)
-    first[np.unique(np.round(places, 2), axis=0, return_index=True)[1]] = True
-    return first
-
-
-def _spread(features: Features, size_px: Array, count: int) -> Indices:
-    """Indices of the strongest features of every cell in turn, until there are enough."""
-    cell = np.floor(features.places_px / size_px * _CELLS).astype(np.intp) @ np.array([1, _CELLS])
-    return interleave_groups(cell, features.strengths)[:count]
+    tiles = [(np.empty((0, 2)), np.empty((0, 128), np.float32), np.empty(0), np.empty(0))]
+    for row0, col0 in product(*(range(0, side, _TILE_PX) for side in picture.shape)):
+        corner = np.array([col0, row0])
+        first, last = np.maximum(corner - _OVERLAP_PX, 0), corner + _TILE_PX + _OVERLAP_PX
+        tile = picture[first[1] : last[1], first[0] : last[0]]
+        sift = cv2.SIFT.create(int(np.ceil(count * tile.size / picture.size)), contrastThreshold=_CONTRAST)
+        points, described = sift.detectAndCompute(tile, None)
+        if not points:
+            continue
+        places = np.array([point.pt for point in points]) + first
+        once = np.zeros(len(places), bool)
+        once[np.unique(np.round(places, 2), axis=0, return_index=True)[1]] = True
+        within = places - corner + 0.5
+        own = once & np.all((within >= 0) & (within < _TILE_PX), axis=1)
+        col, row = np.round(places[own] - first).astype(np.intp).T
+        textures = cv2.cornerMinEigenVal(tile, patch_px)[row, col].astype(np.float64)
+        strengths = np.array([point.response for point in points])[own]
+        tiles.append((places[own], np.asarray(described, np.float32)[own], strengths, textures))
+    return Features(*map(np.concatenate, zip(*tiles, strict=True)))
 
 
 def interleave_groups(group: Indices, strengths: Array) -> Indices:
@@ -211,10 +209,3 @@ def interleave_groups(group: Indices, strengths: Array) -> Indices:
     _, starts = np.unique(group[order], return_index=True)
     rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
     return np.asarray(order[np.lexsort((-strengths[order], rank))], np.intp)
-
-
-def _nearest(first: Features, second: Features) -> list[int]:
-    """For each feature the nearest of the second scan, -1 where another is nearly as near."""
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    pairs = matcher.knnMatch(first.descriptors, second.descriptors, k=2)
-    return [best.trainIdx if best.distance < _RATIO * other.distance else -1 for best, other in pairs]

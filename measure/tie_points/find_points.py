@@ -13,6 +13,7 @@ from itertools import chain, combinations, compress
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
 from measure.errors import MeasurementError
@@ -20,15 +21,13 @@ from measure.flags import NO_REASON, POINT_REFUSED, Code, Reason, Status
 from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.parallel import map_or_replace
-from measure.tie_points.features import Features, TieFrame, read_pieces
+from measure.tie_points.features import Features, TieFrame, find_all_features, read_pieces, unreachable
 from measure.tie_points.multi_image import RADIUS_PX, Bending, Matched, Piece, bending_variance, match_pieces
 from measure.tie_points.tracks import (
     Shared,
     TieCandidate,
     candidates_with_radius,
-    find_all_features,
     find_candidates,
-    unreachable,
     verify_pairs,
 )
 from measure.tie_points.verification import FEWEST_PAIRS, epipolar_outliers, neighbour_outliers
@@ -38,7 +37,9 @@ Mask = NDArray[np.bool_]
 Pieces = dict[int, Piece | Reason]  # by frame; or why there is none
 
 _RADII_PX = (RADIUS_PX, 21, 30)  # of patches: where the texture is too weak for one, of twice its area
-_WIDEST_PX = 2.0 * _RADII_PX[-1]
+_FEATURES = 25  # a scan, for every point wanted; one in five or so has a partner in all frames
+_LEAST_FEATURES = 3000  # a scan: few are wanted of a small project, and its pairs need enough to be verified
+_NONE_HERE = "No natural points are sought here"
 _LEAST_BATCH = 4  # part of the points wanted: every batch goes through all scans
 _FINE_PX = 1.0  # how far measured points may lie off their epipolar lines for the lens
 _CHUNK = 16  # points that a worker gets at a time
@@ -128,43 +129,33 @@ def _apart(
 ) -> tuple[list[TieCandidate], list[TieCandidate]]:
     """The first candidates whose patches overlap in no frame, neither with each other nor with those that
     are measured; and the candidates left that may come later."""
-    taken, chosen = _Taken(measured), _Taken()
-    left = []
-    for candidate in candidates:
-        if taken.touches(candidate):
+    overlapping = _overlapping([*measured, *candidates])
+    taken, chosen = set(range(len(measured))), set[int]()
+    near, left = list[TieCandidate](), list[TieCandidate]()
+    for number, candidate in enumerate(candidates, len(measured)):
+        if overlapping[number] & taken:
             continue
-        if len(chosen.members) == most or chosen.touches(candidate):
+        if len(chosen) == most or overlapping[number] & chosen:
             left.append(candidate)
         else:
-            chosen.add(candidate)
-    return chosen.members, left
+            chosen.add(number)
+            near.append(candidate)
+    return near, left
 
 
-class _Taken:
-    """Where patches lie already, by frame and by squares as wide as the widest patch."""
-
-    def __init__(self, members: Sequence[TieCandidate] = ()) -> None:
-        self.members: list[TieCandidate] = []
-        self.places: dict[tuple[int, int, int], list[tuple[Array, int]]] = defaultdict(list)
-        for member in members:
-            self.add(member)
-
-    def add(self, candidate: TieCandidate) -> None:
-        self.members.append(candidate)
-        for frame, matrix in candidate.maps.items():
-            col, row = np.floor(matrix[:, 2] / _WIDEST_PX).astype(int)
-            self.places[frame, col, row].append((matrix[:, 2], candidate.radius_px))
-
-    def touches(self, candidate: TieCandidate) -> bool:
-        """Whether its patch overlaps one of these in some frame."""
-        for frame, matrix in candidate.maps.items():
-            place = matrix[:, 2]
-            col, row = np.floor(place / _WIDEST_PX).astype(int)
-            near = [self.places.get((frame, col + i, row + j), ()) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-            for other, radius_px in chain.from_iterable(near):
-                if np.hypot(*(place - other)) < candidate.radius_px + radius_px:
-                    return True
-        return False
+def _overlapping(candidates: Sequence[TieCandidate]) -> list[set[int]]:
+    """For each candidate the numbers of those whose patches overlap its own in some frame."""
+    overlapping = [set[int]() for _ in candidates]
+    for frame in set(chain.from_iterable(candidate.maps for candidate in candidates)):
+        own = np.array([k for k, candidate in enumerate(candidates) if frame in candidate.maps])
+        places = np.array([candidates[k].maps[frame][:, 2] for k in own])
+        radii = np.array([candidates[k].radius_px for k in own])
+        pairs = cKDTree(places).query_pairs(2.0 * radii.max(), output_type="ndarray")
+        touching = np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T) < radii[pairs].sum(axis=1)
+        for one, other in own[pairs[touching]].tolist():
+            overlapping[one].add(other)
+            overlapping[other].add(one)
+    return overlapping
 
 
 def _all_pieces(
@@ -177,7 +168,7 @@ def _all_pieces(
         (frame, [(candidates[k].maps[i], candidates[k].radius_px) for k in own])
         for i, (frame, own) in enumerate(zip(frames, shown, strict=True))
     ]
-    for i, found in enumerate(map_or_replace(workers, _read_pieces, task, lambda _, why: unreachable(why))):
+    for i, found in enumerate(map_or_replace(workers, _read_pieces, task, lambda _, why: unreachable(_NONE_HERE, why))):
         for number, k in enumerate(shown[i]):
             pieces_by_frame[k][i] = found if isinstance(found, Reason) else found[number]
     return pieces_by_frame
@@ -187,11 +178,11 @@ def _read_pieces(task: tuple[TieFrame, Sequence[tuple[Array, int]]]) -> list[Pie
     try:
         return read_pieces(*task)
     except MeasurementError as error:
-        return unreachable(str(error))
+        return unreachable(_NONE_HERE, str(error))
 
 
 def _lost_point(task: tuple[TieCandidate, Pieces], why: str) -> TiePoint:
-    return TiePoint(task[0], {}, {i: unreachable(why) for i in task[0].maps})
+    return TiePoint(task[0], {}, {i: unreachable(_NONE_HERE, why) for i in task[0].maps})
 
 
 def _point(fewest: int, task: tuple[TieCandidate, Pieces]) -> TiePoint:
@@ -334,40 +325,30 @@ def measure_ties(
     """
     options, tell = options or TieOptions(), progress or (lambda *_: None)
     steps = len(frames) + 2
-    readable, unreadable = list[tuple[TieFrame, Features]](), dict[str, tuple[Reason, ...]]()
-    found = find_all_features(frames, options.wanted, workers)
-    for done, (frame, features_or_reason) in enumerate(zip(frames, found, strict=True), 1):
+    readable, problems = list[tuple[TieFrame, Features]](), dict[str, tuple[Reason, ...]]()
+    count = max(_FEATURES * options.wanted, _LEAST_FEATURES)
+    found_all = find_all_features(frames, count, False, _NONE_HERE, workers)
+    for done, (frame, features_or_reason) in enumerate(zip(frames, found_all, strict=True), 1):
         if isinstance(features_or_reason, Reason):
-            unreadable[frame.image] = (features_or_reason,)
+            problems[frame.image] = (features_or_reason,)
         else:
             readable.append((frame, features_or_reason))
         tell(frame.image, done, steps)
     frames, features = [frame for frame, _ in readable], [each for _, each in readable]
     shared = verify_pairs(frames, features, workers)
-    tell("pairs of scans", len(unreadable) + len(frames) + 1, steps)
+    tell("pairs of scans", steps - 1, steps)
     candidates = find_candidates(frames, features, shared, options.images)
     sizes_px = [each.size_px for each in features]
     points = measure_points(frames, sizes_px, candidates, options.wanted, options.images, workers)
     tell("all scans together", steps, steps)
-    found_all = _result(frames, points, len(candidates), shared, options)
-    return replace(found_all, problems={**unreadable, **found_all.problems})
-
-
-def _result(
-    frames: Sequence[TieFrame],
-    points: Sequence[TiePoint],
-    candidate_count: int,
-    shared: Shared,
-    options: TieOptions,
-) -> Ties:
     marks: dict[str, list[MarkMeasurement]] = {frame.image: [] for frame in frames}
     for number, point in enumerate(points, 1):
-        for frame in point.candidate.maps:
-            marks[frames[frame].image].append(_mark(f"tie{number:04d}", point, frame, options))
+        for i in point.candidate.maps:
+            marks[frames[i].image].append(_mark(f"tie{number:04d}", point, i, options))
     found = sum(len(point.standing) >= options.images for point in points)
-    problems = _problems(frames, found, candidate_count, shared, options)
-    by_image = {frames[0].image: problems} if frames and problems else {}
-    return Ties({image: tuple(own) for image, own in marks.items()}, by_image)
+    if frames and found < options.wanted:
+        problems[frames[0].image] = (_few_points(frames, found, len(candidates), shared, options),)
+    return Ties({image: tuple(own) for image, own in marks.items()}, problems)
 
 
 def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMeasurement:
@@ -389,10 +370,8 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
     if frame in point.refused:
         status, reason = Status.REJECTED, point.refused[frame]
     elif len(point.standing) < options.images:
-        status, reason = (
-            Status.REJECTED,
-            Reason(f"only {len(point.standing)} scans agree on the point, {options.images} are to", Code.FEW_SCANS),
-        )
+        message = f"only {len(point.standing)} scans agree on the point, {options.images} are to"
+        status, reason = Status.REJECTED, Reason(message, Code.FEW_SCANS)
     elif not point.is_sharp(frame):
         message = f"the texture fixes it to {point.error_px(frame):.2f} px only"
         status, reason = Status.WEAK, Reason(message, Code.IMPRECISE)
@@ -400,27 +379,19 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
     return MarkMeasurement(name, "tie", piece.center_px, covariance, status, reason, quality)
 
 
-def _problems(
-    frames: Sequence[TieFrame],
-    found: int,
-    candidate_count: int,
-    shared: Shared,
-    options: TieOptions,
-) -> tuple[Reason, ...]:
-    """A sentence where fewer points than wanted were found, with the reason."""
-    if found >= options.wanted:
-        return ()
+def _few_points(
+    frames: Sequence[TieFrame], found: int, candidate_count: int, shared: Shared, options: TieOptions
+) -> Reason:
+    """Why fewer points than wanted were found."""
+    message = (
+        f"Of {options.wanted} natural points wanted, {found} were found: {candidate_count} features are in "
+        f"{options.images} scans or more."
+    )
     if not candidate_count:
-        counts = ", ".join(
-            f"{frames[i].image} and {frames[j].image} {len(pairs)}" for (i, j), pairs in sorted(shared.items())
-        )
+        pairs = sorted(shared.items())
+        counts = ", ".join(f"{frames[i].image} and {frames[j].image} {len(own)}" for (i, j), own in pairs)
         message = (
             f"No natural point was found: none is in {options.images} scans. Features that pairs of scans share, of "
             f"{FEWEST_PAIRS} at least: {counts or 'none'}. Overlapping photographs of one season would have some."
         )
-    else:
-        message = (
-            f"Of {options.wanted} natural points wanted, {found} were found: {candidate_count} features are in "
-            f"{options.images} scans or more."
-        )
-    return (Reason(message, Code.FEW_TIES),)
+    return Reason(message, Code.FEW_TIES)

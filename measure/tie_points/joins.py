@@ -6,7 +6,7 @@ resolution. No relief is between them, and what moves unlike its neighbours is d
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import combinations, compress
@@ -22,7 +22,7 @@ from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import (
     Features,
     TieFrame,
-    find_frame_features,
+    find_all_features,
     interleave_groups,
     read_pieces,
     shared_features,
@@ -31,7 +31,6 @@ from measure.tie_points.multi_image import RADIUS_PX, Matched, Piece, match_piec
 from measure.tie_points.verification import neighbour_outliers
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 WANTED = 60  # joins of two scans
 _FEW = 12  # joins: fewer are a problem
@@ -42,15 +41,13 @@ _FEWEST = 12  # features that one similarity explains: chance makes three or fou
 _TRIALS, _CONFIDENCE = 5000, 0.9999  # of RANSAC
 _APART_PX = 2 * RADIUS_PX + 2  # of joins: patches that overlap have correlated errors
 _SHARP_PX = 0.5  # rms length of an error: with less texture a join is weak
-_INTERPOLATION_PX = (
-    0.01  # that sharp pictures without noise are off by, between pixels; in aerial photographs 0.01 at most
-)
+_INTERPOLATION_PX = 0.01  # that sharp pictures without noise are off by, between pixels; aerial ones at most
 _CHUNK = 16  # places that a worker gets at a time
 _UNEVEN = Reason("parts of the picture about the place move unlike each other", Code.OTHER_SCANS)
 _LOST = Reason("the process that matched it was ended", Code.UNREACHABLE)
 _UNLIKE = Reason("the places about it map elsewhere from scan to scan: dust on the glass, or chance", Code.OTHER_SCANS)
+_UNJOINED = "It is not joined to the other scans of its frame"
 
-_Pair = tuple[Piece, Piece]
 _MatchedPair = tuple[Matched, ...]
 
 
@@ -68,134 +65,104 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
     Raises nothing for what the pictures show, nor for a scan that cannot be read: a problem says why it has none. The
     result does not depend on the number of workers.
     """
-    found_or_not = list(map_or_replace(workers, _features, parts, lambda _, why: _out_of_reach(why)))
-    unreadable = {part.image: each for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Reason)}
-    readable = [(part, each) for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Features)]
-    parts, features = [part for part, _ in readable], [each for _, each in readable]
-    marks: dict[str, list[MarkMeasurement]] = {part.image: [] for part in parts}
-    shared: dict[tuple[int, int], _SharedFeatures] = {}
-    number, problems = 0, dict[str, Reason]()
-    for i, j in combinations(range(len(parts)), 2):
-        shared[i, j] = _match_features(features[i], features[j])
-        second_from_first = shared[i, j].second_from_first
+    found = list(find_all_features(parts, _FEATURES, True, _UNJOINED, workers))
+    readable = [(part, each) for part, each in zip(parts, found, strict=True) if isinstance(each, Features)]
+    marks: dict[str, list[MarkMeasurement]] = {part.image: [] for part, _ in readable}
+    agreements: dict[str, list[str]] = {part.image: [] for part, _ in readable}
+    problems, number = dict[str, Reason](), 0
+    for (first, first_features), (second, second_features) in combinations(readable, 2):
+        both = first, second
+        second_from_first, agreement = _match_features(first_features, second_features)
+        for part, other in (both, both[::-1]):
+            agreements[part.image].append(f"with {other.image} {agreement}")
         if second_from_first is None:
             continue
-        both = features[i], features[j]
-        found, refused = _measure_pair((parts[i], parts[j]), both, second_from_first, wanted, workers)
-        for pair in found:
+        places = _places(second, first_features, second_features, second_from_first, wanted)
+        pairs, refused = _measure_pair(both, places, wanted, workers)
+        for pair in pairs:
             number += 1
-            for part, matched in zip((parts[i], parts[j]), pair, strict=True):
+            for part, matched in zip(both, pair, strict=True):
                 marks[part.image].append(_mark(f"join{number:04d}", matched))
-        if len(found) < _FEW:
-            problems |= {part.image: _few(parts[i], parts[j], len(found), refused) for part in (parts[i], parts[j])}
-    unjoined = dict(_unjoined(parts, shared, marks))
-    return Joins({image: tuple(own) for image, own in marks.items()}, problems | unjoined | unreadable)
+        if len(pairs) < _FEW:
+            problems |= {part.image: _few(both, len(pairs), refused) for part in both}
+    for image, own in marks.items():
+        if not any(mark.status.is_observation for mark in own):
+            problems[image] = _none(agreements[image])
+    problems |= {part.image: each for part, each in zip(parts, found, strict=True) if isinstance(each, Reason)}
+    return Joins({image: tuple(own) for image, own in marks.items()}, problems)
 
 
-def _features(part: TieFrame) -> Features | Reason:
-    try:
-        return find_frame_features(part, False, _FEATURES)
-    except MeasurementError as error:
-        return _out_of_reach(str(error))
-
-
-def _out_of_reach(why: str) -> Reason:
-    return Reason(f"It is not joined to the other scans of its frame: {why}", Code.UNREACHABLE)
-
-
-@dataclass(frozen=True, eq=False)
-class _SharedFeatures:
-    """alike: how many features two scans share; agree: how many of them one similarity explains. second_from_first:
-    (2, 3) affine map of pixels through these; None where too few agree."""
-
-    alike: int
-    agree: int
-    second_from_first: Array | None
-
-
-def _match_features(first: Features, second: Features) -> _SharedFeatures:
+def _match_features(first: Features, second: Features) -> tuple[Array | None, str]:
+    """(2, 3) affine map of pixels from the first scan to the second, through the features that one similarity explains;
+    None where too few agree. And how many agree, a part of a sentence."""
     pairs = shared_features(first, second)
-    if len(pairs) < _FEWEST:
-        return _SharedFeatures(len(pairs), 0, None)
     here, there = first.places_px[pairs[:, 0]], second.places_px[pairs[:, 1]]
-    within_px = _AGREE_PX * max(first.reduction, second.reduction)
-    cv2.setRNGSeed(0)
-    _, inside = cv2.estimateAffinePartial2D(
-        here, there, method=cv2.RANSAC, ransacReprojThreshold=within_px, maxIters=_TRIALS, confidence=_CONFIDENCE
-    )
-    agree = np.zeros(len(pairs), dtype=bool) if inside is None else inside.ravel() > 0
+    agree = np.zeros(len(pairs), dtype=bool)
+    if len(pairs) >= _FEWEST:
+        within_px = _AGREE_PX * max(first.reduction, second.reduction)
+        cv2.setRNGSeed(0)
+        _, inside = cv2.estimateAffinePartial2D(
+            here, there, method=cv2.RANSAC, ransacReprojThreshold=within_px, maxIters=_TRIALS, confidence=_CONFIDENCE
+        )
+        agree = agree if inside is None else inside.ravel() > 0
+    agreement = f"{agree.sum()} of {len(pairs)} similar features agree on one similarity"
     if agree.sum() < _FEWEST:
-        return _SharedFeatures(len(pairs), int(agree.sum()), None)
-    return _SharedFeatures(len(pairs), int(agree.sum()), _affine(here[agree], there[agree]))
-
-
-def _affine(here: Array, there: Array) -> Array:
-    """(2, 3) of places (n, 2) to places, by least squares."""
-    design = np.column_stack([here, np.ones(len(here))])
-    return np.asarray(np.linalg.lstsq(design, there, rcond=None)[0].T)
-
-
-def _measure_pair(
-    both: tuple[TieFrame, TieFrame],
-    features: tuple[Features, Features],
-    second_from_first: Array,
-    wanted: int,
-    workers: Executor | None,
-) -> tuple[list[_MatchedPair], Counter[str]]:
-    """Both places of every join, so many at most, and why other places are none."""
-    places = _places(both[1], features, second_from_first, wanted)
-    try:
-        pieces = list(zip(*(read_pieces(part, own) for part, own in zip(both, places, strict=True)), strict=True))
-    except MeasurementError as error:
-        return [], Counter([str(error)])
-    matched = list(map_or_replace(workers, _match, pieces, lambda *_: (), _CHUNK))
-    refused = Counter(str(_refused(pair)) for pair in matched if _refused(pair))
-    good = [pair for pair in matched if not _refused(pair)]
-    if good:
-        unlike = neighbour_outliers(*(np.array([pair[of].center_px for pair in good]) for of in (0, 1)))
-        refused[_UNLIKE] += int(unlike.sum())
-        good = list(compress(good, ~unlike))
-    return good[:wanted], refused
+        return None, agreement
+    design = np.column_stack([here[agree], np.ones(agree.sum())])
+    return np.asarray(np.linalg.lstsq(design, there[agree], rcond=None)[0].T), agreement
 
 
 def _places(
-    other: TieFrame, features: tuple[Features, Features], second_from_first: Array, wanted: int
-) -> tuple[list[tuple[Array, int]], ...]:
-    """Maps (2, 3) from patches to both scans, and radii: the best textured of every part of the overlap first, none
-    touching another."""
-    first, second = features
+    other: TieFrame, first: Features, second: Features, second_from_first: Array, wanted: int
+) -> list[tuple[Array, Array]]:
+    """Maps (2, 3) from patches to both scans: the best textured of every part of the overlap first, none touching
+    another."""
     there = first.places_px @ second_from_first[:, :2].T + second_from_first[:, 2]
     common = np.flatnonzero(other.usable(there, second.size_px))
     if not len(common):
-        return [], []
-    here = first.places_px[common]
+        return []
+    here, there = first.places_px[common], there[common]
     cell_px = max(float(np.sqrt(np.prod(np.ptp(here, axis=0) + 1.0) / wanted)), float(_APART_PX))
     cell = np.floor((here - here.min(axis=0)) / cell_px).astype(np.intp) @ np.array([1, 10000])
     chosen = list[int]()
     for k in interleave_groups(cell, first.textures[common]).tolist():
-        if all(np.hypot(*(here[k] - here[other_k])) >= _APART_PX for other_k in chosen):
+        if np.all(np.hypot(*(here[chosen] - here[k]).T) >= _APART_PX):
             chosen.append(k)
         if len(chosen) == _TRIED * wanted:
             break
     linear = second_from_first[:, :2]
-    return (
-        [(np.column_stack([np.eye(2), here[k]]), RADIUS_PX) for k in chosen],
-        [(np.column_stack([linear, there[common[k]]]), RADIUS_PX) for k in chosen],
-    )
+    return [(np.column_stack([np.eye(2), here[k]]), np.column_stack([linear, there[k]])) for k in chosen]
 
 
-def _match(pieces: _Pair) -> _MatchedPair:
+def _measure_pair(
+    both: tuple[TieFrame, TieFrame], places: Sequence[tuple[Array, Array]], wanted: int, workers: Executor | None
+) -> tuple[list[_MatchedPair], Counter[str]]:
+    """Both places of every join, so many at most, and why other places are none."""
+    try:
+        read = (read_pieces(part, [(maps[k], RADIUS_PX) for maps in places]) for k, part in enumerate(both))
+        pieces = list(zip(*read, strict=True))
+    except MeasurementError as error:
+        return [], Counter([str(error)])
+    matched = list(map_or_replace(workers, _match, pieces, lambda *_: (), _CHUNK))
+    reasons = [_refusal(pair) for pair in matched]
+    good = [pair for pair, reason in zip(matched, reasons, strict=True) if not reason]
+    if good:
+        is_unlike = neighbour_outliers(*(np.array([pair[k].center_px for pair in good]) for k in (0, 1)))
+        good = list(compress(good, ~is_unlike))
+        reasons += [_UNLIKE] * int(is_unlike.sum())
+    return good[:wanted], Counter(str(reason) for reason in reasons if reason)
+
+
+def _match(pieces: tuple[Piece, Piece]) -> _MatchedPair:
     return match_pieces(pieces, 0)
 
 
-def _refused(pair: _MatchedPair) -> Reason:
+def _refusal(pair: _MatchedPair) -> Reason:
     """Why its own pictures are no join; empty where they are."""
     if not pair:
         return _LOST
-    for matched in pair:
-        if matched.reason:
-            return matched.reason
-    return _UNEVEN if pair[1].unevenness < POINT_REFUSED else NO_REASON
+    uneven = _UNEVEN if pair[1].unevenness < POINT_REFUSED else NO_REASON
+    return next((matched.reason for matched in pair if matched.reason), uneven)
 
 
 def _mark(name: str, matched: Matched) -> MarkMeasurement:
@@ -210,36 +177,21 @@ def _mark(name: str, matched: Matched) -> MarkMeasurement:
     return MarkMeasurement(name, "join", matched.center_px, covariance, status, reason, quality)
 
 
-def _few(one: TieFrame, other: TieFrame, found: int, refused: Counter[str]) -> Reason:
+def _few(both: tuple[TieFrame, TieFrame], found: int, refused: Counter[str]) -> Reason:
     most = refused.most_common(1)
     why = f", most of the others because {most[0][0]}" if most else ""
     return Reason(
-        f"Only {found} of {found + refused.total()} places join {one.image} and {other.image}{why}. Scans that overlap "
-        "by more, of ground with texture, would have some tens; the standard deviations say what these are worth.",
+        f"Only {found} of {found + refused.total()} places join {both[0].image} and {both[1].image}{why}. Scans that "
+        "overlap by more, of ground with texture, would have some tens; the standard deviations say what these are "
+        "worth.",
         Code.FEW_TIES,
     )
 
 
-def _unjoined(
-    parts: Sequence[TieFrame],
-    shared: Mapping[tuple[int, int], _SharedFeatures],
-    marks: Mapping[str, Sequence[MarkMeasurement]],
-) -> Iterator[tuple[str, Reason]]:
-    """Every scan that nothing joins to the others, and why."""
-    for number, part in enumerate(parts):
-        if any(mark.status.is_observation for mark in marks[part.image]):
-            continue
-        pairs_message = "; ".join(
-            f"with {parts[i].image if j == number else parts[j].image} {each.agree} of {each.alike} similar features "
-            "agree on one similarity"
-            for (i, j), each in shared.items()
-            if number in (i, j)
-        )
-        yield (
-            part.image,
-            Reason(
-                f"Nothing joins it to the other scans of its frame: {pairs_message}; at least {_FEWEST} are needed. "
-                "Check whether it is a scan of that frame, and whether the scans overlap.",
-                Code.FEW_TIES,
-            ),
-        )
+def _none(agreements: Sequence[str]) -> Reason:
+    """Of a scan that nothing joins to the others."""
+    return Reason(
+        f"Nothing joins it to the other scans of its frame: {'; '.join(agreements)}; at least {_FEWEST} are needed. "
+        "Check whether it is a scan of that frame, and whether the scans overlap.",
+        Code.FEW_TIES,
+    )

@@ -104,19 +104,6 @@ def _valid(components: Array) -> Array:
     return np.array([matrix[0, 0], matrix[0, 1], matrix[1, 1]])
 
 
-# Multi-image least-squares matching: one natural point in all frames that show it, none of them a perfect original.
-#
-# The same small piece of ground is resampled from every frame onto one grid. All frames' pieces are one unknown common
-# patch, each with an offset and a gain of its own and with an affine geometry; the grid of one frame, the reference,
-# says which point is meant. The patch being unknown too, its best estimate is the pieces' mean, and a frame's geometry
-# follows from the difference of its piece and the reference's (the object-based matching of Gruen and Baltsavias 1988
-# and of Rosenholm 1987, the patch eliminated).
-#
-# Covariance: a frame's own noise alone moves its own point, the reference's as much as another's. The definition of the
-# point is free of error, for the unknown object point takes it up: so frames are uncorrelated, each with the covariance
-# of its own noise, and what separates two frames has the sum of both.
-
-
 @dataclass(frozen=True, eq=False)
 class Piece:
     """What a frame shows about a point: grey values (height, width) whose top-left pixel is origin_px (col, row) of the

@@ -4,22 +4,21 @@ maps from scan to scan.
 Features of all scans are compared in pairs; what one epipolar geometry explains is joined to tracks, and the tracks are
 ordered so that the first of them, however many, spread evenly over the frames."""
 
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import partial
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from measure.errors import MeasurementError
-from measure.flags import Code, Reason
 from measure.noise.robust_estimation import least_distances
 from measure.scans.parallel import map_or_replace
-from measure.tie_points.features import Features, TieFrame, find_frame_features, interleave_groups, shared_features
+from measure.tie_points.features import Features, TieFrame, interleave_groups, shared_features
 from measure.tie_points.multi_image import RADIUS_PX
 from measure.tie_points.verification import epipolar_inliers
 
@@ -32,11 +31,8 @@ _REWEIGHTINGS = 6  # of least distances
 _STRETCH = 2.0  # the most by which a small piece of ground can differ in scale between photographs to be matched
 _NEIGHBOURS = 12  # that tell the map about a point: four times its unknowns, for some of them may be false
 Shared = Mapping[tuple[int, int], Indices]
-Place = tuple[int, int]  # a frame, and a feature of it
 Track = dict[int, int]  # the feature in every frame
 
-_FEATURES = 25  # a scan, for every point wanted; one in five or so has a partner in all frames
-_LEAST_FEATURES = 3000  # a scan: few are wanted of a small project, and its pairs need enough to be verified
 _AGREE_PX = 2.0  # in the reduced scan: what a feature's place and a lens leave
 _CELLS = 8  # a side of a frame, over which points are spread
 
@@ -44,7 +40,7 @@ _CELLS = 8  # a side of a frame, over which points are spread
 class LocalMaps:
     """Affine maps about a place from one scan to another."""
 
-    def __init__(self, features: Sequence[Features], shared: Mapping[tuple[int, int], Indices]) -> None:
+    def __init__(self, features: Sequence[Features], shared: Shared) -> None:
         self._places: dict[tuple[int, int], tuple[Array, Array]] = {}
         for (i, j), pairs in shared.items():
             if len(pairs):
@@ -82,13 +78,6 @@ def _affine_map(here: Array, there: Array, usual: Array, weight: float) -> Array
     return np.column_stack([matrix, target - matrix @ middle])
 
 
-# Which natural points are worth measuring: features that three scans or more share, and how the ground about them maps
-# from scan to scan.
-#
-# Features of all scans are compared in pairs; what one epipolar geometry explains is joined to tracks, and the tracks
-# are ordered so that the first of them, however many, spread evenly over the frames.
-
-
 @dataclass(frozen=True, eq=False)
 class TieCandidate:
     """A track: the approximate affine maps (2, 3) from its patch, of radius_px, to the scans, by frame; which frame
@@ -97,23 +86,6 @@ class TieCandidate:
     reference: int
     maps: dict[int, Array]
     radius_px: int = RADIUS_PX
-
-
-def find_all_features(frames: Sequence[TieFrame], wanted: int, workers: Executor | None) -> Iterator[Features | Reason]:
-    """The features of every scan from which so many natural points are to come; or why it has none."""
-    return map_or_replace(workers, partial(_features, wanted), frames, lambda _, why: unreachable(why))
-
-
-def _features(wanted: int, frame: TieFrame) -> Features | Reason:
-    try:
-        return find_frame_features(frame, frame.mirrored, max(_FEATURES * wanted, _LEAST_FEATURES))
-    except MeasurementError as error:
-        return unreachable(str(error))
-
-
-def unreachable(why: str) -> Reason:
-    """Of a scan that could not be looked at once more."""
-    return Reason(f"No natural points are sought here: {why}", Code.UNREACHABLE)
 
 
 def verify_pairs(
@@ -126,8 +98,9 @@ def verify_pairs(
     pairs_of = [(features[i], features[j]) for i, j in both]
     found = map_or_replace(workers, _match_pair, pairs_of, lambda *_: np.zeros((0, 2), np.intp))
     for (i, j), pairs in zip(both, found, strict=True):
-        first = frames[i].camera_px(features[i].places_px[pairs[:, 0]])
-        second = frames[j].camera_px(features[j].places_px[pairs[:, 1]])
+        first, second = (
+            frames[k].camera_px(features[k].places_px[own]) for k, own in zip((i, j), pairs.T, strict=True)
+        )
         shared[i, j] = pairs[epipolar_inliers(first, second, _AGREE_PX * features[i].reduction)]
     return shared
 
@@ -227,42 +200,35 @@ def _most_central(frames: Sequence[TieFrame], features: Sequence[Features], trac
     return min(off, key=lambda i: (off[i], i))
 
 
-def tracks_of_pairs(shared: Mapping[tuple[int, int], NDArray[np.intp]]) -> list[Track]:
-    """Tracks in the order of their features.
+def tracks_of_pairs(shared: Shared) -> list[Track]:
+    """Join features that pairs of frames share to tracks.
 
-    shared: by pair of frames, (n, 2) features that they share. A track that has two features in a frame is none; and a
-    feature stays in one of three frames or more only where two others share it. What one pair alone has is a track of
-    two.
+    Parameters
+    ----------
+    shared : by pair of frames, (n, 2) features that they share.
+
+    Returns
+    -------
+    The tracks in the order of their features. A track that has two features in a frame is none; and a feature stays in
+    one of three frames or more only where two others share it. What one pair alone has is a track of two.
     """
-    links = [((i, int(a)), (j, int(b))) for (i, j), pairs in sorted(shared.items()) for a, b in pairs]
-    parent: dict[Place, Place] = {}
-    for link in links:
-        parent[_root(parent, link[0])] = _root(parent, link[1])
-    groups: dict[Place, list[tuple[Place, Place]]] = defaultdict(list)
-    for link in links:
-        groups[_root(parent, link[0])].append(link)
-    tracks = [_proven(group) for group in groups.values()]
-    return sorted((track for track in tracks if track), key=lambda track: sorted(track.items()))
-
-
-def _root(parent: dict[Place, Place], place: Place) -> Place:
-    parent.setdefault(place, place)
-    while parent[place] != place:
-        parent[place] = parent[parent[place]]
-        place = parent[place]
-    return place
-
-
-def _proven(links: Iterable[tuple[Place, Place]]) -> Track:
-    """The features of one group that two others hold, or its only pair; none where a frame has two."""
-    kept = list(links)
-    if len(kept) == 1:
-        return dict(kept[0])
+    links = [np.zeros((0, 4), np.intp)]
+    links += [np.column_stack([np.full_like(own, pair), own])[:, [0, 2, 1, 3]] for pair, own in shared.items()]
+    places, ends = np.unique(np.concatenate(links).reshape(-1, 2), axis=0, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    graph = coo_array((np.ones(len(ends)), ends.T), (len(places), len(places)))
+    group = connected_components(graph, directed=False)[1]
+    is_alone = np.bincount(group[ends[:, 0]], minlength=len(places))[group[ends[:, 0]]] == 1
+    kept = np.ones(len(ends), bool)
     while True:
-        count = Counter(place for link in kept for place in link)
-        left = [link for link in kept if min(count[link[0]], count[link[1]]) >= 2]
-        if len(left) == len(kept):
+        links_of = np.bincount(ends[kept].ravel(), minlength=len(places))
+        held = kept & (is_alone | (links_of[ends].min(axis=1) >= 2))
+        if held.sum() == kept.sum():
             break
-        kept = left
-    track = dict(count.keys())
-    return track if len(track) == len(count) else {}
+        kept = held
+    members: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for place in np.unique(ends[kept]).tolist():
+        frame, feature = places[place].tolist()
+        members[int(group[place])].append((frame, feature))
+    tracks = (dict(own) for own in members.values() if len({frame for frame, _ in own}) == len(own))
+    return sorted(tracks, key=lambda track: sorted(track.items()))
