@@ -1,17 +1,22 @@
 """The datum of the object space: the similarity transformations that no observation sees, and how they are fixed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.errors import DatumError
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import angles_near, rotation_from_vector
+from adjust.problem.network import Network, ObjectPoint
+from adjust.problem.parameter import Parameter, object_coordinate
 from adjust.problem.problem import Problem, State
+from adjust.rank_defect.named_directions import DATUM_DIRECTIONS
 
 EXACT = 1e-9  # what a generator may move of a given quantity and still be unhindered: rounding
 FLAT = 1e-3  # the same where relief, in parts of the field's extent, is too little to carry a datum
+DEPENDENT = 1e-6  # part of a coordinate's motion that those before it must leave open, or it is theirs already
 CENTERINGS = 10  # the transformation is all but linear: two or three do
 LEVERAGES = (0.4, 0.1)  # part of a coordinate's motion that other datum values must leave open: at first, at the least
 
@@ -28,6 +33,10 @@ class ObjectDatum:
     extent: float
     generators: Array
     free: Array
+
+    def motions(self, positions: Indices) -> Array:
+        """How some unknowns move (k, d) with what is free."""
+        return np.asarray(self.generators[positions] @ self.free)
 
 
 def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> ObjectDatum:
@@ -85,34 +94,42 @@ def minimal_datum(problem: Problem) -> Indices:
     """
     state = problem.start()
     datum = object_datum(problem, state, FLAT)
+    candidates = _candidates(problem, state)
+    motions, basis = datum.motions(candidates), np.zeros((0, datum.free.shape[1]))
     chosen: list[int] = []
-    motions = np.zeros((0, datum.free.shape[1]))
-    for leverage, position in product(LEVERAGES, _candidates(problem, state)):
-        if len(chosen) == datum.free.shape[1]:
-            break
-        motion = datum.generators[position] @ datum.free
-        rest = motion - motions.T @ (motions @ motion)
-        if np.linalg.norm(rest) > leverage * np.linalg.norm(motion):
-            chosen.append(int(position))
-            motions = np.vstack([motions, rest / np.linalg.norm(rest)])
-    return np.array(chosen, dtype=np.intp)
+    for leverage in LEVERAGES:
+        more, basis = _independent(motions, leverage * np.linalg.norm(motions, axis=1), basis)
+        chosen += more
+    return candidates[chosen]
 
 
-def _candidates(problem: Problem, state: State) -> list[int]:
+def _independent(motions: Array, least: Array | float, basis: Array) -> tuple[list[int], Array]:
+    """Of motions (m, d), one after the other, those of which a basis (k, d) and those before leave more open than their
+    least; and the basis that they make with it."""
+    chosen = []
+    for i, (motion, enough) in enumerate(zip(motions, np.broadcast_to(least, len(motions)), strict=True)):
+        rest = motion - basis.T @ (basis @ motion)
+        if len(basis) < len(motion) and np.linalg.norm(rest) > enough:
+            chosen.append(i)
+            basis = np.vstack([basis, rest / np.linalg.norm(rest)])
+    return chosen, basis
+
+
+def _candidates(problem: Problem, state: State) -> Indices:
     """Free coordinates, of points that two images show at least, in the order in which they are to be fixed."""
     positions = _point_positions(problem)
     free = np.isinf(problem.unknowns.sigma[positions[:, :2]]).all(axis=1)
     rays = np.bincount(problem.places[~problem.is_fiducial, 0], minlength=len(problem.unknowns))
     usable = positions[free & (rays[positions[:, 0]] >= 2)]
     if len(usable) == 0:
-        return []
+        return np.empty(0, dtype=np.intp)
     plan = state.values[usable[:, :2]]
     a = int(np.argmax(((plan - plan.mean(axis=0)) ** 2).sum(axis=1)))
     b = int(np.argmax(((plan - plan[a]) ** 2).sum(axis=1)))
     along = plan[b] - plan[a]
     c = int(np.argmax(np.abs((plan - plan[a]) @ np.array([-along[1], along[0]]))))
-    order = [*usable[a], *usable[b], usable[c, 2], *usable[c, :2]]
-    return [int(position) for position in order if np.isinf(problem.unknowns.sigma[position])]
+    order = np.array([*usable[a], *usable[b], usable[c, 2], *usable[c, :2]])
+    return np.asarray(order[np.isinf(problem.unknowns.sigma[order])])
 
 
 def centered(problem: Problem, state: State, members: Indices) -> State:
@@ -124,7 +141,7 @@ def centered(problem: Problem, state: State, members: Indices) -> State:
     wanted = np.where(is_given, given, problem.unknowns.start[members])
     for _ in range(CENTERINGS):
         datum = object_datum(problem, state, FLAT)
-        amount = _nearest(datum.generators[members] @ datum.free, wanted - state.values[members], is_given)
+        amount = _nearest(datum.motions(members), wanted - state.values[members], is_given)
         state = _transformed(problem, state, datum, datum.free @ amount)
         if np.abs(amount).max(initial=0.0) <= EXACT * datum.extent:
             break
@@ -162,15 +179,99 @@ def _transformed(problem: Problem, state: State, datum: ObjectDatum, amounts: Ar
     for i, positions in enumerate(problem.exterior[:, 3:]):
         if problem.unknowns.sigma[positions].any():
             values[positions] = angles_near(rotations[i], values[positions])
-    return State(values, np.where(_fixed_attitudes(problem)[:, None, None], state.rotations, rotations))
-
-
-def _fixed_attitudes(problem: Problem) -> Mask:
-    """Images whose attitude is fixed."""
-    return np.asarray((problem.unknowns.sigma[problem.exterior[:, 3:]] == 0.0).all(axis=1))
+    fixed = (problem.unknowns.sigma[problem.exterior[:, 3:]] == 0.0).all(axis=1)
+    return State(values, np.where(fixed[:, None, None], state.rotations, rotations))
 
 
 def free_motion(problem: Problem, state: State) -> Array:
     """How all quantities move (n, d) with what is free of the datum."""
-    datum = object_datum(problem, state, FLAT)
-    return np.asarray(datum.generators @ datum.free)
+    return object_datum(problem, state, FLAT).motions(np.arange(len(problem.unknowns)))
+
+
+def held_as_known(network: Network, coordinates: Sequence[str]) -> Network:
+    """The network for approximations: coordinates that are to be held, and have a value, count as known."""
+    held = {object_coordinate(text) for text in coordinates}
+    return replace(network, points=tuple(_known_point(point, held) for point in network.points))
+
+
+def _known_point(point: ObjectPoint, held: set[Parameter]) -> ObjectPoint:
+    priors = [
+        Prior(prior.value) if prior is not None and Parameter.point(point.id, axis) in held else prior
+        for axis, prior in zip("XYZ", (point.X, point.Y, point.Z), strict=True)
+    ]
+    return ObjectPoint(point.id, *priors)
+
+
+def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
+    """Positions of the coordinates, "point.X" and so on, that a minimal datum is to hold.
+
+    Raises DatumError where one is unknown or given already, where they hold less than is free of the datum, or
+    more: that would strain the network.
+    """
+    positions = np.array([_position(problem, text) for text in coordinates], dtype=np.intp)
+    datum = object_datum(problem, problem.start(), FLAT)
+    motions = datum.motions(positions)
+    least = DEPENDENT * np.maximum(np.linalg.norm(motions, axis=1), DEPENDENT)
+    chosen, basis = _independent(motions, least, np.zeros((0, datum.free.shape[1])))
+    strained = [text for i, text in enumerate(coordinates) if i not in chosen]
+    if strained:
+        others = "the other datum coordinates and" if chosen else ""
+        raise DatumError(
+            f"The datum is over-constrained: {others} what is given hold {', '.join(strained)} already, and "
+            f"a minimal datum takes {datum.free.shape[1]} values here. To hold more would strain the network. "
+            f"Leave {'it' if len(strained) == 1 else 'them'} out of the datum coordinates, or say by a standard "
+            f"deviation in the points how well each is known."
+        )
+    _check_complete(datum, basis, f"The datum coordinates {', '.join(coordinates)}")
+    return positions
+
+
+def _position(problem: Problem, coordinate: str) -> int:
+    parameter = object_coordinate(coordinate)
+    _check_points(problem, [parameter.id])
+    position = int(problem.unknowns.point[parameter.id]["XYZ".index(parameter.quantity)])
+    if np.isfinite(problem.unknowns.sigma[position]):
+        raise DatumError(
+            f"The datum coordinate {coordinate} is given with the standard deviation "
+            f"{problem.unknowns.sigma[position]:g}: it holds the network as it is. Leave it out of the datum "
+            f"coordinates, or leave its standard deviation blank."
+        )
+    return position
+
+
+def chosen_points(problem: Problem, points: Sequence[str]) -> Indices:
+    """Positions of the free coordinates of the points (all points if none is named) that carry the inner constraints.
+
+    Raises DatumError where one is unknown, or where they do not carry all that is free of the datum.
+    """
+    _check_points(problem, points)
+    members = free_coordinates(problem, points)
+    if points:
+        datum = object_datum(problem, problem.start(), FLAT)
+        motions = datum.motions(members)
+        _, strength, right = np.linalg.svd(np.vstack([motions, np.zeros((7, motions.shape[1]))]), full_matrices=False)
+        _check_complete(datum, right[strength > FLAT], f"The datum points {', '.join(points)}")
+    return members
+
+
+def _check_points(problem: Problem, points: Sequence[str]) -> None:
+    for point in points:
+        if point not in problem.unknowns.point:
+            given = point in problem.network.point_by_id
+            why = "is shown by no image" if given else "is not among the object points"
+            raise DatumError(f"Point {point}, which the datum names, {why}. Name another point, or correct it.")
+
+
+def _check_complete(datum: ObjectDatum, motions: Array, what: str) -> None:
+    """Refuse a choice whose motions (k, d), orthonormal rows, leave some of the free directions (7, d) open."""
+    _, _, right = np.linalg.svd(np.vstack([motions, np.zeros((motions.shape[1], motions.shape[1]))]))
+    open_directions = datum.free @ right[len(motions) :].T
+    if open_directions.shape[1] == 0:
+        return
+    order = [3, 4, 5, 6, 0, 1, 2]  # turns and scale first, which move along with shifts
+    named, _ = _independent(open_directions[order], FLAT, np.zeros((0, open_directions.shape[1])))
+    moving, remedies = zip(*(DATUM_DIRECTIONS[i] for i in sorted(order[k] for k in named)), strict=True)
+    raise DatumError(
+        f"{what} do not hold the object space: it {'; it '.join(moving)}. Name "
+        f"{'; '.join(dict.fromkeys(remedies))}, or leave the choice to the program."
+    )

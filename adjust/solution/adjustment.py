@@ -14,8 +14,16 @@ from adjust.least_squares.malloc_tuning import keep_freed_memory
 from adjust.problem.network import STRAIGHT, Approximations, Network
 from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
-from adjust.rank_defect.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
-from adjust.rank_defect.datum_choice import chosen_coordinates, chosen_points, held_as_known
+from adjust.rank_defect.datum import (
+    CENTERINGS,
+    EXACT,
+    centered,
+    chosen_coordinates,
+    chosen_points,
+    held_as_known,
+    minimal_datum,
+    object_datum,
+)
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
 from adjust.solution.coordinate_blunders import Slip, coordinate_slips, far_points, few_points, free_points
 from adjust.solution.left_out_images import adopt_lens, fitting, leave_out

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from simulated import camera_of_film
 
 from adjust.functional_model.lens import Prior
+from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Network
 
 Array = NDArray[np.float64]
@@ -131,12 +133,8 @@ def _function(network: Network, x: Values, row: int, xy: Array | Complex, mirror
     observations = network.observations
     image = network.image_by_name[observations.image[row]]
     point = observations.point[row]
-    place = _film(
-        image.transformation,
-        {k: x[f"T.{image.name}.{k}"] for k in _FILM[image.transformation]},
-        xy,
-        image.name in mirrored,
-    )
+    film = np.array([x[f"T.{image.name}.{name}"] for name in film_parameter_names(image.transformation)])
+    place = np.array(camera_of_film(image.transformation, film, image.name in mirrored, xy[0] + 0j, xy[1] + 0j))
     if observations.kind[row] == "fiducial":
         return np.asarray(place - np.array([x[f"FID.{image.camera}.{point}.{axis}"] for axis in "xy"]))
     o, p, k = (x[f"EO.{image.name}.{name}"] for name in ("omega", "phi", "kappa"))
@@ -159,29 +157,6 @@ _LENS = {
     "torlegard": ("k3", "k5", "k7", "p1", "p2", "p3", "p4"),
     "brown": ("k1", "k2", "k3", "p1", "p2", "b1", "b2"),
 }
-_FILM = {
-    "none": (),
-    "congruent": ("a1", "b1", "angle"),
-    "similarity": ("a1", "b1", "p", "q"),
-    "affine": ("a1", "a2", "a3", "b1", "b2", "b3"),
-    "projective": ("a1", "a2", "a3", "b1", "b2", "b3", "c1", "c2"),
-}
-
-
-def _film(kind: str, t: Values, xy: Array | Complex, is_mirrored: bool) -> Complex:
-    x, y = xy[0] + 0j, xy[1] + 0j
-    m = -1.0 if is_mirrored else 1.0
-    match kind:
-        case "none":
-            return np.array([x, y])
-        case "congruent":
-            c, s = np.cos(t["angle"]), np.sin(t["angle"])
-            return np.array([t["a1"] + c * x - m * s * y, t["b1"] + s * x + m * c * y])
-        case "similarity":
-            return np.array([t["a1"] + t["p"] * x - m * t["q"] * y, t["b1"] + t["q"] * x + m * t["p"] * y])
-    divisor = 1 + t["c1"] * x + t["c2"] * y if kind == "projective" else 1.0
-    upper = [t["a1"] + t["a2"] * x + t["a3"] * y, t["b1"] + t["b2"] * x + t["b3"] * y]
-    return np.array([upper[0] / divisor, upper[1] / divisor])
 
 
 def _distortion(network: Network, camera: str, x: Values, r: Complex, place: Complex) -> Complex:

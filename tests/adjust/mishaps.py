@@ -8,7 +8,6 @@ from setups import CONVERGENT, FREE, HEIGHT, LEVEL_STATIONS, UNKNOWN, Setup, giv
 from simulated import STATIONS, field_points
 
 from adjust.problem.network import Approximations, Network
-from adjust.problem.observations import Observations
 from adjust.solution.adjustment import Options
 from adjust.solution.result import Adjustment
 
@@ -98,14 +97,7 @@ def _kept(network: Network, keep: Callable[[str, str, str], bool]) -> Network:
     """The network with some of its observations."""
     rows = network.observations
     kept = [i for i, row in enumerate(zip(rows.image, rows.point, rows.kind, strict=True)) if keep(*row)]
-    shorter = Observations(
-        tuple(rows.image[i] for i in kept),
-        tuple(rows.point[i] for i in kept),
-        tuple(rows.kind[i] for i in kept),
-        rows.xy_mm[kept],
-        rows.covariance_mm2[kept],
-    )
-    return replace(network, observations=shorter)
+    return replace(network, observations=rows.only(np.array(kept)))
 
 
 MISHAPS: dict[str, Mishap] = {

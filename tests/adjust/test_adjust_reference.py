@@ -9,7 +9,6 @@ from reference_cases import CAMERA, Case, approximations_of, load, network_of, o
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Network
-from adjust.problem.observations import Observations
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 
@@ -77,18 +76,11 @@ def test_the_order_of_inputs_does_not_matter(name: str) -> None:
     network = network_of(case)
     order = list(range(len(network.observations)))
     random.Random(7).shuffle(order)
-    rows = network.observations
     shuffled = Network(
         network.cameras,
         network.images[::-1],
         tuple(sorted(network.points, key=lambda point: point.id[::-1])),
-        Observations(
-            tuple(rows.image[i] for i in order),
-            tuple(rows.point[i] for i in order),
-            tuple(rows.kind[i] for i in order),
-            rows.xy_mm[order],
-            rows.covariance_mm2[order],
-        ),
+        network.observations.only(np.array(order)),
     )
     plain, other = adjusted(case), adjusted(case, shuffled)
     for i, unknown in enumerate(plain.names):

@@ -209,13 +209,7 @@ def with_unknown(network: Network, names: set[str]) -> Network:
 
 
 def subset(observations: Observations, rows: Sequence[int]) -> Observations:
-    return Observations(
-        tuple(observations.image[i] for i in rows),
-        tuple(observations.point[i] for i in rows),
-        tuple(observations.kind[i] for i in rows),
-        observations.xy_mm[rows],
-        observations.covariance_mm2[rows],
-    )
+    return observations.only(np.array(rows))
 
 
 def test_heights_alone_and_two_points_orient_vertical_frames() -> None:

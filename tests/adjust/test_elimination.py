@@ -17,7 +17,6 @@ from adjust.linear_algebra import elimination, multifrontal, sparse_factor
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.problem.network import Approximations, Network
-from adjust.problem.observations import Observations
 from adjust.problem.problem import number
 from adjust.solution.adjustment import adjust
 
@@ -253,14 +252,7 @@ def test_large_networks_are_adjusted_alike_whatever_the_order(monkeypatch: pytes
 
     rows = network.observations
     order = rng.permutation(len(rows))
-    shuffled = Observations(
-        tuple(rows.image[i] for i in order),
-        tuple(rows.point[i] for i in order),
-        tuple(rows.kind[i] for i in order),
-        rows.xy_mm[order],
-        rows.covariance_mm2[order],
-    )
-    other = adjust(replace(network, images=network.images[::-1], observations=shuffled), start)
+    other = adjust(replace(network, images=network.images[::-1], observations=rows.only(order)), start)
     sigmas = np.sqrt(first.cofactor.variances)
     for i, name in enumerate(first.names):
         assert abs(other.value(name) - first.values[i]) <= 1e-7 * sigmas[i]

@@ -21,7 +21,6 @@ from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.fronts import Fronts, make_fronts
 from adjust.problem.camera import Fiducial
 from adjust.problem.network import Approximations, Network, ObjectPoint
-from adjust.problem.observations import Observations
 from adjust.problem.problem import number
 from adjust.rank_defect import diagnosis
 from adjust.solution.adjustment import adjust
@@ -56,11 +55,7 @@ def strip(sigma: float) -> tuple[Network, Approximations]:
         kind == "fiducial" or abs(points[int(point), 0] - stations[image]) < 600.0
         for image, point, kind in zip(seen.image, seen.point, seen.kind, strict=True)
     ]
-    rows = np.flatnonzero(near)
-    image, point = (tuple(each[i] for i in rows) for each in (seen.image, seen.point))
-    kinds = tuple(seen.kind[i] for i in rows)
-    observations = Observations(image, point, kinds, seen.xy_mm[rows], seen.covariance_mm2[rows])
-    return replace(network, observations=observations), start
+    return replace(network, observations=seen.only(np.flatnonzero(near))), start
 
 
 def sparse_rows(rows: WhitenedRows, weights: Array) -> csc_array:

@@ -12,7 +12,6 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
-from adjust.problem.observations import Observations
 from adjust.solution.adjustment import Datum, Options, adjust
 
 Change = Callable[[Network], Network]
@@ -20,17 +19,7 @@ Change = Callable[[Network], Network]
 
 def rows(network: Network, keep: list[int]) -> Network:
     """The network with some of its observations; a row may be repeated."""
-    all_rows = network.observations
-    return replace(
-        network,
-        observations=Observations(
-            tuple(all_rows.image[i] for i in keep),
-            tuple(all_rows.point[i] for i in keep),
-            tuple(all_rows.kind[i] for i in keep),
-            all_rows.xy_mm[keep],
-            all_rows.covariance_mm2[keep],
-        ),
-    )
+    return replace(network, observations=network.observations.only(np.array(keep, dtype=np.intp)))
 
 
 def without(network: Network, image: str, kind: str, left: int) -> Network:

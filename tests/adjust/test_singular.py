@@ -9,7 +9,6 @@ from reference_cases import CAMERA, CAUSES, DROPPED, Case, approximations_of, lo
 from simulated import Truth, field_points, simulated
 
 from adjust.problem.network import Network
-from adjust.problem.observations import Observations
 from adjust.problem.parameter import CODES
 from adjust.solution.adjustment import Datum, Options, adjust
 from adjust.solution.result import Adjustment
@@ -143,15 +142,7 @@ def test_a_point_in_one_image_only_is_named(count: int) -> None:
 
 def kept(network: Network, keep: list[int]) -> Network:
     """The network with some of its observations."""
-    rows = network.observations
-    shorter = Observations(
-        tuple(rows.image[i] for i in keep),
-        tuple(rows.point[i] for i in keep),
-        tuple(rows.kind[i] for i in keep),
-        rows.xy_mm[keep],
-        rows.covariance_mm2[keep],
-    )
-    return replace(network, observations=shorter)
+    return replace(network, observations=network.observations.only(np.array(keep)))
 
 
 def test_what_no_image_shows_is_told() -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from simulated import Truth, field_points, simulated
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.camera import Camera
-from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint
+from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint, Transformation
 from adjust.problem.observations import Observations
 from adjust.solution.adjustment import adjust
 
@@ -129,6 +130,13 @@ def fiducials_fixed_free_and_given() -> Case:
     return replace(network, cameras=(replace(camera, fiducials=marks),)), start
 
 
+def bent_films(kind: Transformation) -> Case:
+    """Scans far from the comparator's origin, one mirrored."""
+    truth = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
+    points = field_points(np.random.default_rng(7), 12)
+    return simulated(np.random.default_rng(6), truth, kind, points, free={"k3": np.inf})
+
+
 CASES = (
     all_free_of_torlegard,
     mirrored_similarity,
@@ -138,6 +146,11 @@ CASES = (
     heights_and_mixtures,
     two_cameras,
     fiducials_fixed_free_and_given,
+    *(partial(bent_films, kind) for kind in ("projective", "conformal(2)")),
+    *(
+        pytest.param(partial(bent_films, kind), marks=pytest.mark.slow)
+        for kind in ("bilinear", "conformal(3)", "polynomial(2)", "polynomial(3)")
+    ),
 )
 
 
