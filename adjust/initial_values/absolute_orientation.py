@@ -35,18 +35,26 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
     the known coordinates do not determine the similarity. Once the attitude is given, scale and shift are linear; so
     the attitude is sought from starts all over.
     """
+    from scipy.optimize import least_squares  # takes longer to import than most adjustments
+
     given = ~np.isnan(known)
     if given.sum() < 7 or not given.any(axis=0).all():
         return None
-    target = _centred(np.where(given, known, 0.0), given)
+    target = _centred(known, given)
     starts = Rotation.from_quat(np.random.default_rng(0).normal(size=(STARTS, 4))).as_matrix()  # even over all turns
     costs = np.array([(_misfit(start, model, target, given) ** 2).sum() for start in starts])
-    refined = [_refined(starts[i], model, target, given) for i in np.argsort(costs, kind="stable")[:REFINED]]
-    least = min(cost for cost, _ in refined)
+    found = []
+    for start in starts[np.argsort(costs, kind="stable")[:REFINED]]:
+        near = least_squares(
+            lambda turn, start=start: _misfit(rotation_from_vector(turn) @ start, model, target, given), np.zeros(3)
+        )
+        is_determined = np.linalg.svd(near.jac, compute_uv=False)[2] > SINGULAR * np.linalg.norm(target)
+        found.append((2.0 * float(near.cost), is_determined, rotation_from_vector(near.x) @ start))
+    most = min(cost for cost, _, _ in found) + AS_GOOD * (target**2).sum()
     candidates = [
         _similarity(rotation, model, known, given)
-        for cost, rotation in refined
-        if cost <= least + AS_GOOD * (target**2).sum() and _determined(rotation, model, target, given)
+        for cost, is_determined, rotation in found
+        if cost <= most and is_determined
     ]
     return max(
         candidates, key=lambda s: float(s.apply(stations)[:, 2].mean() - s.apply(model)[:, 2].mean()), default=None
@@ -88,41 +96,17 @@ def _centred(xyz: Array, given: Mask) -> Array:
 
 
 def _misfit(rotation: Array, model: Array, target: Array, given: Mask) -> Array:
-    """What the best scale and shift leave of the coordinates with this attitude; a negative scale is no solution."""
+    """What the best scale and shift leave of the coordinates with this attitude."""
     turned = _centred(model @ rotation.T, given)
-    return np.asarray(_scale(turned, target) * turned - target)
+    return np.asarray((_scale(turned, target) * turned - target)[given])
 
 
 def _scale(turned: Array, target: Array) -> float:
+    """A negative one is no solution."""
     return max(float((turned * target).sum() / (turned**2).sum()), 0.0)
-
-
-def _refined(start: Array, model: Array, target: Array, given: Mask) -> tuple[float, Array]:
-    """The sum of squares and the attitude at the minimum near a start."""
-    from scipy.optimize import least_squares  # takes longer to import than most adjustments
-
-    def misfit(turn: Array) -> Array:
-        return np.asarray(_misfit(rotation_from_vector(turn) @ start, model, target, given)[given])
-
-    found = least_squares(misfit, np.zeros(3))
-    return 2.0 * float(found.cost), rotation_from_vector(found.x) @ start
-
-
-def _determined(rotation: Array, model: Array, target: Array, given: Mask) -> bool:
-    """Whether every small turn changes the misfit, and the model has a size."""
-    step = 1e-5
-    columns = [
-        _misfit(rotation_from_vector(sign * step * axis) @ rotation, model, target, given)[given]
-        for axis in np.eye(3)
-        for sign in (1.0, -1.0)
-    ]
-    derivatives = np.stack([(columns[2 * i] - columns[2 * i + 1]) / (2 * step) for i in range(3)], axis=1)
-    singular = np.linalg.svd(derivatives, compute_uv=False)
-    return bool(singular[2] > SINGULAR * np.linalg.norm(target))
 
 
 def _similarity(rotation: Array, model: Array, known: Array, given: Mask) -> Similarity:
     turned = model @ rotation.T
-    scale = _scale(_centred(turned, given), _centred(np.where(given, known, 0.0), given))
-    left = np.where(given, known - scale * turned, 0.0)
-    return Similarity(scale, rotation, left.sum(axis=0) / given.sum(axis=0))
+    scale = _scale(_centred(turned, given), _centred(known, given))
+    return Similarity(scale, rotation, np.nanmean(np.where(given, known - scale * turned, np.nan), axis=0))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from adjust.array_types import Array, Complex
+from adjust.array_types import Array, Complex, Indices
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.pose import Pose
@@ -28,36 +28,22 @@ def orient_vertical_block(sights: Mapping[str, Sight], known: Mapping[str, Array
     are flown over. A start within a few degrees of the vertical.
     """
     images = _connected(sights, known)
-    if not images or not _heights_only(sights, images, known):
+    if not images:
         return {}
-    rows = [
-        _Row(i, name, complex(*xy), sights[image].principal_distance_mm)
-        for i, image in enumerate(images)
-        for name, xy in zip(sights[image].points, sights[image].xy_mm, strict=True)
-    ]
-    planimetry = {row.point: complex(*known[row.point][:2]) for row in rows if not np.isnan(known[row.point][:2]).any()}
-    if len(planimetry) == 1:
+    rays = _Rays.from_images([sights[image] for image in images], known)
+    nan = np.isnan(rays.known)
+    planimetric = int((~nan[:, :2].any(axis=1)).sum())
+    if (nan[:, 0] & nan[:, 1] & ~nan[:, 2]).mean() < 0.5 or planimetric == 1:
         return {}
-    mean, relief = _relief(rows, known)
-    plane, _ = _similarities(rows, planimetry, len(images), np.ones(len(rows)))
-    scale = 1.0 if planimetry else _scale_of_relief(rows, plane, relief)
-    flattened = _flattening(rows, scale * plane, relief)
-    plane, _ = _similarities(rows, planimetry, len(images), flattened)
+    plane, _ = rays.similarities(np.ones(len(rays.z)))
+    scale = 1.0 if planimetric else rays.scale_of_relief(plane)
+    plane, _ = rays.similarities(rays.flattening(scale * plane))
+    mean = float(np.nanmean(rays.known[rays.point, 2]))
     return {
-        image: _pose(scale * plane[2 * i], scale * plane[2 * i + 1], sights[image].principal_distance_mm, mean)
-        for i, image in enumerate(images)
-        if abs(plane[2 * i]) > 0
+        image: _pose(scale * turn, scale * shift, sights[image].principal_distance_mm, mean)
+        for image, turn, shift in zip(images, plane[::2].tolist(), plane[1::2].tolist(), strict=True)
+        if abs(turn) > 0
     }
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A point seen in a frame, by the frame's number: where (mm, complex), and the frame's principal distance."""
-
-    image: int
-    point: str
-    z: complex
-    c: float
 
 
 def _connected(sights: Mapping[str, Sight], known: Mapping[str, Array]) -> list[str]:
@@ -65,80 +51,85 @@ def _connected(sights: Mapping[str, Sight], known: Mapping[str, Array]) -> list[
     largest.
     """
     planimetric = {name for name, xyz in known.items() if not np.isnan(xyz[:2]).any()}
+    points = {image: set(sight.points) for image, sight in sights.items()}
     left, groups = set(sights), []
     while left:
         group = {min(left)}
-        while grown := {i for i in left - group if any(_common_points(sights, i, j) >= FEWEST_SHARED for j in group)}:
+        while grown := {i for i in left - group if any(len(points[i] & points[j]) >= FEWEST_SHARED for j in group)}:
             group |= grown
         left -= group
-        controlled = min(len(planimetric & {name for i in group for name in sights[i].points}), 2)
+        controlled = min(len(planimetric & set().union(*(points[i] for i in group))), 2)
         groups.append((controlled, len(group), sorted(group)))
     return max(groups, key=lambda each: each[:2])[2] if groups else []
 
 
-def _heights_only(sights: Mapping[str, Sight], images: list[str], known: Mapping[str, Array]) -> bool:
-    names = sorted({name for image in images for name in sights[image].points})
-    nan = np.isnan([known[name] for name in names])
-    return bool((nan[:, 0] & nan[:, 1] & ~nan[:, 2]).mean() >= 0.5)
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Points seen in frames: the number of frame and of point (n,), where (n,) in mm, and the principal distance (n,).
 
-
-def _common_points(sights: Mapping[str, Sight], first: str, second: str) -> int:
-    return len(set(sights[first].points) & set(sights[second].points))
-
-
-def _relief(rows: list[_Row], known: Mapping[str, Array]) -> tuple[float, Array]:
-    """The mean of the known heights, and every row's height above it, 0 where unknown."""
-    heights = np.array([known[row.point][2] for row in rows])
-    mean = float(np.nanmean(heights))
-    return mean, np.nan_to_num(heights - mean, nan=0.0)
-
-
-def _scale_of_relief(rows: list[_Row], plane: Complex, relief: Array) -> float:
-    """Object units a unit of the plane at which the relief displacements leave least."""
-    if np.ptp(relief) == 0.0:
-        return 1.0
-    lowest = np.ptp(relief) / min(abs(plane[2 * row.image]) * row.c for row in rows)
-    scales = lowest * HEIGHTS
-    left = [_similarities(rows, {}, len(plane) // 2, _flattening(rows, s * plane, relief))[1] for s in scales]
-    return float(scales[int(np.argmin(left))])
-
-
-def _flattening(rows: list[_Row], similarities: Complex, relief: Array) -> Array:
-    """What an image coordinate is multiplied by to be that of the point's foot at the mean height: 1 - dZ / H."""
-    height = np.array([abs(similarities[2 * row.image]) * row.c for row in rows])
-    return np.asarray(1.0 - relief / height)
-
-
-def _similarities(
-    rows: list[_Row], planimetry: Mapping[str, complex], images: int, flattening: Array
-) -> tuple[Complex, float]:
-    """Scale-and-turn and shift of every image in turn (2 images,): ground = a z + b; the median distance left.
-
-    Where no planimetry is known, the first image keeps its own coordinates: held by two of its points alone, all others
-    would shrink to one place, where their distances are none.
+    known (p, 3): the points' coordinates, nan where unknown.
     """
-    design = np.zeros((len(rows), 2 * images), dtype=np.complex128)
-    for i, row in enumerate(rows):
-        design[i, 2 * row.image : 2 * row.image + 2] = row.z * flattening[i], 1.0
-    point = np.unique([row.point for row in rows], return_inverse=True)[1]
-    given = np.array([planimetry.get(row.point, np.nan) for row in rows], complex)
-    weights = np.ones(len(rows))
-    for _ in range(REWEIGHTINGS):
-        # An unknown ground point is eliminated: it is the weighted mean of what its frames say.
-        share = weights / np.bincount(point, weights)[point]
-        mean = np.asarray(sparse.csr_array((share, (point, np.arange(len(rows))))) @ design)
-        reduced = design - np.where(np.isnan(given)[:, None], mean[point], 0.0)
-        right = np.nan_to_num(given, nan=0.0)
-        held = 0 if planimetry else 2
-        solution = np.concatenate([np.array([1.0, 0.0], complex)[:held], np.zeros(2 * images - held, complex)])
-        right -= reduced @ solution
-        root, unknown = np.sqrt(weights), reduced[:, held:]
-        scale = np.where((size := np.abs(unknown).max(axis=0)) > 0, size, 1.0)
-        solution[held:] = np.linalg.lstsq(root[:, None] * unknown / scale, root * right)[0] / scale
-        distance = np.abs(unknown @ solution[held:] - right)
-        weights = 1.0 / np.maximum(distance, 0.1 * np.median(distance) + np.finfo(float).tiny)
-        weights /= weights.max()
-    return solution, float(np.median(distance))
+
+    image: Indices
+    point: Indices
+    z: Complex
+    c: Array
+    known: Array
+
+    @classmethod
+    def from_images(cls, sights: list[Sight], known: Mapping[str, Array]) -> "_Rays":
+        image = np.repeat(np.arange(len(sights)), [len(sight.points) for sight in sights])
+        names, point = np.unique([name for sight in sights for name in sight.points], return_inverse=True)
+        xy = np.concatenate([sight.xy_mm for sight in sights])
+        c = np.array([sight.principal_distance_mm for sight in sights])[image]
+        return cls(image, point, xy[:, 0] + 1j * xy[:, 1], c, np.array([known[name] for name in names]))
+
+    @property
+    def relief(self) -> Array:
+        """(n,) the points' heights above the mean, 0 where unknown."""
+        heights = self.known[self.point, 2]
+        return np.nan_to_num(heights - np.nanmean(heights), nan=0.0)
+
+    def scale_of_relief(self, plane: Complex) -> float:
+        """Object units a unit of the plane at which the relief displacements leave least."""
+        if np.ptp(self.relief) == 0.0:
+            return 1.0
+        scales = np.ptp(self.relief) / (np.abs(plane[2 * self.image]) * self.c).min() * HEIGHTS
+        left = [self.similarities(self.flattening(s * plane))[1] for s in scales]
+        return float(scales[int(np.argmin(left))])
+
+    def flattening(self, plane: Complex) -> Array:
+        """What image coordinates (n,) are multiplied by to be those of points at the mean height: 1 - dZ / H."""
+        return np.asarray(1.0 - self.relief / (np.abs(plane[2 * self.image]) * self.c))
+
+    def similarities(self, flattening: Array) -> tuple[Complex, float]:
+        """Scale-and-turn and shift of every image in turn (2 images,): ground = a z + b; the median distance left.
+
+        Where no planimetry is known, the first image keeps its own coordinates: held by two of its points alone, all
+        others would shrink to one place, where their distances are none.
+        """
+        rows = np.arange(len(self.z))
+        design = np.zeros((len(rows), 2 * int(self.image[-1]) + 2), dtype=np.complex128)
+        design[rows, 2 * self.image], design[rows, 2 * self.image + 1] = self.z * flattening, 1.0
+        given = (self.known[:, 0] + 1j * self.known[:, 1])[self.point]
+        given[np.isnan(given)] = np.nan
+        held = 0 if np.isfinite(given).any() else 2
+        weights = np.ones(len(rows))
+        for _ in range(REWEIGHTINGS):
+            # An unknown ground point is eliminated: it is the weighted mean of what its frames say.
+            share = weights / np.bincount(self.point, weights)[self.point]
+            mean = np.asarray(sparse.csr_array((share, (self.point, rows))) @ design)
+            reduced = design - np.where(np.isnan(given)[:, None], mean[self.point], 0.0)
+            solution = np.zeros(design.shape[1], dtype=np.complex128)
+            solution[:held] = np.array([1.0, 0.0])[:held]
+            right = np.nan_to_num(given, nan=0.0) - reduced @ solution
+            root, unknown = np.sqrt(weights), reduced[:, held:]
+            scale = np.where((size := np.abs(unknown).max(axis=0)) > 0, size, 1.0)
+            solution[held:] = np.linalg.lstsq(root[:, None] * unknown / scale, root * right)[0] / scale
+            distance = np.abs(unknown @ solution[held:] - right)
+            weights = 1.0 / np.maximum(distance, 0.1 * np.median(distance) + np.finfo(float).tiny)
+            weights /= weights.max()
+        return solution, float(np.median(distance))
 
 
 def _pose(turn: complex, shift: complex, principal_distance_mm: float, height: float) -> Pose:

@@ -1,14 +1,14 @@
 """The functions F1 to F4 of all observations: the observations that satisfy them, and their derivatives there.
 
 A target obeys T(S(x, y)) = image of its ray, a fiducial T(S(x, y)) = its place in the camera frame, with S the bend of
-the scanner. The derivatives are taken
-at computed observations, those that satisfy the functions for the unknowns of the moment: after convergence these are
-the adjusted observations. By elements the distortion is taken at the observed camera point instead: then
-F = T(S(x, y)) - image of the ray - distortion there, which depends on the observations by T and S alone.
+the scanner. The derivatives are taken at computed observations, those that satisfy the functions for the unknowns of
+the moment: after convergence these are the adjusted observations. By elements the distortion is taken at the observed
+camera point instead: then F = T(S(x, y)) - image of the ray - distortion there, which depends on the observations by T
+and S alone.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import SightVectors, sight_vectors
 from adjust.functional_model.projection import rays
 from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, product, take_members, zeros
-from adjust.problem.problem import Films, Part, Problem, State
+from adjust.problem.problem import Part, Problem, State
 
 Rows = Indices | slice
 
@@ -172,12 +172,8 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         by_exterior = by_station, by_attitude
         _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
         _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
-        _fill(
-            by_unknowns,
-            rows,
-            parts.board,
-            [applied(by_point, problem.lift_directions[rows, k]) for k in parts.board.members],
-        )
+        by_boards = [applied(by_point, problem.lift_directions[rows, k]) for k in parts.board.members]
+        _fill(by_unknowns, rows, parts.board, by_boards)
         own = [k for k in parts.camera.members if k < len(lens.quantities)]  # others have other families
         _fill(by_unknowns, rows, parts.camera, [at.quantity_derivative(k) for k in own])
     for part, of_film, of_distorted in (
@@ -217,39 +213,21 @@ class _FilmDerivatives:
 
 
 def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
-    film = _film_terms(problem, state, _straight(problem, state, xy_mm))
-    if not problem.scans:
-        return film
-    width = max(len(scans.positions) for scans in problem.scans)
-    xy_jacobian, by_scanner = film.xy_jacobian.copy(), zeros(len(xy_mm), 2, width)
+    straight_mm, count = _straight(problem, state, xy_mm), len(xy_mm)
+    widths = [max((each.positions.shape[-1] for each in some), default=0) for some in (problem.films, problem.scans)]
+    film = _FilmDerivatives(zeros(count, 2), zeros(count, 2, 2), *(zeros(count, 2, width) for width in widths))
+    for films in problem.films:
+        parameters, rows = state.values[films.positions][films.of], _as_slice(films.rows)
+        film.camera_xy[rows] = films.kind.apply(parameters, straight_mm[rows])
+        film.xy_jacobian[rows] = films.kind.gradient(parameters, straight_mm[rows])
+        design = films.kind.design(parameters, straight_mm[rows], films.centers_mm, films.halves_mm)
+        film.parameter_jacobian[rows, :, : design.shape[2]] = design
     for scans in problem.scans:
         rows = scans.rows
-        at = scans.bend.displacement(state.values[scans.positions], xy_mm[rows])
-        xy_jacobian[rows] = product(film.xy_jacobian[rows], np.eye(2) - at.xy_jacobian)
-        by_scanner[rows, :, : len(scans.positions)] = -product(film.xy_jacobian[rows], at.parameter_jacobian)
-    return replace(film, xy_jacobian=xy_jacobian, by_scanner=by_scanner)
-
-
-def _film_terms(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
-    """Of places that are freed of the scanners' bends, without the derivatives by these."""
-    of_films = [_kind_terms(films, state, xy_mm) for films in problem.films]
-    if len(of_films) == 1:
-        return of_films[0]
-    count, width = len(xy_mm), max(each.parameter_jacobian.shape[2] for each in of_films)
-    result = _FilmDerivatives(zeros(count, 2), zeros(count, 2, 2), zeros(count, 2, width), zeros(count, 2, 0))
-    for films, each in zip(problem.films, of_films, strict=True):
-        result.camera_xy[films.rows], result.xy_jacobian[films.rows] = each.camera_xy, each.xy_jacobian
-        result.parameter_jacobian[films.rows, :, : each.parameter_jacobian.shape[2]] = each.parameter_jacobian
-    return result
-
-
-def _kind_terms(films: Films, state: State, xy_mm: Array) -> _FilmDerivatives:
-    """The derivatives of the films of one kind alone."""
-    parameters, xy = state.values[films.positions][films.of], xy_mm[_as_slice(films.rows)]
-    design = films.kind.design(parameters, xy, films.centers_mm, films.halves_mm)
-    return _FilmDerivatives(
-        films.kind.apply(parameters, xy), films.kind.gradient(parameters, xy), design, zeros(len(xy), 2, 0)
-    )
+        at, gradient = scans.bend.displacement(state.values[scans.positions], xy_mm[rows]), film.xy_jacobian[rows]
+        film.by_scanner[rows, :, : len(scans.positions)] = -product(gradient, at.parameter_jacobian)
+        film.xy_jacobian[rows] = product(gradient, np.eye(2) - at.xy_jacobian)
+    return film
 
 
 def _as_slice(rows: Indices) -> Rows:
@@ -263,22 +241,18 @@ def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
     no name what is wrong with a whole camera."""
     observations, numbers = problem.network.observations, problem.image_numbers
     blind: dict[int, tuple[str, str]] = {}
-    for name, rows in problem.targets_by_camera.items():
-        lens = _lens(problem, state, name)
+    targets = [_image_targets(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
+    for shown, rows in zip(targets, problem.targets_by_camera.values(), strict=True):
+        lens = _lens(problem, state, shown.camera)
         if lens.interior[0] <= 0.0:
-            reason = f"the principal distance of camera {name} is {lens.interior[0]:.6g} mm and must be positive"
+            reason = (
+                f"the principal distance of camera {shown.camera} is {lens.interior[0]:.6g} mm and must be positive"
+            )
             return {"": (reason, "Give a positive one.")}
-        shown = _image_targets(problem, state, name, rows)
-        behind = shown.in_camera[:, 2] >= 0.0
         _, found = lens.camera_from_image(shown.imaged)
-        for which, is_behind in ((behind, True), (~found, False)):
+        for which, is_behind in ((shown.in_camera[:, 2] >= 0.0, True), (~found, False)):
             for row in _first_of_images(rows[which], numbers):
                 blind.setdefault(numbers[row], _blind_target(problem, row, is_behind))
-    targets = (
-        []
-        if blind
-        else [_image_targets(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
-    )
     camera_xy = None if blind else _computed_in_camera(problem, state, targets)
     if camera_xy is not None:
         _, found = _computed_in_comparator(problem, state, camera_xy)

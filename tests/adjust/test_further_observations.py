@@ -11,10 +11,8 @@ from simulated import ATTITUDES, STATIONS, Truth, camera_point, field_points, ro
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
-from adjust.least_squares.numbering import Numbering
 from adjust.problem.network import Exterior, Network, ObjectPoint
 from adjust.problem.observations import Distance
-from adjust.problem.problem import number
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.planning import plan
 from adjust.solution.result import Adjustment
@@ -180,18 +178,6 @@ def test_a_wrong_distance_shows_in_its_w() -> None:
     bad = adjust(wrong, start, Options("minimal"))
     assert max(abs(row.w) for row in good.further) < 3.0
     assert min(abs(row.w) for row in bad.further) > 10.0  # two bars: one of them is wrong, nothing tells which
-
-
-def test_points_tied_by_a_distance_are_shared() -> None:
-    """Many points, so that points are blocks: those of the bars are not among them."""
-    network, points = scaled_by_bars(24)
-    _, start = simulated(np.random.default_rng(5), points=points, point_sigma=np.inf)
-    problem = number(network, start)
-    numbering = Numbering(problem)
-    own = np.concatenate([touched.own.ravel() for touched in numbering.touched])
-    tied = {f"PT.{id}.{axis}" for id in "0123" for axis in "XYZ"}
-    assert len(own) == 3 * 20
-    assert not tied & {problem.unknowns.parameters[numbering.free[i]].text for i in own}
 
 
 def test_approximations_of_a_model_have_the_size_of_the_distances() -> None:

@@ -36,20 +36,6 @@ def simulated(
 
 @pytest.mark.parametrize("relief", FIELDS.values(), ids=FIELDS.keys())
 @pytest.mark.parametrize("tilt_rad", [0.05, 0.7], ids=["vertical", "oblique"])
-@pytest.mark.parametrize("n", [4, 6, 12, 300])
-def test_exact_points_give_the_pose(n: int, relief: float, tilt_rad: float) -> None:
-    rng = np.random.default_rng(n)
-    for _ in range(5):
-        xyz, xy, pose = simulated(n, relief, tilt_rad, rng)
-        found = resect(xyz, xy, C_MM)
-        assert found is not None
-        assert np.linalg.norm(found.pose.center - pose.center) < 1e-3
-        np.testing.assert_allclose(found.pose.rotation, pose.rotation, atol=1e-6)
-        assert found.inliers.all()
-
-
-@pytest.mark.parametrize("relief", FIELDS.values(), ids=FIELDS.keys())
-@pytest.mark.parametrize("tilt_rad", [0.05, 0.7], ids=["vertical", "oblique"])
 def test_gross_errors_are_found_and_do_no_harm(relief: float, tilt_rad: float) -> None:
     rng = np.random.default_rng(7)
     for _ in range(5):
@@ -106,7 +92,7 @@ def known_fields(
 @pytest.mark.parametrize("relief", [*FIELDS.values(), 0.2], ids=[*FIELDS, "between"])
 @pytest.mark.parametrize("tilt_rad", [0.05, 0.7], ids=["vertical", "oblique"])
 def test_exact_points_give_the_poses_of_images_of_any_size(relief: float, tilt_rad: float) -> None:
-    given, poses = known_fields([40, 6, 300, 12, 7, 40], relief, tilt_rad, 0.0)
+    given, poses = known_fields([40, 4, 6, 300, 12, 7, 40], relief, tilt_rad, 0.0)
     for found, pose in zip(resect_images(given, [C_MM] * len(given)), poses, strict=True):
         assert found is not None
         assert np.linalg.norm(found.center - pose.center) < 1e-3

@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_cases import CAMERA, CAUSES, DROPPED, Case, approximations_of, load, network_of
-from simulated import Truth, field_points, simulated
+from reference_cases import CAUSES, DROPPED, Case, approximations_of, load, network_of
+from simulated import field_points, simulated
 
 from adjust.problem.network import Network
-from adjust.problem.parameter import CODES
 from adjust.solution.adjustment import Datum, Options, adjust
 from adjust.solution.result import Adjustment
 
@@ -81,47 +80,9 @@ def test_a_flat_field_of_heights_needs_four_datum_values() -> None:
     assert sorted(name[-1] for name in fixed) == ["X", "X", "Y", "Y"]
 
 
-def test_a_prior_that_nothing_else_determines_is_told() -> None:
-    """One flat vertical frame: the principal distance cannot be told from the flying height."""
-    case = load("v_singular_K2D_vert0_affine")
-    result = adjusted(dropped(case, set()))
-    assert result.converged
-    (warning,) = [text for text in result.warnings if "say nothing" in text]
-    assert f"say nothing about c, x0 and y0 of camera {CAMERA}:" in warning
-    for name in ("c", "x0", "y0"):
-        assert result.cofactor.variances[result.index(f"IO.{CAMERA}.{name}")] == pytest.approx(1.0, rel=1e-6)
-
-
 def test_a_good_network_has_no_warning() -> None:
     network, start = simulated(np.random.default_rng(2), free={"k3": np.inf, "p1": np.inf})
     assert adjust(network, start).warnings == ()
-
-
-def test_a_nearly_flat_and_vertical_network_is_practically_singular() -> None:
-    """c free, relief of a decimetre under 1500 m: only noise tells c from the flying height."""
-    rng = np.random.default_rng(5)
-    truth = Truth(
-        attitudes=((0.0, 0.0, 0.0), (1e-5, 0.0, 1.5), (0.0, 1e-5, 3.1), (0.0, 0.0, -1.5)),
-        stations=((0.0, 0.0, 1500.0), (300.0, 100.0, 1500.0), (-280.0, 80.0, 1500.0), (60.0, 320.0, 1500.0)),
-    )
-    network, start = simulated(rng, truth, points=field_points(rng, 20, relief=0.02), free={})
-    camera = replace(network.cameras[0], principal_distance_mm=None)
-    result = adjust(replace(network, cameras=(camera,)), start)
-    warning = " ".join(result.warnings)
-    assert result.converged
-    assert "Practically singular" in warning
-    assert "c of camera K" in warning
-
-
-def test_points_of_an_image_on_one_line_are_named() -> None:
-    """An image whose targets all lie on a line cannot be oriented: its own unknowns are singular."""
-    rng = np.random.default_rng(3)
-    points = np.stack([np.linspace(-700, 700, 6), np.linspace(-300, 300, 6), np.zeros(6)], axis=1)
-    network, start = simulated(rng, Truth(distortion={}), points=points, noise=False)
-    result = adjust(network, start)
-    assert result.termination == "singular"
-    assert {"EO"} <= {CODES[each.kind] for each in result.singular[0].parameters}
-    assert "do not determine its own orientation" in result.singular[0].cause
 
 
 @pytest.mark.parametrize("count", [9, 40])
