@@ -10,18 +10,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
-from adjust.linear_algebra.factor import Blocks, Factor
+from adjust.array_types import Array, Mask
 from adjust.problem.further_observations import ObservedCalibration
 from adjust.problem.parameter import Parameter
-from adjust.problem.problem import Problem, State
 from adjust.quality.residuals import surplus
-
-Indices = NDArray[np.intp]
-
-Array = NDArray[np.float64]
+from adjust.quality.run import Run
 
 UNSEEN = 1e-6  # part of a direction's variance: where the others say so little, they say nothing
 
@@ -50,23 +45,21 @@ class CalibrationTest:
         return tuple(np.argsort(-size, kind="stable").tolist())
 
 
-def calibration_tests(
-    problem: Problem, state: State, rows: Sequence[Blocks], factor: Factor, vpv: float, redundancy: int
-) -> Iterator[CalibrationTest]:
-    """Of every earlier calibration of several quantities; rows, factor: as of the residuals, vpv and redundancy of the
-    whole adjustment, whose other part tells sigma0."""
-    for each, block in zip(problem.further, rows, strict=True):
+def calibration_tests(run: Run, sigma0: float, redundancy: float) -> Iterator[CalibrationTest]:
+    """Of every earlier calibration of several quantities; sigma0, redundancy: of the whole adjustment."""
+    vpv = sigma0**2 * redundancy
+    for each, block in zip(run.problem.further, run.end.rows.further, strict=True):
         if not isinstance(each, ObservedCalibration) or len(each.observed) < 2:
             continue
         root = np.linalg.cholesky(each.covariance)
-        free, directions = np.linalg.eigh(surplus(block, factor))
+        free, directions = np.linalg.eigh(surplus(block, run.factor))
         visible = free > UNSEEN
         freedom = int(visible.sum())
         if not freedom:
             continue
-        u = directions.T @ np.linalg.solve(root, each.computed(state.values) - each.observed)
+        u = directions.T @ np.linalg.solve(root, each.computed(run.end.state.values) - each.observed)
         chi_square = float((u[visible] ** 2 / free[visible]).sum())
-        left = redundancy - freedom
+        left = round(redundancy) - freedom
         variance = (vpv - chi_square) / left if left > 0 and vpv > chi_square else 1.0
         along = _as_marks_show(root @ directions, ~visible, each.parameters)
         difference = along[:, visible] @ (u[visible] / free[visible])
@@ -84,7 +77,7 @@ def calibration_tests(
         )
 
 
-def _as_marks_show(along: Array, unseen: NDArray[np.bool_], parameters: Sequence[Parameter]) -> Array:
+def _as_marks_show(along: Array, unseen: Mask, parameters: Sequence[Parameter]) -> Array:
     """Changes (n, m) of the quantities, each with so much of the unseen ones that the fiducial marks move least.
 
     The frame of the marks can shift, turn and grow, and the camera with it: as where two calibrations are compared,

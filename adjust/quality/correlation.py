@@ -10,16 +10,14 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.families import family
 from adjust.functional_model.rotation import rotation_from_angles, vector_by_angles
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates
 from adjust.problem.network import EXTERIOR_NAMES, Network
 from adjust.problem.parameter import MANY, Parameter
-
-Array = NDArray[np.float64]
 
 HIGH = 0.95
 IMAGES_AT_ONCE = 16

@@ -9,12 +9,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.transformation import Film, film_kind, film_parameter_names
 from adjust.initial_values.fiducial_fit import fit_transformation
-
-Array = NDArray[np.float64]
 
 KEEPS_DISTANCES = ("none", "congruent")
 STEPS = 10  # of Gauss and Newton; formulas that are linear in their parameters take one

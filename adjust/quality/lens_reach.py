@@ -4,14 +4,11 @@ extrapolated."""
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates
 from adjust.problem.images import adjusted_image, adjusted_lens
 from adjust.problem.parameter import Parameter
-
-Array = NDArray[np.float64]
 
 DIRECTIONS = 12
 RADII = 8  # at which the distortion's standard deviation is taken, out to the outermost target

@@ -4,19 +4,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Mask
 from adjust.least_squares.rows import prior_differences
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.problem.further_observations import square_sum
-from adjust.problem.problem import ABSENT, Problem, State
-from adjust.problem.tested import TestedUnits
-from adjust.quality.reliability import UNCHECKED, Misfits, redundancies, statistics
-from adjust.quality.reweighting import Weighting
-
-Indices = NDArray[np.intp]
-
-Array = NDArray[np.float64]
+from adjust.problem.problem import ABSENT
+from adjust.quality.run import UNCHECKED, Run
 
 UM_PER_MM = 1000.0
 NEARLY_ONE = 0.99  # redundancy of a group, below which its residuals say nothing of its standard deviations
@@ -73,25 +67,23 @@ class Group:
     redundancy: float
 
 
-def residuals(v_mm: Array, found: Misfits | None, weighting: Weighting) -> Residuals:
-    """The residuals of the observations with their redundancy numbers and standardised; found None: no solution."""
-    if found is None:
+def residuals(run: Run) -> Residuals:
+    """The residuals of the observations with their redundancy numbers and standardised; these 0 without a solution."""
+    v_mm = run.end.v_mm
+    if not (run.has_solution and run.is_tested):
         return Residuals(v_mm, np.zeros_like(v_mm), np.zeros_like(v_mm))
-    count = len(v_mm)
-    return Residuals(v_mm, redundancies(found)[:count], statistics(found, weighting.weights).w[:count])
+    return Residuals(v_mm, run.redundancies[: len(v_mm)], run.statistics.w[: len(v_mm)])
 
 
-def further_residuals(
-    problem: Problem, state: State, rows: Sequence[Blocks], factor: Factor | None, noncentrality: float
-) -> Iterator[FurtherResidual]:
-    """The residuals of further observations, whose rows these are; without a factor nothing is said of their check.
+def further_residuals(run: Run, noncentrality: float) -> Iterator[FurtherResidual]:
+    """The residuals of further observations; without a solution nothing is said of their check.
 
     With C = L L' and H the cofactor matrix of the adjusted rows, which are of unit weight: Q_vv = L (I - H) L'.
     """
-    for each, block in zip(problem.further, rows, strict=True):
-        v = each.computed(state.values) - each.observed
+    for each, block in zip(run.problem.further, run.end.rows.further, strict=True):
+        v = each.computed(run.end.state.values) - each.observed
         root = np.linalg.cholesky(each.covariance)
-        free = np.zeros_like(root) if factor is None else surplus(block, factor)
+        free = surplus(block, run.factor) if run.has_solution else np.zeros_like(root)
         cofactor_v = root @ free @ root.T
         weighted = np.linalg.inv(root).T @ free @ np.linalg.inv(root)
         redundancy = np.einsum("ij,ji->i", cofactor_v, np.linalg.inv(each.covariance))
@@ -109,30 +101,22 @@ def surplus(block: Blocks, factor: Factor) -> Array:
     return np.asarray(np.eye(len(roots)) - roots @ roots.T)
 
 
-def groups(
-    problem: Problem,
-    state: State,
-    v_mm: Array,
-    found: Misfits | None,
-    weighting: Weighting,
-    further: Sequence[FurtherResidual],
-) -> dict[str, Group]:
+def groups(run: Run, further: Sequence[FurtherResidual]) -> dict[str, Group]:
     """The groups of observations: target, tie, fiducial and join in the comparator, and the priors.
 
     control: object coordinates, whose rms is in millionths of the object unit; datum: the fiducials' given places
     (F5, F6); interior: c, x0', y0' and distortion; exterior; and those of further observations. All behind datum have
     no rms. target, fiducial and control are always there. What the adjustment does without is in none of them.
     """
-    units = TestedUnits(problem)
-    result = {}
+    problem, result = run.problem, {}
     for name in ("target", "tie", "fiducial", "join", "control", "datum", "interior", "scanner", "board", "exterior"):
-        members = (units.groups == name) & weighting.used
+        members = (run.units.groups == name) & run.weighting.used
         if not members.any() and name not in ("target", "fiducial", "control"):
             continue
-        vpv, redundancy = group_sums(units, found, members) if found else (0.0, 0.0)
-        result[name] = _group(vpv, redundancy, *_rms_um(problem, state, v_mm, name, members))
+        sums = run.group_sums(members) if run.has_solution and run.is_tested else (0.0, 0.0)
+        result[name] = _group(*sums, *_rms_um(run, name, members))
     for name in dict.fromkeys(each.group for each in problem.further):
-        vpv = square_sum(tuple(each for each in problem.further if each.group == name), state.values)
+        vpv = square_sum(tuple(each for each in problem.further if each.group == name), run.end.state.values)
         result[name] = _group(vpv, sum(each.redundancy for each in further if each.group == name), 0.0, 0.0)
     return result
 
@@ -142,25 +126,18 @@ def _group(vpv: float, redundancy: float, rms_x_um: float, rms_y_um: float) -> G
     return Group(sigma0, rms_x_um, rms_y_um, redundancy)
 
 
-def group_sums(units: TestedUnits, found: Misfits, members: NDArray[np.bool_]) -> tuple[float, float]:
-    """v'Pv and redundancy of some of what is tested."""
-    vpv = float((found.residual[members] ** 2).sum())
-    # Behind a single coordinate stands a 1 in the hat matrix.
-    return vpv, float(2 * members.sum() - np.trace(found.hat[members], axis1=1, axis2=2).sum())
-
-
-def _rms_um(problem: Problem, state: State, v_mm: Array, group: str, members: NDArray[np.bool_]) -> tuple[float, float]:
+def _rms_um(run: Run, group: str, members: Mask) -> tuple[float, float]:
     """The rms of a group by axis, in um or in millionths of the object unit; 0 where units are mixed."""
-    count = len(v_mm)
+    problem, v_mm = run.problem, run.end.v_mm
     if group in problem.network.observations.kind or group in ("target", "fiducial"):
-        v_um = UM_PER_MM * v_mm[members[:count]]
+        v_um = UM_PER_MM * v_mm[members[: len(v_mm)]]
         return _rms(v_um[:, 0]), _rms(v_um[:, 1])
     if group not in ("control", "datum"):
         return 0.0, 0.0
-    given = TestedUnits(problem).positions[members[count:]].ravel()
+    given = run.units.positions[members[len(v_mm) :]].ravel()
     given = given[given != ABSENT]
     quantities = np.array([problem.unknowns.parameters[i].quantity for i in given], dtype=np.str_)
-    v = (1e6 if group == "control" else UM_PER_MM) * prior_differences(problem, state)[given]
+    v = (1e6 if group == "control" else UM_PER_MM) * prior_differences(problem, run.end.state)[given]
     x, y = ("X", "Y") if group == "control" else ("x", "y")
     return _rms(v[quantities == x]), _rms(v[quantities == y])
 

@@ -14,17 +14,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr
 
+from adjust.array_types import Array
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates, GivenGroup
 from adjust.problem.parameter import Kind, Parameter
-
-Array = NDArray[np.float64]
 
 LEVEL = 0.01  # probability of calling a superfluous parameter significant
 UNCHECKED = 1e-6  # redundancy of a prior below which the data say nothing against it

@@ -9,22 +9,18 @@ backward steps of a regression).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from adjust.least_squares.iteration import Linearised
-from adjust.least_squares.numbering import Numbering
-from adjust.linear_algebra.factor import Factor
+from adjust.array_types import Array, Mask
 from adjust.linear_algebra.small_matrices import applied, eigen
 from adjust.problem.probabilities import Probabilities
-from adjust.problem.tested import Tested, TestedUnits
-from adjust.quality.reliability import UNCHECKED, Misfits, Reliability, statistics, unit_rows
-from adjust.quality.reweighting import Weighting, robust_scale
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from adjust.problem.tested import Tested
+from adjust.quality.reliability import Reliability
+from adjust.quality.run import UNCHECKED, GrossError, Run
+from adjust.quality.weighting import robust_scale
 
 TOLD_APART = 7.0  # difference of two statistics from which on one explanation is clearly the better: odds of 30 to 1
 ALIKE_SHOWN = 3
@@ -59,224 +55,226 @@ class Suspect:
     removed: bool
 
 
-@dataclass(frozen=True)
-class Search:
-    """The tests of one adjustment: residuals and hat matrices, and what chance lets the statistics (N,) reach."""
+class Snooping:
+    """The search for gross errors in one adjustment.
 
-    numbering: Numbering
-    end: Linearised
-    factor: Factor
-    found: Misfits
-    weighting: Weighting
-    probabilities: Probabilities
-    critical: Array
-
-
-def search(
-    numbering: Numbering,
-    end: Linearised,
-    factor: Factor,
-    found: Misfits,
-    weighting: Weighting,
-    probabilities: Probabilities,
-) -> Search:
-    """The tests of an adjustment with their critical values."""
-    tests = statistics(found, weighting.weights)
-    critical = probabilities.critical(tests.sizes, int((tests.sizes > 0).sum()))
-    tested = (tests.sizes > 0) & ~_impossible(numbering, end, tests.error)
-    return Search(numbering, end, factor, found, weighting, probabilities, np.where(tested, critical, np.inf))
-
-
-def _impossible(numbering: Numbering, end: Linearised, error: Array) -> NDArray[np.bool_]:
-    """Which units (N,) cannot have the gross errors (N, 2) that the others see in them: a given principal distance is
-    not wrong by more than itself.
-
-    Over flat ground v'Pv hardly changes with the principal distance, and what change there is need not come from it:
-    nearer stations let errors of given heights explain more of the image residuals. In the linear model that small
-    slope looks like a gross error of metres.
-    """
-    positions = TestedUnits(numbering.problem).positions[:, 0]
-    is_distance = np.isin(positions, [some[0] for some in numbering.problem.unknowns.camera.values()])
-    impossible = is_distance & (np.abs(error[len(end.v_mm) :, 0]) > np.abs(end.state.values[positions]))
-    return np.concatenate([np.zeros(len(end.v_mm), dtype=bool), impossible])
-
-
-@dataclass(frozen=True)
-class GrossError:
-    """A unit that contradicts the others, the other such units left out: its statistic, and what chance lets it reach.
-
-    error (2,): the gross error as the others see it. alike: units that explain the contradiction as well.
+    Columns of V are made when they are used and many at a time, for each costs a pass over all blocks.
     """
 
-    unit: int
-    statistic: float
-    limit: float
-    error: Array
-    alike: tuple[int, ...]
-
-
-def contradictions(search: Search) -> list[GrossError]:
-    """What contradicts the others beyond its limit, in the order in which it was found.
-
-    Where the observations are worse than given, so that everything contradicts everything, limits are raised by their
-    scale. That is learnt without what contradicts the others, for in a small network one gross error spoils all.
-    """
-    covariance = _Covariance(search)
-    most = min(int(MOST_SUSPECT * len(search.critical)), MOST_AT_ONCE)
-    scale = _median_scale(search, covariance, []) if len(search.end.v_mm) > MANY else 1.0
-    while True:
-        limits = scale**2 * search.critical
-        chosen = _chosen(search, covariance, limits, most)
-        if len(chosen) < most:
-            learnt = _significant_scale(*_rest(search, covariance, chosen), search.probabilities)
-        else:  # there may be more, which the sum of squares would take for a bad scale
-            learnt = _median_scale(search, covariance, chosen)
-        if learnt <= RAISED * scale:
-            return [_contradiction(search, covariance, chosen, unit, limits) for unit in chosen]
-        scale = learnt
-
-
-def rest_after(search: Search, units: Sequence[int]) -> tuple[float, float]:
-    """v'Pv and redundancy of an adjustment that would do without some units."""
-    return _rest(search, _Covariance(search), units)
-
-
-def _significant_scale(vpv: float, redundancy: float, probabilities: Probabilities) -> float:
-    """Root of v'Pv over the redundancy, where that is larger than chance makes it, else 1."""
-    chance = redundancy < 1.0 or special.chdtrc(redundancy, vpv) > probabilities.family
-    return 1.0 if chance else float(np.sqrt(vpv / redundancy))
-
-
-def limits(search: Search) -> Array:
-    """What the statistics (N,) may reach in an adjustment that does without what contradicts the others."""
-    scale = _significant_scale(*_rest(search, _Covariance(search), []), search.probabilities)
-    return np.asarray(scale**2 * search.critical)
-
-
-def _median_scale(search: Search, covariance: "_Covariance", left_out: Sequence[int]) -> float:
-    """What the median of the other image points' statistics tells, no less than 1."""
-    points = np.setdiff1d(np.arange(len(search.end.v_mm)), left_out)
-    sizes = np.where(np.isfinite(search.critical[points]), 2, 0)
-    return max(1.0, robust_scale(_reduced_statistics(search, covariance, left_out)[points], sizes))
-
-
-def _chosen(search: Search, covariance: "_Covariance", limits: Array, most: int) -> list[int]:
-    chosen: list[int] = []
-    for _ in range(2 * most):
-        statistic = _reduced_statistics(search, covariance, chosen)
-        worst = int(np.argmax(statistic / limits))
-        found = [worst] if statistic[worst] > limits[worst] else _hidden_pair(search, covariance, chosen, limits)
-        if not found or len(chosen) + len(found) > most:
-            break
-        chosen += found
-        confirmed = _joint(search, covariance, chosen)[1] > limits[chosen]
-        chosen = [unit for unit, still in zip(chosen, confirmed, strict=True) if still or unit in found]
-    return chosen
-
-
-def _hidden_pair(search: Search, covariance: "_Covariance", chosen: Sequence[int], limits: Array) -> list[int]:
-    """Two units that hide each other: each contradicts the others without the other one, and both do together.
-
-    Looked for where all that is left contradicts itself (the test of v'Pv), and among the PAIRED worst units alone. In
-    large networks, where no unit bears on so much of another's residual, they are not.
-    """
-    if len(limits) > MOST_PAIRED:
-        return []
-    finite = np.isfinite(limits)
-    raised = float((limits[finite] / search.critical[finite]).max(initial=1.0))
-    rest, redundancy = _rest(search, covariance, chosen)
-    if special.chdtrc(redundancy, rest / raised) > search.probabilities.family:
-        return []
-    alone = _reduced_statistics(search, covariance, chosen)
-    candidates = np.argsort(-alone / search.critical, kind="stable")[:PAIRED]
-    covariance.prepare([int(unit) for unit in candidates])
-    critical = raised * search.probabilities.critical(np.array([4]), len(candidates) * (len(candidates) - 1) // 2)[0]
-    given = np.array([_reduced_statistics(search, covariance, [*chosen, int(unit)])[candidates] for unit in candidates])
-    of_pair = alone[candidates][:, None] + given
-    hidden = (of_pair > critical) & (given > limits[candidates]) & (limits[candidates][:, None] < given.T)
-    if not hidden.any():
-        return []
-    first, second = np.unravel_index(np.argmax(np.where(hidden, of_pair, 0.0)), hidden.shape)
-    return [int(candidates[first]), int(candidates[second])]
-
-
-def _rest(search: Search, covariance: "_Covariance", chosen: Sequence[int]) -> tuple[float, float]:
-    """v'Pv and redundancy that are left without some units."""
-    residual, hat = search.found.residual, search.found.hat[search.weighting.used]
-    vpv = float((residual**2).sum())
-    redundancy = 2.0 * len(hat) - float(np.trace(hat, axis1=1, axis2=2).sum())
-    if not chosen:
-        return vpv, redundancy
-    joint = covariance.columns(chosen)[chosen].reshape(2 * len(chosen), -1)
-    explained = residual[chosen].ravel() @ _inverse(joint) @ residual[chosen].ravel()
-    rank = int(np.linalg.matrix_rank(joint, tol=UNCHECKED, hermitian=True))
-    return max(vpv - float(explained), 0.0), redundancy - rank
-
-
-class _Covariance:
-    """Columns of V, made when they are asked for and many at a time, for each costs a pass over all blocks."""
-
-    def __init__(self, search: Search) -> None:
-        self._search = search
+    def __init__(self, run: Run, probabilities: Probabilities) -> None:
+        self.run, self.probabilities = run, probabilities
         self._columns: dict[int, Array] = {}
 
-    def columns(self, units: Sequence[int]) -> Array:
-        """(N, 2, 2 k) of some units."""
+    @cached_property
+    def critical(self) -> Array:
+        """What chance lets the statistics (N,) reach; inf where nothing is tested."""
+        tests = self.run.statistics
+        is_tested = tests.sizes > 0
+        critical = self.probabilities.critical(tests.sizes, int(is_tested.sum()))
+        return np.where(is_tested & ~self._impossible, critical, np.inf)
+
+    @property
+    def _impossible(self) -> Mask:
+        """Which units (N,) cannot have the gross errors (N, 2) that the others see in them: a given principal distance
+        is not wrong by more than itself.
+
+        Over flat ground v'Pv hardly changes with the principal distance, and what change there is need not come from
+        it: nearer stations let errors of given heights explain more of the image residuals. In the linear model that
+        small slope looks like a gross error of metres.
+        """
+        run, observed = self.run, len(self.run.end.v_mm)
+        positions = run.units.positions[:, 0]
+        is_distance = np.isin(positions, [some[0] for some in run.problem.unknowns.camera.values()])
+        errors = np.abs(run.statistics.error[observed:, 0])
+        impossible = is_distance & (errors > np.abs(run.end.state.values[positions]))
+        return np.concatenate([np.zeros(observed, dtype=bool), impossible])
+
+    @property
+    def limits(self) -> Array:
+        """What the statistics (N,) may reach in an adjustment that does without what contradicts the others."""
+        return np.asarray(self._significant_scale([]) ** 2 * self.critical)
+
+    @cached_property
+    def contradictions(self) -> list[GrossError]:
+        """What contradicts the others beyond its limit, in the order in which it was found.
+
+        Where the observations are worse than given, so that everything contradicts everything, limits are raised by
+        their scale. That is learnt without what contradicts the others, for in a small network one gross error spoils
+        all.
+        """
+        most = min(int(MOST_SUSPECT * len(self.critical)), MOST_AT_ONCE)
+        scale = self._median_scale([]) if len(self.run.end.v_mm) > MANY else 1.0
+        while True:
+            limits = scale**2 * self.critical
+            chosen = self._chosen(limits, most)
+            # Where there may be more, the sum of squares would take these for a bad scale.
+            learnt = self._significant_scale(chosen) if len(chosen) < most else self._median_scale(chosen)
+            if learnt <= RAISED * scale:
+                return [self._contradiction(chosen, unit, limits) for unit in chosen]
+            scale = learnt
+
+    def rest(self, units: Sequence[int]) -> tuple[float, float]:
+        """v'Pv and redundancy of an adjustment that would do without some units."""
+        found = self.run.misfits
+        residual, hat = found.residual, found.hat[self.run.weighting.used]
+        vpv = float((residual**2).sum())
+        redundancy = 2.0 * len(hat) - float(np.trace(hat, axis1=1, axis2=2).sum())
+        if not units:
+            return vpv, redundancy
+        joint = self._joint_cofactor(units)
+        explained = residual[units].ravel() @ _inverse(joint) @ residual[units].ravel()
+        rank = int(np.linalg.matrix_rank(joint, tol=UNCHECKED, hermitian=True))
+        return max(vpv - float(explained), 0.0), redundancy - rank
+
+    def suspects(self, result: Reliability, redundancy: int) -> tuple[Suspect, ...]:
+        """What contradicts the others and what weighs less for that reason, with names, the worst first."""
+        tests, weighting = self.run.statistics, self.run.weighting
+        entries = {each.unit: each for each in self.contradictions}
+        alike = {each.unit: each.alike for each in self.run.removed}
+        limits = self.limits
+        for unit in map(int, np.flatnonzero((weighting.weights < 1.0) & (tests.statistic > limits))):
+            figures = float(tests.statistic[unit]), float(limits[unit]), tests.error[unit]
+            entries[unit] = GrossError(unit, *figures, alike.get(unit, ()))
+        critical_tau = self.probabilities.critical_tau(redundancy, int((tests.sizes > 0).sum()))
+        worst_first = sorted(entries.values(), key=lambda each: -each.statistic / each.limit)
+        return tuple(self._suspect(entry, result, critical_tau) for entry in worst_first)
+
+    def _suspect(self, entry: GrossError, result: Reliability, critical_tau: float) -> Suspect:
+        unit, tested = entry.unit, result.tested[entry.unit]
+        worst = int(np.abs(result.w[unit]).argmax())
+        return Suspect(
+            tested=tested,
+            size=int(result.sizes[unit]),
+            statistic=entry.statistic,
+            critical=entry.limit,
+            w=float(result.w[unit, worst]),
+            tau=float(result.tau[unit, worst]),
+            critical_tau=critical_tau,
+            error=tuple(float(value) for value in entry.error[: len(tested.coordinates)]),
+            alike=tuple(result.tested[other].name for other in entry.alike[:ALIKE_SHOWN]),
+            removed=not bool(self.run.weighting.used[unit]),
+        )
+
+    def _significant_scale(self, units: Sequence[int]) -> float:
+        """Root of v'Pv over the redundancy without some units, where that is larger than chance makes it, else 1."""
+        vpv, redundancy = self.rest(units)
+        chance = redundancy < 1.0 or special.chdtrc(redundancy, vpv) > self.probabilities.family
+        return 1.0 if chance else float(np.sqrt(vpv / redundancy))
+
+    def _median_scale(self, units: Sequence[int]) -> float:
+        """What the median of the other image points' statistics tells, no less than 1."""
+        points = np.setdiff1d(np.arange(len(self.run.end.v_mm)), units)
+        sizes = np.where(np.isfinite(self.critical[points]), 2, 0)
+        return max(1.0, robust_scale(self._reduced_statistics(units)[points], sizes))
+
+    def _chosen(self, limits: Array, most: int) -> list[int]:
+        chosen: list[int] = []
+        for _ in range(2 * most):
+            statistic = self._reduced_statistics(chosen)
+            worst = int(np.argmax(statistic / limits))
+            found = [worst] if statistic[worst] > limits[worst] else self._hidden_pair(chosen, limits)
+            if not found or len(chosen) + len(found) > most:
+                break
+            chosen += found
+            confirmed = self._joint_errors(chosen)[1] > limits[chosen]
+            chosen = [unit for unit, still in zip(chosen, confirmed, strict=True) if still or unit in found]
+        return chosen
+
+    def _hidden_pair(self, chosen: Sequence[int], limits: Array) -> list[int]:
+        """Two units that hide each other: each contradicts the others without the other one, and both do together.
+
+        Looked for where all that is left contradicts itself (the test of v'Pv), and among the PAIRED worst units alone.
+        In large networks, where no unit bears on so much of another's residual, they are not.
+        """
+        if len(limits) > MOST_PAIRED:
+            return []
+        finite = np.isfinite(limits)
+        raised = float((limits[finite] / self.critical[finite]).max(initial=1.0))
+        rest, redundancy = self.rest(chosen)
+        if special.chdtrc(redundancy, rest / raised) > self.probabilities.family:
+            return []
+        alone = self._reduced_statistics(chosen)
+        candidates = np.argsort(-alone / self.critical, kind="stable")[:PAIRED]
+        self._prepare([int(unit) for unit in candidates])
+        pairs = len(candidates) * (len(candidates) - 1) // 2
+        critical = raised * self.probabilities.critical(np.array([4]), pairs)[0]
+        given = np.array([self._reduced_statistics([*chosen, int(unit)])[candidates] for unit in candidates])
+        of_pair = alone[candidates][:, None] + given
+        hidden = (of_pair > critical) & (given > limits[candidates]) & (limits[candidates][:, None] < given.T)
+        if not hidden.any():
+            return []
+        first, second = np.unravel_index(np.argmax(np.where(hidden, of_pair, 0.0)), hidden.shape)
+        return [int(candidates[first]), int(candidates[second])]
+
+    def _contradiction(self, chosen: Sequence[int], unit: int, limits: Array) -> GrossError:
+        errors, joint = self._joint_errors(chosen)
+        at = chosen.index(unit)
+        others = self._reduced_statistics([each for each in chosen if each != unit])
+        near = np.flatnonzero((others > limits) & (others > joint[at] - TOLD_APART))
+        alike = sorted((int(other) for other in near if other != unit), key=lambda other: -others[other])
+        error = self.run.misfits.back[unit] @ errors[at]
+        return GrossError(unit, float(joint[at]), float(limits[unit]), error, tuple(alike))
+
+    def _reduced_statistics(self, left_out: Sequence[int]) -> Array:
+        """The statistics (N,) as they would be without some units; 0 for these."""
+        residual, cofactor = self.run.misfits.residual, np.eye(2) - self.run.misfits.hat
+        if left_out:
+            columns = self._cofactor_columns(left_out)
+            through = columns @ _inverse(columns[left_out].reshape(2 * len(left_out), -1))
+            residual = residual - through @ residual[left_out].ravel()
+            cofactor = cofactor - through @ columns.transpose(0, 2, 1)
+        variance, axes = eigen(cofactor)
+        statistic = _square_sums(variance, applied(axes.transpose(0, 2, 1), residual))
+        statistic[left_out] = 0.0
+        return statistic
+
+    def _joint_errors(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """The gross errors (k, 2) of all chosen units together, in unit weight, and their statistics (k,)."""
+        inverse = _inverse(self._joint_cofactor(chosen))
+        errors = -(inverse @ self.run.misfits.residual[chosen].ravel()).reshape(-1, 2)
+        own = inverse.reshape(len(chosen), 2, len(chosen), 2)
+        variance, axes = np.linalg.eigh(np.einsum("kikj->kij", own))
+        return errors, _square_sums(variance, (axes.transpose(0, 2, 1) @ errors[..., None])[..., 0])
+
+    def _joint_cofactor(self, units: Sequence[int]) -> Array:
+        """(2 k, 2 k) of some units."""
+        return self._cofactor_columns(units)[units].reshape(2 * len(units), -1)
+
+    def _cofactor_columns(self, units: Sequence[int]) -> Array:
+        """The columns (N, 2, 2 k) of V of some units."""
         missing = [unit for unit in units if unit not in self._columns]
         if missing:
-            self.prepare(self._likely(missing))
-        size = len(self._search.critical)
-        return np.concatenate([np.zeros((size, 2, 0)), *(self._columns[unit] for unit in units)], axis=2)
+            worst = np.argsort(-self.run.statistics.statistic / self.critical)[:AT_ONCE]  # that are likely to follow
+            self._prepare([*missing, *(int(unit) for unit in worst if unit not in missing)])
+        nothing = np.zeros((len(self.critical), 2, 0))
+        return np.concatenate([nothing, *(self._columns[unit] for unit in units)], axis=2)
 
-    def prepare(self, units: list[int]) -> None:
-        """Make the columns of some units in one pass."""
-        missing = [unit for unit in units if unit not in self._columns]
-        if missing:
-            self._columns |= _columns(self._search, missing)
-
-    def _likely(self, missing: list[int]) -> list[int]:
-        tests = statistics(self._search.found, self._search.weighting.weights)
-        worst = np.argsort(-tests.statistic / self._search.critical)[:AT_ONCE]
-        return [*missing, *(int(unit) for unit in worst if unit not in self._columns and unit not in missing)]
-
-
-def _columns(search: Search, units: Sequence[int]) -> dict[int, Array]:
-    """The columns (N, 2, 2) of V of some units."""
-    homes: dict[int, tuple[int, int, Array, Array]] = {}  # what holds the unit's block, which it is there, own rows,
-    triangle = search.factor.triangle  # and the covariances of its rows with the shared unknowns
-    for part, rows in enumerate(unit_rows(search.numbering, search.end, search.factor)):
-        for block, place in np.argwhere(np.isin(rows.units, units)):
-            through = np.zeros((len(triangle), 2))
-            np.add.at(through, rows.shared[block], rows.through[block, place].T)
-            by_shared = triangle.cofactor_times(through)
-            homes[int(rows.units[block, place])] = (part, int(block), rows.own[block, place], by_shared)
-    columns = {unit: np.zeros((len(search.critical) + 1, 2, 2)) for unit in units}  # the last stands for ABSENT
-    for part, rows in enumerate(unit_rows(search.numbering, search.end, search.factor)):
-        for unit, (home, block, own, by_shared) in homes.items():
-            columns[unit][rows.units] = -(rows.through @ by_shared[rows.shared][:, None])
-            if part == home:
-                columns[unit][rows.units[block]] -= rows.own[block] @ own.T
-    columns = {unit: of_unit[:-1] for unit, of_unit in columns.items()}
-    for unit in units:
-        columns[unit][unit] = np.eye(2) - search.found.hat[unit]
-    return columns
+    def _prepare(self, units: list[int]) -> None:
+        """Make the columns (N, 2, 2) of some units in one pass."""
+        units = [unit for unit in units if unit not in self._columns]
+        homes: dict[int, tuple[int, int, Array, Array]] = {}  # what holds the unit's block, which it is there, own
+        triangle = self.run.factor.triangle  # rows, and the covariances of its rows with the shared unknowns
+        for part, rows in enumerate(self.run.unit_rows()):
+            for block, place in np.argwhere(np.isin(rows.units, units)):
+                through = np.zeros((len(triangle), 2))
+                np.add.at(through, rows.shared[block], rows.through[block, place].T)
+                by_shared = triangle.cofactor_times(through)
+                homes[int(rows.units[block, place])] = (part, int(block), rows.own[block, place], by_shared)
+        columns = {unit: np.zeros((len(self.critical) + 1, 2, 2)) for unit in units}  # the last stands for ABSENT
+        for part, rows in enumerate(self.run.unit_rows()):
+            for unit, (home, block, own, by_shared) in homes.items():
+                columns[unit][rows.units] = -(rows.through @ by_shared[rows.shared][:, None])
+                if part == home:
+                    columns[unit][rows.units[block]] -= rows.own[block] @ own.T
+        for unit in units:
+            self._columns[unit] = columns[unit][:-1]
+            self._columns[unit][unit] = np.eye(2) - self.run.misfits.hat[unit]
 
 
-def _reduced_statistics(search: Search, covariance: _Covariance, left_out: Sequence[int]) -> Array:
-    """The statistics (N,) as they would be without some units; 0 for these."""
-    residual, cofactor = search.found.residual, np.eye(2) - search.found.hat
-    if left_out:
-        columns = covariance.columns(left_out)
-        inverse = _inverse(columns[left_out].reshape(2 * len(left_out), -1))
-        through = columns @ inverse
-        residual = residual - through @ residual[left_out].ravel()
-        cofactor = cofactor - through @ columns.transpose(0, 2, 1)
-    variance, axes = eigen(cofactor)
-    along = applied(axes.transpose(0, 2, 1), residual)
+def _square_sums(variance: Array, along: Array) -> Array:
+    """Sums (n,) of squares over variances (n, 2), what nothing checks left out."""
     visible = variance > UNCHECKED
-    statistic: Array = np.where(visible, along**2 / np.where(visible, variance, 1.0), 0.0).sum(axis=1)
-    statistic[left_out] = 0.0
-    return statistic
+    return np.asarray(np.where(visible, along**2 / np.where(visible, variance, 1.0), 0.0).sum(axis=1))
 
 
 def _inverse(cofactor: Array) -> Array:
@@ -284,66 +282,3 @@ def _inverse(cofactor: Array) -> Array:
     variance, axes = np.linalg.eigh(cofactor)
     visible = variance > UNCHECKED
     return np.asarray((axes[:, visible] / variance[visible]) @ axes[:, visible].T)
-
-
-def _joint(search: Search, covariance: _Covariance, chosen: Sequence[int]) -> tuple[Array, Array]:
-    """The gross errors (k, 2) of all chosen units together, in unit weight, and their statistics (k,)."""
-    inverse = _inverse(covariance.columns(chosen)[chosen].reshape(2 * len(chosen), -1))
-    errors = -(inverse @ search.found.residual[chosen].ravel()).reshape(-1, 2)
-    own = inverse.reshape(len(chosen), 2, len(chosen), 2)
-    variance, axes = np.linalg.eigh(np.einsum("kikj->kij", own))
-    along = (axes.transpose(0, 2, 1) @ errors[..., None])[..., 0]
-    visible = variance > UNCHECKED
-    return errors, np.where(visible, along**2 / np.where(visible, variance, 1.0), 0.0).sum(axis=1)
-
-
-def _contradiction(
-    search: Search, covariance: _Covariance, chosen: Sequence[int], unit: int, limits: Array
-) -> GrossError:
-    errors, joint = _joint(search, covariance, chosen)
-    at = chosen.index(unit)
-    others = _reduced_statistics(search, covariance, [each for each in chosen if each != unit])
-    near = np.flatnonzero((others > limits) & (others > joint[at] - TOLD_APART))
-    alike = sorted((int(other) for other in near if other != unit), key=lambda other: -others[other])
-    error = search.found.back[unit] @ errors[at]
-    return GrossError(unit, float(joint[at]), float(limits[unit]), error, tuple(alike))
-
-
-def suspects(
-    search: Search,
-    contradicting: Sequence[GrossError],
-    removed: Sequence[GrossError],
-    result: Reliability,
-    probabilities: Probabilities,
-    redundancy: int,
-) -> tuple[Suspect, ...]:
-    """What contradicts the others and what weighs less for that reason, with names, the worst first."""
-    tests = statistics(search.found, search.weighting.weights)
-    entries = {each.unit: each for each in contradicting}
-    known = {each.unit: each.alike for each in removed}
-    reach = limits(search)
-    weakened = (search.weighting.weights < 1.0) & (tests.statistic > reach)
-    for unit in map(int, np.flatnonzero(weakened)):
-        measured = float(tests.statistic[unit]), float(reach[unit]), tests.error[unit]
-        entries[unit] = GrossError(unit, *measured, known.get(unit, ()))
-    count = int((tests.sizes > 0).sum())
-    named = []
-    for entry in sorted(entries.values(), key=lambda each: -each.statistic / each.limit):
-        unit = entry.unit
-        worst = int(np.abs(result.w[unit]).argmax())
-        tested = result.tested[unit]
-        named.append(
-            Suspect(
-                tested=tested,
-                size=int(tests.sizes[unit]),
-                statistic=entry.statistic,
-                critical=entry.limit,
-                w=float(result.w[unit, worst]),
-                tau=float(result.tau[unit, worst]),
-                critical_tau=probabilities.critical_tau(redundancy, count),
-                error=tuple(float(value) for value in entry.error[: len(tested.coordinates)]),
-                alike=tuple(result.tested[other].name for other in entry.alike[:ALIKE_SHOWN]),
-                removed=not bool(search.weighting.used[unit]),
-            )
-        )
-    return tuple(named)

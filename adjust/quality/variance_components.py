@@ -4,75 +4,66 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from adjust.least_squares.iteration import Linearised
-from adjust.least_squares.numbering import Numbering
+from adjust.array_types import Array, Mask
 from adjust.linear_algebra.factor import Factor
 from adjust.linear_algebra.schur_complement import spread_squares
-from adjust.problem.tested import TestedUnits
-from adjust.quality.reliability import Misfits, unit_rows
-from adjust.quality.residuals import group_sums
-from adjust.quality.reweighting import Weighting
-
-Array = NDArray[np.float64]
+from adjust.quality.run import Run
+from adjust.quality.weighting import Weighting
 
 COLUMNS_AT_ONCE = 500  # of the cofactor matrix of the shared unknowns
 LEAST_REDUNDANCY = 1.0  # a group with less redundancy keeps its variance
 
 
-def refined_factors(numbering: Numbering, found: Misfits, weighting: Weighting) -> Weighting:
+def refined_factors(run: Run) -> Weighting:
     """The weighting with every factor multiplied by its group's v'Pv over redundancy.
 
     Repeated until nothing changes this is Helmert's estimate, and the restricted maximum likelihood of normally
     distributed errors. Source: W. Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten, 1979.
     """
-    units = TestedUnits(numbering.problem)
     factors = {}
-    for group, factor in weighting.factors.items():
-        members = (units.groups == group) & weighting.used
-        vpv, redundancy = group_sums(units, found, members)
+    for group, factor in run.weighting.factors.items():
+        vpv, redundancy = run.group_sums((run.units.groups == group) & run.weighting.used)
         lacking = vpv / redundancy if redundancy > LEAST_REDUNDANCY and vpv > 0.0 else 1.0
         factors[group] = factor * lacking
-    return Weighting(weighting.weights, factors)
+    return Weighting(run.weighting.weights, factors)
 
 
-def factor_sigmas(
-    numbering: Numbering, end: Linearised, factor: Factor, found: Misfits, weighting: Weighting
-) -> dict[str, float]:
+def factor_sigmas(run: Run) -> dict[str, float]:
     """The standard deviations of the settled factors.
 
     Twice the inverse of Helmert's matrix, S_gh = trace of (P Q_v)_gh (P Q_v)_hg, over all groups that were estimated
     together; their correlations are in it. 0 for a group that has kept its variance. Source: K.-R. Koch, Parameter
     Estimation and Hypothesis Testing in Linear Models, section 36.
     """
-    units = TestedUnits(numbering.problem)
-    names = list(weighting.factors)
-    members = [(units.groups == group) & weighting.used for group in names]
-    helmert = _traces(numbering, end, factor, members)
-    redundancies = np.array([group_sums(units, found, of_group)[1] for of_group in members])
+    units, factors = run.units, run.weighting.factors
+    names = list(factors)
+    members = [(units.groups == group) & run.weighting.used for group in names]
+    helmert = _traces(run, members)
+    redundancies = np.array([run.group_sums(of_group)[1] for of_group in members])
     helmert += np.diag(2.0 * redundancies - [units.sizes[of_group].sum() for of_group in members])
     estimated = np.flatnonzero(redundancies > LEAST_REDUNDANCY)
     sigmas = dict.fromkeys(names, 0.0)
     variances = np.diag(np.linalg.pinv(helmert[np.ix_(estimated, estimated)]))
     for name, variance in zip([names[i] for i in estimated], variances, strict=True):
-        sigmas[name] = float(weighting.factors[name] * np.sqrt(2.0 * variance))
+        sigmas[name] = float(factors[name] * np.sqrt(2.0 * variance))
     return sigmas
 
 
-def _traces(numbering: Numbering, end: Linearised, factor: Factor, members: Sequence[NDArray[np.bool_]]) -> Array:
+def _traces(run: Run, members: Sequence[Mask]) -> Array:
     """The squared norms (g, g) of the parts of the hat matrix between groups.
 
     Rows of one block share its own columns; between blocks only the shared unknowns meet, and what the groups tell of
     these is summed up first.
     """
+    factor = run.factor
     within = np.zeros((len(members), len(members)))
     normals = [csr_array((factor.shared_count, factor.shared_count)) for _ in members]
     is_member = np.append(
         np.array(members), np.zeros((len(members), 1), dtype=bool), axis=1
     )  # the last stands for ABSENT
-    for rows in unit_rows(numbering, end, factor):
+    for rows in run.unit_rows():
         count = len(rows.units)
         masks = is_member[:, rows.units][..., None, None]
         shape = len(members), count, 2 * rows.units.shape[1]

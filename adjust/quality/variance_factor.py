@@ -9,20 +9,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import fdtr
 
-from adjust.least_squares.numbering import Numbering
+from adjust.array_types import Array, Indices
 from adjust.least_squares.rows import prior_differences
-from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import GivenGroup, VarianceFactor
-from adjust.problem.problem import ABSENT, Problem, State
-from adjust.problem.tested import TestedUnits
-from adjust.quality.reweighting import Weighting
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from adjust.problem.problem import ABSENT, Problem
+from adjust.quality.run import Run
 
 UNCHECKED = 0.01  # redundancy of given values that place something alone, and contradict nothing
 LEAST_REDUNDANCY = 1.0  # of observations that are to tell sigma0
@@ -44,9 +38,7 @@ class _Given:
     evidence: float
 
 
-def variance_factor(
-    numbering: Numbering, state: State, factor: Factor, weighting: Weighting, vpv: float, redundancy: int
-) -> VarianceFactor:
+def variance_factor(run: Run, redundancy: int) -> VarianceFactor:
     """Estimate sigma0 from the observations that have redundancy of their own.
 
     The given values of fiducials (F5, F6), of interior orientations and distortion (F7 to F9), of scanners and of
@@ -58,9 +50,8 @@ def variance_factor(
 
     Parameters
     ----------
-    numbering, state, factor : the network where the adjustment ended
-    weighting : the weights that were used
-    vpv, redundancy : of the whole adjustment
+    run : the adjustment; without a solution sigma0 is that of all
+    redundancy : of the whole adjustment
 
     Notes
     -----
@@ -68,8 +59,10 @@ def variance_factor(
     a group is the trace of M = I - P^½ Q P^½. Along an eigenvector of M with the eigenvalue m the others' errors are
     1 - m of the residual's variance; m is 0 along what the group alone determines.
     """
-    problem = numbering.problem
-    given = [each for each in _given_groups(numbering, state, factor, weighting) if each.redundancy > UNCHECKED]
+    problem, vpv = run.numbering.problem, run.vpv
+    if not run.has_solution:
+        return VarianceFactor(float(np.sqrt(vpv / redundancy)) if redundancy > 0 else 1.0, max(redundancy, 0))
+    given = [each for each in _given_groups(run) if each.redundancy > UNCHECKED]
     left = redundancy - sum(each.redundancy for each in given)
     if left < LEAST_REDUNDANCY:
         return VarianceFactor(1.0, 0.0)
@@ -92,11 +85,15 @@ def _places_only(problem: Problem, given: _Given, variance: float, redundancy: f
     return bool(fdtr(given.redundancy, redundancy, given.vpv / given.redundancy / min(variance, 1.0)) < TOO_GOOD)
 
 
-def _given_groups(numbering: Numbering, state: State, factor: Factor, weighting: Weighting) -> Iterator[_Given]:
-    problem = numbering.problem
-    sigma, differences = problem.unknowns.sigma, prior_differences(problem, state)
-    for group, positions in _owned(problem, weighting):
-        q = factor.function_cofactor(_rows(numbering.numbers[positions], len(numbering.free)))
+def _given_groups(run: Run) -> Iterator[_Given]:
+    numbering = run.numbering
+    sigma = numbering.problem.unknowns.sigma
+    differences = prior_differences(numbering.problem, run.end.state)
+    for group, positions in _given_positions(run):
+        count = len(positions)
+        shape = count, len(numbering.free)
+        entries = np.arange(count), numbering.numbers[positions]
+        q = run.factor.function_cofactor(csr_array((np.ones(count), entries), shape=shape))
         free = np.eye(len(positions)) - q / np.outer(sigma[positions], sigma[positions])
         vpv = float(((differences[positions] / sigma[positions]) ** 2).sum())
         redundancy = float(np.trace(free))
@@ -104,10 +101,10 @@ def _given_groups(numbering: Numbering, state: State, factor: Factor, weighting:
         yield _Given(group, positions, vpv, redundancy, evidence)
 
 
-def _owned(problem: Problem, weighting: Weighting) -> Iterator[tuple[GivenGroup, Indices]]:
+def _given_positions(run: Run) -> Iterator[tuple[GivenGroup, Indices]]:
     """The given values that take part, by what they are of; those of fiducials by the size of their sigma, too."""
-    unknowns, units = problem.unknowns, TestedUnits(problem)
-    used = units.positions[weighting.used[len(problem.network.observations) :]]
+    unknowns = run.problem.unknowns
+    used = run.units.positions[run.weighting.used[len(run.end.v_mm) :]]
     takes_part = np.zeros(len(unknowns), dtype=bool)
     takes_part[used[used != ABSENT]] = True
     fiducials: dict[str, list[int]] = {}
@@ -115,7 +112,7 @@ def _owned(problem: Problem, weighting: Weighting) -> Iterator[tuple[GivenGroup,
         fiducials.setdefault(camera, []).extend(pair[takes_part[pair]].tolist())
     for camera, members in fiducials.items():
         positions = np.array(members, dtype=np.intp)
-        for some in _split_sources(positions, unknowns.sigma[positions]):
+        for some in _split_sources(positions, run.numbering.problem.unknowns.sigma[positions]):
             yield GivenGroup("datum", camera), some
     for name, owned in (("interior", unknowns.camera), ("scanner", unknowns.scanner), ("board", unknowns.board)):
         for owner, positions in owned.items():
@@ -128,9 +125,3 @@ def _split_sources(positions: Indices, sigma: Array) -> list[Indices]:
     order = np.argsort(sigma, kind="stable")
     leaps = np.flatnonzero(sigma[order][1:] > APART * sigma[order][:-1]) + 1
     return [part for part in np.split(positions[order], leaps) if len(part)]
-
-
-def _rows(columns: Indices, count: int) -> csr_array:
-    """Rows (n, count) with a 1 in the columns (n,)."""
-    shape = len(columns), count
-    return csr_array((np.ones(len(columns)), (np.arange(len(columns)), columns)), shape=shape)

@@ -5,15 +5,16 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from adjust.array_types import Indices
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.initial_values.approximations import initial_values
 from adjust.least_squares.malloc_tuning import keep_freed_memory
 from adjust.problem.network import STRAIGHT, Approximations, Network
 from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
+from adjust.quality.run import Run
 from adjust.rank_defect.datum import (
     CENTERINGS,
     EXACT,
@@ -30,12 +31,11 @@ from adjust.solution.left_out_images import adopt_lens, fitting, leave_out
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, is_fixed, run_result
-from adjust.solution.reweighting import Run, again, run
+from adjust.solution.reweighting import again, run
 from adjust.validation import validate
 
 __all__ = ["Datum", "Method", "Options", "adjust", "adjust_problem", "settle_datum"]
 
-Indices = NDArray[np.intp]
 
 GUESSED = 0.1  # standard deviation of a principal distance, over it, from which on it is a guess
 TRIAL_STEPS = 6  # of an adjustment that only has to show whether the observations agree: v'Pv falls with every one

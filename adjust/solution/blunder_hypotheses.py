@@ -9,17 +9,15 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
 from adjust.solution.left_out_images import leave_out
 from adjust.solution.result import Adjustment
-
-Array = NDArray[np.float64]
 
 TOLERATED = 2.0  # times the standard deviations that were given, and residuals still need no other explanation
 CLEARLY = 3.0  # times smaller than as it is given a network's sigma0 is with what explains it
@@ -358,7 +356,7 @@ def _points(result: Adjustment) -> Array:
     return result.values_of(Parameter.point(id, axis) for id in ids for axis in "XYZ").reshape(-1, 3)
 
 
-def _near(stations: Array, given: Array, depths: Array) -> NDArray[np.bool_]:
+def _near(stations: Array, given: Array, depths: Array) -> Mask:
     return np.asarray(np.linalg.norm(stations - given, axis=1) < NEAR * depths)
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array
 from adjust.functional_model.lens import Lens, Prior
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.frames import camera_frames
@@ -18,8 +18,6 @@ from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
 from adjust.solution.options import Options
 from adjust.solution.result import Adjustment
-
-Array = NDArray[np.float64]
 
 MOST_FAR = 0.25  # part of the given points: where more lie far off, who is to say which are right
 FEWEST_IMAGES = 2  # whose rays meet at a place

@@ -8,14 +8,11 @@ that of weighted two-means, from the best thresholds of shifts in some direction
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Mask
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
-from adjust.solution.reweighting import Run
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from adjust.quality.run import Run
 
 MOST_TURNS = 20  # of two-means
 FLAT = 1e-9  # part of the largest eigenvalue below which an image says nothing of a direction

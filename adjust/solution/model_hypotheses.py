@@ -4,74 +4,98 @@ orientation for all images, a flat board.
 Every one starts where the adjustment without its unknowns ended, so that one linearised step tells what it explains.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices
 from adjust.functional_model.added_terms import DECENTERING, RADIAL
 from adjust.functional_model.families import EXTENDED, family
-from adjust.functional_model.lens import Prior
+from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
 from adjust.problem.camera import Camera
-from adjust.problem.network import Approximations, Board, Image, Network, Scanner
-from adjust.problem.problem import Problem, State, number
-from adjust.solution.image_groups import two_groups
-from adjust.solution.reweighting import Run
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from adjust.problem.network import Approximations, Board, Network, Scanner
+from adjust.problem.problem import Problem, number
+from adjust.quality.cofactor import free_cofactor
+from adjust.quality.run import Run
+from adjust.solution.image_groups import ImageGroups, two_groups
 
 FREE = Prior(0.0, np.inf)
 TERMS_TOGETHER = 2  # radial terms that are tested as one
 OTHERS = " (other images)"  # behind a camera's name: the part of its images that may have another interior orientation
-SCANNER = "scanner"
-BOARD = "board"
-INTERIOR = ("c", "x0", "y0")
+SCANNER, BOARD, GROUPS = "scanner", "board", "groups"
+NAMED = 5  # images
+ALIKE = 7.0  # difference of chi-square plus twice the unknowns within which two readings explain alike
+
+# Of the adjustment with the unknowns at these positions, and the rms in µm of what they take of residuals.
+Words = Callable[[Run, Indices, float], tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class ModelHypothesis:
     """A model with added unknowns.
 
-    camera: of which it is, empty of a board. problem: it starts where the simpler model ended. added (k,): positions of
-    the added unknowns. choices: natural logarithm of how many such models it was chosen from; contrasts: the unknowns
-    that all of these together would have. images: the smaller of two groups.
+    kind: "radial", "decentering", "pixels", "groups" or "board". words: its cause with figures, and the remedy.
+    problem: it starts where the simpler model ended. added (k,): positions of the added unknowns. choices: natural
+    logarithm of how many such models it was chosen from; contrasts: the unknowns that all of these together would have.
     """
 
-    camera: str
+    kind: str
+    words: Words
     problem: Problem
     added: Indices
     choices: float = 0.0
     contrasts: int = 0
-    images: tuple[str, ...] = ()
 
 
-def radial_terms(run: Run) -> Iterator[ModelHypothesis]:
-    """The next radial terms that a camera's own do not have."""
-    for camera in _cameras(run):
-        count = sum(name in _free_terms(camera) for name in (*_own_terms(camera, "radial"), *RADIAL))
-        first = min(count, len(RADIAL) - TERMS_TOGETHER)
-        yield _extended_lens(run, camera, RADIAL[first : first + TERMS_TOGETHER])
-
-
-def decentering_terms(run: Run) -> Iterator[ModelHypothesis]:
-    """Decentering, or the next terms of it."""
-    for camera in _cameras(run):
-        free = _free_terms(camera)
-        has_decentering = any(name in free for name in (*_own_terms(camera, "decentering"), *DECENTERING[0]))
-        if not free.intersection(DECENTERING[1]):
-            yield _extended_lens(run, camera, DECENTERING[int(has_decentering)])
-
-
-def unequal_pixels(run: Run) -> Iterator[ModelHypothesis]:
-    """A digital camera's, or those of a scanner that stretches one axis where film transformations do not take that."""
+def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
+    """All that the model of an adjustment may lack."""
     network = run.problem.network
-    for camera in _cameras(run):
-        digital = all(image.transformation == "none" for image in network.images if image.camera == camera.name)
-        if digital and not _free_terms(camera).intersection({*_own_terms(camera, "affinity")[:1], "+b1"}):
-            yield _extended_lens(run, camera, ("+b1",))
+    used = run.problem.unknowns.camera.keys() - network.idle_cameras
+    cameras = [camera for camera in network.cameras if camera.name in used]
+    for hypotheses in (_radial_terms, _decentering_terms, _digital_pixels):
+        for camera in cameras:
+            yield from hypotheses(run, camera)
+    yield from _scanner_pixels(run)
+    if not any(each.name.endswith(OTHERS) for each in network.cameras):
+        for camera in cameras:
+            yield from _second_interior_orientation(run, camera)
+    yield from _bent_board(run)
+
+
+def _radial_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    """The next radial terms that the camera's own do not have."""
+    free = _free_terms(camera)
+    count = sum(name in free for name in (*_own_terms(camera, "radial"), *RADIAL))
+    first = min(count, len(RADIAL) - TERMS_TOGETHER)
+    terms = RADIAL[first : first + TERMS_TOGETHER]
+    degrees = ", ".join(name.removeprefix("+r") for name in terms)
+    pattern = f"a radial pattern, of the degrees {degrees} in r"
+    yield _extended_lens(run, camera, terms, "radial", partial(_lens_words, camera, "radial", pattern))
+
+
+def _decentering_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    """Decentering, or the next terms of it."""
+    free = _free_terms(camera)
+    if not free.intersection(DECENTERING[1]):
+        has_decentering = any(name in free for name in (*_own_terms(camera, "decentering"), *DECENTERING[0]))
+        words = partial(_lens_words, camera, "decentering", "a tangential pattern (decentering)")
+        yield _extended_lens(run, camera, DECENTERING[int(has_decentering)], "decentering", words)
+
+
+def _digital_pixels(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    images = run.problem.network.images
+    digital = all(image.transformation == "none" for image in images if image.camera == camera.name)
+    if digital and not _free_terms(camera).intersection({*_own_terms(camera, "affinity")[:1], "+b1"}):
+        half_mm = _lens_half_mm(run.problem.network, camera)[0]
+        yield _extended_lens(run, camera, ("+b1",), "pixels", partial(_pixel_words, camera.name, 1.0 / half_mm))
+
+
+def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
+    """A scanner that stretches one axis where film transformations do not take that."""
+    network = run.problem.network
     films = [image for image in network.images if image.transformation != "none"]
     if not films or network.scanners or not all(is_left(image.transformation, "stretch") for image in films):
         return
@@ -80,29 +104,26 @@ def unequal_pixels(run: Run) -> Iterator[ModelHypothesis]:
     half_mm = max(extent.half_mm for extent in extents)
     scanner = Scanner(SCANNER, {"stretch": FREE}, (float(middle[0]), float(middle[1])), (half_mm, half_mm))
     images = tuple(replace(image, scanner=SCANNER) if image in films else image for image in network.images)
-    problem = continued(run, replace(network, images=images, scanners=(scanner,)))
-    yield ModelHypothesis(films[0].camera, problem, problem.unknowns.scanner[SCANNER])
+    problem = _continued(run, replace(network, images=images, scanners=(scanner,)))
+    words = partial(_pixel_words, films[0].camera, 2.0 / half_mm)
+    yield ModelHypothesis("pixels", words, problem, problem.unknowns.scanner[SCANNER])
 
 
-def second_interior_orientation(run: Run) -> Iterator[ModelHypothesis]:
-    """Some of a camera's images with another principal distance and principal point."""
-    network = run.problem.network
-    if any(each.name.endswith(OTHERS) for each in network.cameras):
+def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    """Some of the camera's images with another principal distance and principal point."""
+    network, groups = run.problem.network, two_groups(run, camera.name)
+    if groups is None:
         return
-    for camera in _cameras(run):
-        groups = two_groups(run, camera.name)
-        if groups is None:
-            continue
-        others, own = camera.name + OTHERS, groups.images
-        images = tuple(replace(image, camera=others) if image.name in own else image for image in network.images)
-        cameras = (*network.cameras, replace(camera, name=others))
-        problem = continued(run, replace(network, images=images, cameras=cameras), {others: camera.name})
-        added = problem.unknowns.camera[others][: len(INTERIOR)]
-        contrasts = len(INTERIOR) * (groups.count - 1)
-        yield ModelHypothesis(camera.name, problem, added, groups.choices, contrasts, own)
+    others = camera.name + OTHERS
+    images = tuple(replace(each, camera=others) if each.name in groups.images else each for each in network.images)
+    cameras = (*network.cameras, replace(camera, name=others))
+    problem = _continued(run, replace(network, images=images, cameras=cameras), {others: camera.name})
+    added = problem.unknowns.camera[others][: len(INTERIOR_NAMES)]
+    contrasts = len(INTERIOR_NAMES) * (groups.count - 1)
+    yield ModelHypothesis(GROUPS, partial(_group_words, camera.name, groups), problem, added, groups.choices, contrasts)
 
 
-def bent_board(run: Run) -> Iterator[ModelHypothesis]:
+def _bent_board(run: Run) -> Iterator[ModelHypothesis]:
     """All given points as a board that is bent, where they are a flat one."""
     network = run.problem.network
     places = network.known_places
@@ -112,15 +133,8 @@ def bent_board(run: Run) -> Iterator[ModelHypothesis]:
         board = Board(BOARD, places, (FREE, FREE))
     except ValueError:
         return
-    problem = continued(run, replace(network, boards=(board,)))
-    yield ModelHypothesis("", problem, problem.unknowns.board[BOARD])
-
-
-def _cameras(run: Run) -> list[Camera]:
-    """Those whose images show object points."""
-    network = run.problem.network
-    used = run.problem.unknowns.camera.keys() - network.idle_cameras
-    return [camera for camera in network.cameras if camera.name in used]
+    problem = _continued(run, replace(network, boards=(board,)))
+    yield ModelHypothesis(BOARD, _board_words, problem, problem.unknowns.board[BOARD])
 
 
 def _free_terms(camera: Camera) -> set[str]:
@@ -132,22 +146,24 @@ def _own_terms(camera: Camera, group: str) -> tuple[str, ...]:
     return tuple(dict(family(camera.distortion.family.removesuffix(EXTENDED)).groups).get(group, ()))
 
 
-def _extended_lens(run: Run, camera: Camera, terms: Sequence[str]) -> ModelHypothesis:
-    distortion = camera.distortion
-    extended = distortion.family if distortion.family.endswith(EXTENDED) else distortion.family + EXTENDED
-    half_mm = distortion.half_mm if min(distortion.half_mm) > 0.0 else (_reach(run.problem.network, camera.name),) * 2
+def _lens_half_mm(network: Network, camera: Camera) -> tuple[float, float]:
+    """Half the frame, by the marks of the camera's images where it is not given."""
+    if min(camera.distortion.half_mm) > 0.0:
+        return camera.distortion.half_mm
+    own = [image for image in network.images if image.camera == camera.name]
+    return (max(network.extent_by_image[image.name].half_mm for image in own),) * 2
+
+
+def _extended_lens(run: Run, camera: Camera, terms: Sequence[str], kind: str, words: Words) -> ModelHypothesis:
+    network, distortion = run.problem.network, camera.distortion
+    extended = distortion.family.removesuffix(EXTENDED) + EXTENDED
     parameters = dict(distortion.parameters) | dict.fromkeys(terms, FREE)
-    changed = replace(camera, distortion=replace(distortion, family=extended, parameters=parameters, half_mm=half_mm))
-    cameras = tuple(changed if each is camera else each for each in run.problem.network.cameras)
-    problem = continued(run, replace(run.problem.network, cameras=cameras))
+    distortion = replace(distortion, family=extended, parameters=parameters, half_mm=_lens_half_mm(network, camera))
+    cameras = (replace(each, distortion=distortion) if each is camera else each for each in network.cameras)
+    problem = _continued(run, replace(network, cameras=tuple(cameras)))
     names = family(extended).parameters
     added = problem.unknowns.camera[camera.name][[3 + names.index(term) for term in terms]]
-    return ModelHypothesis(camera.name, problem, added)
-
-
-def _reach(network: Network, camera: str) -> float:
-    """Half the extent of the camera's images in mm, by their marks."""
-    return max(network.extent_by_image[image.name].half_mm for image in network.images if image.camera == camera)
+    return ModelHypothesis(kind, words, problem, added)
 
 
 def separate_lenses(run: Run) -> Problem | None:
@@ -155,7 +171,7 @@ def separate_lenses(run: Run) -> Problem | None:
     network = run.problem.network
     if any(camera.fiducials for camera in network.cameras):
         return None
-    problem = continued(run, network)
+    problem = _continued(run, network)
     unknowns, old = problem.unknowns, run.problem.unknowns
     sigma, start = unknowns.sigma.copy(), unknowns.start.copy()
     for name, at in old.camera.items():
@@ -163,44 +179,122 @@ def separate_lenses(run: Run) -> Problem | None:
     return replace(problem, unknowns=replace(unknowns, sigma=sigma, start=start))
 
 
-def continued(run: Run, network: Network, like: dict[str, str] | None = None) -> Problem:
+def _continued(run: Run, network: Network, like: dict[str, str] | None = None) -> Problem:
     """A network with more unknowns as a problem that starts where an adjustment ended, in the datum of that.
 
     like: cameras that share the distortion and the fiducial marks of another one, and start with its interior
     orientation.
     """
-    old, state, like = run.problem.unknowns, run.end.state, like or {}
-    problem = number(network, _approximations(run.problem, network, state, like), run.problem.by_elements)
+    old, values, like, count = run.problem.unknowns, run.end.state.values, like or {}, len(INTERIOR_NAMES)
+    interior = {name: values[at[:count]] for name, at in old.camera.items()}
+    state = Approximations(
+        interior=interior | {name: interior[other] for name, other in like.items()},
+        exterior={image.name: values[old.exterior[image.name]] for image in network.images},
+        transformation={image.name: values[old.transformation[image.name]] for image in network.images},
+        points={id_: values[at] for id_, at in old.point.items()},
+        mirrored=run.problem.mirrored,
+        joins={key: values[at] for key, at in old.join.items()},
+    )
+    problem = number(network, state, run.problem.by_elements)
     unknowns = problem.unknowns
     position = {parameter: i for i, parameter in enumerate(old.parameters)}
     new = np.array([i for i, parameter in enumerate(unknowns.parameters) if parameter in position], dtype=np.intp)
     at = np.array([position[unknowns.parameters[i]] for i in new], dtype=np.intp)
     given, sigma, start = unknowns.given.copy(), unknowns.sigma.copy(), unknowns.start.copy()
-    given[new], sigma[new], start[new] = old.given[at], old.sigma[at], state.values[at]
+    given[new], sigma[new], start[new] = old.given[at], old.sigma[at], values[at]
     camera, fiducial = dict(unknowns.camera), dict(unknowns.fiducial)
-    for name, of in like.items():
-        apart, own = camera[name][: len(INTERIOR)], camera[of]
-        given[apart], sigma[apart], start[apart] = np.nan, np.inf, start[own[: len(INTERIOR)]]
-        sigma[camera[name][len(INTERIOR) :]] = 0.0
-        camera[name] = np.concatenate([apart, own[len(INTERIOR) :]])
+    for name, other in like.items():
+        apart, own = camera[name][:count], camera[other]
+        given[apart], sigma[apart], start[apart] = np.nan, np.inf, start[own[:count]]
+        sigma[camera[name][count:]] = 0.0
+        camera[name] = np.concatenate([apart, own[count:]])
         for (owner, id_), pair in unknowns.fiducial.items():
             if owner == name:
                 sigma[pair] = 0.0
-                fiducial[name, id_] = fiducial[of, id_]
+                fiducial[name, id_] = fiducial[other, id_]
     shared = replace(unknowns, given=given, sigma=sigma, start=start, camera=camera, fiducial=fiducial)
     return replace(problem, unknowns=shared)
 
 
-def _approximations(problem: Problem, network: Network, state: State, like: dict[str, str]) -> Approximations:
-    """The state of a problem, for a network of the same images."""
-    unknowns, values = problem.unknowns, state.values
-    interior = {name: values[at[: len(INTERIOR)]] for name, at in unknowns.camera.items()}
-    images: Sequence[Image] = network.images
-    return Approximations(
-        interior=interior | {name: interior[of] for name, of in like.items()},
-        exterior={image.name: values[unknowns.exterior[image.name]] for image in images},
-        transformation={image.name: values[unknowns.transformation[image.name]] for image in images},
-        points={id_: values[at] for id_, at in unknowns.point.items()},
-        mirrored=problem.mirrored,
-        joins={key: values[at] for key, at in unknowns.join.items()},
+def _lens_words(camera: Camera, group: str, what: str, run: Run, added: Indices, rms_um: float) -> tuple[str, str]:
+    cause = f"The lens model of camera {camera.name} is too simple: the residuals have {what}, {rms_um:.2g} µm rms"
+    fixed = [name for name in _own_terms(camera, group) if name not in _free_terms(camera)]
+    if camera.distortion.family.removesuffix(EXTENDED) == "none":
+        names = "k1 and k2" if group == "radial" else "p1 and p2"
+        return cause, f'Give the camera a [distortion] of the family "brown", say, with {names} free.'
+    if fixed:
+        return cause, f'Free {", ".join(fixed)} under [distortion.sigma] of the camera ("free").'
+    return cause, "Choose a distortion family with more terms, legendre(5) say; `reseau adjust --choose` compares some."
+
+
+def _pixel_words(camera: str, per_mm: float, run: Run, added: Indices, _: float) -> tuple[str, str]:
+    """Of pixels that are not square; per_mm: change of the ratio by the added unknown."""
+    value, covariance = _estimate(run, added)
+    ratio = 1.0 - per_mm * float(value[0])
+    cause = (
+        f"The pixels of camera {camera} are not square: their width is {ratio:.6f} ± "
+        f"{per_mm * float(np.sqrt(covariance[0, 0])):.6f} times their height (b1 = {1.0 - ratio:+.2g})"
     )
+    return cause, (
+        f"Give pitch_um as [x, y] with x / y = {ratio:.6f}, or free the affinity b1 of the distortion (families brown, "
+        "opencv)."
+    )
+
+
+def _board_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
+    value, covariance = _estimate(run, added)
+    sigma = np.sqrt(np.diag(covariance))
+    cause = (
+        f"The board of the given points is not flat: its middle stands {value[0]:.3g} ± {sigma[0]:.1g} off along its "
+        f"first axis and {value[1]:.3g} ± {sigma[1]:.1g} along its second (object units)"
+    )
+    return cause, 'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object].'
+
+
+def _group_words(camera: str, groups: ImageGroups, run: Run, added: Indices, _: float) -> tuple[str, str]:
+    """Of two groups of images with an interior orientation each, in the readings that fit their difference."""
+    values, covariance = _estimate(run, np.concatenate([added, run.problem.unknowns.camera[camera][:3]]))
+    base, difference = values[3:], values[:3] - values[3:]
+    by_both = np.hstack([np.eye(3), -np.eye(3)])
+    spread = by_both @ covariance @ by_both.T
+    shown = ", ".join(groups.images[:NAMED])
+    more = f" and {len(groups.images) - NAMED} more" if len(groups.images) > NAMED else ""
+    who = f"the images {shown}{more} ({len(groups.images)} of {groups.count}) of camera {camera}"
+    sigma = np.sqrt(np.diag(spread))
+    scale = 1.0 + float(difference @ base) / float(base @ base)
+    readings = (
+        (
+            np.eye(3)[:, :1],
+            f"{who} have another principal distance than the others, by {difference[0]:+.4g} ± {sigma[0]:.1g} mm "
+            "(zoom or focus changed)",
+        ),
+        (
+            np.eye(3)[:, 1:],
+            f"{who} have another principal point than the others, by ({difference[1]:+.4g}, {difference[2]:+.4g}) ± "
+            f"({sigma[1]:.1g}, {sigma[2]:.1g}) mm: images of different sizes in one camera (cropped)",
+        ),
+        (
+            base[:, None] / np.linalg.norm(base),
+            f"{who} are {scale:.5g} times as large as the others: images of different sizes in one camera (scaled)",
+        ),
+        (np.eye(3), f"{who} have another interior orientation than the others"),
+    )
+    costs = [_misfit(difference, spread, along) + 2.0 * along.shape[1] for along, _cause in readings]
+    fitting = [each for each, cost in zip(readings, costs, strict=True) if cost < min(costs) + ALIKE]
+    special = [cause for along, cause in fitting if along.shape[1] < len(base)]
+    causes = "; or ".join(special or [cause for _, cause in fitting])
+    return f"{causes[0].upper()}{causes[1:]}", "Give these images a camera of their own (column camera of images.csv)."
+
+
+def _misfit(difference: Array, covariance: Array, along: Array) -> float:
+    """Chi-square of a difference (3,) that is held to some directions."""
+    weight = np.linalg.pinv(covariance, hermitian=True)
+    normal = along.T @ weight @ along
+    rest = difference - along @ np.linalg.pinv(normal, hermitian=True) @ (along.T @ weight @ difference)
+    return float(rest @ weight @ rest)
+
+
+def _estimate(run: Run, positions: Indices) -> tuple[Array, Array]:
+    """Values (k,) of some unknowns and their covariance (k, k), of unit weight or the larger one that was found."""
+    cofactor = free_cofactor(run.numbering, run.end.state, run.factor)
+    return run.end.state.values[positions], cofactor.part(positions)

@@ -13,12 +13,10 @@ from scipy.optimize import brentq
 from scipy.spatial import KDTree
 from scipy.special import chdtr, chdtrc, ndtr
 
-from adjust.problem.tested import TestedUnits
-from adjust.quality.residuals import group_sums, residuals
-from adjust.solution.reweighting import Run, again
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from adjust.array_types import Array, Indices, Mask
+from adjust.quality.residuals import residuals
+from adjust.quality.run import Run
+from adjust.solution.reweighting import again
 
 FEWEST = 30  # coordinates from which on residuals tell what they are distributed like
 CHANCE = 0.001  # of each test below which residuals are no mere noise
@@ -26,6 +24,7 @@ NEIGHBOURS = 8  # that are looked at, the nearest first
 UNCHECKED = 0.05  # redundancy number below which a residual tells nothing
 KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")), ("fiducials", ("fiducial",)))
 STEPS = 20
+UM_PER_MM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -34,14 +33,30 @@ class AddedNoise:
 
     marks: str
     sigma_mm: float
+    covariance_mm2: Array
     run: Run
+
+    @property
+    def words(self) -> tuple[str, str]:
+        """The cause and the remedy; `covariance_mm2` is that given of the marks."""
+        given_um = UM_PER_MM * float(np.sqrt(np.median(np.trace(self.covariance_mm2, axis1=1, axis2=2) / 2.0)))
+        added_um = UM_PER_MM * self.sigma_mm
+        key = "sigma_fiducial_um" if self.marks == "fiducials" else "sigma_target_um"
+        return (
+            f"The standard deviations given to the {self.marks} are too small everywhere: the residuals are plain "
+            f"noise, alike in all images; {added_um:.3g} µm added to the {given_um:.3g} µm given (in quadrature) "
+            "explains all",
+            f"Give film_sigma_um = {added_um:.3g} under [adjust], which is added to the sigma of every mark, or larger "
+            f"sigmas in comparator.csv or {key}.",
+        )
 
 
 def added_noise(run: Run, redundancy: int) -> AddedNoise | None:
     """The standard deviation that, added to those of marks, explains all residuals; None where it does not."""
     if not _is_noise(run):
         return None
-    kind = np.array(run.problem.network.observations.kind)
+    network = run.problem.network
+    kind, covariance = np.array(network.observations.kind), network.observations.covariance_mm2
     for marks, kinds in KINDS:
         members = np.isin(kind, kinds)
         if marks != "marks" and members.all():
@@ -49,25 +64,25 @@ def added_noise(run: Run, redundancy: int) -> AddedNoise | None:
         sigma_mm = _added_sigma(run, members, redundancy)
         if sigma_mm is None:
             continue
-        noisy = _add_noise(run, members, sigma_mm)
-        if noisy.converged and noisy.misfits is not None and _groups_agree(noisy):
-            return AddedNoise(marks, sigma_mm, noisy)
+        larger = covariance + np.where(members, sigma_mm**2, 0.0)[:, None, None] * np.eye(2)
+        observations = replace(network.observations, covariance_mm2=larger)
+        problem = replace(run.problem, network=replace(network, observations=observations))
+        noisy = again(replace(run, problem=problem), run.weighting, STEPS, run.end.state)
+        if noisy.converged and noisy.is_tested and _groups_agree(noisy):
+            return AddedNoise(marks, sigma_mm, covariance, noisy)
     return None
 
 
 def _is_noise(run: Run) -> bool:
     """Whether standardised residuals are normally distributed, alike in all images and independent of neighbours."""
-    if run.misfits is None:
-        return False
-    v = residuals(run.end.v_mm, run.misfits, run.weighting)
+    v = residuals(run)
     checked = (v.redundancy > UNCHECKED).all(axis=1)
     if 2 * checked.sum() < FEWEST:
         return False
     w, images = v.w[checked], run.problem.image_numbers[checked]
     places = run.end.computed_mm[checked]
     points = np.array(run.problem.network.observations.point)[checked]
-    rotations = run.end.state.rotations
-    in_object = np.einsum("nji,nj->ni", rotations[images][:, :2], w)
+    in_object = np.einsum("nji,nj->ni", run.end.state.rotations[images][:, :2], w)
     return (
         _is_normal(w)
         and _is_alike(w, v.redundancy[checked], images)
@@ -84,7 +99,7 @@ def _is_normal(w: Array) -> bool:
     return bool(ndtr(-abs(kurtosis) / np.sqrt(24.0 / len(w))) > 0.5 * CHANCE)
 
 
-def _is_alike(w: Array, redundancy: Array, images: NDArray[np.intp]) -> bool:
+def _is_alike(w: Array, redundancy: Array, images: Indices) -> bool:
     """Whether the mean square of every image is that of all, by chi-square of their differences."""
     shares = np.bincount(images, (w**2 * redundancy).sum(axis=1))
     freedom = np.bincount(images, redundancy.sum(axis=1))
@@ -96,7 +111,7 @@ def _is_alike(w: Array, redundancy: Array, images: NDArray[np.intp]) -> bool:
     return bool(chdtrc(present.sum() - 1, square) > CHANCE)
 
 
-def _is_shared(w: Array, places: Array, images: NDArray[np.intp], same_image: bool) -> bool:
+def _is_shared(w: Array, places: Array, images: Indices, same_image: bool) -> bool:
     """Whether nearest neighbours, in the same image or in another, have residuals alike."""
     if same_image:  # far apart in a third coordinate, images keep to themselves
         apart = 10.0 * float(np.ptp(places, axis=0).max())
@@ -109,7 +124,7 @@ def _is_shared(w: Array, places: Array, images: NDArray[np.intp], same_image: bo
     return len(rows) > 2 and _is_positive((w[rows] * w[nearest]).sum(axis=1))
 
 
-def _is_shared_by_point(in_object: Array, points: NDArray[np.str_], images: NDArray[np.intp]) -> bool:
+def _is_shared_by_point(in_object: Array, points: NDArray[np.str_], images: Indices) -> bool:
     """Whether a point's residuals, turned into the axes of the object, are alike in one image and the next."""
     order = np.lexsort((images, points))
     follows = points[order][1:] == points[order][:-1]
@@ -139,21 +154,10 @@ def _added_sigma(run: Run, members: Mask, redundancy: int) -> float | None:
     return float(np.sqrt(brentq(excess, 0.0, largest, rtol=1e-6)))
 
 
-def _add_noise(run: Run, members: Mask, sigma_mm: float) -> Run:
-    network = run.problem.network
-    covariance = network.observations.covariance_mm2 + np.where(members, sigma_mm**2, 0.0)[:, None, None] * np.eye(2)
-    observations = replace(network.observations, covariance_mm2=covariance)
-    problem = replace(run.problem, network=replace(network, observations=observations))
-    return again(replace(run, problem=problem), run.weighting, STEPS, run.end.state)
-
-
 def _groups_agree(run: Run) -> bool:
     """Whether every group of observations agrees with its standard deviations, neither too small nor too large."""
-    units, found = TestedUnits(run.problem), run.misfits
-    if found is None:
-        return False
-    for name in np.unique(units.groups):
-        vpv, freedom = group_sums(units, found, (units.groups == name) & run.weighting.used)
+    for name in np.unique(run.units.groups):
+        vpv, freedom = run.group_sums((run.units.groups == name) & run.weighting.used)
         if freedom > 1.0 and min(chdtr(freedom, vpv), chdtrc(freedom, vpv)) < CHANCE:
             return False
     return True

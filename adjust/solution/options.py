@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.tested import PRIOR_GROUPS
-from adjust.quality.reweighting import WeightFunction
+from adjust.quality.weighting import WeightFunction
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]

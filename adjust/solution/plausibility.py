@@ -9,18 +9,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.problem.camera import Camera
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.blunder_hypotheses import Tried, explains, mirrored_images, y_downward
 from adjust.solution.result import Adjustment
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MARGIN = 0.01  # of the frame by which a mark may lie outside: the outermost pixel's edge, a frame's rounded size
 NEARLY_ALL = 0.9  # of the marks outside the picture, from which on the axes are wrong and not the marks
@@ -97,13 +94,13 @@ def _outside(network: Network, result: Adjustment) -> Mask:
     return outside
 
 
-def _targets(network: Network, camera: Camera) -> NDArray[np.intp]:
+def _targets(network: Network, camera: Camera) -> Indices:
     """The observations of object points by a camera."""
     own = np.array([image.camera == camera.name for image in network.images])
     return np.flatnonzero(own[network.image_numbers] & ~network.observations.is_fiducial)
 
 
-def _camera_places(network: Network, result: Adjustment, rows: NDArray[np.intp]) -> Array:
+def _camera_places(network: Network, result: Adjustment, rows: Indices) -> Array:
     """Observed camera coordinates (m, 2) of some observations."""
     xy_mm = network.straight_xy_mm[rows].copy()
     numbers = network.image_numbers[rows]

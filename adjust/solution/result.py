@@ -6,32 +6,28 @@ from functools import cached_property
 from html import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.iteration import Iteration, factorise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.problem import Problem
-from adjust.problem.tested import TestedUnits
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.quality.contradiction import CalibrationTest, calibration_tests
 from adjust.quality.correlation import Correlation, correlations
 from adjust.quality.lens_reach import LensReach, lens_reach
-from adjust.quality.reliability import Misfits, Reliability, reliability
+from adjust.quality.reliability import Reliability, reliability
 from adjust.quality.residuals import FurtherResidual, Group, Residuals, further_residuals, groups, residuals
+from adjust.quality.run import Run
 from adjust.quality.significance import SignificanceTest, significance_tests
-from adjust.quality.snooping import Suspect, contradictions, search, suspects
+from adjust.quality.snooping import Snooping, Suspect
 from adjust.quality.variance_components import factor_sigmas
 from adjust.quality.variance_factor import variance_factor
 from adjust.rank_defect.flat_valleys import held_directions, inseparable
 from adjust.solution.explanations import Explained, Explanation, explain
-from adjust.solution.reweighting import Run
 from adjust.solution.warnings import run_warnings
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,43 +64,35 @@ class Adjustment(Estimates):
 
     @cached_property
     def residuals(self) -> Residuals:
-        return residuals(self.run.end.v_mm, self._misfits, self.run.weighting)
+        return residuals(self.run)
 
     @cached_property
     def groups(self) -> Mapping[str, Group]:
         """The kinds of observations, with their share of v'Pv."""
-        run = self.run
-        return groups(run.problem, run.end.state, run.end.v_mm, self._misfits, run.weighting, self.further)
+        return groups(self.run, self.further)
 
     @cached_property
     def further(self) -> tuple[FurtherResidual, ...]:
         """The residuals of distances and the like."""
-        run, delta = self.run, self.probabilities.noncentrality(1)
-        of_state = run.problem, run.end.state, run.end.rows.further
-        return tuple(further_residuals(*of_state, run.solution.factor, delta))
+        return tuple(further_residuals(self.run, self.probabilities.noncentrality(1)))
 
     @cached_property
     def contradictions(self) -> tuple[CalibrationTest, ...]:
         """What the images say against earlier calibrations as wholes."""
-        run = self.run
-        if not run.has_solution or not run.problem.further:
+        if not self.run.has_solution:
             return ()
-        of_state = run.problem, run.end.state, run.end.rows.further
-        vpv = self.variance.sigma0**2 * self.variance.redundancy
-        return tuple(calibration_tests(*of_state, run.factor, vpv, round(self.variance.redundancy)))
+        return tuple(calibration_tests(self.run, self.variance.sigma0, self.variance.redundancy))
 
     @cached_property
     def variance_sigmas(self) -> Mapping[str, float]:
         """The standard deviations of the variance factors."""
-        run, found = self.run, self._misfits
-        if found is None or not run.weighting.factors:
-            return {}
-        return factor_sigmas(run.numbering, run.end, run.factor, found, run.weighting)
+        has_factors = self._is_tested and self.run.weighting.factors
+        return factor_sigmas(self.run) if has_factors else {}
 
     @cached_property
     def reliability(self) -> Reliability | None:
         """Baarda's inner and outer reliability; None where there is no solution."""
-        return _reliability(self.run, self.variance, self.probabilities)
+        return _reliability(self.run, self.variance, self.probabilities) if self._is_tested else None
 
     @cached_property
     def correlations(self) -> tuple[Correlation, ...]:
@@ -130,23 +118,18 @@ class Adjustment(Estimates):
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
         """What contradicts the others, the worst first: beside what explains the residuals of all."""
-        if self.misread:
+        if self.misread or not self._is_tested:
             return ()
-        run, variance = self._explanation_run.run, self.variance
+        run, variance, tested = self._explained.run, self.variance, self.reliability
         if run is not self.run:
-            variance = _run_variance(run, _run_redundancy(run, self.cofactor))
-        tested = _reliability(run, variance, self.probabilities) if run is not self.run else self.reliability
-        found = run.misfits if run.has_solution else None
-        if found is None or tested is None:
-            return ()
-        tests = search(run.numbering, run.end, run.factor, found, run.weighting, self.probabilities)
-        gross = contradictions(tests)
-        return suspects(tests, gross, run.removed, tested, self.probabilities, round(variance.redundancy))
+            variance = variance_factor(run, _redundancy(run, self.cofactor))
+            tested = _reliability(run, variance, self.probabilities)
+        return Snooping(run, self.probabilities).suspects(tested, round(variance.redundancy)) if tested else ()
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
         """Of a sigma0 that is too large; suspects are then those of an adjustment with them in the model."""
-        return () if self.misread else self._explanation_run.explanations
+        return () if self.misread else self._explained.explanations
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -163,12 +146,12 @@ class Adjustment(Estimates):
         return (*self.unused, *found)
 
     @cached_property
-    def _explanation_run(self) -> Explained:
-        return explain(self.run, _run_redundancy(self.run, self.cofactor), self.probabilities)
+    def _explained(self) -> Explained:
+        return explain(self.run, _redundancy(self.run, self.cofactor), self.probabilities)
 
     @property
-    def _misfits(self) -> Misfits | None:
-        return self.run.misfits if self.run.has_solution else None
+    def _is_tested(self) -> bool:
+        return self.run.has_solution and self.run.is_tested
 
     def __repr__(self) -> str:
         return (
@@ -212,32 +195,31 @@ def run_result(given: Problem, last: Run, members: Indices | None, probabilities
     members : positions of the coordinates that carry inner constraints, None without a free datum
     probabilities : of the tests
     """
-    problem, state, weighting = last.problem, last.end.state, last.weighting
+    problem = last.problem
     plain = _cofactor(given, last, members)
-    redundancy = _run_redundancy(last, plain)
-    variance = _run_variance(last, redundancy)
+    redundancy = _redundancy(last, plain)
+    variance = variance_factor(last, redundancy)
     scaled = _scaled_run(last, variance)
-    cofactor = plain if scaled is last else _cofactor(given, scaled, members)
     return Adjustment(
         network=problem.network,
         termination=last.solution.termination,
         iterations=len(last.solution.history),
-        conditions=_condition_count(last, plain),
+        conditions=redundancy + len(last.numbering.free),
         unknowns=len(last.numbering.free),
         redundancy=redundancy,
         vpv=last.vpv,
         variance=variance,
         parameters=problem.unknowns.parameters,
-        values=np.where(_meaningless(problem), np.nan, state.values),
-        cofactor=cofactor,
+        values=np.where(_meaningless(problem), np.nan, last.end.state.values),
+        cofactor=plain if scaled is last else _cofactor(given, scaled, members),
         run=last,
         scaled=scaled,
         probabilities=probabilities,
         singular=last.singular if last.solution.termination == "singular" else (),
         history=last.solution.history,
         mirrored=problem.mirrored,
-        weights=weighting.weights[: len(last.end.v_mm)],
-        variance_factors=weighting.factors,
+        weights=last.weighting.weights[: len(last.end.v_mm)],
+        variance_factors=last.weighting.factors,
     )
 
 
@@ -254,7 +236,7 @@ def _scaled_run(last: Run, variance: VarianceFactor) -> Run:
     return replace(last, numbering=numbering, solution=replace(last.solution, factor=factor), factor=factor)
 
 
-def _meaningless(problem: Problem) -> NDArray[np.bool_]:
+def _meaningless(problem: Problem) -> Mask:
     """The quantities (n,) that nothing is given of and that nothing tells, for no object point is seen."""
     network, unknowns = problem.network, problem.unknowns
     meaningless = np.zeros(len(unknowns), dtype=bool)
@@ -267,29 +249,14 @@ def _meaningless(problem: Problem) -> NDArray[np.bool_]:
     return meaningless
 
 
-def _condition_count(run: Run, cofactor: Cofactor) -> int:
-    """Equations, without what the adjustment does without; with what pseudo-observations determine."""
+def _redundancy(run: Run, cofactor: Cofactor) -> int:
+    """Equations, without what the adjustment does without and with what pseudo-observations determine, less
+    unknowns."""
     problem = run.problem
     further = sum(len(each.observed) for each in problem.further)
     held = held_directions(problem, cofactor.variances) if problem.pseudo_observed else 0
-    return int(TestedUnits(problem).sizes[run.weighting.used].sum()) + further + held
+    return int(run.units.sizes[run.weighting.used].sum()) + further + held - len(run.numbering.free)
 
 
-def _run_redundancy(run: Run, cofactor: Cofactor) -> int:
-    """Equations less unknowns."""
-    return _condition_count(run, cofactor) - len(run.numbering.free)
-
-
-def _run_variance(run: Run, redundancy: int) -> VarianceFactor:
-    """sigma0 and what it comes from; redundancy: of all."""
-    factor = run.solution.factor
-    if factor is None:
-        return VarianceFactor(float(np.sqrt(run.vpv / redundancy)) if redundancy > 0 else 1.0, max(redundancy, 0))
-    return variance_factor(run.numbering, run.end.state, factor, run.weighting, run.vpv, redundancy)
-
-
-def _reliability(run: Run, variance: VarianceFactor, probabilities: Probabilities) -> Reliability | None:
-    if run.misfits is None or not run.has_solution:
-        return None
-    at, weights = (run.numbering, run.end, run.factor, run.misfits), run.weighting.weights
-    return reliability(*at, weights, variance.sigma0, round(variance.redundancy), probabilities)
+def _reliability(run: Run, variance: VarianceFactor, probabilities: Probabilities) -> Reliability:
+    return reliability(run, variance.sigma0, round(variance.redundancy), probabilities)

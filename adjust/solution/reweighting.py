@@ -1,109 +1,59 @@
 """Adjustments one after the other, until the residuals ask for no other weights."""
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.errors import NoImageError
 from adjust.functional_model.families import family
 from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
 from adjust.least_squares.numbering import Numbering
-from adjust.linear_algebra.factor import Factor
 from adjust.problem.condition_equations import blind_marks
-from adjust.problem.estimates import NullDirection, Termination
+from adjust.problem.estimates import Termination
 from adjust.problem.problem import Problem, State
 from adjust.problem.tested import TestedUnits
 from adjust.quality.cofactor import free_cofactor
-from adjust.quality.reliability import Misfits, misfits, statistics
-from adjust.quality.reweighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
-from adjust.quality.snooping import GrossError, contradictions, limits, search
+from adjust.quality.run import GrossError, Run
+from adjust.quality.snooping import Snooping
 from adjust.quality.variance_components import refined_factors
+from adjust.quality.weighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
 from adjust.rank_defect.diagnosis import singular_directions
-from adjust.rank_defect.flat_valleys import (
-    REACHES,
-    edge_motions,
-    is_contradicted,
-    pseudo_square_sum,
-    unresolved,
-)
+from adjust.rank_defect.flat_valleys import REACHES, edge_motions, is_contradicted, unresolved
 from adjust.solution.options import Options
 
 ROUNDS = 30  # of robust estimation, of variance components or of data snooping at most
 ITERATIONS_A_ROUND = 8  # of the adjustments whose weights robust estimation is to change anyway
 
 
-def run(problem: Problem, options: Options, doubted: Collection[int] = ()) -> "Run":
+def run(problem: Problem, options: Options, doubted: Collection[int] = ()) -> Run:
     """Adjust a problem, whose datum is settled, from where it starts.
 
     doubted: quantities whose given values robust estimation and data snooping begin without; where these agree with
     the rest they come back. Raises NoImageError where a point has no image there.
     """
-    begun = _snooping if options.snooping else _weighted
-    return begun(problem, options, doubted)
-
-
-@dataclass(frozen=True)
-class Run:
-    """One adjustment with given weights, and where it ended.
-
-    problem: as it was given, `numbering` holds it with the priors' weights. singular: what is not determined at the
-    end, be that a solution or not. settled: whether the residuals ask for no other weights. removed: what data snooping
-    has taken out.
-    """
-
-    problem: Problem
-    numbering: Numbering
-    weighting: Weighting
-    solution: Solution
-    singular: tuple[NullDirection, ...]
-    factor: Factor
-    settled: bool = True
-    removed: tuple[GrossError, ...] = ()
-
-    @cached_property
-    def misfits(self) -> Misfits | None:
-        """What everything that is tested contradicts the others by; None where something is not determined."""
-        return None if self.singular else misfits(self.numbering, self.end, self.factor)
-
-    @property
-    def end(self) -> Linearised:
-        return self.solution.end
-
-    @property
-    def vpv(self) -> float:
-        """v'Pv of all that is observed or given."""
-        return self.end.vpv - pseudo_square_sum(self.problem, self.end.state)
-
-    @property
-    def converged(self) -> bool:
-        return self.solution.termination == "converged"
-
-    @property
-    def has_solution(self) -> bool:
-        return self.solution.factor is not None
-
-
-def _first(problem: Problem, options: Options, doubted: Collection[int]) -> Run:
     units = TestedUnits(problem)
-    factors = {group: 1.0 for group in options.groups if (units.groups == group).any()}
+    alone = np.isin(units.positions[:, 0], list(doubted))
+    doubted_units = (len(units) - len(units.positions) + np.flatnonzero(alone)).tolist()
     weights = np.ones(len(units))
-    weights[_prior_units(units, doubted)] = NO_WEIGHT
-    return _run(problem, Weighting(weights, factors), problem.start(), options.iteration_limit)
+    weights[doubted_units] = NO_WEIGHT
+    factors = {group: 1.0 for group in options.groups if (units.groups == group).any()}
+    begun = Weighting(weights, {} if options.snooping else factors)
+    last = _run(problem, begun, problem.start(), options.iteration_limit)
+    if not options.snooping:
+        return _settle(last, options, doubted_units)
+    # Variance components come second: those of contaminated groups would hide what contaminates them.
+    if doubted_units and last.is_tested:
+        tests = last.statistics
+        removed = (GrossError(unit, float(tests.statistic[unit]), 0.0, tests.error[unit]) for unit in doubted_units)
+        last = replace(last, removed=tuple(removed))
+    last = _snoop_rounds(last, replace(options, variance_components=False))
+    if not options.groups:
+        return last
+    return _snoop_rounds(_settle(replace(last, weighting=replace(last.weighting, factors=factors)), options), options)
 
 
-def _prior_units(units: TestedUnits, quantities: Collection[int]) -> NDArray[np.intp]:
-    """The given values that stand alone, of some quantities."""
-    return len(units) - len(units.positions) + np.flatnonzero(np.isin(units.positions[:, 0], list(quantities)))
-
-
-def _weighted(problem: Problem, options: Options, doubted: Collection[int]) -> Run:
-    return _settle(_first(problem, options, doubted), options, _prior_units(TestedUnits(problem), doubted))
-
-
-def _settle(last: Run, options: Options, doubted: Collection[int] = ()) -> Run:
+def _settle(last: Run, options: Options, doubted: Sequence[int] = ()) -> Run:
     """Adjust until the weights that robust estimation and variance components ask for are those that were used.
 
     doubted: units that the redescending function is the first to weigh: the little that Huber's leaves an error of
@@ -112,7 +62,7 @@ def _settle(last: Run, options: Options, doubted: Collection[int] = ()) -> Run:
     limit = min(options.iteration_limit, ITERATIONS_A_ROUND) if options.robust else options.iteration_limit
     for function in options.weight_functions or (None,):
         for _ in range(ROUNDS):
-            refined = _reweight(last, options, function)
+            refined = _reweight(last, function)
             if function in options.weight_functions[:-1]:
                 refined.weights[list(doubted)] = NO_WEIGHT
             if not refined.differs(last.weighting):
@@ -125,16 +75,15 @@ def _settle(last: Run, options: Options, doubted: Collection[int] = ()) -> Run:
     return last
 
 
-def _reweight(last: Run, options: Options, function: WeightFunction | None) -> Weighting:
+def _reweight(last: Run, function: WeightFunction | None) -> Weighting:
     """The weights that the residuals of a run ask for; its own where there is nothing to ask, or not to be trusted."""
-    if not (function or (last.weighting.factors and last.converged)) or last.misfits is None:
+    if not (function or (last.weighting.factors and last.converged)) or not last.is_tested:
         return last.weighting
-    weighting = refined_factors(last.numbering, last.misfits, last.weighting)
-    if function:
-        tests = statistics(last.misfits, last.weighting.weights)
-        observed = len(last.end.v_mm)
-        weighting = replace(weighting, weights=robust_weights(tests.statistic, tests.sizes, observed, function))
-    return weighting
+    weighting = refined_factors(last)
+    if function is None:
+        return weighting
+    tests = last.statistics
+    return replace(weighting, weights=robust_weights(tests.statistic, tests.sizes, len(last.end.v_mm), function))
 
 
 def again(last: Run, weighting: Weighting, limit: int, state: State | None = None) -> Run:
@@ -142,35 +91,16 @@ def again(last: Run, weighting: Weighting, limit: int, state: State | None = Non
     return replace(_run(last.problem, weighting, state or last.end.state, limit), removed=last.removed)
 
 
-def _snooping(problem: Problem, options: Options, doubted: Collection[int]) -> Run:
-    """Adjust without what contradicts the others, until nothing does and what was taken out would do so again.
-
-    Variance components come second: those of contaminated groups would hide what contaminates them.
-    """
-    plain = replace(options, variance_components=False)
-    last = _first(problem, plain, doubted)
-    if doubted and last.misfits is not None:
-        tests = statistics(last.misfits, last.weighting.weights)
-        left_out = map(int, _prior_units(TestedUnits(problem), doubted))
-        removed = (GrossError(unit, float(tests.statistic[unit]), 0.0, tests.error[unit], ()) for unit in left_out)
-        last = replace(last, removed=tuple(removed))
-    last = _snoop_rounds(last, plain)
-    if not options.groups:
-        return last
-    factors = {group: 1.0 for group in options.groups if (TestedUnits(problem).groups == group).any()}
-    return _snoop_rounds(_settle(replace(last, weighting=replace(last.weighting, factors=factors)), options), options)
-
-
 def _snoop_rounds(last: Run, options: Options) -> Run:
+    """Adjust without what contradicts the others, until nothing does and what was taken out would do so again."""
     earlier: set[frozenset[int]] = set()
     for _ in range(ROUNDS):
-        if last.misfits is None:
+        if not last.is_tested:
             return last
-        tests = search(last.numbering, last.end, last.factor, last.misfits, last.weighting, options.probabilities)
-        statistic = statistics(last.misfits, last.weighting.weights).statistic
-        reach = limits(tests)
-        confirmed = [each for each in last.removed if statistic[each.unit] > reach[each.unit]]
-        removed = (*confirmed, *contradictions(tests))
+        search = Snooping(last, options.probabilities)
+        limits = search.limits
+        confirmed = [each for each in last.removed if last.statistics.statistic[each.unit] > limits[each.unit]]
+        removed = (*confirmed, *search.contradictions)
         out = frozenset(each.unit for each in removed)
         if out == {each.unit for each in last.removed}:
             return last
@@ -208,7 +138,11 @@ def _release_cameras(problem: Problem, weighting: Weighting, begun: Run, limit: 
     motions = edge_motions(problem, at) if at is not None else {}
     for reach in REACHES if motions else ():
         held = replace(problem, pseudo_observed={i: reach * motion for i, motion in motions.items()})
-        if not unresolved(held.pseudo_observed, _variances(held, weighting, start)):
+        at = _linearise(held, weighting, start)
+        if at is None:
+            break
+        variances = free_cofactor(at.rows.numbering, start, at.factor).variances
+        if not unresolved(held.pseudo_observed, variances):
             break
         last = _iterate(held, weighting, state, limit)
         if last.converged and not is_contradicted(held, last.end.state):
@@ -221,14 +155,6 @@ def _release_cameras(problem: Problem, weighting: Weighting, begun: Run, limit: 
 def _linearise(problem: Problem, weighting: Weighting, state: State) -> Linearised | None:
     weighted, covariance = weighting.applied(problem)
     return linearise(Numbering(weighted), covariance, state)
-
-
-def _variances(problem: Problem, weighting: Weighting, state: State) -> NDArray[np.float64]:
-    """A-priori variances (n,) of all quantities at a state; 0 where some point has no image there."""
-    at = _linearise(problem, weighting, state)
-    if at is None:
-        return np.zeros(len(problem.unknowns))
-    return free_cofactor(at.rows.numbering, state, at.factor).variances
 
 
 def _alike_at_zero(problem: Problem, state: State) -> dict[str, list[int]]:
@@ -272,9 +198,9 @@ def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -
             f"The adjustment cannot start: with the approximations, {next(iter(reasons.values()), '')}",
             {of_name[name].frame: reason for name, reason in reasons.items() if name},
         )
+    solution = Solution(start, None, "singular", ())
     singular = singular_directions(weighted, state, numbering.free, start.factor)
     if singular:
-        solution = Solution(start, None, "singular", ())
         return Run(problem, numbering, weighting, solution, singular, start.factor)
     solution = iterate(numbering, covariance, start, limit)
     factor = solution.end.factor
@@ -282,5 +208,4 @@ def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -
     if singular:
         ended: Termination = "singular" if solution.termination == "converged" else "diverged"
         solution = replace(solution, factor=None, termination=ended)
-        return Run(problem, numbering, weighting, solution, singular, factor)
-    return Run(problem, numbering, weighting, solution, (), factor)
+    return Run(problem, numbering, weighting, solution, singular, factor)

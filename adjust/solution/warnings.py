@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.transformation import marks_needed
 from adjust.least_squares.iteration import factorise
 from adjust.problem.condition_equations import computed_observations
@@ -14,12 +14,10 @@ from adjust.problem.observations import Observations
 from adjust.problem.parameter import description
 from adjust.problem.problem import Problem
 from adjust.quality.residuals import Residuals
+from adjust.quality.run import Run
 from adjust.rank_defect.diagnosis import undetermined, weak_directions
 from adjust.rank_defect.scanner_directions import weak_term_sentences
-from adjust.solution.reweighting import ROUNDS, Run
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from adjust.solution.reweighting import ROUNDS
 
 GROSS = 20.0  # a-priori standard deviations from which on a residual can be that of another mark
 NEARER = 0.5  # of the distance of two marks that each may lie from where the other is expected
@@ -104,7 +102,7 @@ def _films_by_targets(problem: Problem) -> list[str]:
     ]
 
 
-def _is_gross(observations: Observations, v_mm: Array) -> NDArray[np.bool_]:
+def _is_gross(observations: Observations, v_mm: Array) -> Mask:
     """(n,) Whether residuals (n, 2) can be those of other marks."""
     sigma = np.sqrt(np.trace(observations.covariance_mm2, axis1=1, axis2=2) / 2)
     return np.asarray(np.linalg.norm(v_mm, axis=1) > GROSS * sigma)

@@ -11,7 +11,7 @@ from adjust.functional_model.scanner import is_term
 from adjust.functional_model.transformation import film_kind
 from adjust.problem.network import Transformation
 from adjust.problem.tested import PRIOR_GROUPS
-from adjust.quality.reweighting import WeightFunction
+from adjust.quality.weighting import WeightFunction
 from adjust.solution.options import MEASURED_KINDS
 from pipeline.text.table_models import FLAG, NOT_NEGATIVE, POSITIVE, TABLE, Key, choice, read_model
 from pipeline.text.tables import Table

@@ -15,7 +15,7 @@ from adjust.model_selection.cross_validation import CrossValidation, cross_valid
 from adjust.model_selection.model_choice import Choice, choose, weighted_network
 from adjust.model_selection.models import Model, lenses
 from adjust.problem.network import Network, ObjectPoint, Transformation
-from adjust.quality.reweighting import WeightFunction
+from adjust.quality.weighting import WeightFunction
 from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]

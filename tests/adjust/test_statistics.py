@@ -12,7 +12,7 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Exterior, Network
 from adjust.problem.observations import ObservationKind, Observations
-from adjust.quality.reweighting import robust_weights
+from adjust.quality.weighting import robust_weights
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 

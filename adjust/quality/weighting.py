@@ -5,14 +5,11 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from adjust.array_types import Array, Indices, Mask
 from adjust.linear_algebra.small_matrices import laid_out
 from adjust.problem.problem import Problem
 from adjust.problem.tested import TestedUnits
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 WeightFunction = Literal["huber", "igg3"]
 
@@ -58,7 +55,7 @@ class Weighting:
         return bool((np.abs(here - there) > STANDSTILL * there).any())
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Mask:
         """(N,) what takes part."""
         return np.asarray(self.weights > NO_WEIGHT)
 
