@@ -55,46 +55,23 @@ def image_without_terms(image: Image, count: int) -> Image:
 def _added(unit_mm: float, reduced: Array, parameters: Array) -> Correction:
     """The added terms and their derivatives at points (n, 2) about the principal point."""
     x, y = (reduced / unit_mm).T
-    terms = [_radial(x, y, (degree - 1) // 2) for degree in RADIAL_DEGREES]
-    terms += [_decentering(x, y, axis, power) for power in range(len(DECENTERING)) for axis in (0, 1)]
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    terms += [
-        (vectors(x, zero), matrices((one, zero), (zero, zero))),
-        (vectors(y, zero), matrices((zero, one), (zero, zero))),
-    ]
-    value = sum((each * parameter for (each, _), parameter in zip(terms, parameters, strict=True)), np.zeros((1, 2)))
-    by_scaled = sum(
-        (each * parameter for (_, each), parameter in zip(terms, parameters, strict=True)), np.zeros((1, 2, 2))
+    one, zero, s = np.ones_like(x), np.zeros_like(x), x**2 + y**2
+    radial = vectors(x, y), matrices((one, zero), (zero, one))
+    tangential = (
+        (vectors(s + 2.0 * x**2, 2.0 * x * y), matrices((6.0 * x, 2.0 * y), (2.0 * y, 2.0 * x))),
+        (vectors(2.0 * x * y, s + 2.0 * y**2), matrices((2.0 * y, 2.0 * x), (2.0 * x, 6.0 * y))),
     )
-    xy_jacobian = by_scaled / unit_mm
-    return Correction(value, xy_jacobian, -xy_jacobian, columns([each for each, _ in terms]))
-
-
-def _radial(x: Array, y: Array, power: int) -> tuple[Array, Array]:
-    """(x, y) s^power and its derivative."""
-    return _times_power(vectors(x, y), _identity(x), x, y, power)
-
-
-def _decentering(x: Array, y: Array, axis: int, power: int) -> tuple[Array, Array]:
-    """(s + 2x², 2xy) or (2xy, s + 2y²), times s^power, and its derivative."""
-    mixed = 2.0 * x * y
-    if axis == 0:
-        term, xy_jacobian = vectors(3.0 * x**2 + y**2, mixed), matrices((6.0 * x, 2.0 * y), (2.0 * y, 2.0 * x))
-    else:
-        term, xy_jacobian = vectors(mixed, x**2 + 3.0 * y**2), matrices((2.0 * y, 2.0 * x), (2.0 * x, 6.0 * y))
-    return _times_power(term, xy_jacobian, x, y, power)
-
-
-def _times_power(term: Array, xy_jacobian: Array, x: Array, y: Array, power: int) -> tuple[Array, Array]:
-    """A term times s^power, and its derivative."""
-    if power == 0:
-        return term, xy_jacobian
-    s = x**2 + y**2
-    slope = 2.0 * power * s ** (power - 1)
-    outer = term[:, :, None] * vectors(x, y)[:, None, :] * slope[:, None, None]
-    return term * (s**power)[:, None], xy_jacobian * (s**power)[:, None, None] + outer
-
-
-def _identity(x: Array) -> Array:
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    return matrices((one, zero), (zero, one))
+    factors = [(radial, (degree - 1) // 2) for degree in RADIAL_DEGREES]
+    factors += [(term, power) for power in range(len(DECENTERING)) for term in tangential]
+    factors += [
+        ((vectors(x, zero), matrices((one, zero), (zero, zero))), 0),
+        ((vectors(y, zero), matrices((zero, one), (zero, zero))), 0),
+    ]
+    value, by_scaled, terms = np.zeros_like(reduced), 0.0, []
+    for ((term, slope), power), parameter in zip(factors, parameters, strict=True):
+        outward = 2.0 * power * s ** max(power - 1, 0)
+        slope = slope * (s**power)[:, None, None] + term[:, :, None] * vectors(x, y)[:, None] * outward[:, None, None]
+        terms.append(term * (s**power)[:, None])
+        value, by_scaled = value + parameter * terms[-1], by_scaled + parameter * slope
+    xy_jacobian = np.asarray(by_scaled) / unit_mm
+    return Correction(value, xy_jacobian, -xy_jacobian, columns(terms))

@@ -12,6 +12,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from adjust.array_types import Array
+from adjust.functional_model import fourier_sets, juhl, opencv_family, physical, polynomial_sets
 from adjust.functional_model.added_terms import ADDED_NAMES, correction_with_terms, image_without_terms
 from adjust.functional_model.correction import (
     Correct,
@@ -21,36 +22,6 @@ from adjust.functional_model.correction import (
     ray_family,
     undistorted,
 )
-from adjust.functional_model.fourier_sets import fourier, fourier_names, order_groups
-from adjust.functional_model.juhl import JUHL_GROUPS, JUHL_NAMES, JUHL_UNITS, juhl
-from adjust.functional_model.opencv_family import (
-    FISHEYE_GROUPS,
-    FISHEYE_NAMES,
-    OPENCV_DENOMINATOR,
-    OPENCV_GROUPS,
-    OPENCV_NAMES,
-    OPENCV_UNITS,
-    OPENCV_Y_DOWN,
-    expanded,
-    opencv,
-    opencv_fisheye,
-)
-from adjust.functional_model.physical import (
-    AICON_GROUPS,
-    AICON_NAMES,
-    AUSTRALIS_NAMES,
-    BROWN_GROUPS,
-    BROWN_NAMES,
-    BROWN_UNITS,
-    TORLEGARD_GROUPS,
-    TORLEGARD_NAMES,
-    TORLEGARD_UNITS,
-    aicon,
-    australis,
-    brown,
-    torlegard,
-)
-from adjust.functional_model.polynomial_sets import EBNER, GRUEN, PolynomialSet, correct, degree_groups, legendre
 
 LEGENDRE_ORDERS = range(2, 10)  # from 2, the degree of the tilts that are left out, to one digit an index
 FOURIER_ORDERS = range(1, 10)
@@ -85,64 +56,67 @@ class Family:
         return self.units[self.parameters.index(parameter)] if self.units else "mm"
 
 
-def _polynomials(of: PolynomialSet) -> Family:
-    return Family(of.names, correct=partial(correct, of), needs="half_mm", groups=degree_groups(of))
-
-
-def _legendre(order: int) -> Family:
-    return _polynomials(legendre(order))
+def _polynomials(terms: polynomial_sets.PolynomialSet) -> Family:
+    groups = polynomial_sets.degree_groups(terms)
+    return Family(terms.names, correct=partial(polynomial_sets.correct, terms), needs="half_mm", groups=groups)
 
 
 def _fourier(order: int) -> Family:
-    return Family(fourier_names(order), correct=partial(fourier, order), needs="half_mm", groups=order_groups(order))
+    names, groups = fourier_sets.fourier_names(order), fourier_sets.order_groups(order)
+    return Family(names, correct=partial(fourier_sets.fourier, order), needs="half_mm", groups=groups)
 
 
 _BROWN_LADDER = ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 k3 p1 p2")
+_BROWN = Family(
+    physical.BROWN_NAMES,
+    correct=physical.brown,
+    units=physical.BROWN_UNITS,
+    groups=physical.BROWN_GROUPS,
+    ladder=_BROWN_LADDER,
+)
 _FAMILIES = {
     "none": Family(),
     "torlegard": Family(
-        TORLEGARD_NAMES,
-        correct=torlegard,
-        units=TORLEGARD_UNITS,
-        groups=TORLEGARD_GROUPS,
+        physical.TORLEGARD_NAMES,
+        correct=physical.torlegard,
+        units=physical.TORLEGARD_UNITS,
+        groups=physical.TORLEGARD_GROUPS,
         ladder=("k3", "k3 k5", "k3 p1 p2", "k3 k5 p1 p2", "k3 k5 k7 p1 p2"),
     ),
-    "brown": Family(BROWN_NAMES, correct=brown, units=BROWN_UNITS, groups=BROWN_GROUPS, ladder=_BROWN_LADDER),
-    "australis": Family(
-        AUSTRALIS_NAMES, correct=australis, units=BROWN_UNITS, groups=BROWN_GROUPS, ladder=_BROWN_LADDER
-    ),
+    "brown": _BROWN,
+    "australis": replace(_BROWN, correct=physical.australis),
     "aicon": Family(
-        AICON_NAMES,
-        image=ideal_point_family(aicon),
-        units=BROWN_UNITS,
-        groups=AICON_GROUPS,
+        physical.AICON_NAMES,
+        image=ideal_point_family(physical.aicon),
+        units=physical.BROWN_UNITS,
+        groups=physical.AICON_GROUPS,
         ladder=("a1", "a1 a2", "a1 b1 b2", "a1 a2 b1 b2", "a1 a2 a3 b1 b2"),
     ),
     "opencv": Family(
-        OPENCV_NAMES,
-        image=ray_family(opencv),
-        units=OPENCV_UNITS,
-        y_down=OPENCV_Y_DOWN,
-        groups=OPENCV_GROUPS,
+        opencv_family.OPENCV_NAMES,
+        image=ray_family(opencv_family.opencv),
+        units=opencv_family.OPENCV_UNITS,
+        y_down=opencv_family.OPENCV_Y_DOWN,
+        groups=opencv_family.OPENCV_GROUPS,
         ladder=("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3"),
-        alike_at_zero=OPENCV_DENOMINATOR,
-        apart=expanded,
+        alike_at_zero=opencv_family.OPENCV_DENOMINATOR,
+        apart=opencv_family.expanded,
     ),
     "opencv_fisheye": Family(
-        FISHEYE_NAMES,
-        image=ray_family(opencv_fisheye),
-        units=("–",) * len(FISHEYE_NAMES),
+        opencv_family.FISHEYE_NAMES,
+        image=ray_family(opencv_family.opencv_fisheye),
+        units=("–",) * len(opencv_family.FISHEYE_NAMES),
         y_down=("b2",),
-        groups=FISHEYE_GROUPS,
+        groups=opencv_family.FISHEYE_GROUPS,
         ladder=("k1", "k1 k2", "k1 k2 k3", "k1 k2 k3 k4"),
         is_pinhole_at_zero=False,
     ),
-    "juhl": Family(JUHL_NAMES, correct=juhl, units=JUHL_UNITS, needs="r0_mm", groups=JUHL_GROUPS),
-    "ebner": _polynomials(EBNER),
-    "gruen": _polynomials(GRUEN),
+    "juhl": Family(juhl.JUHL_NAMES, correct=juhl.juhl, units=juhl.JUHL_UNITS, needs="r0_mm", groups=juhl.JUHL_GROUPS),
+    "ebner": _polynomials(polynomial_sets.EBNER),
+    "gruen": _polynomials(polynomial_sets.GRUEN),
 }
 _WITH_ORDER: dict[str, tuple[range, Callable[[int], Family]]] = {
-    "legendre": (LEGENDRE_ORDERS, _legendre),
+    "legendre": (LEGENDRE_ORDERS, lambda order: _polynomials(polynomial_sets.legendre(order))),
     "fourier": (FOURIER_ORDERS, _fourier),
 }
 EXTENDED = "+"  # behind a family's name: with the added terms, by which an adjustment tests what the family lacks

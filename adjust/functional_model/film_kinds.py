@@ -5,10 +5,10 @@ so that the adjustment moves centred parameters: those of the same formula in (x
 half the extent of what was observed in an image. `design` is the derivative by these, `centred_jacobian` leads back.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
-from typing import Protocol
 
 import numpy as np
 
@@ -19,30 +19,57 @@ NEWTON_STEPS = 30
 NEWTON_TOLERANCE = 1e-9  # of a coordinate: the error left is the square of the last step
 
 
-class FilmKind(Protocol):
-    """A formula for x', y' in x, y and its own parameters."""
+class FilmKind(ABC):
+    """A formula for x', y' in x, y and its own parameters.
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the parameters, in their order; a1 and b1 are the constants."""
+    names: of the parameters, in their order; a1 and b1 are the constants.
+    """
 
+    names: tuple[str, ...]
+
+    @abstractmethod
     def apply(self, parameters: Array, xy: Array) -> Array:
         """The camera coordinates (..., 2) of comparator coordinates (..., 2)."""
 
+    @abstractmethod
     def gradient(self, parameters: Array, xy: Array) -> Array:
         """Their derivative (..., 2, 2) by the comparator coordinates."""
 
+    @abstractmethod
     def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
         """Their derivative (..., 2, k) by the centred parameters; center (..., 2), half (...)."""
 
+    @abstractmethod
     def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
         """Derivative (..., k, k) of the parameters by the centred ones."""
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether it is linear in the coordinates."""
+        return False
 
     def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
         """The comparator coordinates (n, 2), and which of them lie where the formula does not fold over.
 
         center (2,) or (n, 2): a place in the middle of the image, from which the formula must be regular to the point.
+        By Newton's method from there; found is what it comes to with the orientation that the film has at the centre.
         """
+        steps = 1 if self.is_linear else NEWTON_STEPS
+        xy = np.broadcast_to(center, camera_xy.shape).astype(np.float64)
+        at_center = self.gradient(parameters, xy)
+        turn = np.sign(determinant(at_center))
+        found = np.zeros(len(xy), dtype=bool)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for number in range(steps):
+                gradient = self.gradient(parameters, xy) if number else at_center
+                step, regular = _solved(gradient, self.apply(parameters, xy) - camera_xy)
+                xy = xy - step
+                settled = np.abs(step).max(axis=-1) <= NEWTON_TOLERANCE * (1.0 + np.abs(xy).max(axis=-1))
+                found = regular & (settled | self.is_linear)
+                if found.all():
+                    break
+            same_side = np.sign(determinant(self.gradient(parameters, xy))) == turn
+        return xy, np.asarray(found & same_side)
 
 
 def least_marks(kind: FilmKind) -> int:
@@ -51,7 +78,7 @@ def least_marks(kind: FilmKind) -> int:
 
 
 @dataclass(frozen=True)
-class Identity:
+class Identity(FilmKind):
     """x' = x, y' = y."""
 
     names: tuple[str, ...] = ()
@@ -72,108 +99,20 @@ class Identity:
         return camera_xy.copy(), np.ones(len(camera_xy), dtype=bool)
 
 
-@dataclass(frozen=True)
-class Congruent:
-    """A turn, a shift and, told beforehand, a mirror."""
+@dataclass(frozen=True, eq=False)
+class Polynomial(FilmKind):
+    """x' = sum of a_k x^p_k y^q_k, y' = sum of b_k x^p_k y^q_k; exponents (p_k, q_k), the constant first.
 
-    mirrored: bool
-    names: tuple[str, ...] = ("a1", "b1", "angle")
+    mixing (2 t, k): the coefficients a, b of t terms by the parameters, the columns orthogonal.
+    """
 
-    def apply(self, parameters: Array, xy: Array) -> Array:
-        return parameters[..., :2] + applied(self._turn(parameters), xy)
-
-    def gradient(self, parameters: Array, xy: Array) -> Array:
-        return np.broadcast_to(self._turn(parameters), (*xy.shape[:-1], 2, 2))
-
-    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
-        design = np.zeros((*xy.shape, 3), dtype=np.result_type(parameters, xy))
-        design[..., :2] = np.eye(2)
-        design[..., 2] = applied(self._turn_by_angle(parameters), xy - center)
-        return design
-
-    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
-        result = np.broadcast_to(np.eye(3), (*np.shape(half), 3, 3)).copy()
-        result[..., :2, 2] = -applied(self._turn_by_angle(parameters), center)
-        return result
-
-    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
-        transposed = self._turn(parameters).swapaxes(-1, -2)
-        return applied(transposed, camera_xy - parameters[..., :2]), np.ones(len(camera_xy), dtype=bool)
-
-    def _turn(self, parameters: Array) -> Array:
-        c, s = np.cos(parameters[..., 2]), np.sin(parameters[..., 2])
-        m = -1.0 if self.mirrored else 1.0
-        return np.stack([np.stack([c, -m * s], axis=-1), np.stack([s, m * c], axis=-1)], axis=-2)
-
-    def _turn_by_angle(self, parameters: Array) -> Array:
-        turn = self._turn(parameters)
-        return np.stack([-turn[..., 1, :], turn[..., 0, :]], axis=-2)
-
-
-@dataclass(frozen=True)
-class Conformal:
-    """x' + i y' = sum of (a_k + i b_k) (x + i m y)^(k-1), k = 1 .. order + 1; m = -1 where mirrored."""
-
-    order: int
-    mirrored: bool
     names: tuple[str, ...]
-
-    def apply(self, parameters: Array, xy: Array) -> Array:
-        return self._combination(parameters, self._powers(xy))
-
-    def gradient(self, parameters: Array, xy: Array) -> Array:
-        powers = self._powers(xy)
-        factors = np.arange(1, self.order + 1)[:, None]
-        by_x = self._combination(parameters[..., 2:], powers[..., :-1, :] * factors)
-        m = -1.0 if self.mirrored else 1.0
-        by_y = np.stack([-m * by_x[..., 1], m * by_x[..., 0]], axis=-1)
-        return np.stack([by_x, by_y], axis=-1)
-
-    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
-        powers = self._powers((xy - center) / half[..., None])
-        design = np.empty((*xy.shape, 2 * self.order + 2), dtype=powers.dtype)
-        design[..., 0, 0::2], design[..., 0, 1::2] = powers[..., 0], -powers[..., 1]
-        design[..., 1, 0::2], design[..., 1, 1::2] = powers[..., 1], powers[..., 0]
-        return design
-
-    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
-        m = -1.0 if self.mirrored else 1.0
-        origin = -(center[..., 0] + 1j * m * center[..., 1])
-        result = np.zeros((*np.shape(half), 2 * self.order + 2, 2 * self.order + 2))
-        for j in range(self.order + 1):
-            for k in range(j + 1):
-                factor = comb(j, k) * origin ** (j - k) / half**j
-                result[..., 2 * k, 2 * j] = result[..., 2 * k + 1, 2 * j + 1] = factor.real
-                result[..., 2 * k, 2 * j + 1], result[..., 2 * k + 1, 2 * j] = -factor.imag, factor.imag
-        return result
-
-    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
-        return _newton(self, parameters, camera_xy, center, 1 if self.order == 1 else NEWTON_STEPS)
-
-    def _powers(self, xy: Array) -> Array:
-        """Real and imaginary parts (..., order + 1, 2) of (x + i m y)^k."""
-        x, y = xy[..., 0], (-xy[..., 1] if self.mirrored else xy[..., 1])
-        powers = [np.stack([np.ones_like(x), np.zeros_like(x)], axis=-1)]
-        for _ in range(self.order):
-            real, imaginary = powers[-1][..., 0], powers[-1][..., 1]
-            powers.append(np.stack([real * x - imaginary * y, real * y + imaginary * x], axis=-1))
-        return np.stack(powers, axis=-2)
-
-    def _combination(self, parameters: Array, powers: Array) -> Array:
-        a, b = parameters[..., 0::2], parameters[..., 1::2]
-        real, imaginary = powers[..., 0], powers[..., 1]
-        return np.stack([(a * real - b * imaginary).sum(-1), (a * imaginary + b * real).sum(-1)], axis=-1)
-
-
-@dataclass(frozen=True)
-class Polynomial:
-    """x' = sum of a_k x^p_k y^q_k, y' = sum of b_k x^p_k y^q_k; exponents (p_k, q_k), the constant first."""
-
     exponents: tuple[tuple[int, int], ...]
+    mixing: Array
 
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        return tuple(f"{axis}{k}" for axis in "ab" for k in range(1, len(self.exponents) + 1))
+    @property
+    def is_linear(self) -> bool:
+        return self._degree == 1
 
     def apply(self, parameters: Array, xy: Array) -> Array:
         return self._combination(parameters, self._terms(xy))
@@ -186,7 +125,7 @@ class Polynomial:
         count = len(self.exponents)
         design = np.zeros((*xy.shape, 2 * count), dtype=terms.dtype)
         design[..., 0, :count] = design[..., 1, count:] = terms
-        return design
+        return np.asarray(design @ self.mixing)
 
     def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
         count = len(self.exponents)
@@ -197,10 +136,7 @@ class Polynomial:
                     shift = (-center[..., 0]) ** (p - u) * (-center[..., 1]) ** (q - v)
                     result[..., i, j] = comb(p, u) * comb(q, v) * shift / half ** (p + q)
         result[..., count:, count:] = result[..., :count, :count]
-        return result
-
-    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
-        return _newton(self, parameters, camera_xy, center, 1 if self._degree == 1 else NEWTON_STEPS)
+        return np.asarray((self.mixing / (self.mixing**2).sum(axis=0)).T @ result @ self.mixing)
 
     @cached_property
     def _degree(self) -> int:
@@ -221,13 +157,68 @@ class Polynomial:
         return np.stack(terms, axis=-1)
 
     def _combination(self, parameters: Array, terms: Array) -> Array:
+        coefficients = parameters @ self.mixing.T
         count = len(self.exponents)
-        first, second = parameters[..., :count], parameters[..., count:]
+        first, second = coefficients[..., :count], coefficients[..., count:]
         return np.stack([(first * terms).sum(-1), (second * terms).sum(-1)], axis=-1)
 
 
+def polynomial(exponents: tuple[tuple[int, int], ...]) -> Polynomial:
+    """With free coefficients."""
+    names = tuple(f"{axis}{k}" for axis in "ab" for k in range(1, len(exponents) + 1))
+    return Polynomial(names, exponents, np.eye(len(names)))
+
+
+def whole_polynomial(order: int) -> Polynomial:
+    """With all terms up to a total degree."""
+    return polynomial(tuple((degree - q, q) for degree in range(order + 1) for q in range(degree + 1)))
+
+
+def conformal(order: int, mirrored: bool, names: tuple[str, ...]) -> Polynomial:
+    """x' + i y' = sum of (a_k + i b_k) (x + i m y)^(k-1), k = 1 .. order + 1; m = -1 where mirrored."""
+    exponents, turn = whole_polynomial(order).exponents, -1j if mirrored else 1j
+    powers = np.array([[comb(p + q, q) * turn**q * (p + q == k) for k in range(order + 1)] for p, q in exponents])
+    columns = np.stack([powers, 1j * powers], axis=-1).reshape(len(exponents), -1)  # by a_1, b_1, a_2, ...
+    return Polynomial(names, exponents, np.concatenate([columns.real, columns.imag]))
+
+
 @dataclass(frozen=True)
-class Projective:
+class Congruent(FilmKind):
+    """A turn, a shift and, known beforehand, a mirror: a similarity with p, q the cosine and sine of the angle."""
+
+    mirrored: bool
+    names: tuple[str, ...] = ("a1", "b1", "angle")
+
+    @property
+    def is_linear(self) -> bool:
+        return True
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        return parameters[..., :2] + applied(self._turn(parameters), xy)
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        return np.broadcast_to(self._turn(parameters), (*xy.shape[:-1], 2, 2))
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        design = np.zeros((*xy.shape, 3), dtype=np.result_type(parameters, xy))
+        design[..., :2] = np.eye(2)
+        design[..., 2] = applied(self._turn(parameters, np.pi / 2.0), xy - center)
+        return design
+
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
+        result = np.broadcast_to(np.eye(3), (*np.shape(half), 3, 3)).copy()
+        result[..., :2, 2] = -applied(self._turn(parameters, np.pi / 2.0), center)
+        return result
+
+    def _turn(self, parameters: Array, further: float = 0.0) -> Array:
+        """The turn's matrix; its derivative is that of a right angle further."""
+        c, s = np.cos(parameters[..., 2] + further), np.sin(parameters[..., 2] + further)
+        m = -1.0 if self.mirrored else 1.0
+        return np.stack([np.stack([c, -m * s], axis=-1), np.stack([s, m * c], axis=-1)], axis=-2)
+
+
+@dataclass(frozen=True)
+class Projective(FilmKind):
     """x' = (a1 + a2 x + a3 y) / d, y' = (b1 + b2 x + b3 y) / d, d = 1 + c1 x + c2 y."""
 
     names: tuple[str, ...] = ("a1", "a2", "a3", "b1", "b2", "b3", "c1", "c2")
@@ -275,28 +266,6 @@ class Projective:
 
     def _denominator(self, parameters: Array, xy: Array) -> Array:
         return np.asarray(1.0 + (parameters[..., 6:] * xy).sum(-1))
-
-
-def _newton(kind: FilmKind, parameters: Array, camera_xy: Array, center: Array, steps: int) -> tuple[Array, Mask]:
-    """Newton's method from the centre; one step is exact where the formula is linear.
-
-    Found is what the iteration comes to with the orientation that the film has at the centre.
-    """
-    xy = np.broadcast_to(center, camera_xy.shape).astype(np.float64)
-    at_center = kind.gradient(parameters, xy)
-    turn = np.sign(determinant(at_center))
-    found = np.zeros(len(xy), dtype=bool)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for number in range(steps):
-            gradient = kind.gradient(parameters, xy) if number else at_center
-            step, regular = _solved(gradient, kind.apply(parameters, xy) - camera_xy)
-            xy = xy - step
-            settled = np.abs(step).max(axis=-1) <= NEWTON_TOLERANCE * (1.0 + np.abs(xy).max(axis=-1))
-            found = regular & (settled | (steps == 1))
-            if found.all():
-                break
-        same_side = np.sign(determinant(kind.gradient(parameters, xy))) == turn
-    return xy, np.asarray(found & same_side)
 
 
 def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:

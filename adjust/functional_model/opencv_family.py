@@ -163,14 +163,8 @@ def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
 
     r1, r2, r3 are the rows of R = Ry(tau_y) Rx(tau_x), p = (x, y, 1).
     """
-    rx, rx_by_angle = _turn(tau_x)
-    ry, ry_by_angle = _turn(tau_y)
-    about_x, about_y = [0, 1, 2], [1, 2, 0]  # the axis of the turn first
-    rotation = _placed(ry, about_y) @ _placed(rx, about_x)
-    moved = (
-        _placed(ry, about_y) @ _placed(rx_by_angle, about_x, 0.0),
-        _placed(ry_by_angle, about_y, 0.0) @ _placed(rx, about_x),
-    )
+    (rx, rx_by_angle), (ry, ry_by_angle) = _turn(tau_x, 0), _turn(tau_y, 1)
+    rotation, by_angles = ry @ rx, (ry @ rx_by_angle, ry_by_angle @ rx)
     *over, depth = _turned(rotation, point)
     over, size = [each / depth for each in over], rotation[2, 2] / depth
     by_point = [
@@ -178,7 +172,7 @@ def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
     ]
 
     def angle_derivative(k: int) -> Array:
-        change = moved[k]
+        change = by_angles[k]
         *shift, deeper = _turned(change, point)
         return vectors(
             *(size * (shift[i] - at * deeper) + change[2, 2] * at - change[i, 2] for i, at in enumerate(over))
@@ -194,15 +188,10 @@ def _turned(matrix: Array, point: Array) -> list[Array]:
     return [row[0] * x + row[1] * y + row[2] for row in matrix]
 
 
-def _turn(angle: float) -> tuple[Array, Array]:
-    """The 2x2 matrix of OpenCV's turn by an angle, and its derivative."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, s], [-s, c]]), np.array([[-s, c], [-c, -s]])
-
-
-def _placed(turn: Array, axes: list[int], along: float = 1.0) -> Array:
-    """The turn (2, 2) as a matrix (3, 3) in the plane of the last two axes; along: what stands on the first."""
-    matrix = np.zeros((3, 3), dtype=turn.dtype)
-    matrix[axes[0], axes[0]] = along
-    matrix[np.ix_(axes[1:], axes[1:])] = turn
-    return matrix
+def _turn(angle: float, axis: int) -> tuple[Array, Array]:
+    """OpenCV's turn (3, 3) by an angle about x (0) or y (1), and its derivative."""
+    c, s, i = np.cos(angle), np.sin(angle), np.arange(axis + 1, axis + 3) % 3
+    turn, derivative = np.zeros((2, 3, 3), dtype=np.result_type(c))
+    turn[axis, axis] = 1.0
+    turn[np.ix_(i, i)], derivative[np.ix_(i, i)] = [[c, s], [-s, c]], [[-s, c], [-c, -s]]
+    return turn, derivative

@@ -14,7 +14,6 @@ from adjust.linear_algebra.small_matrices import matrices, vectors
 
 TORLEGARD_NAMES = ("k3", "k5", "k7", "p1", "p2", "p3", "p4")
 BROWN_NAMES = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
-AUSTRALIS_NAMES = BROWN_NAMES
 AICON_NAMES = ("a1", "a2", "a3", "b1", "b2", "c1", "c2")
 TORLEGARD_UNITS = ("mm⁻²", "mm⁻⁴", "mm⁻⁶", "mm⁻¹", "mm⁻¹", "mm⁻²", "mm⁻⁴")
 BROWN_UNITS = (*TORLEGARD_UNITS[:5], "–", "–")

@@ -20,13 +20,14 @@ from functools import lru_cache
 
 from adjust.array_types import Array, Mask
 from adjust.functional_model.film_kinds import (
-    Conformal,
     Congruent,
     FilmKind,
     Identity,
-    Polynomial,
     Projective,
+    conformal,
     least_marks,
+    polynomial,
+    whole_polynomial,
 )
 
 HIGHEST_ORDER = 5
@@ -45,17 +46,17 @@ def film_kind(spelling: str, mirrored: bool = False) -> FilmKind:
         case "congruent":
             return Congruent(mirrored)
         case "similarity":
-            return Conformal(1, mirrored, ("a1", "b1", "p", "q"))
+            return conformal(1, mirrored, ("a1", "b1", "p", "q"))
         case "affine":
-            return _polynomial(1)
+            return whole_polynomial(1)
         case "projective":
             return Projective()
         case "bilinear":
-            return Polynomial(((0, 0), (1, 0), (0, 1), (1, 1)))
+            return polynomial(((0, 0), (1, 0), (0, 1), (1, 1)))
     name, order = _name_and_order(spelling)
     if name == "polynomial":
-        return _polynomial(order)
-    return Conformal(order, mirrored, tuple(f"{axis}{k}" for k in range(1, order + 2) for axis in "ab"))
+        return whole_polynomial(order)
+    return conformal(order, mirrored, tuple(f"{axis}{k}" for k in range(1, order + 2) for axis in "ab"))
 
 
 def _name_and_order(spelling: str) -> tuple[str, int]:
@@ -68,10 +69,6 @@ def _name_and_order(spelling: str) -> tuple[str, int]:
     elif spelling in ("conformal", "polynomial"):
         why = f' it lacks its order, as in "{spelling}(2)";'
     raise ValueError(f'there is no transformation "{spelling}":{why} possible are {POSSIBLE}')
-
-
-def _polynomial(order: int) -> Polynomial:
-    return Polynomial(tuple((degree - q, q) for degree in range(order + 1) for q in range(degree + 1)))
 
 
 def film_parameter_names(spelling: str) -> tuple[str, ...]:

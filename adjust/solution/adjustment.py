@@ -1,8 +1,7 @@
 """The simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9)."""
 
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import replace
-from functools import partial
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc
@@ -28,6 +27,7 @@ from adjust.rank_defect.datum import (
 from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
 from adjust.solution.coordinate_blunders import Slip, coordinate_slips, far_points, few_points, free_points
 from adjust.solution.left_out_images import adopt_lens, fitting, leave_out
+from adjust.solution.network_hypotheses import Trials
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, is_fixed, run_result
@@ -61,235 +61,217 @@ def adjust(
     """
     keep_freed_memory()
     validate(network)
-    options = options or Options()
-    tried, family = partial(_try_network, options=options), options.probabilities.family
-    if approximations is not None:
-        return check_plausibility(_as_a_whole(network, approximations, None, options), tried, family)
-    result, left_out = _leave_out_blind(*_orientable(network, options), options)
-    found = _try_again(network, result, left_out, options) if left_out else result
-    return check_plausibility(found, tried, family)
+    solver = _Solver(options or Options())
+    if approximations is None:
+        result, left_out = solver.leave_out_blind(*solver.orientable(network))
+        found = solver.try_again(network, result, left_out) if left_out else result
+    else:
+        found = solver.check_whole(network, approximations, None)
+    return check_plausibility(found, solver.trials)
 
 
-def _orientable(network: Network, options: Options) -> tuple[Network, Approximations | None, dict[str, str]]:
-    """The network without the images for which no orientation is found, its own approximations, and why these are left
-    out. The whole network without approximations where too little would be left, or something else is wrong.
-    """
-    try:
-        return network, initial_values(held_as_known(network, options.datum_coordinates)), {}
-    except UnorientedError as error:
-        part, reasons = leave_out(network, error.reasons), error.reasons
-    except AdjustmentError:
-        return network, None, {}
-    start = None if part is None else _own_start(part, options)
-    return (network, None, {}) if part is None or start is None else (part, start, reasons)
+@dataclass(frozen=True)
+class _Solver:
+    """Adjusts networks with some options."""
 
+    options: Options
 
-def _leave_out_blind(
-    part: Network, start: Approximations | None, left_out: dict[str, str], options: Options
-) -> tuple[Adjustment, dict[str, str]]:
-    """The adjustment of a network without those images, too, in which some point has no image to begin with, and why
-    images are left out. Raises NoImageError where too little would be left."""
-    try:
-        return _as_a_whole(part, None, start, options), left_out
-    except NoImageError as error:
-        rest = leave_out(part, error.reasons) if error.reasons else None
-        begun = None if rest is None else _own_start(rest, options)
-        if rest is None or begun is None:
-            raise
-        reasons = error.reasons
-    return _leave_out_blind(rest, begun, left_out | reasons, options)
+    @property
+    def trials(self) -> Trials:
+        return Trials(lambda network: self.solve_plainly(network, self.own_start(network)), self.family)
 
+    @property
+    def family(self) -> float:
+        return self.options.probabilities.family
 
-def _try_again(network: Network, rest: Adjustment, left_out: dict[str, str], options: Options) -> Adjustment:
-    """The adjustment with those images that were left out and that fit once the lens is known."""
-    found = rest
-    if rest.converged:
-        _, start, reasons = _orientable(adopt_lens(network, rest), options)
-        came = left_out.keys() - reasons.keys()
-        while start is not None and came:
-            part = leave_out(network, left_out.keys() - came)
-            if part is None:
-                break
-            try:
-                tried = _adjust_points(part, start, options)
-                fit = fitting(tried, came, rest.sigma0) if tried.converged else set()
-            except NoImageError as error:
-                tried, fit = rest, came - error.reasons.keys()
-            if fit == came:
-                found = tried
-                break
-            came = fit
-    frames = {image.frame for image in found.network.images}
-    return replace(found, left_out={name: reason for name, reason in left_out.items() if name not in frames})
+    def initial_values(self, network: Network) -> Approximations:
+        return initial_values(held_as_known(network, self.options.datum_coordinates))
 
-
-def _as_a_whole(
-    network: Network, approximations: Approximations | None, own: Approximations | None, options: Options
-) -> Adjustment:
-    """The adjustment of a network; own: its own approximations, where these are known already."""
-    weighs_anew = options.plain != options
-    if weighs_anew:  # what is wrong with all would be weighed away here and there
-        own = own or _own_start(network, options)
-        _check_whole(network, _plainly(network, own, options), options)
-    try:
-        start = approximations or own or initial_values(held_as_known(network, options.datum_coordinates))
-        result = _adjust_points(network, start, options)
-    except DatumError:  # whatever the observations say
-        raise
-    except AdjustmentError:
-        if not weighs_anew:
-            _check_whole(network, None, options)
-        raise
-    if result.termination == "singular":
-        return result
-    if not weighs_anew:
-        _check_whole(network, result, options)
-    if elsewhere := stations_elsewhere(network, result):
-        result = replace(result, remarks=(*result.remarks, elsewhere))
-    return result
-
-
-def _check_whole(network: Network, given: Adjustment | None, options: Options) -> None:
-    """Raise AdjustmentError where a slip of the whole network explains what the network as it is given does not."""
-    slip = blunder_sentence(network, given, partial(_try_network, options=options), options.probabilities.family)
-    if slip:
-        raise AdjustmentError(slip)
-
-
-def _try_network(network: Network, options: Options) -> Adjustment | None:
-    """Another network adjusted from its own approximations; None where it cannot begin."""
-    return _plainly(network, _own_start(network, options), options)
-
-
-def _own_start(network: Network, options: Options) -> Approximations | None:
-    """A network's own approximations; None where it has none."""
-    try:
-        return initial_values(held_as_known(network, options.datum_coordinates))
-    except AdjustmentError:
-        return None
-
-
-def _plainly(network: Network, start: Approximations | None, options: Options) -> Adjustment | None:
-    """A network adjusted with the weights as they are given; None where it cannot begin."""
-    if start is None:
-        return None
-    plain = replace(options.plain, iteration_limit=min(options.iteration_limit, TRIAL_STEPS))
-    try:
-        return _solve(network, start, plain)
-    except AdjustmentError:
-        return None
-
-
-def _adjust_points(network: Network, approximations: Approximations, options: Options) -> Adjustment:
-    """The adjustment, and what is to be said of single given points."""
-    begun = _start_robustly(network, approximations, options) if options.robust or options.snooping else None
-    if begun is not None and begun.converged:
-        return begun if _agrees(begun, options) else _report_slips(begun, network, approximations, options)
-    try:
-        result = _solve(network, approximations, options)
-    except NoImageError as error:
-        if found := _slips(network, approximations, options):
-            raise AdjustmentError(" ".join(slip.sentence for slip in found)) from error
-        raise
-    if result.termination not in ("converged", "singular"):
-        result = _begin_anew(network, approximations, options, result)
-    if result.termination == "singular" or _agrees(result, options):
-        return result
-    return _report_slips(result, network, approximations, options)
-
-
-def _report_slips(result: Adjustment, network: Network, approximations: Approximations, options: Options) -> Adjustment:
-    """The same, with what is to be said of given points where the observations do not agree."""
-    if found := _slips(network, approximations, options):
-        return replace(result, slips=tuple(slip.sentence for slip in found))
-    return result if result.converged else replace(result, remarks=(*result.remarks, *few_points(network)))
-
-
-def _solve(
-    network: Network, approximations: Approximations, options: Options, doubted_points: Iterable[str] = ()
-) -> Adjustment:
-    """A network adjusted about its centroid, in its own coordinates; without the given places of some points to begin
-    with.
-    """
-    reduction = Reduction.to_centroid(network)
-    problem = _numbered(reduction.network(network), reduction.approximations(approximations), options)
-    unknowns = problem.unknowns
-    doubted = [int(position) for name in doubted_points for position in unknowns.point[name]]
-    result = adjust_problem(problem, options, doubted=doubted)
-    return replace(result, network=network, values=reduction.unreduced_values(unknowns, result.values, network))
-
-
-def _numbered(network: Network, approximations: Approximations, options: Options) -> Problem:
-    return number(network, approximations, options.method == "elements")
-
-
-def _agrees(result: Adjustment, options: Options) -> bool:
-    """Whether chance alone explains v'Pv."""
-    chance = result.redundancy < 1 or chdtrc(result.redundancy, result.vpv) > options.probabilities.family
-    return result.converged and bool(chance)
-
-
-def _start_robustly(network: Network, approximations: Approximations, options: Options) -> Adjustment | None:
-    """Robust estimation or data snooping that begins without the given points that are slips; None without any.
-
-    From an adjustment with a slip in it neither finds back: its linear equations say nothing of errors so large.
-    """
-    found = _slips(network, approximations, options)
-    if not found:
-        return None
-    _, start = free_points(network, approximations, [slip.far for slip in found])
-    try:
-        return _solve(network, start, options, [slip.far.name for slip in found])
-    except NoImageError:
-        return None
-
-
-def _slips(network: Network, approximations: Approximations, options: Options) -> list[Slip]:
-    """The given points that contradict, beyond chance, an adjustment that knows nothing of their coordinates."""
-    far = far_points(_numbered(network, approximations, options), options.probabilities.family)
-    if not far:
-        return []
-    without, start = free_points(network, approximations, far)
-    plain = options.plain
-    try:
-        return coordinate_slips(network, far, _solve(without, start, plain), options)
-    except AdjustmentError:  # without these points it cannot even begin
-        return []
-
-
-def _begin_anew(network: Network, approximations: Approximations, options: Options, stopped: Adjustment) -> Adjustment:
-    """The adjustment from the network's own approximations; what is there already where these are no better."""
-    for known in (*_free_guesses(network), network):
+    def own_start(self, network: Network) -> Approximations | None:
+        """A network's own approximations; None where it has none."""
         try:
-            own = initial_values(held_as_known(known, options.datum_coordinates))
+            return self.initial_values(network)
         except AdjustmentError:
-            continue
-        if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):
-            continue
-        result = _solve(network, own, options)
-        if result.converged:
-            warning = (
-                f"From the given approximations the iteration did not come to rest ({stopped.termination} after "
-                f"{stopped.iterations} steps); it was begun anew from approximations found from the network itself. "
-                "Check those given."
+            return None
+
+    def orientable(self, network: Network) -> tuple[Network, Approximations | None, dict[str, str]]:
+        """The network without the images for which no orientation is found, its own approximations, and why these are
+        left out. The whole network without approximations where too little would be left, or something else is wrong.
+        """
+        try:
+            return network, self.initial_values(network), {}
+        except UnorientedError as error:
+            part, reasons = leave_out(network, error.reasons), error.reasons
+        except AdjustmentError:
+            return network, None, {}
+        start = None if part is None else self.own_start(part)
+        return (network, None, {}) if part is None or start is None else (part, start, reasons)
+
+    def leave_out_blind(
+        self, part: Network, start: Approximations | None, left_out: dict[str, str]
+    ) -> tuple[Adjustment, dict[str, str]]:
+        """The adjustment of a network without those images, too, in which some point has no image to begin with, and
+        why images are left out. Raises NoImageError where too little would be left."""
+        try:
+            return self.check_whole(part, None, start), left_out
+        except NoImageError as error:
+            rest = leave_out(part, error.reasons) if error.reasons else None
+            begun = None if rest is None else self.own_start(rest)
+            if rest is None or begun is None:
+                raise
+            reasons = error.reasons
+        return self.leave_out_blind(rest, begun, left_out | reasons)
+
+    def try_again(self, network: Network, rest: Adjustment, left_out: dict[str, str]) -> Adjustment:
+        """The adjustment with those images that were left out and that fit once the lens is known."""
+        found = rest
+        if rest.converged:
+            _, start, reasons = self.orientable(adopt_lens(network, rest))
+            came = left_out.keys() - reasons.keys()
+            while start is not None and came:
+                part = leave_out(network, left_out.keys() - came)
+                if part is None:
+                    break
+                try:
+                    tried = self.check_points(part, start)
+                    fit = fitting(tried, came, rest.sigma0) if tried.converged else set()
+                except NoImageError as error:
+                    tried, fit = rest, came - error.reasons.keys()
+                if fit == came:
+                    found = tried
+                    break
+                came = fit
+        frames = {image.frame for image in found.network.images}
+        return replace(found, left_out={name: reason for name, reason in left_out.items() if name not in frames})
+
+    def check_whole(
+        self, network: Network, approximations: Approximations | None, own: Approximations | None
+    ) -> Adjustment:
+        """The adjustment of a network that is free of slips of the whole; own: its own approximations, where these are
+        known already. Raises AdjustmentError where such a slip explains what the network as it is given does not.
+        """
+        weighs_anew = self.options.plain != self.options
+        if weighs_anew:  # what is wrong with all would be weighed away here and there
+            own = own or self.own_start(network)
+            self._refuse_blunder(network, self.solve_plainly(network, own))
+        try:
+            result = self.check_points(network, approximations or own or self.initial_values(network))
+        except DatumError:  # whatever the observations say
+            raise
+        except AdjustmentError:
+            if not weighs_anew:
+                self._refuse_blunder(network, None)
+            raise
+        if result.termination == "singular":
+            return result
+        if not weighs_anew:
+            self._refuse_blunder(network, result)
+        elsewhere = stations_elsewhere(network, result)
+        return replace(result, remarks=(*result.remarks, elsewhere)) if elsewhere else result
+
+    def _refuse_blunder(self, network: Network, given: Adjustment | None) -> None:
+        if slip := blunder_sentence(network, given, self.trials):
+            raise AdjustmentError(slip)
+
+    def check_points(self, network: Network, start: Approximations) -> Adjustment:
+        """The adjustment, and what is to be said of single given points."""
+        try:
+            result = self._start_robustly(network, start) or self.solve(network, start)
+        except NoImageError as error:
+            if slips := self._slips(network, start):
+                raise AdjustmentError(" ".join(slip.sentence for slip in slips)) from error
+            raise
+        if result.termination not in ("converged", "singular"):
+            result = self._begin_anew(network, start, result)
+        if result.termination == "singular" or self._agrees(result):
+            return result
+        if slips := self._slips(network, start):
+            return replace(result, slips=tuple(slip.sentence for slip in slips))
+        return result if result.converged else replace(result, remarks=(*result.remarks, *few_points(network)))
+
+    def solve(
+        self, network: Network, start: Approximations, doubted_points: Iterable[str] = (), plain: bool = False
+    ) -> Adjustment:
+        """A network adjusted about its centroid, in its own coordinates; without the given places of some points to
+        begin with.
+        """
+        reduction = Reduction.to_centroid(network)
+        problem = self._numbered(reduction.network(network), reduction.approximations(start))
+        unknowns = problem.unknowns
+        doubted = [int(position) for name in doubted_points for position in unknowns.point[name]]
+        result = adjust_problem(problem, self.options.plain if plain else self.options, doubted=doubted)
+        return replace(result, network=network, values=reduction.unreduced_values(unknowns, result.values, network))
+
+    def solve_plainly(self, network: Network, start: Approximations | None) -> Adjustment | None:
+        """A network adjusted in a few steps with the weights as they are given; None where it cannot begin."""
+        if start is None:
+            return None
+        limit = min(self.options.iteration_limit, TRIAL_STEPS)
+        try:
+            return _Solver(replace(self.options.plain, iteration_limit=limit)).solve(network, start)
+        except AdjustmentError:
+            return None
+
+    def _numbered(self, network: Network, start: Approximations) -> Problem:
+        return number(network, start, self.options.method == "elements")
+
+    def _agrees(self, result: Adjustment) -> bool:
+        """Whether chance alone explains v'Pv."""
+        chance = result.redundancy < 1 or chdtrc(result.redundancy, result.vpv) > self.family
+        return result.converged and bool(chance)
+
+    def _start_robustly(self, network: Network, start: Approximations) -> Adjustment | None:
+        """Robust estimation or data snooping that begins without the given points that are slips; None without any, or
+        where it comes to no end.
+
+        From an adjustment with a slip in it neither finds back: its linear equations say nothing of errors so large.
+        """
+        slips = self._slips(network, start) if self.options.robust or self.options.snooping else []
+        if not slips:
+            return None
+        _, freed = free_points(network, start, [slip.far for slip in slips])
+        try:
+            result = self.solve(network, freed, [slip.far.name for slip in slips])
+        except NoImageError:
+            return None
+        return result if result.converged else None
+
+    def _slips(self, network: Network, start: Approximations) -> list[Slip]:
+        """The given points that contradict, beyond chance, an adjustment that knows nothing of their coordinates."""
+        far = far_points(self._numbered(network, start), self.family)
+        if not far:
+            return []
+        try:
+            return coordinate_slips(
+                network, far, self.solve(*free_points(network, start, far), plain=True), self.options
             )
-            return replace(result, remarks=(warning, *result.remarks))
-    return stopped
+        except AdjustmentError:  # without these points it cannot even begin
+            return []
 
-
-def _free_guesses(network: Network) -> Iterator[Network]:
-    """The network without principal distances of which so little is known that images of known points tell more."""
-    guessed = {
-        camera.name
-        for camera in network.cameras
-        if (c := camera.principal_distance_mm) is not None and c.sigma > GUESSED * abs(c.value)
-    }
-    if guessed:
-        cameras = (
-            replace(camera, principal_distance_mm=None) if camera.name in guessed else camera
+    def _begin_anew(self, network: Network, start: Approximations, stopped: Adjustment) -> Adjustment:
+        """The adjustment from the network's own approximations, without principal distances of which so little is known
+        that images of known points tell more, then with them; what is there already where these are no better."""
+        cameras = tuple(
+            replace(camera, principal_distance_mm=None)
+            if (c := camera.principal_distance_mm) is not None and c.sigma > GUESSED * abs(c.value)
+            else camera
             for camera in network.cameras
         )
-        yield replace(network, cameras=tuple(cameras))
+        for known in (cameras, network.cameras) if cameras != network.cameras else (cameras,):
+            own = self.own_start(replace(network, cameras=known))
+            if own is None or all(
+                np.array_equal(own.exterior[name], start.exterior.get(name, [])) for name in own.exterior
+            ):
+                continue
+            result = self.solve(network, own)
+            if result.converged:
+                warning = (
+                    f"From the given approximations the iteration did not come to rest ({stopped.termination} after "
+                    f"{stopped.iterations} steps); it was begun anew from approximations found from the network itself."
+                    " Check those given."
+                )
+                return replace(result, remarks=(warning, *result.remarks))
+        return stopped
 
 
 def adjust_problem(
@@ -344,7 +326,3 @@ def _center_datum(problem: Problem, last: Run, members: Indices, options: Option
         history = before.solution.history + last.solution.history
         last = replace(last, settled=before.settled, solution=replace(last.solution, history=history))
     return last
-
-
-def _was_fixed(problem: Problem, last: Run) -> bool:
-    return bool((last.problem.unknowns.sigma != problem.unknowns.sigma).any())

@@ -120,7 +120,7 @@ class Adjustment(Estimates):
         """What contradicts the others, the worst first: beside what explains the residuals of all."""
         if self.misread or not self._is_tested:
             return ()
-        run, variance, tested = self._explained.run, self.variance, self.reliability
+        run, variance, tested = self._explanation_run.run, self.variance, self.reliability
         if run is not self.run:
             variance = variance_factor(run, _redundancy(run, self.cofactor))
             tested = _reliability(run, variance, self.probabilities)
@@ -129,7 +129,7 @@ class Adjustment(Estimates):
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
         """Of a sigma0 that is too large; suspects are then those of an adjustment with them in the model."""
-        return () if self.misread else self._explained.explanations
+        return () if self.misread else self._explanation_run.explanations
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -146,7 +146,7 @@ class Adjustment(Estimates):
         return (*self.unused, *found)
 
     @cached_property
-    def _explained(self) -> Explained:
+    def _explanation_run(self) -> Explained:
         return explain(self.run, _redundancy(self.run, self.cofactor), self.probabilities)
 
     @property

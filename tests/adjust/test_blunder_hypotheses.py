@@ -8,7 +8,7 @@ from planted import KINDS, exchanged, network, outcome, said, with_points
 
 from adjust.errors import AdjustmentError
 from adjust.solution.adjustment import Options, adjust
-from adjust.solution.blunder_hypotheses import AXES
+from adjust.solution.network_hypotheses import AXES
 
 FAST = (
     "sign of X, approximate orientations",
