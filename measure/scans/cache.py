@@ -5,14 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from threading import Lock
-from typing import Protocol
 
 import numpy as np
 
-from measure.scans.metadata import (
-    Pitch,
-    Samples,
-)
+from measure.scans.metadata import Pitch, Samples
 
 Place = tuple[int, int]  # row and column in a grid of segments
 
@@ -30,7 +26,7 @@ class LostPart:
     why: str
 
 
-class Segments(Protocol):
+class Segments:
     """A picture as its file stores it: a grid of tiles or strips, each decoded on its own.
 
     height_px, width_px: of the picture; segment_height_px, segment_width_px: of a segment, those at the right and lower
@@ -50,17 +46,21 @@ class Segments(Protocol):
     rounding_step_dn: float
 
     @property
-    def lost(self) -> Sequence[LostPart]: ...
+    def lost(self) -> Sequence[LostPart]:
+        return ()
 
     def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
         """What the file has stored of segments (row, column), where asking for all together is quicker than for one
         after the other; else nothing."""
+        return {}
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         """Segment (row, column) of the grid: (height, width, channels), values that grow with light. stored: as
         `fetch` gives it."""
+        raise NotImplementedError
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class SegmentCache:
         tall = min(2 * segments.segment_height_px, segments.height_px)
         self._limit = max(CACHE_BYTES, tall * self._row_bytes)
         self._held = 0
-        self._kept: OrderedDict[tuple[int, int], _Segment] = OrderedDict()
+        self._kept: OrderedDict[Place, _Segment] = OrderedDict()
         self._lock = Lock()
 
     @property
@@ -120,27 +120,21 @@ class SegmentCache:
             row, col = max(row, 0), max(col, 0)
             samples[row : row + part.shape[0], col : col + part.shape[1]] = part
 
-        others: list[tuple[tuple[int, int], _Segment]] = []
         wanted = {key: self._segment(key) for key in product(rows, cols)}
-        stored = self._segments.fetch(
-            [key for key, segment in wanted.items() if segment.samples is None and not segment.lock.locked()]
-        )
-        for key, segment in wanted.items():
-            if segment.samples is None and segment.lock.locked():
-                others.append((key, segment))
-            else:
-                take(*key, self._decode(key, segment, stored.get(key, ())))
-        for key, segment in others:
-            take(*key, self._decode(key, segment))
+        others = [key for key, segment in wanted.items() if segment.samples is None and segment.lock.locked()]
+        own = [key for key, segment in wanted.items() if segment.samples is None and not segment.lock.locked()]
+        stored = self._segments.fetch(own)
+        for key in sorted(wanted, key=others.__contains__):
+            take(*key, self._decode(key, wanted[key], stored.get(key, ())))
 
-    def _segment(self, key: tuple[int, int]) -> _Segment:
+    def _segment(self, key: Place) -> _Segment:
         """Of the grid, by row and column."""
         with self._lock:
             segment = self._kept.setdefault(key, _Segment())
             self._kept.move_to_end(key)
         return segment
 
-    def _decode(self, key: tuple[int, int], segment: _Segment, stored: Sequence[bytes] = ()) -> Samples:
+    def _decode(self, key: Place, segment: _Segment, stored: Sequence[bytes] = ()) -> Samples:
         """Decoded here unless another thread has begun to."""
         with segment.lock:
             samples = segment.samples
@@ -159,27 +153,23 @@ class SegmentCache:
                 del self._kept[oldest]
 
 
-class WholePicture:
+class WholePicture(Segments):
     """A picture in memory: (height, width, channels) of 8 or 16 bits, one segment. damage: why it cannot be trusted, a
     part of a sentence, empty where it can."""
 
     def __init__(self, samples: Samples, rounding_step_dn: float = 0.0, damage: str = "") -> None:
-        self._samples, self.rounding_step_dn = samples, rounding_step_dn
+        self._samples, self._damage, self.rounding_step_dn = samples, damage, rounding_step_dn
         self.height_px, self.width_px, self.channels = samples.shape
         self.segment_height_px, self.segment_width_px = self.height_px, self.width_px
         self.sample_bytes = samples.itemsize
         self.full_scale_dn = float(2 ** (8 * samples.itemsize) - 1)
-        self.lost: Sequence[LostPart] = ()
         if damage:
-            self.lost = (LostPart(0, 0, self.width_px, self.height_px, damage),)
             self._samples = np.full_like(samples, self.full_scale_dn // 2)
 
-    def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
-        return {}
+    @property
+    def lost(self) -> Sequence[LostPart]:
+        return (LostPart(0, 0, self.width_px, self.height_px, self._damage),) if self._damage else ()
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         """All of it."""
         return self._samples
-
-    def close(self) -> None:
-        """Nothing is open."""

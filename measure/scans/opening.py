@@ -1,7 +1,7 @@
 """Scans opened by the format of their first bytes, their heads alone, and scans that are made of a scan."""
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
-from measure.scans.cache import LostPart, OpenedPicture, Place, WholePicture
+from measure.scans.cache import LostPart, OpenedPicture, Segments, WholePicture
 from measure.scans.jpeg import JPEG_START, jpeg_colour_tags, jpeg_pitch, open_jpeg, picture_form
 from measure.scans.metadata import (
     DECODING_ERRORS,
@@ -61,24 +61,17 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     start = first_bytes(path)
     if isinstance(path, ScanPart) and (path.page or 1) > 1 and start[:4] not in TIFF_STARTS:
         raise MeasurementError(f"{path}: such a file has one page: take `page` out of images.csv")
-    opened = _opened_picture(path, start, max_pixels)
+    openers = dict.fromkeys(TIFF_STARTS, open_tiff) | {JPEG_START: open_jpeg, PNG_START: open_png}
+    open_picture = next((openers[first] for first in openers if start.startswith(first)), None)
+    if open_picture is None:
+        raise no_picture_error(path, start)
+    opened = open_picture(path, max_pixels)
     segments = opened.segments
     is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px
     if isinstance(path, Address) and is_one:
         whole = "the file has its picture in one piece, and was fetched whole: of tiles, most would not be"
         opened = replace(opened, notes=(*opened.notes, whole))
     return Scan(path, segments, opened.pitch, opened)
-
-
-def _opened_picture(path: Path, start: bytes, max_pixels: int | None) -> OpenedPicture:
-    """start: the file's first bytes, by which its format is told."""
-    if start[:4] in TIFF_STARTS:
-        return open_tiff(path, max_pixels)
-    if start.startswith(JPEG_START):
-        return open_jpeg(path, max_pixels)
-    if start.startswith(PNG_START):
-        return open_png(path, max_pixels)
-    raise no_picture_error(path, start)
 
 
 @dataclass(frozen=True)
@@ -119,11 +112,9 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         raise no_picture_error(path, start)
     data, end = _head_and_end(path)
     if start.startswith(JPEG_START):
-        form, marker, pitch = picture_form(data), b"\xff\xd9", jpeg_pitch(data)
-        file_format = "JPEG"
+        file_format, form, marker, pitch = "JPEG", picture_form(data), b"\xff\xd9", jpeg_pitch(data)
     else:
-        form, marker, pitch = png_form(data), b"IEND", png_pitch(data)
-        file_format = "PNG"
+        file_format, form, marker, pitch = "PNG", png_form(data), b"IEND", png_pitch(data)
     if form is None or 0 in form:
         raise damage_error(path, "its header is cut short")
     if marker not in end:
@@ -185,8 +176,8 @@ def crop_scan(scan: Scan, window: Window) -> Scan:
     return view.replace_tone(scan.tone)
 
 
-class WindowSegments:
-    """A window of a scan in bands of rows, as `Segments` has it."""
+class WindowSegments(Segments):
+    """A window of a scan in bands of rows; the scan is another's to close."""
 
     def __init__(self, scan: Scan, window: Window) -> None:
         self._scan = scan
@@ -205,17 +196,11 @@ class WindowSegments:
             for part in self._scan.lost
         )
 
-    def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
-        return {}
-
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         """A band of rows."""
         first = row * self.segment_height_px
         height = min(self.segment_height_px, self.height_px - first)
         return self._scan.samples(self._col0, self._row0 + first, self.width_px, height)
-
-    def close(self) -> None:
-        """The scan is another's to close."""
 
 
 def thumbnail(scan: Scan, largest_px: int) -> Scan:

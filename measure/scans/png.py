@@ -24,7 +24,6 @@ from measure.scans.metadata import (
 from measure.tone.declared import ColourTags
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
-_PNG_SIZE = slice(16, 25)  # width, height and the bits of a sample: IHDR is the first chunk (PNG specification, 11.2.2)
 _PNG_HEADER = ">IIBB"  # width, height, bits and kind of colour (PNG specification, 11.2.2)
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 1, 6: 3}  # by that kind, without transparency; a palette has colours
 
@@ -47,10 +46,10 @@ def open_png(path: Path, max_pixels: int | None = None) -> OpenedPicture:
 
 def _png_samples(path: Path, data: bytes, max_pixels: int | None) -> Samples:
     """Grey or RGB, 8 or 16 bits."""
-    header = data[_PNG_SIZE]
-    if len(header) < 9:
+    form = png_form(data)
+    if form is None:
         raise damage_error(path, "its header is cut short")
-    width, height, bits = struct.unpack(">IIB", header)
+    width, height, _, bits = form
     if bits == 1:
         raise MeasurementError(
             f"{path} is a PNG of black and white pixels only (1 bit), and marks are measured by the grey values along "

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tifffile import TIFF, TiffFile, TiffPage
 from tifffile.tifffile import jpeg_decode_colorspace
 
-from measure.scans.cache import LostPart, Place
+from measure.scans.cache import LostPart, Place, Segments
 from measure.scans.jpeg import decode_checked
 from measure.scans.metadata import (
     DECODING_ERRORS,
@@ -28,7 +28,7 @@ _INTO_MEMORY = (5, 8, 32773, 32946, 34926, 50000)  # LZW, deflate, PackBits, zst
 _MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time; larger tiles and strips are not copied
 
 
-class TiffSegments:
+class TiffSegments(Segments):
     """The tiles or strips of a TIFF page."""
 
     def __init__(

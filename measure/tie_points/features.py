@@ -191,16 +191,17 @@ def _tiled(picture: NDArray[np.uint8], count: int, patch_px: int) -> Features:
         points, described = sift.detectAndCompute(tile, None)
         if not points:
             continue
-        places = np.array([point.pt for point in points]) + first
-        once = np.zeros(len(places), bool)
-        once[np.unique(np.round(places, 2), axis=0, return_index=True)[1]] = True
-        within = places - corner + 0.5
+        found = np.array([point.pt for point in points]) + first
+        once = np.zeros(len(found), bool)
+        once[np.unique(np.round(found, 2), axis=0, return_index=True)[1]] = True
+        within = found - corner + 0.5
         own = once & np.all((within >= 0) & (within < _TILE_PX), axis=1)
-        col, row = np.round(places[own] - first).astype(np.intp).T
+        col, row = np.round(found[own] - first).astype(np.intp).T
         textures = cv2.cornerMinEigenVal(tile, patch_px)[row, col].astype(np.float64)
         strengths = np.array([point.response for point in points])[own]
-        tiles.append((places[own], np.asarray(described, np.float32)[own], strengths, textures))
-    return Features(*map(np.concatenate, zip(*tiles, strict=True)))
+        tiles.append((found[own], np.asarray(described, np.float32)[own], strengths, textures))
+    places, descriptors, strengths, textures = (np.concatenate(parts) for parts in zip(*tiles, strict=True))
+    return Features(places, descriptors, strengths, textures)
 
 
 def interleave_groups(group: Indices, strengths: Array) -> Indices:
