@@ -62,11 +62,11 @@ class BadDirectory(ValueError):
 
 
 class _Entry(NamedTuple):
-    """One tag: its type, the count of its numbers, and where these stand, (first byte, byte after the last)."""
+    """One tag: its type, how many numbers it has, and where these stand, (first byte, byte after the last)."""
 
     tag: int
     kind: int
-    count: int
+    length: int
     extent: Extent
 
 
@@ -150,12 +150,12 @@ class _Directories:
         name = TIFF.TAGS[entry.tag]
         if entry.kind not in _WHOLE:
             raise BadDirectory(f"its tag {name} is no whole number (type {entry.kind})")
-        if entry.count < 1 or (entry.tag in _ONE_NUMBER and entry.count != 1):
+        if entry.length < 1 or (entry.tag in _ONE_NUMBER and entry.length != 1):
             only = ", not one" if entry.tag in _ONE_NUMBER else ""
-            raise BadDirectory(f"its tag {name} holds {entry.count} numbers{only}")
+            raise BadDirectory(f"its tag {name} holds {entry.length} numbers{only}")
         if entry.extent[1] > self._file_bytes:
             size = f"its end of {self._file_bytes} bytes"
-            raise BadDirectory(f"the {entry.count} numbers of its tag {name} lie beyond {size}")
+            raise BadDirectory(f"the {entry.length} numbers of its tag {name} lie beyond {size}")
         if entry.tag in _SIZES and self.numbers(entry) == (0,):
             raise BadDirectory(f"its tag {name} is 0")
 
@@ -172,7 +172,7 @@ class _Directories:
         """None where the tag holds no whole numbers, or the file does not hold them."""
         if entry.kind not in _WHOLE or entry.extent[1] > self._file_bytes:
             return ()
-        return self._unpack(entry.extent[0], f"{entry.count}{_WHOLE[entry.kind]}")
+        return self._unpack(entry.extent[0], f"{entry.length}{_WHOLE[entry.kind]}")
 
 
 def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
