@@ -1,4 +1,4 @@
-"""An edge of the exposed frame: a straight line, by many profiles across it.
+"""An edge of the exposed frame: a straight line, by many profiles across it; a corner of the frame, where two meet.
 
 Across an edge the light is a step under the scanner's blur, an error function; it is fitted to every profile. The line
 through them is a robust one (Tukey), for stamps, dust and marks lie on the edge too. The landscape's contrast with the
@@ -24,6 +24,7 @@ from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import MarkTone
+from measure.tone.score import ToneScore, tone_score
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,44 +41,40 @@ _ROUNDS = 20  # of Tukey's line, which rests after a few
 _START_BLUR_PX = 1.5  # about that of scans
 _RIM_PX = 2.0  # of a profile: a step so near its end may be another's
 _MOST_ALIKE = 0.9  # correlation of neighbouring profiles: nineteen count as one
-_BLUR_RANGE_PX = (0.3, 4.0)
+_BLUR_RANGE_PX = (0.3, 4.0)  # from where pixels hide it to where an edge is no line
 _SCATTER_FLOOR_PX = 0.01  # under the scatter about a line: clean pictures have none
 _LEAST = 1e-6  # of the variance of all that edges show: what they hardly show
 _DRAWN = 0.005  # of a step: what is left of it below that may be the drawing's own
-_UNSEEN = Reason("an edge of the frame is not to be seen there as one line", Code.NOT_FOUND)
 _ROUNDED = 0.1  # of the reach: left out at every corner, for few are sharp
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeTone:
-    """What an edge says of the tone curve. Of each profile: scores (n, k), as `ToneInformation.from_score` takes them,
-    normal (n, k, k), by which these grow with the departures, and floor (n, k, k), the least covariance that they have.
-    on_line (2, k): by how much the offset and slope change for each departure of 1. least, greatest: the codes between
-    which it steps, shares of full scale."""
+    """What an edge says of the tone curve. score: of each profile; floor (k, k): the least covariance of one profile's;
+    on_line (2, k): by how much the offset and slope change for each departure of 1. codes: the least and the greatest,
+    shares of full scale, between which it steps."""
 
-    scores: Array
-    normal: Array
+    score: ToneScore
     floor: Array
     on_line: Array
-    least: float
-    greatest: float
+    codes: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """across = offset + slope * along, px from the start; covariance (2, 2) of both; share: of the profiles that lie on
-    it; contrast_dn, noise_dn, blur_px, likeness: medians over these; tone: None where the curve is known."""
+    """across = offset + slope * along, px from the start, line (2,) being both, and covariance (2, 2); share: of the
+    profiles that lie on it, of which there are count; contrast_dn, noise_dn, blur_px, likeness: medians over these;
+    tone: None where the curve is known."""
 
-    offset: float
-    slope: float
+    line: Array
     covariance: Array
     share: float
+    count: int
     contrast_dn: float
     noise_dn: float
     blur_px: float
     likeness: float
-    count: int
-    tone: EdgeTone | None = None
+    tone: EdgeTone | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,30 +91,42 @@ class Course:
     def profiles(self, middle: Array, offset: Array, share: float, half: float) -> tuple[Array, Mask]:
         """(n, samples) light across the edge about an offset (n,), each the median over its share of the edge, and
         which of them lie in the scan. A median is the same through any curve, and where noise is cut off at black."""
-        s = np.arange(-round(half / _STEP_PX), round(half / _STEP_PX) + 1) * _STEP_PX
+        samples = np.arange(-round(half / _STEP_PX), round(half / _STEP_PX) + 1) * _STEP_PX
         run = np.linspace(-0.5, 0.5, max(int(share), 2), endpoint=False) * share
         slope = np.gradient(offset, middle) if len(middle) > 1 else np.zeros(1)
-        t = middle[:, None, None] + run[:, None]
-        q = (offset[:, None] + slope[:, None] * run)[:, :, None] + s
-        places = (
-            self.start[:, None, None, None] + self.along[:, None, None, None] * t + self.across[:, None, None, None] * q
-        )
-        low = np.floor(places.min(axis=(1, 2, 3))).astype(int) - 2
-        size = np.ceil(places.max(axis=(1, 2, 3))).astype(int) + 3 - low
+        along = (middle[:, None] + run)[..., None, None] * self.along
+        across = (offset[:, None] + slope[:, None] * run)[..., None] + samples
+        places = self.start + along + across[..., None] * self.across  # (n, run, samples, 2)
+        low = np.floor(places.min(axis=(0, 1, 2))).astype(int) - 2
+        size = np.ceil(places.max(axis=(0, 1, 2))).astype(int) + 3 - low
         window = self.scan.light(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
-        col, row = places - low[:, None, None, None]
-        grey = map_coordinates(window, [row, col], order=1, mode="nearest")
-        limit = np.array([self.scan.width_px, self.scan.height_px])[:, None, None, None] - 1
-        inside = ((places >= 0) & (places <= limit)).all(axis=(0, 2, 3))
-        return np.asarray(np.median(grey, axis=1), dtype=float), np.asarray(inside)
+        grey = map_coordinates(window, np.moveaxis(places - low, -1, 0)[::-1], order=1, mode="nearest")
+        inside = (places >= 0) & (places <= np.array([self.scan.width_px, self.scan.height_px]) - 1)
+        return np.asarray(np.median(grey, axis=1), dtype=float), np.asarray(inside.all(axis=(1, 2, 3)))
 
 
 def edge_along(
     course: Course, extent: tuple[float, float], search_px: float, polarity: int, count: int = PROFILES
 ) -> Edge | None:
-    """The edge that runs along from the start between two distances, px; None where it is not to be seen as one line.
-    polarity: 1 where the frame's inside is lighter than its outside, -1 where it is darker, 0 where nobody knows;
-    count: of profiles."""
+    """Measure the edge of the frame along a course.
+
+    Parameters
+    ----------
+    course : Course
+        Where it is expected.
+    extent : (float, float)
+        From which to which distance from the start, px.
+    search_px : float
+        How far from the course it may lie.
+    polarity : int
+        1 where the frame's inside is lighter than its outside, -1 where it is darker, 0 where nobody knows.
+    count : int
+        Of profiles.
+
+    Returns
+    -------
+    Edge, or None where no straight line is to be seen.
+    """
     share = (extent[1] - extent[0]) / count
     middle: Array = np.asarray(extent[0] + share * (np.arange(count) + 0.5), dtype=float)
     half = round(search_px + _ABOUT_PX)
@@ -125,32 +134,29 @@ def edge_along(
     near, middle = near[inside], middle[inside]
     if len(middle) < _LEAST_SHARE * count:
         return None
-    if not polarity:
-        polarity = int(np.sign(np.median(near[:, -1] - near[:, 0])))
-    line = _straightest(near * polarity, middle, half)
-    found, _ = course.profiles(middle, line[0] + line[1] * middle, share, _ABOUT_PX)
-    steps = _fit_steps(found)
+    polarity = polarity or int(np.sign(np.median(near[:, -1] - near[:, 0])))
+    offset, slope = _straightest(near * polarity, middle, half)
+    steps = _fit_steps(course.profiles(middle, offset + slope * middle, share, _ABOUT_PX)[0])
     good = steps.good & (steps.contrast * polarity > FAINT * course.scan.full_scale_dn)
     good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise
     if good.sum() < _LEAST_SHARE * count:
         return None
-    place = line[0] + line[1] * middle[good] + steps.place[good]
-    return _line(course.scan, middle[good], place, steps, good, len(middle))
+    return _fit_line(course.scan, middle, offset + slope * middle + steps.place, steps, good)
 
 
 def pool_edge_tones(edges: Sequence[EdgeTone], tone: Tone) -> ToneInformation:
     """What several of them say of the curve by which they were fitted, known as well as the scatter of their profiles
     says, and that from edge to edge: what is alike along an edge, a landscape or what JPEG made of it, counts once."""
-    scores, normal, floor = (
-        np.concatenate([getattr(edge, name) for edge in edges]) for name in ("scores", "normal", "floor")
+    values = np.concatenate([edge.score.value for edge in edges])
+    normals = np.concatenate([edge.score.normal for edge in edges])
+    least = np.average([edge.floor for edge in edges], axis=0, weights=[len(edge.score.value) for edge in edges])
+    by_profile = np.cov(values.T) + least + _LEAST * np.trace(least) * np.eye(len(least))
+    off = np.array(
+        [(edge.score.value - values.mean(axis=0)).sum(axis=0) / np.sqrt(len(edge.score.value)) for edge in edges]
     )
-    least = floor.mean(axis=0)
-    by_profile = np.cov(scores.T) + least + _LEAST * np.trace(least) * np.eye(len(least))
-    off = np.array([(edge.scores - scores.mean(axis=0)).sum(axis=0) / np.sqrt(len(edge.scores)) for edge in edges])
     square = float(np.sum(off * np.linalg.solve(by_profile, off.T).T))
-    more = max(square / (scores.shape[1] * max(len(edges) - 1, 1)), 1.0)
-    total = normal.sum(axis=0)
-    return ToneInformation.from_score(total, scores.sum(axis=0) + total @ tone.mean, more * len(scores) * by_profile)
+    more = max(square / (len(least) * max(len(edges) - 1, 1)), 1.0)
+    return ToneScore(off, values, normals, off).information(more * len(values) * by_profile, tone)
 
 
 def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
@@ -158,13 +164,11 @@ def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
     of them, and so counts no more there than the frame's does elsewhere."""
     rise = np.gradient(cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX / _STEP_PX, sigmaY=1e-3), axis=1)
     rise = np.clip(rise, 0.0, float(np.median(rise.max(axis=1))))
-    middle = float(along.mean())
+    middle, samples = float(along.mean()), np.arange(grey.shape[1])
     tilts = np.linspace(-_TILT, _TILT, 2 * int(np.ceil(_TILT * float(np.ptp(along)) / 2 / _STEP_PX)) + 1)
-    samples = np.arange(grey.shape[1])
     votes = np.empty((len(tilts), grey.shape[1]))
     for index, tilt in enumerate(tilts):
-        moved = np.rint(tilt * (along - middle) / _STEP_PX).astype(int)
-        column = samples[None, :] + moved[:, None]
+        column = samples + np.rint(tilt * (along - middle) / _STEP_PX).astype(int)[:, None]
         inside = (column >= 0) & (column < len(samples))
         votes[index] = (np.take_along_axis(rise, np.clip(column, 0, len(samples) - 1), axis=1) * inside).sum(axis=0)
     best, place = np.unravel_index(int(votes.argmax()), votes.shape)
@@ -174,7 +178,7 @@ def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
 @dataclass(frozen=True, eq=False)
 class _Steps:
     """(n,) of every profile: where it steps (px), by how much, under which blur, and how well that describes it; drawn,
-    residuals (n, samples) and design (n, samples, 4): the light by that, what it leaves, and its derivatives."""
+    residuals (n, samples) and design (n, 4, samples): the light by that, what it leaves, and its derivatives."""
 
     place: Array
     contrast: Array
@@ -189,58 +193,49 @@ class _Steps:
 
 def _fit_steps(grey: Array) -> _Steps:
     """The step level + contrast * Phi((s - place) / blur) in every profile, by Gauss-Newton."""
-    s = (np.arange(grey.shape[1]) - (grey.shape[1] - 1) / 2) * _STEP_PX
-    count = len(grey)
-    place, blur = np.zeros(count), np.full(count, _START_BLUR_PX)
-    contrast, level = np.zeros(count), np.zeros(count)
+    s = _samples(grey)
+    place, blur = np.zeros((len(grey), 1)), np.full((len(grey), 1), _START_BLUR_PX)
     for rounds_left in range(_ITERATIONS, -1, -1):
-        z = (s - place[:, None]) / blur[:, None]
+        z = (s - place) / blur
         step = (1 + erf(z / np.sqrt(2))) / 2
-        slope = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / blur[:, None]
-        level, contrast = _linear(step, grey)
-        by_place, by_blur = -contrast[:, None] * slope, -contrast[:, None] * slope * z
-        design = np.stack([by_place, by_blur, step, np.ones_like(step)], axis=1)
-        residuals = grey - level[:, None] - contrast[:, None] * step
-        if not rounds_left:
-            break
-        change = gauss_newton_step(design, residuals, np.ones_like(residuals), _DAMPING)
-        place = place + np.clip(change[:, 0], -1.0, 1.0)
-        blur = np.clip(blur + np.clip(change[:, 1], -0.5, 0.5), *_BLUR_RANGE_PX)
+        slope = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / blur
+        centred = step - step.mean(axis=1, keepdims=True)
+        squares = np.maximum((centred**2).sum(axis=1, keepdims=True), 1e-12)
+        contrast = (centred * grey).sum(axis=1, keepdims=True) / squares
+        residuals = grey - grey.mean(axis=1, keepdims=True) - contrast * centred
+        design = np.stack([-contrast * slope, -contrast * slope * z, step, np.ones_like(step)], axis=1)
+        if rounds_left:
+            change = gauss_newton_step(design, residuals, np.ones_like(residuals), _DAMPING)
+            place = place + np.clip(change[:, :1], -1.0, 1.0)
+            blur = np.clip(blur + np.clip(change[:, 1:2], -0.5, 0.5), *_BLUR_RANGE_PX)
     noise = np.sqrt((residuals**2).mean(axis=1))
-    spread = np.maximum(grey.std(axis=1), 1e-12)
-    likeness = np.sqrt(np.clip(1 - (noise / spread) ** 2, 0.0, 1.0))
-    good = np.abs(place) < s[-1] - _RIM_PX
-    return _Steps(place, contrast, blur, noise, likeness, good, grey - residuals, residuals, design.swapaxes(1, 2))
+    likeness = np.sqrt(np.clip(1 - (noise / np.maximum(grey.std(axis=1), 1e-12)) ** 2, 0.0, 1.0))
+    good = np.abs(place[:, 0]) < s[-1] - _RIM_PX
+    return _Steps(place[:, 0], contrast[:, 0], blur[:, 0], noise, likeness, good, grey - residuals, residuals, design)
 
 
-def _linear(step: Array, grey: Array) -> tuple[Array, Array]:
-    """Level and contrast (n,) that put the steps best through the grey values."""
-    centred = step - step.mean(axis=1, keepdims=True)
-    contrast = (centred * grey).sum(axis=1) / np.maximum((centred**2).sum(axis=1), 1e-12)
-    return grey.mean(axis=1) - contrast * step.mean(axis=1), contrast
+def _samples(profiles: Array) -> Array:
+    """(samples,) px across the edge, of profiles (n, samples)."""
+    return np.asarray((np.arange(profiles.shape[1]) - (profiles.shape[1] - 1) / 2) * _STEP_PX)
 
 
-def _line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask, asked: int) -> Edge | None:
-    """Tukey's line, its covariance from the scatter about it and from how far along the edge that is alike."""
-    design = np.stack([np.ones_like(along), along])
-    line = tukey_fit(design, across, _ROUNDS, _SCATTER_FLOOR_PX)
-    residuals, on = line.residuals, line.weights > 0
-    if on.sum() < _LEAST_SHARE * asked:
+def _fit_line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask) -> Edge | None:
+    """Tukey's line through the good profiles, its covariance from the scatter about it and from how far along the edge
+    that is alike."""
+    design = np.stack([np.ones_like(along), along])[:, good]
+    line = tukey_fit(design, across[good], _ROUNDS, _SCATTER_FLOOR_PX)
+    residuals, on, share = line.residuals, line.weights > 0, float((line.weights > 0).sum() / len(along))
+    if share < _LEAST_SHARE:
         return None
-    weighted = design * line.weights
+    weighted, kept, count = design * line.weights, np.flatnonzero(good)[on], int(on.sum())
     inverse = np.linalg.inv(weighted @ design.T)
-    variance = float((residuals[on] ** 2).sum() / max(int(on.sum()) - 2, 1)) + _SCATTER_FLOOR_PX**2
-    kept = np.flatnonzero(good)[on]
+    variance = float((residuals[on] ** 2).sum() / max(count - 2, 1)) + _SCATTER_FLOOR_PX**2
     return Edge(
-        float(line.factors[0]),
-        float(line.factors[1]),
+        line.factors,
         np.asarray(inverse * variance * _alike(residuals, on), dtype=float),
-        float(on.sum() / asked),
-        float(np.median(steps.contrast[kept])),
-        float(np.median(steps.noise[kept])),
-        float(np.median(steps.blur[kept])),
-        float(np.median(steps.likeness[kept])),
-        int(on.sum()),
+        share,
+        count,
+        *(float(np.median(each[kept])) for each in (steps.contrast, steps.noise, steps.blur, steps.likeness)),
         None if scan.tone.is_known else _edge_tone(scan, steps, kept, np.asarray(inverse @ weighted)[:, on]),
     )
 
@@ -258,32 +253,25 @@ def _alike(residuals: Array, on: Mask) -> float:
 def _edge_tone(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) -> EdgeTone:
     """By the profiles kept, (n,) of all; by_place (2, n): derivatives of the line's offset and slope by their places.
 
-    As `fitting.tone_estimate` has it for marks. Light that is uneven on either side says nothing of the curve, nor does
-    the shape of the blur, as long as it is even; pixels and what lies between them make it no Gaussian."""
+    Light that is uneven on either side says nothing of the curve, nor does the shape of the blur, as long as it is
+    even; pixels and what lies between them make it no Gaussian."""
     drawn, design = steps.drawn[kept], steps.design[kept]
-    z = ((np.arange(drawn.shape[1]) - (drawn.shape[1] - 1) / 2) * _STEP_PX - steps.place[kept, None])[..., None]
-    z = z / steps.blur[kept, None, None]
-    changes = np.moveaxis(scan.tone.derivatives(drawn, scan.full_scale_dn), 0, -1)
-    s = np.linspace(-1.0, 1.0, drawn.shape[1])[:, None]
-    step, slope = design[:, :, 2:3], design[:, :, :1]
-    by_shape = [slope * z**3, slope * z**5]
-    uneven = np.concatenate([design, *by_shape, step * s, step * s**2, 0 * step + s, 0 * step + s**2], axis=2)
-    left = changes - uneven @ np.linalg.pinv(uneven) @ changes
-    own = left * (_DRAWN * steps.contrast[kept, None, None])
+    z = (_samples(drawn) - steps.place[kept, None]) / steps.blur[kept, None]
+    changes = np.moveaxis(scan.tone.derivatives(drawn, scan.full_scale_dn), 0, 1)
+    s, step, slope = np.linspace(-1.0, 1.0, drawn.shape[1]), design[:, 2], design[:, 0]
+    uneven = [
+        slope * z**3,
+        slope * z**5,
+        step * s,
+        step * s**2,
+        np.broadcast_to(s, z.shape),
+        np.broadcast_to(s**2, z.shape),
+    ]
+    score = tone_score(np.concatenate([design, np.stack(uneven, axis=1)], axis=1), changes, steps.residuals[kept])
+    own = score.left * (_DRAWN * steps.contrast[kept, None, None])
+    moved = tone_score(design, changes, steps.residuals[kept]).by_unknown[:, 0]
     codes = scan.tone.code(np.quantile(drawn, (0.0, 1.0)), scan.full_scale_dn) / scan.full_scale_dn
-    return EdgeTone(
-        scores=-np.einsum("nsk,ns->nk", left, steps.residuals[kept]),
-        normal=np.einsum("nsk,nsj->nkj", left, changes),
-        floor=np.einsum("nsk,nsj->nkj", own, own),
-        on_line=by_place @ (np.linalg.pinv(design) @ changes)[:, 0],
-        least=float(codes[0]),
-        greatest=float(codes[1]),
-    )
-
-
-# Corners of the exposed frame: the edge of the frame along both sides, each a straight line, and where they meet.
-#
-# What is rounded at the corner is left out.
+    return EdgeTone(score, np.mean(own @ own.swapaxes(1, 2), axis=0), by_place @ moved, codes)
 
 
 def fit_frame_corner(
@@ -294,85 +282,72 @@ def fit_frame_corner(
     polarity: int,
     weights: Sequence[float] | None = None,
 ) -> MarkFit:
-    """The mark, within the search radius of its predicted place, its frame being lighter than its border or darker as
-    the polarity says. Not converged, with a reason, where either edge is not to be seen."""
+    """Fit a corner of the exposed frame: the edges along both sides, each a straight line, and where they meet. What is
+    rounded at the corner is left out.
+
+    Parameters
+    ----------
+    pixel_from_mark, search_px
+        Where the corner is predicted, (2, 3), and how far from there it may lie.
+    polarity : int
+        Whether its frame is lighter (1) or darker (-1) than its border.
+    weights : optional
+        Of the scan's channels.
+
+    Returns
+    -------
+    MarkFit
+        Not converged, with a reason, where either edge is not to be seen.
+    """
     inward = pixel_from_mark[:, :2] * np.array(mark.toward)  # columns: along x', y' into the frame, px per mm
     per_mm = np.hypot(*inward)
     unit = inward / per_mm
     edges = []
     for side in (0, 1):
-        along, across = unit[:, side], unit[:, 1 - side]
         reach = mark.reach_mm * per_mm[side]
         first = max(mark.radius_mm * per_mm[side], _ROUNDED * reach)
-        course = Course(scan, pixel_from_mark[:, 2], along, across, weights)
+        course = Course(scan, pixel_from_mark[:, 2], unit[:, side], unit[:, 1 - side], weights)
         edge = edge_along(course, (first, reach), search_px, polarity)
         if edge is None:
-            return _missed(pixel_from_mark, _UNSEEN)
+            unseen = Reason("an edge of the frame is not to be seen there as one line", Code.NOT_FOUND)
+            nothing = Covariance.from_noise(np.full((2, 2), np.inf))
+            return MarkFit(False, unseen, pixel_from_mark[:, 2], nothing, pixel_from_mark)
         edges.append(edge)
     return _intersect_edges(edges, unit, pixel_from_mark, scan.tone)
 
 
 def _intersect_edges(edges: Sequence[Edge], unit: Array, pixel_from_mark: Array, tone: Tone) -> MarkFit:
     """The corner: along the first edge x, y = a + b x, and along the second x = c + d y."""
-    first, second = edges
-    a, b, c, d = first.offset, first.slope, second.offset, second.slope
-    x, y = (c + d * a) / (1 - b * d), (a + b * c) / (1 - b * d)
+    (a, b), (c, d) = (edge.line for edge in edges)
     scale = 1 / (1 - b * d)
-    by_first = scale * np.array([[d, d * x], [1.0, x]])  # of (x, y) by a, b
-    by_second = scale * np.array([[1.0, y], [b, b * y]])
-    covariance = by_first @ first.covariance @ by_first.T + by_second @ second.covariance @ by_second.T
+    x, y = scale * (c + d * a), scale * (a + b * c)
+    # Of column and row by each edge's offset and slope.
+    by_lines = [unit @ (scale * np.array(by)) for by in ([[d, d * x], [1.0, x]], [[1.0, y], [b, b * y]])]
+    covariance = sum(by @ edge.covariance @ by.T for by, edge in zip(by_lines, edges, strict=True))
     center = pixel_from_mark[:, 2] + unit @ (x, y)
-    noise = max(edge.noise_dn for edge in edges)
+    noise, least = max(edge.noise_dn for edge in edges), min(edge.count for edge in edges)
     contrast = min((edge.contrast_dn for edge in edges), key=abs)
+    tones = [edge.tone for edge in edges if edge.tone is not None]
     return MarkFit(
         converged=True,
         reason=NO_REASON,
         center_px=center,
-        place_covariance=Covariance.from_noise(unit @ covariance @ unit.T),
+        place_covariance=Covariance.from_noise(np.asarray(covariance)),
         pixel_from_mark=np.column_stack([pixel_from_mark[:, :2], center]),
         contrast_dn=contrast,
         stored_contrast_dn=contrast,
         noise_dn=noise,
         blur_px=max(edge.blur_px for edge in edges),
         damaged_fraction=1.0 - min(edge.share for edge in edges),
-        lost_fraction=0.0,
         redundancy=sum(edge.count for edge in edges) - 4,
-        neighbour_correlation=0.0,
-        covariance_is_white=False,
         likeness=min(edge.likeness for edge in edges),
-        significance=abs(contrast) / max(noise, 1e-12) * float(np.sqrt(min(edge.count for edge in edges))),
-        tone=_corner_tone(first, second, unit @ by_first, unit @ by_second, tone),
+        significance=abs(contrast) / max(noise, 1e-12) * float(np.sqrt(least)),
+        tone=None if len(tones) < len(edges) else _corner_tone(tones, by_lines, tone),
     )
 
 
-def _corner_tone(first: Edge, second: Edge, by_first: Array, by_second: Array, tone: Tone) -> MarkTone | None:
-    """by_first, by_second (2, 2): derivatives of the corner's column and row by an edge's offset and slope."""
-    if first.tone is None or second.tone is None:
-        return None
-    return MarkTone(
-        pool_edge_tones([first.tone, second.tone], tone),
-        by_first @ first.tone.on_line + by_second @ second.tone.on_line,
-        min(first.tone.least, second.tone.least),
-        max(first.tone.greatest, second.tone.greatest),
-    )
-
-
-def _missed(pixel_from_mark: Array, reason: Reason) -> MarkFit:
-    return MarkFit(
-        converged=False,
-        reason=reason,
-        center_px=pixel_from_mark[:, 2],
-        place_covariance=Covariance.from_noise(np.full((2, 2), np.inf)),
-        pixel_from_mark=pixel_from_mark,
-        contrast_dn=0.0,
-        stored_contrast_dn=0.0,
-        noise_dn=0.0,
-        blur_px=0.0,
-        damaged_fraction=1.0,
-        lost_fraction=1.0,
-        redundancy=0,
-        neighbour_correlation=0.0,
-        covariance_is_white=True,
-        likeness=0.0,
-        significance=0.0,
-    )
+def _corner_tone(tones: Sequence[EdgeTone], by_lines: Sequence[Array], tone: Tone) -> MarkTone:
+    """by_lines (2, 2) each: derivatives of the corner's column and row by an edge's offset and slope."""
+    on_place = sum(by @ each.on_line for by, each in zip(by_lines, tones, strict=True))
+    least, greatest = min(each.codes[0] for each in tones), max(each.codes[1] for each in tones)
+    return MarkTone(pool_edge_tones(tones, tone), np.asarray(on_place), float(least), float(greatest))

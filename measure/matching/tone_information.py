@@ -1,11 +1,6 @@
-"""What a mark's picture says of the tone curve, and how far another curve moves the mark.
-
-In light the two sides of a blurred edge are alike; under a wrong curve one of them is softer. That is left over when
-place, blur and contrast are fitted, and by how much tells the curve: one more linear estimate from the residuals.
-"""
+"""What a mark's picture says of the tone curve, and how far another curve moves the mark."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +10,12 @@ from measure.matching.models import GREY
 from measure.noise.noise_model import combined, products
 from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import MarkTone
+from measure.tone.score import ToneScore, tone_score
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_PIECE_PX = 8  # of a mark's edges that are witnesses of their own, and of what JPEG rounds by itself
+_PIECE_PX = 8  # of a mark's edges that tell the curve by themselves, and of what JPEG rounds by itself
 _LEAST_CONTRAST = 1e-6  # of the light that is drawn: rounding is about that large
 _LEAST_VARIANCE = 1e-9  # of what is left of departures, over that of the departures themselves
 
@@ -35,55 +31,64 @@ def mark_tone_information(
     full_scale_dn: float,
     landscape: Landscape,
 ) -> MarkTone:
-    """Beside the unknowns of a linearised fit. drawn, grey (height, width): the light that it draws, and that it was
-    fitted to; clear, alike: where that is not near an end of the scanner's range, where noise is cut off, which bends
-    an edge as a curve does; priors_dn2 (unknowns,): weights of what was known of the unknowns before, and departures
-    (unknowns,) of the fit from that, which are residuals like those of pixels. landscape: in the mark.
+    """What a linearised fit says of the curve beside its unknowns.
 
-    With the departures d the residuals are r + H d - D x. The score H'r of what D leaves of H grows with d by N and has
-    the covariance S that the noise gives it: N' S^-1 N is the information, also where the noise is not white. H is
-    taken at the drawn light: at the observed one, it would go along with the noise. Light that is not even on the mark
-    or about it says nothing of the curve, but might seem to: D has bends of both, too.
+    The changes by the curve are taken at the drawn light: at the observed one, they would go along with the noise.
+    Light that is not even on the mark or about it says nothing of the curve, but might seem to: bends of both are
+    unknowns, too. What another curve moves the mark by follows from the observed light, with all that the drawing
+    leaves unexplained.
 
-    Each piece of its edges is a witness. Where they differ by more than the noise makes them, in what moves the mark,
-    they are not as drawn, and S is so many times larger.
-
-    What another curve moves the mark by follows from the observed light, with all that the drawing leaves unexplained.
+    Parameters
+    ----------
+    drawn, grey : (height, width)
+        The light that the fit draws, and that it was fitted to.
+    clear : (height, width)
+        Where that is not near an end of the scanner's range, where noise is cut off, which bends an edge as a curve
+        does.
+    priors_dn2, departures : (unknowns,)
+        As of `tone_score`.
+    landscape : Landscape
+        In the mark.
     """
-    mark_tone = _mark_tone(
-        fit, ToneInformation.empty(), tone.derivatives(grey, full_scale_dn), tone, drawn, full_scale_dn
-    )
-    if np.ptp(drawn) <= _LEAST_CONTRAST * np.abs(drawn).max():  # nothing is drawn: there are no edges
-        return mark_tone
-    counts = fit.used & clear
-    changes = tone.derivatives(drawn, full_scale_dn) * counts * fit.steadiness
-    uneven = _uneven(fit.design[-GREY], fit.steadiness)
-    known, priors = np.concatenate([fit.design, uneven]) * counts, np.diag(np.append(priors_dn2, np.zeros(len(uneven))))
-    inverse = _inverse(products(known, known) + priors)
-    shares = inverse @ products(known, changes)
-    left = changes - combined(shares.T, known)
-    normal = products(left, changes)
-    residuals = np.where(counts, fit.residuals, 0.0)
-    score = -products(left, residuals[None])[:, 0] - shares[: len(departures)].T @ (priors_dn2 * departures)
-    covariance = fit.covariance(left) + landscape.covariance(left) + fit.noise.variance_dn2 * shares.T @ priors @ shares
-    # Of departures that the picture's own unknowns take up whole, only rounding is left: it must not tell of the curve.
-    whole = float(np.trace(fit.covariance(changes)))
-    covariance += _LEAST_VARIANCE * max(whole, 1e-30) * np.eye(len(covariance))
-    weighted = np.linalg.solve(covariance, normal).T
-    estimate: Array = np.asarray(np.linalg.inv(np.eye(len(normal)) + weighted @ normal) @ weighted, float)
-    by_piece = mark_tone.on_place @ estimate @ _piece_sums(left * (residuals + combined(estimate @ score, left)))
-    by_noise = np.trace(mark_tone.on_place @ estimate @ covariance @ estimate.T @ mark_tone.on_place.T)
-    worse = max(float(np.sum(by_piece**2) / max(by_noise, 1e-30)), 1.0)
-    return replace(
-        mark_tone, information=ToneInformation.from_score(normal, score + normal @ tone.mean, worse * covariance)
-    )
+    on_place = _moved_px(fit, tone.derivatives(grey, full_scale_dn))
+    information = ToneInformation.empty()
+    if np.ptp(drawn) > _LEAST_CONTRAST * np.abs(drawn).max():  # else nothing is drawn: there are no edges
+        counts = fit.used & clear
+        uneven = _uneven(fit.design[-GREY], fit.steadiness)
+        design = np.concatenate([fit.design, uneven]) * counts
+        changes = tone.derivatives(drawn, full_scale_dn) * counts * fit.steadiness
+        residuals = np.where(counts, fit.residuals, 0.0)
+        priors = np.append(priors_dn2, np.zeros(len(uneven)))
+        flat = [images.reshape(-1, counts.size) for images in (design, changes)]
+        score = tone_score(*flat, residuals.ravel(), priors, np.append(departures, np.zeros(len(uneven))))
+        left, by_prior = score.left.reshape(changes.shape), score.by_unknown * np.sqrt(priors)[:, None]
+        covariance = fit.covariance(left) + landscape.covariance(left) + fit.noise.variance_dn2 * by_prior.T @ by_prior
+        # Of departures that the picture's own unknowns take up whole, only rounding is left: it must not tell of the
+        # curve.
+        whole = float(np.trace(fit.covariance(changes)))
+        covariance += _LEAST_VARIANCE * max(whole, 1e-30) * np.eye(len(covariance))
+        covariance *= _disagreement(score, left, residuals, covariance, on_place)
+        information = score.information(covariance, tone)
+    return _mark_tone(fit, information, on_place, drawn, tone, full_scale_dn)
 
 
-def _inverse(normal: Array) -> Array:
-    """(n, n) with all unknowns brought to one size: beside a strong prior the others would pass for nothing."""
-    size = np.sqrt(np.where(np.diag(normal) > 0, np.diag(normal), 1.0))
-    scale = np.outer(size, size)
-    return np.asarray(np.linalg.pinv(normal / scale, hermitian=True) / scale, float)
+def tone_without_information(
+    fit: LinearFit, light: Array, detail: Callable[[Array], Array], tone: Tone, full_scale_dn: float
+) -> MarkTone:
+    """Of a mark whose detail alone was fitted: the curve moves it all the same, but its picture says nothing of the
+    curve, for its surroundings are not drawn. light (height, width): with these; detail: takes them away."""
+    changes = np.stack([detail(each) for each in tone.derivatives(light, full_scale_dn)])
+    return _mark_tone(fit, ToneInformation.empty(), _moved_px(fit, changes), light, tone, full_scale_dn)
+
+
+def _disagreement(score: ToneScore, left: Array, residuals: Array, covariance: Array, on_place: Array) -> float:
+    """How many times larger the covariance of the score is than the noise makes it. Each piece of a mark's edges tells
+    the curve: where they differ by more than the noise makes them, in what moves the mark, they are not as drawn."""
+    weighted = np.linalg.solve(covariance, score.normal).T
+    estimate: Array = np.asarray(np.linalg.inv(np.eye(len(covariance)) + weighted @ score.normal) @ weighted, float)
+    moved = on_place @ estimate
+    by_piece = moved @ _piece_sums(left * (residuals + combined(estimate @ score.value, left)))
+    return max(float(np.sum(by_piece**2) / max(np.trace(moved @ covariance @ moved.T), 1e-30)), 1.0)
 
 
 def _piece_sums(images: Array) -> Array:
@@ -94,23 +99,17 @@ def _piece_sums(images: Array) -> Array:
     return np.asarray(squares.sum(axis=(2, 4)).reshape(count, -1))
 
 
-def tone_without_information(
-    fit: LinearFit, light: Array, detail: Callable[[Array], Array], tone: Tone, full_scale_dn: float
-) -> MarkTone:
-    """Of a mark whose detail alone was fitted: the curve moves it all the same, but its picture says nothing of the
-    curve, for its surroundings are not drawn. light (height, width): with these; detail: takes them away."""
-    changes = np.stack([detail(each) for each in tone.derivatives(light, full_scale_dn)])
-    return _mark_tone(fit, ToneInformation.empty(), changes, tone, light, full_scale_dn)
+def _moved_px(fit: LinearFit, changes: Array) -> Array:
+    """(2, k) how far the departures move the place; changes (k, height, width): of what was fitted, by these."""
+    return products(fit.by_grey[:2], changes * fit.used * fit.steadiness)
 
 
 def _mark_tone(
-    fit: LinearFit, said: ToneInformation, changes: Array, tone: Tone, light: Array, full_scale_dn: float
+    fit: LinearFit, information: ToneInformation, on_place: Array, light: Array, tone: Tone, full_scale_dn: float
 ) -> MarkTone:
-    """changes (k, height, width): of what was fitted, by the departures; light (height, width): of the picture."""
+    """light (height, width): of the picture."""
     codes = tone.code(np.quantile(light[fit.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
-    return MarkTone(
-        said, products(fit.by_grey[:2], changes * fit.used * fit.steadiness), float(codes[0]), float(codes[1])
-    )
+    return MarkTone(information, on_place, float(codes[0]), float(codes[1]))
 
 
 def _uneven(shown: Array, about: Array) -> Array:
