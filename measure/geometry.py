@@ -5,11 +5,12 @@ from functools import cache
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
+from measure.array_types import Array, Mask
 
-Array = NDArray[np.float64]
+Grid = TypeVar("Grid", Array, Mask)
+
 
 POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
 

@@ -8,17 +8,14 @@ from html import escape
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from measure.annotations.fields import Line
+from measure.array_types import Array
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import linear_scale
 from measure.tone.estimate import FrameTone, MarkTone
 
-Mask = NDArray[np.bool_]
-
-Array = NDArray[np.float64]
 Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # what is a place of the film, and no point of the object
 # Stored results are used again only where this is the same. Raise it whenever scans would be measured otherwise:

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.array_types import Array, Single
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
 
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
+Map = Single
 
 _CLIP = 3.0  # times the local contrast
 _MEAN = 0.3  # of the coarse: the side of the squares whose median is background

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.array_types import Array, Mask
 from measure.detection.localisation import MarkPrediction
 from measure.detection.mark_views import detail_px
 from measure.flags import NO_REASON, Cause
@@ -21,9 +22,6 @@ from measure.marks.rendering import extent_px, picture
 from measure.matching.window import FAINT, Coding
 from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan, means
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _BACKGROUND = 1.2  # times the finest detail: the standard deviation of the blur that is taken for background
 _TEXTURE = 2.0  # times that: over which the strength of the texture is averaged

@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import ndtr
 
+from measure.array_types import Array, Single
 from measure.detection.correlation import WIDE, Surroundings, correlation, variation
 from measure.detection.mark_views import detail_px
 from measure.detection.peaks import highest_about
@@ -21,8 +21,7 @@ from measure.matching.match import mark_window
 from measure.matching.window import FAINT
 from measure.scans.scan import Scan
 
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
+Map = Single
 
 _SURE = 1e-6  # what is less likely is the mark, however soft: there are many marks
 _HALVED_PX = 6.0  # of the finest line: from there on half the resolution shows it as well

@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.geometry import linear_scale, turn_by_quarters
 from measure.marks.rendering import extent_px, known_picture
 from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
 from measure.scans.scan import Scan
-
-Array = NDArray[np.float64]
 
 _EXTENT_PX = 14.0  # of the reduced mark
 _THINNEST_PX = 1.2  # of its thinnest line: below this the line drowns

@@ -1,12 +1,10 @@
 """Peaks of a correlation map: its highest local maxima, and the highest place about given ones."""
 
 import numpy as np
-from numpy.typing import NDArray
 from skimage.feature import peak_local_max
 
+from measure.array_types import Array
 from measure.detection.correlation import Map
-
-Array = NDArray[np.float64]
 
 
 def local_maxima(response: Map, count: int, least: float, apart_px: int = 3) -> tuple[Array, Array]:

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from measure.array_types import Array, Single
 from measure.detection.correlation import WIDE
 from measure.geometry import linear_scale
 from measure.matching.window import FAINT
 from measure.scans.scan import Scan
 
-Array = NDArray[np.float64]
-Window = NDArray[np.float32]
+Window = Single
 
 _SIDE = 24  # samples along the square
 _STEP = 3  # samples between the squares that are tried

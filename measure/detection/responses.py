@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.array_types import Array, Mask
 from measure.detection.correlation import WIDE, Map, Surroundings, correlation, variation
 from measure.detection.mark_views import MarkView, distinct_templates, ground_detail_px, search_reduction
 from measure.detection.peaks import highest_about, local_maxima
@@ -18,7 +19,6 @@ from measure.matching.window import FAINT
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import SINGLE_CHANNELS, Scan
 
-Array = NDArray[np.float64]
 Cached = TypeVar("Cached")
 Key = tuple[int, int]  # a kind of template, and the sign of the mark
 
@@ -185,7 +185,7 @@ class Dilation:
         col, row = np.clip(np.rint(place).astype(int) - self.origin, 0, np.array(self.map.shape[::-1]) - 1)
         return float(self.map[row, col])
 
-    def strength(self, places: NDArray[np.int_]) -> tuple[Array, NDArray[np.bool_]]:
+    def strength(self, places: NDArray[np.int_]) -> tuple[Array, Mask]:
         """How much the places (n, 2) of the reduced scan answer beyond the background, and which of them lie in the
         map; those that do not have no answer."""
         rows, cols = self.map.shape

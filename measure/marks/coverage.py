@@ -12,10 +12,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.array_types import Array, Single
 from measure.marks.shapes import Bar, Disk, MarkShape, Part, Polygon, Ring
 
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 Integers = NDArray[np.intp]
 
 CELLS = 4  # cells along a pixel's side: more than any blur of a scan tells apart

@@ -9,12 +9,10 @@ from dataclasses import replace
 from typing import TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.marks.coverage import outline_mm
 from measure.marks.shapes import FiducialLayout, FrameCorner, LayoutMark, Mark, MarkShape, Polygon
-
-Array = NDArray[np.float64]
 
 _EDGE_MM = 0.1  # so near to the frame's edge a drawing ends on it
 

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
+from measure.array_types import Array, Mask, Single
 from measure.geometry import linear_scale
 from measure.marks.coverage import CELLS, cell_coverage
 from measure.marks.frame_border import drawn_outline_mm, known_outline_mm
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Point
 
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 Integers = NDArray[np.int_]
 
 _DRAWINGS = 16  # kept: more than a camera has kinds of marks
@@ -106,7 +105,7 @@ def _outline_mm(mark: Mark) -> Array:
     return known_outline_mm(mark)
 
 
-def true_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
+def true_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> Mask:
     """(height, width): in which pixels the mark's drawing is true, and in all within margin_px of them."""
     shown = known_mask(mark, pixel_from_mark, width, height, margin_px)
     if isinstance(mark, MarkTemplate) or mark.true_mm is None:
@@ -114,7 +113,7 @@ def true_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margi
     return shown & _rectangle_mask(mark.true_mm, pixel_from_mark, width, height, margin_px)
 
 
-def known_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
+def known_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> Mask:
     """(height, width): in which pixels anything is known of the mark, and in all within margin_px of them."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None:
         return np.ones((height, width), dtype=bool)
@@ -123,16 +122,14 @@ def known_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, marg
 
 def _rectangle_mask(
     rectangle_mm: tuple[Point, Point], pixel_from_mark: Array, width: int, height: int, margin_px: float
-) -> NDArray[np.bool_]:
+) -> Mask:
     """(height, width): which pixels lie in a rectangle of the mark's plane, margin_px from its sides."""
     places, margin_mm = _places_mm(pixel_from_mark, width, height), margin_px / _px_per_mm(pixel_from_mark)
     least, greatest = np.add(rectangle_mm, [[margin_mm], [-margin_mm]])
     return np.asarray(np.all((places >= least) & (places <= greatest), axis=-1))
 
 
-def frame_pixel_mask(
-    mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float
-) -> NDArray[np.bool_]:
+def frame_pixel_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> Mask:
     """(height, width): which pixels show the exposed frame beside a mark that is cut into its border, farther than
     margin_px from the frame's edge; none beside other marks."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None or np.isfinite(mark.known_mm).all():
@@ -153,7 +150,7 @@ def _px_per_mm(pixel_from_mark: Array) -> float:
     return linear_scale(pixel_from_mark)
 
 
-def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> NDArray[np.bool_]:
+def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> Mask:
     """(height, width): which pixels lie on the chip, where it is steady."""
     col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
     rows, cols = mark.image.shape

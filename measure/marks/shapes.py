@@ -9,12 +9,12 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from measure.array_types import Array, Mask
 
 Point = tuple[float, float]
 Polarity = Literal["light", "dark", "auto"]
 Side = Literal["left", "right", "top", "bottom"]
-Array = NDArray[np.float64]
 
 LEARNED_ORIGIN = 0.25  # of a learned mark's size: standard deviation of its template's origin about the mark
 MOST_GIVEN_SIGMA_MM = 0.1  # of a given place: a datum's sigma may be a millimetre, and its place is better than that
@@ -117,8 +117,8 @@ class MarkTemplate:
     noise_dn: float = 0.0
     slope_noise_dn: float = 0.0
     shares: Mapping[str, float] = field(default_factory=dict)
-    steady: NDArray[np.bool_] | None = None
-    steadiness: NDArray[np.float64] | None = None
+    steady: Mask | None = None
+    steadiness: Array | None = None
     learned_mm: float = 0.0
     alike: tuple[str, ...] = ()
 

@@ -12,14 +12,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 from scipy.sparse.linalg import LinearOperator, lsmr
 
+from measure.array_types import Array, Mask
 from measure.noise.robust_estimation import robust_scale, tukey_weights
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _GAIN, _OFFSET, _COL, _ROW, _BLUR = range(5)  # what is estimated of each picture
 _REWEIGHTINGS = 5  # of the pixels by Tukey's function

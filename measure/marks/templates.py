@@ -11,17 +11,14 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from measure.array_types import Array, Mask, Single
 from measure.geometry import POSES, linear_scale, turn_by_quarters, up_from_camera
 from measure.marks.shapes import MarkTemplate
 from measure.marks.shared_picture import NOISE_FLOOR, SharedPicture, adjust_picture, first_picture
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _PHASES = 2  # of rounds: what differs from frame to frame is known once the pictures are aligned
 _ROUNDS = 12  # of adjusting; five are enough where pictures are about as sharp as one another
@@ -208,7 +205,7 @@ def _centre_origin(template: MarkTemplate) -> Array:
     return np.asarray(cv2.warpAffine(template.image, place, (2 * half + 1,) * 2, flags=flags), np.float64)
 
 
-def _middle(picture: Array, side: int) -> NDArray[np.float32]:
+def _middle(picture: Array, side: int) -> Single:
     spare = (len(picture) - side) // 2
     return np.ascontiguousarray(picture[spare : spare + side, spare : spare + side], np.float32)
 

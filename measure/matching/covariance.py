@@ -4,21 +4,18 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
 
+from measure.array_types import Array, Mask
 from measure.geometry import Affine, linear_scale
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
 from measure.marks.shared_picture import SMOOTHED_PX2
 from measure.marks.templates import GRAIN_PX
 from measure.matching.models import GREY
-from measure.noise.noise_model import NoiseModel, autocovariance, coloured, combined, correlated, products
+from measure.noise.noise_model import NoiseModel, autocovariance, combined, correlated, products
 from measure.results import Covariance, MarkFit, OwnShape, SecondPlace
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _ALIKE_PX = 1.5  # standard deviation of the weights by distance of what neighbours leave alike
 _LEAST_SLOPE = 1e-3  # of a clipped grey value: what tells less tells nothing
@@ -60,7 +57,7 @@ class LinearFit:
         place, left = self.by_grey[:2], np.where(self.used, self.residuals, 0.0)[None]
         expected = self.covariance(place)
         if self.noise.is_grain:  # that weighed the fit: as if it were white, so that neighbours share none
-            place, left = coloured(place, self.noise, 0.5), coloured(left, self.noise, -0.5)
+            place, left = correlated(place, self.noise, 0.5), correlated(left, self.noise, -0.5)
             expected = products(place, place)
         shares = place * left
         about = gaussian_filter(shares, (0.0, _ALIKE_PX, _ALIKE_PX), mode="constant") * (2 * np.pi * _ALIKE_PX**2)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
+from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.marks.shapes import FrameCorner
 from measure.matching.window import FAINT
@@ -25,9 +26,6 @@ from measure.scans.scan import Scan
 from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import MarkTone
 from measure.tone.score import ToneScore, tone_score
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 PROFILES = 60  # along an edge, each the median over its share of it
 _LEAST_SHARE = 0.5  # of the profiles that lie on the line: with fewer it may be another line
@@ -230,12 +228,18 @@ def _fit_line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask
     weighted, kept, count = design * line.weights, np.flatnonzero(good)[on], int(on.sum())
     inverse = np.linalg.inv(weighted @ design.T)
     variance = float((residuals[on] ** 2).sum() / max(count - 2, 1)) + _SCATTER_FLOOR_PX**2
+    contrast, noise, blur, likeness = (
+        float(np.median(each[kept])) for each in (steps.contrast, steps.noise, steps.blur, steps.likeness)
+    )
     return Edge(
         line.factors,
         np.asarray(inverse * variance * _alike(residuals, on), dtype=float),
         share,
         count,
-        *(float(np.median(each[kept])) for each in (steps.contrast, steps.noise, steps.blur, steps.likeness)),
+        contrast,
+        noise,
+        blur,
+        likeness,
         None if scan.tone.is_known else _edge_tone(scan, steps, kept, np.asarray(inverse @ weighted)[:, on]),
     )
 

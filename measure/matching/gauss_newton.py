@@ -5,8 +5,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.marks.rendering import chip_mask, picture, true_mask
 from measure.marks.shapes import MarkTemplate
@@ -16,9 +16,6 @@ from measure.matching.window import ScanWindow
 from measure.noise.damage import damage, grown
 from measure.noise.noise_model import NoiseModel, combined, correlated, may_be_noise, products, steadiness, weighted
 from measure.noise.robust_estimation import robust_scale, solution, tukey_loss, tukey_weights
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 UNSETTLED = Reason("the adjustment did not converge", Code.NO_FIT)
 UNDETERMINED = Reason("the picture does not determine the mark's place", Code.NO_FIT)

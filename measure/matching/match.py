@@ -10,8 +10,8 @@ last steps and gives the covariance (generalised least squares).
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array, Mask
 from measure.flags import Cause
 from measure.marks.rendering import extent_px, frame_pixel_mask, known_mask
 from measure.marks.shapes import Mark, MarkTemplate
@@ -37,8 +37,6 @@ from measure.tone.estimate import MarkTone
 
 __all__ = ["MarkFit", "MatchOptions", "mark_window", "match"]
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _SPARE_PX = 2.0  # beyond the margin: room for the mark to move
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.geometry import linear_scale
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
@@ -14,9 +15,6 @@ from measure.matching.options import Freedom, MatchOptions
 from measure.matching.saturation import censored, tells
 from measure.matching.window import ScanWindow
 from measure.noise.noise_model import combined, factors
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Changes of the mark's linear part: (I + e G) times it, G a generator of two ones.
 _GENERATORS = {

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, log_ndtr
 
+from measure.array_types import Array, Mask
 from measure.flags import NATURAL_END
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Sides = NDArray[np.int8]
 
 _BITS = (8, 10, 12, 14, 16)  # of scanners' converters; their numbers are stored as they are, or moved up

@@ -3,17 +3,14 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array, Mask
 from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.models import GREY
 from measure.noise.noise_model import combined, products
 from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import MarkTone
 from measure.tone.score import ToneScore, tone_score
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _PIECE_PX = 8  # of a mark's edges that tell the curve by themselves, and of what JPEG rounds by itself
 _LEAST_CONTRAST = 1e-6  # of the light that is drawn: rounding is about that large
@@ -59,8 +56,9 @@ def mark_tone_information(
         changes = tone.derivatives(drawn, full_scale_dn) * counts * fit.steadiness
         residuals = np.where(counts, fit.residuals, 0.0)
         priors = np.append(priors_dn2, np.zeros(len(uneven)))
-        flat = [images.reshape(-1, counts.size) for images in (design, changes)]
-        score = tone_score(*flat, residuals.ravel(), priors, np.append(departures, np.zeros(len(uneven))))
+        departures = np.append(departures, np.zeros(len(uneven)))
+        flat, flat_changes = (images.reshape(-1, counts.size) for images in (design, changes))
+        score = tone_score(flat, flat_changes, residuals.ravel(), priors, departures)
         left, by_prior = score.left.reshape(changes.shape), score.by_unknown * np.sqrt(priors)[:, None]
         covariance = fit.covariance(left) + landscape.covariance(left) + fit.noise.variance_dn2 * by_prior.T @ by_prior
         # Of departures that the picture's own unknowns take up whole, only rounding is left: it must not tell of the

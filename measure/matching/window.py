@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.filters import threshold_otsu
 
+from measure.array_types import Array, Mask
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
 from measure.matching.saturation import Sides, clipped_sides
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR, Tone
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 _BESIDE_PX = 6.0  # about the drawing: the mark's own ground

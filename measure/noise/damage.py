@@ -2,12 +2,9 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array, Mask
 from measure.noise.robust_estimation import robust_scale
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _SMOOTHING_PX = 0.8  # of residuals: hardly more than a pixel, so that the finest specks stand out too
 

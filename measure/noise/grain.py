@@ -10,32 +10,46 @@ the mark's own window, and in patches of blank film beside it, where there are a
 alone, and more of it than the window holds.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cache
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import nnls
 
+from measure.array_types import Array, Mask, Single
 from measure.noise.noise_model import NoiseModel, padded, to_orthonormal
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Single = NDArray[np.float32]
+Lags = NDArray[np.intp]  # (n, 2) rows and columns between pixels, all of one length
 
 PATCH_PX = 15  # a side: thrice as far as film's grain reaches
 BESIDE_PX = 2 * PATCH_PX + 4.0  # how much of the film beside a mark is asked
-_AS_NOISY = 3.0  # times the variance of the mark's own residuals, or a part of it: beyond it is a picture, text or dust
-_FEWEST = 6  # patches that tell more than the mark's own window
 # Standard deviations of the Gaussian that smears white noise into grain, and the coarsest that is still film's.
 GRAIN_PX = (0.4, 0.5, 0.6, 0.7, 0.8, 0.95, 1.1, 1.3, 1.5, 1.8, 2.2)
 _COARSEST_PX = 1.8
-REACH_PX = 8  # grain of 1.5 px is correlated by one in a thousand there
-_HERE = REACH_PX  # index of no lag at all
+_AS_NOISY = 3.0  # times the variance of the mark's own residuals, or a part of it: beyond it is a picture, text or dust
+_FEWEST = 6  # patches that tell more than the mark's own window
+_REACH_PX = 8  # grain of 1.5 px is correlated by one in a thousand there
 _FARTHEST_PX = 3.0  # lags that are compared: beyond it the residuals hold the fit's marks rather than the noise's
 _FARTHEST_BLANK_PX = 5.0  # the same of blank film, which has no marks in it
+
+
+def _plane() -> Array:
+    """(pixels, 3) an orthonormal base of the planes over a patch."""
+    row, col = np.mgrid[:PATCH_PX, :PATCH_PX].reshape(2, -1) - (PATCH_PX - 1) / 2
+    base, _ = np.linalg.qr(np.stack([np.ones(PATCH_PX**2), col, row], axis=1))
+    return np.asarray(base, dtype=np.float64)
+
+
+def _kernels() -> Array:
+    """(1 + grains, lags, lags) autocorrelations of white noise, and of it smeared by Gaussians, up to the reach."""
+    index = np.arange(-_REACH_PX, _REACH_PX + 1)
+    squared = index[:, None] ** 2 + index**2
+    return np.stack([squared == 0.0, *(np.exp(-squared / (4.0 * grain_px**2)) for grain_px in GRAIN_PX)])
+
+
+PLANE, _KERNELS = _plane(), _kernels()
 
 
 def blank_patches(window: Array, free: Mask, variance_dn2: float) -> Array:
@@ -45,9 +59,7 @@ def blank_patches(window: Array, free: Mask, variance_dn2: float) -> Array:
     rest = patches - patches @ PLANE @ PLANE.T
     variances = (rest**2).sum(axis=1) / (PATCH_PX**2 - PLANE.shape[1])
     alike = (variances > variance_dn2 / _AS_NOISY) & (variances < variance_dn2 * _AS_NOISY)
-    if alike.sum() < _FEWEST:
-        return np.zeros((0, PATCH_PX, PATCH_PX))
-    return np.asarray(rest[alike].reshape(-1, PATCH_PX, PATCH_PX))
+    return np.asarray(rest[alike & (alike.sum() >= _FEWEST)].reshape(-1, PATCH_PX, PATCH_PX))
 
 
 def is_coloured(patches: Array) -> bool:
@@ -58,16 +70,6 @@ def is_coloured(patches: Array) -> bool:
     # A plane takes three pixels' worth out of a patch, and as much out of the products.
     correlation = sums / (2 * (patches**2).sum()) + PLANE.shape[1] / PATCH_PX**2
     return bool(abs(correlation) > 3 / np.sqrt(2 * patches.size))
-
-
-def _plane() -> Array:
-    """(pixels, 3) an orthonormal base of the planes over a patch."""
-    row, col = np.mgrid[:PATCH_PX, :PATCH_PX].reshape(2, -1) - (PATCH_PX - 1) / 2
-    base, _ = np.linalg.qr(np.stack([np.ones(PATCH_PX**2), col, row], axis=1))
-    return np.asarray(base, dtype=np.float64)
-
-
-PLANE = _plane()
 
 
 def _squares(image: Array | Mask) -> Array:
@@ -82,118 +84,103 @@ def grain_model(
 ) -> NoiseModel:
     """The noise model, a sum of white noise and grains, whose residuals after the fit are most like the ones there are.
 
-    residuals (height, width), where used; taken: what the fit takes out of the noise, as `taken_out` gives it.
-    blank (n, PATCH_PX, PATCH_PX): patches of blank film less a plane.
+    Parameters
+    ----------
+    residuals, used : (height, width)
+        What the fit left, and where it counts.
+    taken : (1 + grains, distances)
+        What the fit takes out of the noise, as `taken_out` gives it.
+    neighbour_correlation : float
+        Of the residuals.
+    blank : (n, PATCH_PX, PATCH_PX), optional
+        Patches of blank film less a plane.
     """
-    window = _Pixels(used, _FARTHEST_PX)
-    left = window.products(np.where(used, residuals, 0.0)[None]) * window.weights
-    expected = window.expected(taken) * window.weights
-    if blank is not None and len(blank) > 0:
-        (patch, of_patch), count = _patch(), len(blank)
-        weights = patch.weights / np.sqrt(count)
-        left = np.concatenate([left, patch.products(blank) * weights])
-        expected = np.concatenate([expected, of_patch * weights * count], axis=1)
-    shares, _ = nnls(expected.T, left)
-    lags = np.tensordot(shares, _KERNELS, axes=1)
-    variance = float(lags[_HERE, _HERE])
+    rings = _rings(_FARTHEST_PX)
+    pairs = _pixel_products(used[None], rings)
+    weights = 1.0 / np.sqrt(np.maximum(pairs, 1.0))
+    left = _pixel_products(np.where(used, residuals, 0.0)[None], rings) * weights
+    expected = (pairs * _ring_kernels(rings) + taken) * weights
+    has_blank = blank is not None and len(blank) > 0
+    if blank is not None and has_blank:
+        patch_pairs, patch_expected = _patch()
+        weights = 1.0 / np.sqrt(len(blank) * patch_pairs)
+        left = np.concatenate([left, _pixel_products(blank, _rings(_FARTHEST_BLANK_PX)) * weights])
+        expected = np.concatenate([expected, len(blank) * patch_expected * weights], axis=1)
+    lags = np.tensordot(nnls(expected.T, left)[0], _KERNELS, axes=1)
+    variance, neighbours = lags[_REACH_PX, _REACH_PX], lags[_REACH_PX, _REACH_PX + 1]
     # A fit makes residuals less alike than the noise is. If they still are more alike than the coarsest grain, or the
     # model is, a landscape was taken for grain.
-    alike = max(neighbour_correlation, lags[_HERE, _HERE + 1] / max(variance, 1e-300))
-    is_grain = blank is not None and len(blank) > 0 and bool(alike < _kernel(_COARSEST_PX)[_HERE, _HERE + 1])
-    return NoiseModel(variance, lags, neighbour_correlation, is_grain)
-
-
-def _kernel(grain_px: float | None) -> Array:
-    """Autocorrelation of white noise, smeared by a Gaussian or not, at all lags up to the reach."""
-    index = np.arange(-REACH_PX, REACH_PX + 1)
-    squared = index[:, None] ** 2 + index[None, :] ** 2
-    return np.asarray(squared == 0, float) if grain_px is None else np.exp(-squared / (4.0 * grain_px**2))
+    alike, most = max(neighbour_correlation, neighbours / max(variance, 1e-300)), np.exp(-1 / (4.0 * _COARSEST_PX**2))
+    return NoiseModel(float(variance), lags, neighbour_correlation, has_blank and bool(alike < most))
 
 
 def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> Array:
-    """(1 + grains, distances) what a fit takes out of the sums of products of pixels so far apart, up to farthest_px,
-    that white noise and noise of each grain make at unit variance. used (height, width); design (unknowns, height,
-    width): derivatives by its unknowns.
+    """What a fit takes out of the sums of products of pixels so far apart, up to farthest_px.
 
     The fit leaves M C M of a covariance matrix C, with M = I - Q Q'. Summed over pixels so far apart, by D, that
     is tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q): the last two are sums of products of Q's columns, lag by lag,
     times the autocorrelation at that lag, whatever it is.
+
+    Parameters
+    ----------
+    used, design : (height, width), (unknowns, height, width)
+        The pixels used, and the model's derivatives by its unknowns.
+
+    Returns
+    -------
+    (1 + grains, distances) of white noise and noise of each grain at unit variance.
     """
-    rings, border, used_design = _rings(farthest_px), int(farthest_px), design[:, used]
+    border, used_design = int(farthest_px), design[:, used]
     within = np.pad(used, border)
     base = np.zeros((len(design), *within.shape), np.float32)
     orthonormal = to_orthonormal(used_design @ used_design.T)
     base[: len(orthonormal), within] = orthonormal @ used_design
-    shape, index = padded(within.shape, REACH_PX), np.arange(-REACH_PX, REACH_PX + 1)
+    shape, index = padded(within.shape, _REACH_PX), np.arange(-_REACH_PX, _REACH_PX + 1)
     spectra = np.conj(fft.rfft2(base, s=shape))
     flat, counted = base.reshape(len(base), -1), within.ravel().astype(np.float32)
     taken = []
-    for ring in rings:
-        sums = ring.sums(flat, within.shape[1]) * counted
+    for ring in _rings(farthest_px):
+        sums = _ring_sums(flat, ring, within.shape[1]) * counted
         sums = (flat @ sums.T) @ flat - 2 * sums
         lags = fft.irfft2((spectra * fft.rfft2(sums.reshape(base.shape), s=shape)).sum(axis=0), s=shape)
         taken.append(_KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel())
     return np.stack(taken, axis=1)
 
 
-class _Pixels:
-    """The pixels of a fit (height, width), and sums over all pairs of them so far apart."""
-
-    def __init__(self, used: Mask, farthest_px: float) -> None:
-        self.rings = _rings(farthest_px)
-        self.pairs = self.products(used[None])
-        self.weights = 1.0 / np.sqrt(np.maximum(self.pairs, 1.0))
-
-    def products(self, images: Array | Mask) -> Array:
-        """(distances,) sums over the images of the products of their pixels so far apart."""
-        shape = padded(images.shape[1:], REACH_PX)
-        lags = fft.irfft2((np.abs(fft.rfft2(images.astype(np.float32), s=shape)) ** 2).sum(axis=0), s=shape)
-        return np.array([lags[ring.index].sum() for ring in self.rings])
-
-    def expected(self, taken: Array) -> Array:
-        """(1 + grains, distances) what white noise and noise of each grain make of these sums, at unit variance, less
-        what a fit takes out."""
-        lags = np.array([ring.lags[0] for ring in self.rings]).T + _HERE
-        return np.asarray(self.pairs * _KERNELS[:, *lags] + taken)
+def _pixel_products(images: Array | Mask, rings: Sequence[Lags]) -> Array:
+    """(distances,) sums over images (n, height, width) of the products of their pixels so far apart."""
+    shape = padded(images.shape[1:], _REACH_PX)
+    lags = fft.irfft2((np.abs(fft.rfft2(images.astype(np.float32), s=shape)) ** 2).sum(axis=0), s=shape)
+    return np.array([lags[*ring.T].sum() for ring in rings])
 
 
-@dataclass(frozen=True)
-class _Ring:
-    """All lags (rows, columns) of one length."""
-
-    lags: tuple[tuple[int, int], ...]
-
-    @property
-    def index(self) -> tuple[list[int], list[int]]:
-        """Of these lags in a picture of all of them that begins with none, negative ones at its end."""
-        return [down for down, _ in self.lags], [right for _, right in self.lags]
-
-    def sums(self, images: Single, width: int) -> Single:
-        """Of the pixels at these lags from each pixel of images (n, pixels), row after row of that width, which are 0
-        in a border as wide as the lags."""
-        total = np.zeros_like(images)
-        most = max(max(abs(down), abs(right)) for down, right in self.lags) * (width + 1)
-        for down, right in self.lags:
-            lag = down * width + right
-            total[:, most : total.shape[1] - most] += images[:, most + lag : total.shape[1] - most + lag]
-        return total
+def _ring_kernels(rings: Sequence[Lags]) -> Array:
+    """(1 + grains, distances) autocorrelations so far apart."""
+    return np.asarray(_KERNELS[:, *np.array([ring[0] for ring in rings]).T + _REACH_PX])
 
 
-def _rings(farthest_px: float) -> list[_Ring]:
-    reach = range(-int(farthest_px), int(farthest_px) + 1)
-    by_square: dict[int, list[tuple[int, int]]] = {}
-    for down, right in product(reach, repeat=2):
-        if down**2 + right**2 <= farthest_px**2:
-            by_square.setdefault(down**2 + right**2, []).append((down, right))
-    return [_Ring(tuple(lags)) for _, lags in sorted(by_square.items())]
+def _ring_sums(images: Single, ring: Lags, width: int) -> Single:
+    """Of the pixels at these lags from each pixel of images (n, pixels), row after row of that width, which are 0 in a
+    border as wide as the lags."""
+    total, most = np.zeros_like(images), int(np.abs(ring).max()) * (width + 1)
+    for lag in (ring @ (width, 1)).tolist():
+        total[:, most : total.shape[1] - most] += images[:, most + lag : total.shape[1] - most + lag]
+    return total
 
 
 @cache
-def _patch() -> tuple[_Pixels, Array]:
-    """A patch of blank film, and what noise leaves there less a plane."""
-    whole = np.ones((PATCH_PX, PATCH_PX), dtype=bool)
-    pixels = _Pixels(whole, _FARTHEST_BLANK_PX)
-    return pixels, pixels.expected(taken_out(whole, PLANE.T.reshape(-1, PATCH_PX, PATCH_PX), _FARTHEST_BLANK_PX))
+def _rings(farthest_px: float) -> tuple[Lags, ...]:
+    """The lags of each length up to the farthest, the shortest first."""
+    lags = np.argwhere(np.ones((2 * int(farthest_px) + 1,) * 2)) - int(farthest_px)
+    squares = (lags**2).sum(axis=1)
+    return tuple(lags[squares == square] for square in np.unique(squares[squares <= farthest_px**2]))
 
 
-_KERNELS = np.stack([_kernel(grain_px) for grain_px in (None, *GRAIN_PX)])
+@cache
+def _patch() -> tuple[Array, Array]:
+    """Of a patch of blank film, how many pairs of pixels lie so far apart, and what noise leaves of their products less
+    a plane."""
+    whole, rings = np.ones((PATCH_PX, PATCH_PX), dtype=bool), _rings(_FARTHEST_BLANK_PX)
+    pairs = _pixel_products(whole[None], rings)
+    taken = taken_out(whole, PLANE.T.reshape(-1, PATCH_PX, PATCH_PX), _FARTHEST_BLANK_PX)
+    return pairs, pairs * _ring_kernels(rings) + taken

@@ -7,20 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from measure.noise.robust_estimation import robust_scale
-
-Array = NDArray[np.float64]
-
-_ALIKE = 1e-10  # of the largest eigenvalue: what images differ by in less is no direction of its own
-Mask = NDArray[np.bool_]
-
-_ODDS = 13.8  # chi-square of two coordinates: one in a thousand
-_TEXTURE = 0.25  # correlation at REACH_PX that grain never has
+from measure.array_types import Array, Mask, Single
+from measure.noise.robust_estimation import Real, robust_scale
 
 WHITE = 0.02  # of the variance at least is taken as white: no film's grain is known better at the finest frequencies
 REACH_PX = 5  # the coarsest grain that matters at scanning pitch: correlated over 1.5 px, gone beyond 5
-Single = NDArray[np.float32]
 
+_ALIKE = 1e-10  # of the largest eigenvalue: what images differ by in less is no direction of its own
+_ODDS = 13.8  # chi-square of two coordinates: one in a thousand
+_TEXTURE = 0.25  # correlation at REACH_PX that grain never has
 _POWER, _POWER_SIGMA, _MOST = 0.4, 0.25, 1 - 1 / 2.2  # of light: what is believed of any scan
 _OTHER, _SAME = 0.5, 0.15  # of light's greatest change: from where noise differs, up to where it does not
 _GREATEST = 0.98  # of the pixels change less than what is called the greatest change
@@ -28,7 +23,6 @@ _FEWEST = 12  # pixels that tell how noisy they are
 _SCALE_VARIANCE = 1.36  # of the logarithm of a robust scale, times the number of values it is of
 _LEAST = 0.1  # of light's logarithm: noise hardly changes with less
 _DARKEST = 5e-4  # of full scale: nearer to black no scanner's noise is less
-
 _ROUNDS = 8  # of conjugate gradients, at most
 _CLOSE = 0.03  # of a derivative: so little left costs a thousandth of the standard deviation
 _MISFIT = 0.003  # of the contrast: what the drawing itself gets wrong from pixel to pixel
@@ -86,25 +80,27 @@ class NoiseModel:
         )
 
 
-def noise_model(residuals: Array, used: Mask, unknowns: int, information: float | None = None) -> NoiseModel:
-    """The noise model of residuals (height, width), where used, after a fit of so many unknowns. information: of
-    how many ordinary pixels they have the information, where some are clipped and residuals are their scores.
+def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
+    """The noise model of residuals (height, width), where used, after a fit of so many unknowns.
 
     Noise counts as white where the correlation of neighbours is within three standard errors of nothing.
     """
-    noise, is_white = as_if_white(residuals, used, unknowns, information)
+    noise, is_white = as_if_white(residuals, used, unknowns)
     if is_white:
         return noise
-    lags = autocovariance(np.where(used, residuals, 0.0), used, REACH_PX) * _taper(REACH_PX)
+    lags = autocovariance(np.where(used, residuals, 0.0), used, REACH_PX)
+    index = np.arange(-REACH_PX, REACH_PX + 1)
+    # The far lags are noise themselves: they fade out.
+    lags = lags * np.clip(REACH_PX + 1 - np.hypot(index[:, None], index), 0.0, 1.0)
     return replace(noise, autocovariance_dn2=lags * (noise.variance_dn2 / lags[REACH_PX, REACH_PX]))
 
 
 def as_if_white(
     residuals: Array, used: Mask, unknowns: int, information: float | None = None
 ) -> tuple[NoiseModel, bool]:
-    """The same without correlations, and whether it has none."""
-    count = max(int(used.sum()), 1)
-    kept = np.where(used, residuals, 0.0)
+    """The same without correlations, and whether it has none. information: of how many ordinary pixels they have the
+    information, where some are clipped and residuals are their scores."""
+    count, kept = max(int(used.sum()), 1), np.where(used, residuals, 0.0)
     squares = float((kept**2).sum())
     variance = squares / max((count if information is None else information) - unknowns, 1)
     correlation = _covariance_along(kept, used, 1) / (squares / count) if squares else 0.0
@@ -125,23 +121,29 @@ def may_be_noise(off: Array, covariance: Array) -> bool:
     return bool(off @ np.linalg.solve(covariance, off) < _ODDS)
 
 
-def correlated(columns: Array, noise: NoiseModel) -> Array:
-    """The noise's covariance matrix times images (n, height, width), without ever forming it."""
-    return coloured(columns, noise, 1.0)
-
-
-def coloured(columns: Array, noise: NoiseModel, power: float) -> Array:
-    """A power of the noise's covariance matrix, as if the picture had no border, times images (n, height, width)."""
-    height, width = columns.shape[1:]
-    reach = len(noise.autocovariance_dn2) // 2
-    shape = padded((height, width), reach)
-    kernel, index = np.zeros(shape), np.arange(-reach, reach + 1)
-    kernel[np.ix_(index, index)] = noise.autocovariance_dn2
-    spectrum = fft.rfft2(kernel).real
+def correlated(columns: Array, noise: NoiseModel, power: float = 1.0) -> Array:
+    """The noise's covariance matrix, or a power of it as if the picture had no border, times images (n, height, width):
+    without ever forming it."""
+    spectrum, shape = _spectrum(noise, columns.shape[1:])
     if power != 1.0:
         spectrum = np.maximum(spectrum, WHITE * noise.variance_dn2) ** power
-    smeared = fft.irfft2(fft.rfft2(columns, s=shape) * spectrum, s=shape)
-    return np.asarray(smeared[:, :height, :width])
+    return np.asarray(_filtered(columns, spectrum, shape))
+
+
+def _spectrum(noise: NoiseModel, size: tuple[int, ...]) -> tuple[Array, list[int]]:
+    """Of the noise, in a transform of images of a size, and the transform's own size."""
+    reach = len(noise.autocovariance_dn2) // 2
+    shape, index = padded(size, reach), np.arange(-reach, reach + 1)
+    kernel = np.zeros(shape)
+    kernel[np.ix_(index, index)] = noise.autocovariance_dn2
+    return np.asarray(fft.rfft2(kernel).real), shape
+
+
+def _filtered(images: NDArray[Real], spectrum: NDArray[Real], shape: list[int]) -> NDArray[Real]:
+    """Images (n, height, width) by a spectrum in a transform of a size."""
+    height, width = images.shape[1:]
+    smeared = fft.irfft2(fft.rfft2(images, s=shape) * spectrum, s=shape)
+    return np.asarray(smeared[:, :height, :width], images.dtype)
 
 
 def autocovariance(kept: Array, used: Mask, reach: int) -> Array:
@@ -165,13 +167,6 @@ def _covariance_along(kept: Array, used: Mask, lag: int) -> float:
     products = (kept[:, lag:] * kept[:, :-lag]).sum(), (kept[lag:] * kept[:-lag]).sum()
     pairs = (used[:, lag:] & used[:, :-lag]).sum(), (used[lag:] & used[:-lag]).sum()
     return float(sum(product / max(count, 1) for product, count in zip(products, pairs, strict=True)) / 2)
-
-
-def _taper(reach: int) -> Array:
-    """Fades out the far lags, which are noise themselves."""
-    index = np.arange(-reach, reach + 1)
-    distance = np.hypot(index[:, None], index[None, :])
-    return np.asarray(np.clip(reach + 1 - distance, 0.0, 1.0))
 
 
 # Weights of pixels: by noise that grows with light, and for grain by what the inverse of the noise's covariance matrix
@@ -216,17 +211,21 @@ def steadiness(residuals: Array, light: Array, ground: Mask, used: Mask) -> Arra
 def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -> tuple[Array, Array]:
     """B and C B', each (unknowns, height, width) and 0 where not used: weighted derivatives, and the covariance matrix
     of the noise times them."""
-    covariance = _Covariance(noise, used, max(WHITE * noise.variance_dn2, (_MISFIT * contrast_dn) ** 2))
+    scale_dn2, (spectrum_dn2, shape) = noise.variance_dn2, _spectrum(noise, used.shape)
+    least = max(WHITE * scale_dn2, (_MISFIT * contrast_dn) ** 2) / scale_dn2
+    spectrum: Single = np.maximum(spectrum_dn2 / scale_dn2, least).astype(np.float32)
+    counts = used.astype(np.float32)
+    inverse: Single = np.asarray(1 / spectrum, np.float32)  # as if the pixels used had no border
     # The columns are scaled for single precision, and all are solved at once.
     right = (design * used).astype(np.float32)
     size = np.sqrt(_dots(right, right))
     right /= size
     # Columns that are close leave the rounds: those of a mark's edges are so at once, the ground's later.
     solution, left, rests = np.zeros_like(right), np.arange(len(right)), right.copy()
-    direction = ahead = covariance.roughly_inverse(right)
+    direction = ahead = _filtered(right, inverse, shape) * counts
     strength = _dots(right, ahead)
     for _ in range(_ROUNDS):
-        image = covariance.times(direction)
+        image = _filtered(direction, spectrum, shape) * counts
         length = strength / np.maximum(_dots(direction, image), 1e-30)
         solution[left] += length * direction
         rests[left] -= np.multiply(length, image, out=image)
@@ -235,37 +234,11 @@ def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -
         if not far.any():
             break
         left, rest, direction, before = left[far], rest[far], direction[far], strength[far]
-        ahead = covariance.roughly_inverse(rest)
+        ahead = _filtered(rest, inverse, shape) * counts
         strength = _dots(rest, ahead)
         direction *= strength / np.maximum(before, 1e-30)
         direction += ahead
-    return solution * (size / covariance.scale_dn2).astype(float), (right - rests) * size.astype(float)
-
-
-class _Covariance:
-    """The noise's covariance among the pixels used, in units of scale_dn2, applied by Fourier transforms."""
-
-    def __init__(self, noise: NoiseModel, used: Mask, white_dn2: float) -> None:
-        reach = noise.autocovariance_dn2.shape[0] // 2
-        self.used = used.astype(np.float32)
-        self.scale_dn2 = noise.variance_dn2
-        self.shape = padded(used.shape, reach)
-        kernel, index = np.zeros(self.shape, np.float32), np.arange(-reach, reach + 1)
-        kernel[np.ix_(index, index)] = noise.autocovariance_dn2 / self.scale_dn2
-        spectrum = np.asarray(fft.rfft2(kernel).real, np.float32)
-        self.spectrum: Single = np.asarray(np.maximum(spectrum, white_dn2 / self.scale_dn2), np.float32)
-
-    def times(self, images: Single) -> Single:
-        return self._filtered(images, self.spectrum)
-
-    def roughly_inverse(self, images: Single) -> Single:
-        """As if the pixels used had no border."""
-        return self._filtered(images, np.asarray(1 / self.spectrum, np.float32))
-
-    def _filtered(self, images: Single, spectrum: Single) -> Single:
-        height, width = self.used.shape
-        smeared = fft.irfft2(fft.rfft2(images, s=self.shape) * spectrum, s=self.shape)
-        return np.asarray(smeared[:, :height, :width] * self.used, np.float32)
+    return solution * (size / scale_dn2).astype(float), (right - rests) * size.astype(float)
 
 
 def _dots(first: Single, second: Single) -> Single:

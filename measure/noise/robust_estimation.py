@@ -6,8 +6,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from measure.array_types import Array, Mask
+
 Real = TypeVar("Real", np.float32, np.float64)
 
 MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares

@@ -14,7 +14,7 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from measure.array_types import Array, Single
 
 _PIECES = 1024  # of the range of codes, in which a curve is straight
 _NODES = np.linspace(0.0, 1.0, _PIECES + 1)
@@ -222,7 +222,7 @@ class Tone:
         tone = replace(self, mean=mean, covariance=(covariance + covariance.T) / 2)
         return ToneEstimate(tone, scatter), log_likelihood / 2
 
-    def light(self, code: NDArray[np.floating] | NDArray[np.integer], full_scale: float) -> NDArray[np.float32]:
+    def light(self, code: NDArray[np.floating] | NDArray[np.integer], full_scale: float) -> Single:
         """Light of grey values of a file whose largest is full_scale, on the same scale: 0 stays 0, and white white."""
         if self.is_identity:
             return np.asarray(code, np.float32)
@@ -273,7 +273,7 @@ class Tone:
         return np.concatenate([np.zeros((_COUNT, 1)), sums], axis=1)
 
     @cached_property
-    def _float32_table(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _float32_table(self) -> tuple[Single, Single]:
         return self._table.astype(np.float32), np.diff(self._table).astype(np.float32)
 
     def __repr__(self) -> str:

@@ -6,11 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.tone.curve import Tone, power, sampled_curve, srgb
-
-Array = NDArray[np.float64]
 
 _ICC_HEADER, _CURVES = 128, (b"kTRC", b"gTRC")  # of a grey profile, and of green (ICC.1:2022, 7.2 and 9.2)
 _SAMPLES = np.linspace(0.0, 1.0, 1025)  # codes at which a parametric curve is tabulated

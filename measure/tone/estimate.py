@@ -4,11 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.tone.curve import Tone, ToneInformation
-
-Array = NDArray[np.float64]
 
 _LONGEST = 1.0  # departure that is changed at a time, in its standard deviations
 

@@ -9,11 +9,9 @@ by N and has the covariance S that the noise gives it: N' S^-1 N is the informat
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.tone.curve import Tone, ToneInformation
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

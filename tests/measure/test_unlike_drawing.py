@@ -10,7 +10,7 @@ from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross
 from measure.matching.covariance import LinearFit
 from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
-from measure.noise.noise_model import NoiseModel, coloured, combined, products, weighted
+from measure.noise.noise_model import NoiseModel, combined, correlated, products, weighted
 
 CROSS = MarkShape(cross(1.5, 0.15))
 FOLD, SPARE_PX = 4, 6
@@ -38,7 +38,7 @@ def test_noise_alone_hardly_is_hardly_taken_for_it(is_grain: bool) -> None:
     by_grey = combined(np.asarray(np.linalg.inv(products(weights, design)), np.float64), weights)
     for _ in range(30):
         white = rng.standard_normal(line.shape)
-        left = coloured(white[None], noise, 0.5)[0] if is_grain else white
+        left = correlated(white[None], noise, 0.5)[0] if is_grain else white
         fit = LinearFit(left, used, design, by_grey, noise, np.ones_like(line))
         by_noise = fit.covariance(by_grey[:2])
         shares.append(np.trace(fit.unlike_drawing_px2(by_noise)) / np.trace(by_noise))
