@@ -16,9 +16,9 @@ demo: $(READY)
 test: lint
 	$(MAKE) --no-print-directory --jobs=2 types suite
 
-# With the studies, fuzz and kills that are marked as slow: many minutes.
+# With the studies, fuzz and kills that are marked `study`: many minutes.
 test-all: lint $(DOCS)/ready
-	$(MAKE) --no-print-directory --jobs=2 types suite MARKED="slow or not slow"
+	$(MAKE) --no-print-directory --jobs=2 types suite MARKED="study or not study"
 
 # One BLAS thread a worker: two on two cores make the small factorisations ten times slower. And byte code is kept, also
 # where the environment forbids it: every process that a test starts would compile the program anew.

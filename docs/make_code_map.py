@@ -4,7 +4,6 @@ A line a module: its name and the first sentence of its docstring. The order on 
 is kept; a module that is new comes last in its folder's list, to be moved where it belongs, and one that is gone goes.
 """
 
-import ast
 import re
 from pathlib import Path
 
@@ -24,7 +23,8 @@ def first_sentences() -> dict[str, str]:
 
 
 def _first_sentence(path: Path) -> str:
-    text = " ".join((ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split("\n\n")[0].split())
+    docstring = re.match(r'"""(.*?)"""', path.read_text(encoding="utf-8"), re.DOTALL)
+    text = " ".join(docstring[1].split("\n\n")[0].split()) if docstring else ""
     found = re.match(r".*?[.!?](?=\s|$)", text)
     return found[0] if found else text
 

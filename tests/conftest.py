@@ -1,9 +1,15 @@
-"""What all tests share: the last lines of a run say what was left out for want of data, or of a browser."""
+"""What all tests share: none takes long, and the last lines of a run say what was left out for want of data, or of a
+browser."""
 
 import browser
+import cpu_limit
 import plain_environment
 import pytest
 from real_data import DATA, REASON
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(cpu_limit)  # beside conftest.py: fixtures of a session are not of this folder
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

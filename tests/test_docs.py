@@ -44,6 +44,7 @@ def test_every_link_of_the_pages_leads_somewhere() -> None:
             assert (page.parent / target).exists(), f"{page.relative_to(DOCS.parent)}: {target}"
 
 
+@pytest.mark.study
 def test_the_gallery_quotes_the_program() -> None:
     page = (DOCS / "failure-gallery.md").read_text(encoding="utf-8")
     assert leveled(page) == leveled(script("make_gallery").text()), "run python docs/make_gallery.py"
@@ -105,7 +106,7 @@ def test_what_the_map_of_the_code_says_to_enter_by_exists() -> None:
     assert not missing
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.skipif(not MKDOCS.exists(), reason="there is no environment of the documentation: make docs")
 def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path: Path) -> None:
     command = [str(MKDOCS), "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]

@@ -43,7 +43,7 @@ def test_a_file_that_hides_a_package_is_named(tmp_path: Path, arguments: list[st
     assert ("Traceback" in done.stderr) == ("-c" in arguments)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_mypy_sees_types_in_a_script_that_uses_the_wheel(tmp_path: Path) -> None:
     """Of an installed wheel, not of the sources."""
     pip = [sys.executable, "-m", "pip", "--quiet"]

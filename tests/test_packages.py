@@ -42,10 +42,19 @@ FORBIDDEN_LIBRARIES = {"adjust": {"cv2", "skimage", "tifffile", "imagecodecs"}}
 
 
 @cache
-def import_statements(file: Path) -> tuple[ast.Import | ast.ImportFrom, ...]:
-    """Of a file, wherever they stand in it."""
+def nodes_of_imports(file: Path) -> tuple[ast.Import | ast.ImportFrom | ast.Call, ...]:
+    """Import statements and calls of `import_module` of a file, wherever they stand in it."""
     nodes = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-    return tuple(node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom))
+    return tuple(
+        node
+        for node in nodes
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        or (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "import_module")
+    )
+
+
+def import_statements(file: Path) -> list[ast.Import | ast.ImportFrom]:
+    return [node for node in nodes_of_imports(file) if not isinstance(node, ast.Call)]
 
 
 def imported(file: Path) -> set[str]:
@@ -144,13 +153,9 @@ def test_what_the_packages_import_is_declared_and_what_is_declared_is_imported()
 
 def imported_by_name(file: Path) -> set[str]:
     """The top-level names in calls of `import_module` with a text."""
-    names = set[str]()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "import_module":
-            (name,) = node.args
-            if isinstance(name, ast.Constant) and isinstance(name.value, str):
-                names.add(name.value.split(".")[0])
-    return names
+    calls = (node for node in nodes_of_imports(file) if isinstance(node, ast.Call))
+    names = [name.value for call in calls for name in call.args if isinstance(name, ast.Constant)]
+    return {name.split(".")[0] for name in names if isinstance(name, str)}
 
 
 def normal(distribution: str) -> str:

@@ -135,6 +135,7 @@ def exterior_of(truth: Truth, image: str) -> Array:
     return np.concatenate([truth.centers[image], angles])
 
 
+@pytest.mark.study
 def test_the_order_of_things_does_not_matter() -> None:
     truth = simulated(field(30.0), CONVERGENT[:3], outliers=0.05)
     network = without_interior(truth.network)

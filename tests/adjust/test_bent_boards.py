@@ -93,6 +93,7 @@ def test_the_bends_of_exact_views_are_found() -> None:
     assert flat.sigma0 > 5.0  # without them the board does not fit
 
 
+@pytest.mark.study
 def test_claimed_sigmas_of_bends_are_realised() -> None:
     """Thirty sets of errors: chi-square per degree of freedom of both bends, c and k1 within three sigmas of 1."""
     rng = np.random.default_rng(8)
@@ -164,6 +165,7 @@ def test_bends_that_heights_can_take_are_named() -> None:
     assert found.singular or found.sigma("BD.board.bend_x") / found.sigma0 > 10.0
 
 
+@pytest.mark.study
 def test_a_choice_of_models_knows_the_bend() -> None:
     """k1 is chosen, and left-out points are predicted where the bent board has them."""
     own = adjust(network_of(np.random.default_rng(3)), approximate(network_of(None)))

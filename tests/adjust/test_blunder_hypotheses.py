@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from planted import KINDS, exchanged, network, outcome, said, with_points
+from studies import parametrize_with_studies
 
 from adjust.errors import AdjustmentError
 from adjust.solution.adjustment import Options, adjust
@@ -14,7 +15,6 @@ FAST = (
     "sign of X, approximate orientations",
     "sign of Z, observed orientations",
     "y of the camera down",
-    "c 10 mm too long",
     "mm for m, approximate orientations",
     "names of two frames exchanged, approximate orientations",
     "nothing, approximate orientations",
@@ -22,7 +22,7 @@ FAST = (
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in KINDS]
+    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.study) for name in KINDS]
 )
 def test_what_is_wrong_with_all_is_named(name: str) -> None:
     kind = KINDS[name]
@@ -30,7 +30,7 @@ def test_what_is_wrong_with_all_is_named(name: str) -> None:
     assert outcome(kind, sentences) == "named", sentences
 
 
-@pytest.mark.parametrize("options", [Options(), Options(robust="igg3")])
+@parametrize_with_studies("options", [Options(), Options(robust="igg3")], quick=(1,))
 def test_targets_of_exchanged_frames_are_named(options: Options) -> None:
     few = network(1)
     with pytest.raises(AdjustmentError, match=r"targets of the frames f1 and f3 are exchanged\. Without this all"):

@@ -71,7 +71,7 @@ def table(file: Path) -> list[list[str]]:
     return [[cell.strip() for cell in line.split(",")] for line in lines if line.strip() and not line.startswith("#")]
 
 
-@pytest.mark.slow  # tests/pipeline/test_published_numbers.py finds the same from files
+@pytest.mark.study  # tests/pipeline/test_published_numbers.py finds the same from files
 def test_the_published_result_is_found_from_nothing(network: Network) -> None:
     """By elements: each parameter to a tenth of its sigma, each sigma to half a percent, sigma0 to its last digit."""
     adjustment = adjust(network, approximate(network), Options(method="elements"))
@@ -83,6 +83,7 @@ def test_the_published_result_is_found_from_nothing(network: Network) -> None:
         assert adjustment.sigma(f"IO.C4040Z.{name}") == pytest.approx(sigma, rel=0.005), name
 
 
+@pytest.mark.study
 def test_the_strict_model_is_near_it(network: Network) -> None:
     adjustment = adjust(network, approximate(network))
     assert adjustment.converged

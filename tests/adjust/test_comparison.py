@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from studies import parametrize_with_studies
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Lens
@@ -50,6 +51,7 @@ def drawn(rng: np.random.Generator, change: Array | float = 0.0) -> CameraCalibr
     return calibration(TRUE + change + error[AT], marks)
 
 
+@pytest.mark.study
 def test_false_alarms_come_as_often_as_stated() -> None:
     rng = np.random.default_rng(1)
     probabilities = np.array([compare([drawn(rng), drawn(rng)], HALF).same.probability for _ in range(160)])
@@ -58,6 +60,7 @@ def test_false_alarms_come_as_often_as_stated() -> None:
         assert abs(int((probabilities < level).sum()) - expected) < 3.5 * np.sqrt(expected * (1 - level))
 
 
+@pytest.mark.study
 def test_a_trend_is_tested_at_its_level_and_found() -> None:
     rng = np.random.default_rng(2)
     years, drift = np.array([1952.0, 1955.0, 1961.0, 1970.0]), np.zeros(7)
@@ -82,6 +85,7 @@ def test_a_trend_is_tested_at_its_level_and_found() -> None:
     assert still.trend_um == pytest.approx(ends.field_um[0], abs=0.05)
 
 
+@pytest.mark.study
 def test_the_sigmas_of_the_field_hold() -> None:
     rng = np.random.default_rng(3)
     compared = [compare([drawn(rng), drawn(rng)], HALF) for _ in range(200)]
@@ -94,7 +98,7 @@ def test_the_sigmas_of_the_field_hold() -> None:
     assert np.median(of_marks / sigmas(compared[0].fiducials_covariance_um2[0])) == pytest.approx(1.0, abs=0.08)
 
 
-@pytest.mark.parametrize(("sigmas", "least"), [(3.0, 0.1), (8.0, 0.9)])
+@parametrize_with_studies(("sigmas", "least"), [(3.0, 0.1), (8.0, 0.9)], quick=(1,))
 def test_a_change_is_found_the_oftener_the_larger_it_is(sigmas: float, least: float) -> None:
     rng = np.random.default_rng(4)
     change = np.zeros(7)

@@ -66,6 +66,7 @@ def test_a_slip_without_a_minimum_is_named() -> None:
     assert "The sign of Y looks wrong." in warning
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("offset", [60.0, 300.0])
 def test_a_slip_with_a_wrong_minimum_is_named_alike(offset: float) -> None:
     network, xyz = field()
@@ -127,6 +128,7 @@ def test_fixed_coordinates_are_slips_as_well() -> None:
     assert "X and Y look exchanged." in result.warnings[0]
 
 
+@pytest.mark.study
 def test_what_is_wrong_with_all_points_is_no_slip_of_one() -> None:
     network, xyz = field(3, 20)
     feet = adjusted(with_given(network, {row: each * [1.0, 1.0, 3.2808] for row, each in enumerate(xyz)}))
@@ -137,6 +139,7 @@ def test_what_is_wrong_with_all_points_is_no_slip_of_one() -> None:
     assert shifted.converged
 
 
+@pytest.mark.study
 @pytest.mark.usefixtures("one_by_one")
 def test_four_points_do_not_tell_which_is_wrong() -> None:
     network, xyz = field(4, 12)

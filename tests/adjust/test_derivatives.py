@@ -8,6 +8,7 @@ from bent_scans import MIDDLE_MM, in_a_bent_scanner
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from simulated import KINDS, Truth, simulated
+from studies import parametrize_with_studies
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Decentering, Distortion, Lens, Prior
@@ -99,7 +100,7 @@ def test_rays_accept_complex_steps() -> None:
 
 
 @pytest.mark.parametrize("by_elements", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
+@parametrize_with_studies("kind", KINDS, quick=(0, 2, 4, 5, 7))
 def test_functions_by_differences_of_computed_observations(kind: Transformation, by_elements: bool) -> None:
     """F(l(x), x) = 0 defines l(x), so that dl/dx = -A^-1 B: by central differences of l for every unknown, of an image
     without a scanner and of three of one that bends."""

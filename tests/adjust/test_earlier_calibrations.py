@@ -90,7 +90,7 @@ def with_calibration(network: Network, calibration: Calibration) -> Network:
     return replace(network, cameras=(free,), calibrations=(calibration,))
 
 
-@pytest.mark.parametrize("kind", [pytest.param("none", marks=pytest.mark.slow), "affine"])
+@pytest.mark.parametrize("kind", [pytest.param("none", marks=pytest.mark.study), "affine"])
 def test_an_earlier_calibration_stands_for_its_observations(kind: Transformation) -> None:
     """A, then B with A's calibration, is A and B together: values, sigmas, v'Pv and redundancy.
 
@@ -204,6 +204,7 @@ def contradicted(sigmas: float, draws: int, level: float = 0.05) -> float:
     return float(np.mean(told))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("sigmas", "draws", "least", "most"), [(0.0, 40, 0.005, 0.13), (4.0, 16, 0.5, 1.0)])
 def test_a_contradiction_is_told_as_often_as_stated(sigmas: float, draws: int, least: float, most: float) -> None:
     """At a level of 5 %: of calibrations of the same camera, and of ones whose c has changed by so many sigmas."""

@@ -11,19 +11,19 @@ from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Network
 from adjust.solution.adjustment import adjust
 
-SLOW = ("pitch ten times too large",)
+QUICK = ("lens: no radial term", "mm for m, stations in m", "noise too small")
 SOUND = KINDS[NOTHING]
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in KINDS]
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.study) for name in KINDS]
 )
 def test_what_the_model_lacks_is_named(name: str) -> None:
     sentences, _ = said(drawn(name, 4))
     assert outcome(name, sentences) == "named", sentences
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", list(KINDS))
 def test_what_the_model_of_a_deep_field_lacks_is_named(name: str) -> None:
     sentences, _ = said(drawn(name, 5))
@@ -42,6 +42,7 @@ def test_figures_are_those_that_were_planted() -> None:
     assert found.p < 1e-6
 
 
+@pytest.mark.study
 def test_gross_errors_of_single_marks_are_no_fault_of_the_model() -> None:
     given = network(scene(6, flat=True), Effects(), SOUND, np.random.default_rng(1))
     xy_mm = given.observations.xy_mm.copy()
@@ -56,10 +57,12 @@ def sound(frame_mm: tuple[float, float] = (12.8, 9.6), seed: int = 6) -> Network
     return replace(given, cameras=(replace(given.cameras[0], frame_mm=frame_mm),))
 
 
+@pytest.mark.study
 def test_a_sound_network_has_nothing_implausible() -> None:
     assert said(sound())[0] == []
 
 
+@pytest.mark.study
 def test_a_board_that_is_transparent_shows_from_both_sides() -> None:
     kind = replace(KINDS["one image mirrored, frame_mm"])
     given = network(scene(6, flat=True), Effects(mirrored=True), kind, np.random.default_rng(1))
@@ -69,6 +72,7 @@ def test_a_board_that_is_transparent_shows_from_both_sides() -> None:
     assert adjust(replace(given, transparent=True)).misread == ()
 
 
+@pytest.mark.study
 def test_marks_outside_the_picture_are_named() -> None:
     given = sound()
     assert any("marks lie outside the picture" in each for each in said(sound((10.0, 9.6)))[0])
@@ -78,6 +82,7 @@ def test_marks_outside_the_picture_are_named() -> None:
     assert said(moved)[0] == []  # coordinates that count from the middle of the picture
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("given_mm", "words"),
     [((6.4, -4.8), ""), ((6.9, -4.8), "from (6.9, -4.8) ± (0.05, 0.05)"), ((6.4, 4.8), "The sign of y looks wrong")],
@@ -90,6 +95,7 @@ def test_a_principal_point_far_from_where_it_is_given_is_named(given_mm: tuple[f
     assert bool(named) == bool(words), sentences
 
 
+@pytest.mark.study
 def test_a_principal_point_outside_the_picture_is_named() -> None:
     """The picture is cut from the left part of the sensor's: its size says where it ends."""
     given = sound()
@@ -99,6 +105,7 @@ def test_a_principal_point_outside_the_picture_is_named() -> None:
     assert any("outside the picture (x from 0 to 5.6" in each for each in sentences), sentences
 
 
+@pytest.mark.study
 def test_images_that_look_straight_at_a_board_are_named() -> None:
     made = scene(6, flat=True)
     count = len(made.rotations)
@@ -108,6 +115,7 @@ def test_images_that_look_straight_at_a_board_are_named() -> None:
         adjust(network(straight, Effects(), Kind(lambda e: Effects(), ()), np.random.default_rng(1)))
 
 
+@pytest.mark.study
 def test_derivatives_of_cameras_with_different_families() -> None:
     """What only one of them has, the other has no derivative by."""
     given = network(scene(4, flat=True), Effects(), SOUND, np.random.default_rng(1))

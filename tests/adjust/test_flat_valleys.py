@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from studies import parametrize_with_studies
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
@@ -102,8 +103,8 @@ def distortion_errors(result: Adjustment, radius_mm: float) -> tuple[Array, Arra
     return ((ideal(values) - true_ideal(places)) * outward).sum(axis=1), sigma
 
 
-@pytest.mark.parametrize("free", [EIGHT, TWELVE, FOURTEEN])
-@pytest.mark.parametrize("seed", [0, 1])
+@parametrize_with_studies("free", [EIGHT, TWELVE, FOURTEEN], quick=(0, 1))
+@parametrize_with_studies("seed", [0, 1])
 def test_an_ordinary_board_gives_a_rational_lens(seed: int, free: tuple[str, ...]) -> None:
     result = adjust(board_network(seed, free))
     assert result.converged
@@ -142,7 +143,7 @@ def test_the_other_lenses_have_no_pseudo_observations() -> None:
     assert result.redundancy == 2 * len(network.observations) - result.unknowns
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_distortion_is_as_uncertain_as_it_claims() -> None:
     """Monte Carlo: realised over claimed at three radii, 100 trials; each within what chance allows at 99 %."""
     exact = board_network(0, EIGHT, noise=False)

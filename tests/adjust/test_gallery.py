@@ -30,6 +30,8 @@ GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
     "principal distance of camera K can change": [("it (F9)", lambda network: given(network, {"c": 1.0}))],
 }
 
+DEAR = ("nearly-flat", "swapped")
+
 
 @pytest.mark.parametrize("name", list(CATALOGUE))
 def test_number_words_and_changes_of_the_network_that_mend_it(name: str) -> None:
@@ -75,7 +77,7 @@ def test_fiducials_with_priors_end_what_they_are_to_end(name: str) -> None:
         assert not causes(mended, gone)
 
 
-@pytest.mark.parametrize("name", list(MISHAPS))
+@pytest.mark.parametrize("name", [n if n not in DEAR else pytest.param(n, marks=pytest.mark.study) for n in MISHAPS])
 def test_other_mishaps_are_told_in_words(name: str) -> None:
     mishap = MISHAPS[name]
     said = sentences(adjust(*mishap.network(), mishap.options))

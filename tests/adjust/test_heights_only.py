@@ -39,7 +39,8 @@ def with_heights_alone(seed: int) -> Network:
     return replace(network, points=points, cameras=(interior,))
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.study
+@pytest.mark.parametrize("seed", [1, 2])
 def test_tilted_frames_are_oriented_and_calibrate_the_camera(seed: int) -> None:
     """They start as if they looked straight down, where heights do not tell the principal distance."""
     network = with_heights_alone(seed)

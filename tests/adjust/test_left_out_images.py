@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from studies import parametrize_with_studies
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
@@ -64,7 +65,7 @@ def network_of(
     )
 
 
-@pytest.mark.parametrize("robust", [False, True])
+@parametrize_with_studies("robust", [False, True], quick=(1,))
 def test_an_image_with_wrong_names_is_left_out(robust: bool) -> None:
     rng = np.random.default_rng(1)
     images = good_images(8, rng)
@@ -107,6 +108,7 @@ def test_an_image_of_the_lens_far_outside_comes_in_with_the_adjusted_lens() -> N
     assert 0.9 < result.sigma0 < 1.1
 
 
+@pytest.mark.study
 def test_where_half_of_the_images_fail_it_is_no_single_one() -> None:
     rng = np.random.default_rng(4)
     images = good_images(2, rng)
@@ -116,6 +118,7 @@ def test_where_half_of_the_images_fail_it_is_no_single_one() -> None:
         adjust(network)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("robust", [False, True])
 def test_an_image_with_a_point_behind_its_camera_is_left_out(robust: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """One number of 55 is wrong: its point, in sight of all others, lies behind that one camera."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from lens_networks import LENSES, R0_MM, network_of
+from studies import parametrize_with_studies
 
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Distortion, Lens
@@ -24,7 +25,7 @@ def test_a_lens_is_found_from_exact_images(name: str) -> None:
         assert abs(found.value(f"IO.L.{each}") - value) < 1e-4 * found.sigma(f"IO.L.{each}") / found.sigma0, each
 
 
-@pytest.mark.parametrize("name", list(LENSES))
+@parametrize_with_studies("name", list(LENSES))
 def test_nothing_but_the_points_has_to_be_known(name: str) -> None:
     """Neither c nor the principal point; of the fisheye points up to 80 degrees off the axis."""
     network = network_of(name, np.random.default_rng(1))
@@ -38,7 +39,7 @@ def test_nothing_but_the_points_has_to_be_known(name: str) -> None:
     assert abs(found.value("IO.L.c") - LENSES[name][0]) < 4.0 * found.sigma("IO.L.c")
 
 
-@pytest.mark.parametrize("name", list(LENSES))
+@parametrize_with_studies("name", list(LENSES), quick=(3,))
 def test_claimed_sigmas_are_realised(name: str) -> None:
     """Twelve sets of errors, pooled over the parameters: chi-square per degree of freedom within three sigmas of 1."""
     rng = np.random.default_rng(5)

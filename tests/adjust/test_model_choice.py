@@ -74,6 +74,7 @@ def test_the_true_lens_is_chosen_and_the_simpler_ones_are_told_to_be_too_simple(
     assert {each.model.name for each in choice.candidates} >= {"ebner", "legendre(3)"}
 
 
+@pytest.mark.study
 def test_a_scanners_bend_is_chosen_and_not_taken_for_a_richer_film() -> None:
     """Frames of marks alone, in all four quarters: the terms that bend, beside films that are affine."""
     bend = {"a20": 0.02, "b11": -0.015}
@@ -86,6 +87,7 @@ def test_a_scanners_bend_is_chosen_and_not_taken_for_a_richer_film() -> None:
     assert any(reason.startswith("affine, no distortion is too simple: ") for reason in choice.reasons)
 
 
+@pytest.mark.study
 def test_a_straight_scanner_gets_no_bend_and_what_is_not_told_is_said() -> None:
     few = {name: MARKS_MM[name] for name in "1234"}
     network = films([0.0] * 3, {}, {}, np.random.default_rng(2), marks_mm=few)
@@ -95,7 +97,7 @@ def test_a_straight_scanner_gets_no_bend_and_what_is_not_told_is_said() -> None:
     assert any("all frames lie alike in the scanner" in reason for reason in choice.reasons)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("film", ["none", "congruent", "similarity", "affine", "projective"])
 @pytest.mark.parametrize("lens", list(LENSES))
 def test_the_true_model_is_chosen_nearly_always_and_no_strong_effect_is_ever_missed(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from studies import parametrize_with_studies
 
 from adjust.initial_values.absolute_orientation import absolute_orientation
 from adjust.initial_values.intersection import intersect
@@ -70,7 +71,7 @@ def model_in_space(rng: np.random.Generator) -> tuple[Array, Array, Array, Array
     )
 
 
-@pytest.mark.parametrize("datum", ["all", "minimal", "planimetry and three heights"])
+@parametrize_with_studies("datum", ["all", "minimal", "planimetry and three heights"], quick=(1,))
 def test_absolute_orientation_recovers_the_object_space(datum: str) -> None:
     rng = np.random.default_rng(6)
     for _ in range(4):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from studies import parametrize_with_studies
 
 from adjust.functional_model.rotation import rotation_from_vector
 from adjust.target_identification.naming import Names, name_marks
@@ -39,7 +40,7 @@ def lattice(columns: int, rows: int, jitter: float, rng: np.random.Generator) ->
     return np.column_stack([moved, np.zeros(len(xy))])
 
 
-@pytest.mark.parametrize(("points", "depth"), [(20, 0.5), (60, 0.3), (60, 0.0)])
+@parametrize_with_studies(("points", "depth"), [(20, 0.5), (60, 0.3), (60, 0.0)])
 def test_a_fifth_missing_and_a_fifth_false(points: int, depth: float) -> None:
     rng = np.random.default_rng([points, round(10 * depth)])
     xyz = rng.uniform(-0.5, 0.5, (points, 3)) * (0.9, 0.6, depth)
@@ -51,6 +52,7 @@ def test_a_fifth_missing_and_a_fifth_false(points: int, depth: float) -> None:
     assert names.log10_chance < -10.0
 
 
+@pytest.mark.study
 def test_names_do_not_depend_on_the_order_of_the_marks() -> None:
     rng = np.random.default_rng(3)
     xyz = rng.uniform(-0.4, 0.4, (20, 3))
@@ -61,6 +63,7 @@ def test_names_do_not_depend_on_the_order_of_the_marks() -> None:
     assert turned.mark == {point: len(marks) - 1 - mark for point, mark in names.mark.items()}
 
 
+@pytest.mark.study
 def test_marks_of_nothing_known_get_no_names() -> None:
     rng = np.random.default_rng(4)
     xyz = rng.uniform(-0.5, 0.5, (14, 3))
@@ -81,7 +84,7 @@ def test_a_regular_grid_has_no_names_of_its_own() -> None:
     assert "as a regular grid does" in refused
 
 
-@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.study) for seed in (1, 2))])
 def test_a_grid_off_by_a_twentieth_of_its_step_is_told_by_how_closely_its_marks_agree(seed: int) -> None:
     """Moved on or turned, it agrees with most of the marks as well, but not as closely."""
     rng = np.random.default_rng([9, seed])
@@ -100,6 +103,7 @@ def test_marks_left_out_do_not_tell_where_a_regular_grid_begins() -> None:
     assert "about as closely" in refused
 
 
+@pytest.mark.study
 def test_a_field_seen_from_behind_is_no_other_naming() -> None:
     """A lattice that is its own mirror image may be seen from either side, unless it is known where its points face."""
     rng = np.random.default_rng(6)

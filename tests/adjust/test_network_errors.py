@@ -130,6 +130,7 @@ def test_a_missing_approximation() -> None:
         adjust(network, replace(start, transformation=dict(start.transformation) | {"f1": np.zeros(4)}))
 
 
+@pytest.mark.study
 def test_unknown_point_without_approximation() -> None:
     network, start = simulated(np.random.default_rng(1))
     points = (ObjectPoint("0", None, None, Prior(3.0, 0.1)), *network.points[1:])
@@ -146,6 +147,7 @@ def test_an_image_with_two_targets_and_a_known_orientation_is_adjusted() -> None
     assert result.converged
 
 
+@pytest.mark.study
 def test_wrong_point_numbers_diverge_or_show() -> None:
     """Two images whose points are numbered the other way round never end as if all were well."""
     network, start = simulated(np.random.default_rng(1))

@@ -278,6 +278,7 @@ def wide_network(seed: int, lens: Array = WIDE) -> Network:
     return Network((wide,), tuple(Image(f"i{i}", "D", "none") for i in range(5)), points, observations)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_rational_distortion_begins_at_zero(seed: int) -> None:
     """Where its numerator and its denominator do the same: the solution is regular, and it is found."""

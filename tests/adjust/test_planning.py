@@ -42,6 +42,7 @@ def test_what_was_measured_does_not_matter() -> None:
         assert other.sigma(name) == pytest.approx(one.sigma(name), rel=1e-12)
 
 
+@pytest.mark.study
 def test_simulated_measurements_scatter_as_planned() -> None:
     network, values = simulated(np.random.default_rng(0), noise=False, free={"k3": np.inf})
     network = with_interior(network, np.inf)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from reference_cases import approximations_of, load, network_of, own_name
 from simulated import Truth, field_points, simulated
+from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
@@ -51,6 +52,7 @@ def heights_only() -> tuple[Network, Approximations]:
     return replace(network, points=points), start
 
 
+@pytest.mark.study
 def test_a_curved_valley_is_followed() -> None:
     """Nine of ten starts reach the minimum; before steps were bent along the valley, one of six did."""
     network, start = heights_only()
@@ -74,7 +76,7 @@ def test_the_history_tells_what_was_done() -> None:
     assert result.history[-1].damping == 0.0
 
 
-@pytest.mark.parametrize("sigma", [2.0, np.inf])
+@parametrize_with_studies("sigma", [2.0, np.inf], quick=(1,))
 def test_a_principal_distance_that_is_a_guess_is_found_from_the_images(sigma: float) -> None:
     """Twice the true one, and known no better than that: it is sought where the iteration does not come to rest."""
     rng = np.random.default_rng(1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
+from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import Approximations, LineOfSight, Network, ObjectPoint
@@ -52,7 +53,7 @@ def sigmas_apart(here: Adjustment, there: Adjustment) -> float:
     return float(np.abs((there.values - here.values)[free] / sigma[free]).max())
 
 
-@pytest.mark.parametrize(("sigma", "datum"), [(0.0, "control"), (0.0005, "control"), (np.inf, "free")])
+@parametrize_with_studies(("sigma", "datum"), [(0.0, "control"), (0.0005, "control"), (np.inf, "free")])
 def test_a_network_with_seven_digits_comes_to_the_same_result(sigma: float, datum: Datum) -> None:
     network = on_grid(small_network(sigma)[0])
     here = adjust(network, options=Options(datum=datum))

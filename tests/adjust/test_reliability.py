@@ -244,7 +244,7 @@ def test_critical_tau_is_the_quantile_of_a_residual_over_the_sigma0_that_it_is_p
     assert np.isinf(Probabilities().critical_tau(1))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_smallest_detectable_error_is_detected_as_often_as_told() -> None:
     """Four errors in five at a level of 0.1 %, by the test of the coordinate and by that of the point."""
     points = field_points(np.random.default_rng(0), 12)

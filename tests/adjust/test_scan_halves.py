@@ -26,6 +26,7 @@ def errors(halves: Halves, adjustment: Adjustment) -> dict[str, np.ndarray]:
     return {name: np.array(each) for name, each in found.items() if each}
 
 
+@pytest.mark.study
 def test_errors_are_as_large_as_the_standard_deviations_say() -> None:
     collected: dict[str, list[np.ndarray]] = {}
     for seed in range(16):

@@ -52,6 +52,7 @@ def test_what_is_there_is_significant_and_what_is_not_is_not() -> None:
     assert min(p["p1"], p["p2"], p["decentering"], p["x0"], p["y0"]) > 0.01
 
 
+@pytest.mark.study
 def test_superfluous_parameters_have_evenly_spread_p() -> None:
     """p of p1, of the pair and of the priors' departures are uniform where these are true (Kolmogorov-Smirnov)."""
     truth = Truth(distortion={})

@@ -99,12 +99,14 @@ def test_wrong_given_values_are_named() -> None:
         assert named(adjust(spoilt, start, options)) == ["control point 5 Z", "given fiducial 3 (camera K)"]
 
 
+@pytest.mark.study
 def test_clean_observations_are_rarely_suspect() -> None:
     """One adjustment of a hundred is expected to name any."""
     called = sum(bool(named(adjust(*checkable(100 + seed, 6)))) for seed in range(40))
     assert called <= 3
 
 
+@pytest.mark.study
 def test_observations_all_worse_than_said_raise_the_limits_by_the_square_of_their_scale() -> None:
     """Errors three times as large as they are given: a statistic is a square, so that chance lets it be nine times."""
     network, start = checkable(3)
@@ -117,6 +119,7 @@ def test_observations_all_worse_than_said_raise_the_limits_by_the_square_of_thei
     assert named(result) == sorted(row_name(network, row) for row in amounts)
 
 
+@pytest.mark.study
 def test_two_rays_of_a_point_cannot_be_told_apart() -> None:
     network, start = simulated(np.random.default_rng(4), point_sigma=0.0)
     rows = network.observations
@@ -130,6 +133,7 @@ def test_two_rays_of_a_point_cannot_be_told_apart() -> None:
     assert {result.suspects[0].tested.name, *result.suspects[0].alike} == rays
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("size_mm", [0.1, 5.0])
 def test_five_percent_of_gross_errors_lose_their_influence_wholly(size_mm: float) -> None:
     rng = np.random.default_rng(4)

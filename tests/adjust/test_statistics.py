@@ -70,11 +70,12 @@ def check_monte_carlo(runs: int) -> None:
     assert variance.mean() == pytest.approx(1.0, abs=6.0 * variance.std() / np.sqrt(runs))
 
 
+@pytest.mark.study
 def test_claimed_standard_deviations_are_realised() -> None:
     check_monte_carlo(40)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_claimed_standard_deviations_are_realised_closely() -> None:
     check_monte_carlo(3000)
 
@@ -167,6 +168,7 @@ def with_gross_errors(rng: np.random.Generator) -> tuple[Adjustment, Adjustment,
     return adjust(network, start), adjust(dirty, start), adjust(dirty, start, Options(robust=True)), wrong
 
 
+@pytest.mark.study
 def test_robust_estimation_withstands_gross_errors() -> None:
     clean, plain, robust, wrong = with_gross_errors(np.random.default_rng(6))
     names = [name for name in clean.names if name.startswith(("EO.", "IO.")) and clean.sigma(name) > 0.0]

@@ -21,6 +21,7 @@ def exchanged(network: Network, image: str, first: str, second: str) -> Network:
     return replace(network, observations=replace(observations, point=points))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("seed", "known"), [(8, POINTS), (7, 7)])
 def test_exchanged_numbers_are_named_whether_the_adjustment_ends_or_not(seed: int, known: int) -> None:
     rng = np.random.default_rng(seed)
@@ -38,6 +39,7 @@ def test_exchanged_numbers_are_named_whether_the_adjustment_ends_or_not(seed: in
     ]
 
 
+@pytest.mark.study
 def test_an_image_that_starts_upside_down_has_no_swapped_numbers() -> None:
     rng = np.random.default_rng(1)
     network, start = simulated(rng, points=field_points(rng, POINTS))

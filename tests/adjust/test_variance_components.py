@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from simulated import field_points, simulated
+from studies import parametrize_with_studies
 
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.least_squares.iteration import linearise
@@ -60,7 +61,7 @@ def dense_sigmas(network: Network, start: Approximations, result: Adjustment) ->
     return list(factors * np.sqrt(2.0 * np.diag(np.linalg.inv(np.array(helmert)))))
 
 
-@pytest.mark.parametrize("points", [8, 20])  # images, then points are eliminated first
+@parametrize_with_studies("points", [8, 20])  # images, then points are eliminated first
 def test_the_sigmas_of_the_factors_are_helmerts(points: int) -> None:
     network, start = checkable(3, points)
     result = adjust(network, start, Options(variance_components=GROUPS))
@@ -80,6 +81,7 @@ def test_a_group_without_redundancy_keeps_its_variance() -> None:
     assert few.variance_factors == {}
 
 
+@pytest.mark.study
 def test_a_gross_error_that_is_left_out_does_not_spoil_the_factors() -> None:
     network, start = checkable(5, 15)
     xy = network.observations.xy_mm.copy()
@@ -91,7 +93,7 @@ def test_a_gross_error_that_is_left_out_does_not_spoil_the_factors() -> None:
     assert result.variance_factors["target"] == pytest.approx(clean.variance_factors["target"], rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_factors_scatter_as_claimed() -> None:
     runs = [adjust(*checkable(1000 + seed, 15), Options(variance_components=GROUPS)) for seed in range(300)]
     for group in GROUPS:

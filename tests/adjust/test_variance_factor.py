@@ -129,16 +129,17 @@ def test_corrections_are_the_residuals_of_a_least_squares_fit() -> None:
     assert corrections_to_given([film], moved[:3], given[:3]) is None
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("kind", "marks", "count"),
     [
         ("affine", 4, 1),
         ("affine", 4, 2),
-        pytest.param("projective", 8, 2, marks=pytest.mark.slow),
-        pytest.param("bilinear", 8, 2, marks=pytest.mark.slow),
-        pytest.param("congruent", 4, 2, marks=pytest.mark.slow),
-        pytest.param("conformal(2)", 8, 5, marks=pytest.mark.slow),
-        pytest.param("polynomial(2)", 8, 5, marks=pytest.mark.slow),
+        ("projective", 8, 2),
+        ("bilinear", 8, 2),
+        ("congruent", 4, 2),
+        ("conformal(2)", 8, 5),
+        ("polynomial(2)", 8, 5),
     ],
 )
 def test_every_sigma_holds_against_realisations(kind: Transformation, marks: int, count: int) -> None:

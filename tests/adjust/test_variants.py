@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from dense_adjustment import solve_densely
 from simulated import Truth, field_points, simulated
+from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import rotation_from_angles
@@ -154,7 +155,7 @@ CASES = (
 )
 
 
-@pytest.mark.parametrize("case", CASES)
+@parametrize_with_studies("case", CASES, quick=(2, 3, 5, 7))
 def test_variant(case: Callable[[], Case]) -> None:
     network, start = case()
     result = adjust(network, start)

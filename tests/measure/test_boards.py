@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from real_data import DATA, needs
 from scipy.io import loadmat
 from scipy.spatial import KDTree
+from studies import parametrize_with_studies
 
 from measure.boards.corners import one_definition
 from measure.boards.find import is_even, whole_pattern
@@ -89,7 +90,7 @@ def chessboard_dark(spec: ChessboardSpec) -> Any:
 
 
 @pytest.mark.parametrize(
-    "turn_deg", [*(pytest.param(turn, marks=pytest.mark.slow) for turn in (4.0, 100.0)), 187.0, 275.0]
+    "turn_deg", [*(pytest.param(turn, marks=pytest.mark.study) for turn in (4.0, 100.0, 275.0)), 187.0]
 )
 def test_a_chessboard_in_any_direction_keeps_its_names(turn_deg: float) -> None:
     spec = ChessboardSpec(6, 5, 24.0)
@@ -102,6 +103,7 @@ def test_a_chessboard_in_any_direction_keeps_its_names(turn_deg: float) -> None:
     assert np.sqrt(np.mean(errors**2)) < 0.012
 
 
+@pytest.mark.study
 def test_trap_half_a_pixel_lost() -> None:
     """The mean error of a whole board is a few thousandths of a pixel, at full size and searched at a reduced one."""
     spec = ChessboardSpec(6, 5, 24.0)
@@ -136,7 +138,7 @@ def circles_dark(spec: CircleGridSpec) -> Any:
     return dark
 
 
-@pytest.mark.parametrize(
+@parametrize_with_studies(
     "spec",
     [
         CircleGridSpec(6, 5, 30.0, 14.0),
@@ -195,6 +197,7 @@ def charuco_picture(spec: CharucoSpec, homography: Array) -> Array:
 OLDER = CharucoSpec("4X4_50", 6, 6, 32.0, 24.0, legacy=True)
 
 
+@pytest.mark.study
 def test_trap_charuco_corners_of_the_older_layout_have_their_neighbours_names() -> None:
     """The markers tell the layout; one that is set against them is refused."""
     homography = board_from_pixel(5.0, 2e-4) * np.array([[1.2], [1.2], [1.0]])
@@ -238,7 +241,7 @@ def test_a_charuco_corner_is_held_against_the_markers_beside_it() -> None:
     assert "1.0 squares off where the markers beside it put it" in off_corners(found, spec, read)["c2"]
 
 
-@pytest.mark.parametrize(
+@parametrize_with_studies(
     ("columns", "rows", "words"),
     [
         (5, 5, "one of 6 x 5 is. Set columns and rows"),
@@ -247,6 +250,7 @@ def test_a_charuco_corner_is_held_against_the_markers_beside_it() -> None:
         (7, 5, "one of 6 x 5 is. Set columns and rows"),
         (7, 6, "one of 6 x 5 is: squares may have been counted"),
     ],
+    quick=(2,),
 )
 def test_a_chessboard_of_another_count_is_refused_with_its_own(columns: int, rows: int, words: str) -> None:
     spec = ChessboardSpec(6, 5, 24.0)
@@ -290,7 +294,7 @@ def test_a_pattern_grows_to_where_it_ends() -> None:
     assert not cut.is_bounded
 
 
-@pytest.mark.parametrize("dictionary", ["5X5_100", "APRILTAG_36h11"])
+@parametrize_with_studies("dictionary", ["5X5_100", "APRILTAG_36h11"], quick=(1,))
 def test_aruco_and_apriltag_corners(dictionary: str) -> None:
     spec = ArucoSpec(dictionary, 3, 2, 63.0, 21.0, first_marker=7)
     drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary(dictionary), np.arange(7, 13))
@@ -313,7 +317,7 @@ def squares_dark(spec: SquareGridSpec) -> Any:
     return dark
 
 
-@pytest.mark.parametrize(("turn_deg", "gap_mm"), [(-25.0, 18.0), (7.0, 9.0)])
+@parametrize_with_studies(("turn_deg", "gap_mm"), [(-25.0, 18.0), (7.0, 9.0)], quick=(1,))
 def test_corners_of_separate_squares(turn_deg: float, gap_mm: float) -> None:
     """Named by row, column and corner, to some hundredths of a pixel, their standard deviations honest."""
     spec = SquareGridSpec(5, 4, 45.0 - gap_mm, gap_mm)
@@ -329,6 +333,7 @@ def test_corners_of_separate_squares(turn_deg: float, gap_mm: float) -> None:
     assert 0.6 < np.mean(squares) / 2.0 < 1.6
 
 
+@pytest.mark.study
 def test_a_grid_of_squares_with_some_hidden_keeps_its_names() -> None:
     """A square that is covered is absent, with the reason; the others are what they are."""
     spec = SquareGridSpec(5, 4, 27.0, 18.0)
@@ -389,7 +394,7 @@ def beside_each_other(spec: BoardSpec, is_dark: Any, shown: tuple[float, ...], f
     return 8000 + 30000 * clean + np.random.default_rng(4).normal(0, 300, clean.shape)
 
 
-@pytest.mark.parametrize("kind", ["chessboard", "circle-grid", "squares"])
+@parametrize_with_studies("kind", ["chessboard", "circle-grid", "squares"])
 def test_of_boards_that_look_the_same_none_is_observed(kind: str) -> None:
     """Neither by their size, for nobody knows how far away they are; the reason says how many, and where."""
     spec: ChessboardSpec | CircleGridSpec | SquareGridSpec
@@ -523,6 +528,7 @@ def chessboards(numbers: Iterable[int]) -> tuple[list[Array], list[Array]]:
     )
 
 
+@pytest.mark.study
 @needs("chessboards", "bouguet")
 def test_crossings_under_coma_are_where_a_published_calibration_has_them() -> None:
     """Matched under a symmetric blur they lie elsewhere."""
@@ -536,7 +542,7 @@ def test_crossings_under_coma_are_where_a_published_calibration_has_them() -> No
     assert np.median(met) < 0.6 * np.median(matched)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @needs("chessboards", "bouguet")
 def test_published_calibration_of_a_chessboard() -> None:
     """Every parameter within three of the published standard deviations, in spite of that lens's coma."""
@@ -549,7 +555,7 @@ def test_published_calibration_of_a_chessboard() -> None:
     assert np.all(np.abs(np.array(found) - PUBLISHED) < THREE_SIGMA)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @needs("circles", "boofcv")
 def test_hexagonal_circle_grids_of_another_project() -> None:
     spec = CircleGridSpec(24, 28, 1.2 * np.sqrt(3) / 2, 1.0, asymmetric=True, row_spacing_mm=0.6)

@@ -9,6 +9,7 @@ import pytest
 import tifffile
 from brute_marks import Array, written_scan
 from drawn_frames import CORNERS, NUMBERED, RING_CROSS, assert_right, frame_picture, layout_of, pixel_from_camera
+from studies import parametrize_with_studies
 
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
@@ -45,7 +46,7 @@ def measured(
         return measure_fiducials(scan, layout, PITCH_UM), bool(searches)
 
 
-@pytest.mark.parametrize("pose", ["0", "270m"])
+@parametrize_with_studies("pose", ["0", "270m"])
 def test_a_frame_in_the_middle_is_found_and_named_without_the_whole_scan(
     pose: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -58,7 +59,7 @@ def test_a_frame_in_the_middle_is_found_and_named_without_the_whole_scan(
     assert_right(result, NUMBERED, matrix)
 
 
-@pytest.mark.parametrize("center", [(225.0, 180.0), (202.3, 197.6)])
+@parametrize_with_studies("center", [(225.0, 180.0), (202.3, 197.6)])
 def test_a_frame_off_the_middle_or_with_a_mark_hidden_is_searched_everywhere(
     center: tuple[float, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -80,7 +81,7 @@ def test_a_frame_off_the_middle_or_with_a_mark_hidden_is_searched_everywhere(
     assert max(off) < 0.1
 
 
-@pytest.mark.parametrize("bent_mm", [0.0, 0.03])
+@parametrize_with_studies("bent_mm", [0.0, 0.03])
 def test_of_a_large_scan_with_all_marks_clear_only_windows_are_read(bent_mm: float, tmp_path: Path) -> None:
     """One of eight marks lies farther off than most, by next to nothing or as much as film bends: none is missing, and
     no more of the file is read. How much is, a reader counts that decodes its tiles."""

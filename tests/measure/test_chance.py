@@ -145,6 +145,7 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     assert result.pixel_from_camera is None
 
 
+@pytest.mark.study
 def test_specks_that_lie_as_all_marks_are_doubted_too() -> None:
     as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))

@@ -35,12 +35,16 @@ def clicks_at(matrix: Array, points: str, off_px: tuple[float, float] = (1.2, -0
 def test_three_clicks_find_a_frame_in_any_pose_that_no_search_finds(pose: str, tmp_path: Path) -> None:
     matrix = pixel_from_camera(pose, FAR_TURN_RAD)
     grey = frame_picture(ALIKE, matrix)
-    if pose == "0":
-        assert not any(mark.status.is_observation for mark in measured(grey, ALIKE, tmp_path).marks)
     result = measured(grey, ALIKE, tmp_path, FiducialOptions(clicks=clicks_at(matrix, "124")))
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == (pose, True)
     assert_right(result, ALIKE, matrix)
+
+
+@pytest.mark.study
+def test_no_search_finds_a_frame_that_lies_so(tmp_path: Path) -> None:
+    grey = frame_picture(ALIKE, pixel_from_camera("0", FAR_TURN_RAD))
+    assert not any(mark.status.is_observation for mark in measured(grey, ALIKE, tmp_path).marks)
 
 
 def test_clicks_that_contradict_the_set_pose_give_no_observation(tmp_path: Path) -> None:
@@ -73,6 +77,7 @@ def test_marks_on_a_line_do_not_tell_the_pose(tmp_path: Path) -> None:
     assert not result.pose.decided
 
 
+@pytest.mark.study
 def test_a_click_where_nothing_is_matched_counts_as_well_as_one_points(tmp_path: Path) -> None:
     """The mark's corner is bare ground: with the others' frame alone it would only be predicted."""
     matrix = pixel_from_camera("0")

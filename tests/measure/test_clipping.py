@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from drawn import scan_of
+from studies import parametrize_with_studies
 from true_marks import KIND, TrueMark, some_mark, whitened_rms
 
 from measure.detection.localisation import MarkPrediction
@@ -40,7 +41,7 @@ def test_clipping_does_not_move_a_mark(name: str, beyond: float) -> None:
     np.testing.assert_allclose(sighted(mark, FULL - grey, 1).center_px, mark.place[:, 2], atol=0.002)
 
 
-@pytest.mark.parametrize("name", ["ring-dot", "wing"])
+@parametrize_with_studies("name", ["ring-dot", "wing"], quick=(1,))
 def test_the_sigma_of_a_clipped_mark_says_what_was_lost(name: str) -> None:
     rng = np.random.default_rng(2)
     errors, covariances, whole = [], [], []

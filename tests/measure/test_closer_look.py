@@ -33,6 +33,7 @@ def wing(x: float, y: float) -> MarkShape:
     return MarkShape(tuple(turned_part(part, float(np.degrees(np.arctan2(y, x)))) for part in WING))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("contrast", [4500.0, 0.0])
 def test_wings_are_found_beside_an_edge_that_is_nine_times_as_strong(contrast: float) -> None:
     rng = np.random.default_rng(3)

@@ -6,6 +6,7 @@ from drawn import drawn, transformed, whitened
 from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal
+from studies import parametrize_with_studies
 
 from measure.boards.corners import Corner, Surface, crossing, fit_corner, quarter
 from measure.matching.window import ScanWindow
@@ -52,7 +53,7 @@ def fitted(window: Array, start: Array, steps: Array, alone: bool) -> Corner:
     return fit_corner(ScanWindow(window), start, steps, np.array([6.0, 6.0]), quarter if alone else crossing)
 
 
-@pytest.mark.parametrize(("blur_px", "alone"), [(0.5, False), (0.9, False), (1.5, False), (0.8, True)])
+@parametrize_with_studies(("blur_px", "alone"), [(0.5, False), (0.9, False), (1.5, False), (0.8, True)], quick=(1,))
 def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) -> None:
     rng = np.random.default_rng(2)
     errors = []

@@ -20,7 +20,7 @@ from measure.fiducials.frame_checks import with_damage
 from measure.flags import Status
 from measure.scans.opening import open_scan
 
-CASES = 20  # of each damage in each kind of file, in the slow study
+CASES = 20  # of each damage in each kind of file, in the study
 LONGEST_S = 20.0  # of the processor
 WAITED_S = 300.0  # until a case is a hang: the machine may have other work
 MOST_BYTES = 1 << 30
@@ -34,6 +34,7 @@ def damaged(name: str, kind: str, case: int) -> bytes:
     return bytes(data)
 
 
+@pytest.mark.study
 def test_a_share_of_the_damaged_files(tmp_path: Path) -> None:
     """Some kinds of files, each with another damage that leaves marks to be measured."""
     path = tmp_path / "s"
@@ -110,9 +111,9 @@ def test_a_mark_in_a_damaged_tile_is_absent_and_the_others_are_measured(tmp_path
     assert "file is damaged at its place: tile 0" in frame.marks[2].reason
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_damaged_files_by_the_thousand(tmp_path: Path) -> None:
-    """In a process of its own, which has so much memory and no more. (python -m pytest -m slow -s says the counts.)"""
+    """In a process of its own, which has so much memory and no more. (python -m pytest -m study -s says the counts.)"""
     counts: dict[str, Counter[str]] = {name: Counter() for name in stored()}
     bad = []
     for name, kind, case, told in _outcomes(tmp_path):

@@ -5,6 +5,7 @@ import pytest
 from drawn import drawn, ellipse, scan_of, whitened
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from studies import parametrize_with_studies
 
 from measure.scans.scan import Scan
 from measure.targets.block_search import search_blocks
@@ -21,7 +22,7 @@ def some_ellipse(rng: np.random.Generator, radius_px: float, flatness: float) ->
     return axes @ np.diag([radius_px, radius_px * flatness])
 
 
-@pytest.mark.parametrize(("radius_px", "flatness"), [(3.0, 1.0), (5.0, 0.6), (9.0, 0.8)])
+@parametrize_with_studies(("radius_px", "flatness"), [(3.0, 1.0), (5.0, 0.6), (9.0, 0.8)])
 def test_errors_are_as_large_as_their_sigmas_say(radius_px: float, flatness: float) -> None:
     rng = np.random.default_rng(1)
     size = int(2 * radius_px + 31) | 1
@@ -97,6 +98,7 @@ def test_a_disk_on_the_border_of_two_blocks_is_found_once() -> None:
     assert np.abs(found[0].center_px - center).max() < 0.03
 
 
+@pytest.mark.study
 def test_texture_holds_hardly_any_disks() -> None:
     """Of all the round patches of a cloudy ground, a fifth at most passes for a disk."""
     rng = np.random.default_rng(5)

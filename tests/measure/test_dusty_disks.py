@@ -33,6 +33,7 @@ def test_a_speck_that_passes_for_the_disk_is_told_by_the_other_disks() -> None:
     assert all(mark.status is Status.MEASURED for mark in marks if mark.point != "7")
 
 
+@pytest.mark.study
 def test_small_disks_whose_edges_are_as_soft_as_a_spots_are_measured_where_all_are_alike() -> None:
     rng = np.random.default_rng(2)
     picture = GROUND + rng.normal(0, 500, (60, 40 * 24))

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
@@ -53,6 +54,7 @@ def test_a_cross_of_the_grounds_own_contrast_is_measured_with_an_honest_sigma(tm
     assert 0.7 < float(np.sqrt(np.mean(squares))) < 1.4
 
 
+@pytest.mark.study
 def test_a_mark_many_pixels_wide_is_sought_in_a_reduced_picture_with_an_honest_sigma(tmp_path: Path) -> None:
     """A disk of 116 pixels, of half of the texture's contrast; at full size too little texture lies about it."""
     wide, side_px, errors, squares = MarkShape(dot(1.6), "dark"), 801, [], []
@@ -106,6 +108,7 @@ def test_what_answers_at_the_edge_of_a_wide_search_is_placed_within_the_window(t
             detect_faint(scan, MarkPrediction(wide, predicted, 38.2, -1), 0.0, 0.7)
 
 
+@pytest.mark.study
 def test_bare_texture_answers_as_often_as_chance_says(tmp_path: Path) -> None:
     answers = [found for seed in range(2) for found in seen_at(textured(seed + 50), places(seed), tmp_path)]
     chances = np.array([found.false_alarms for found in answers if found is not None])

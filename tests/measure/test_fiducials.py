@@ -22,6 +22,7 @@ from drawn_frames import (
     pixel_from_camera,
 )
 from scipy.ndimage import gaussian_filter
+from studies import parametrize_with_studies
 
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
@@ -30,7 +31,7 @@ from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cr
 from measure.marks.templates import cut, learn_template
 
 
-@pytest.mark.parametrize("pose", POSES)
+@parametrize_with_studies("pose", POSES, quick=(0, 7))
 def test_identification_dots_decide_each_of_eight_poses(pose: str, tmp_path: Path) -> None:
     matrix = pixel_from_camera(pose)
     result = measured(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path)
@@ -51,6 +52,7 @@ def test_like_marks_leave_the_pose_assumed_and_say_so(tmp_path: Path) -> None:
     assert_right(result, ALIKE, matrix)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("drawn", "decided"), [(ALIKE, False), (NUMBERED, True)])
 def test_learned_marks_tell_the_pose_only_where_they_differ(
     drawn: FiducialLayout, decided: bool, tmp_path: Path
@@ -94,6 +96,7 @@ def test_what_covers_a_dot_and_looks_like_a_smaller_one_is_doubted(tmp_path: Pat
     assert "0.85 times as large as the other marks" in result.marks[3].reason
 
 
+@pytest.mark.study
 def test_a_frame_without_a_mark_free_of_blemish_has_no_decided_pose(tmp_path: Path) -> None:
     """A part of every ring and cross is gone; the identification dots are all there."""
     matrix = pixel_from_camera("90")
@@ -158,6 +161,7 @@ def test_zero_marks_give_no_silent_identity(tmp_path: Path) -> None:
         assert "within 6 degrees of upright or of a quarter turn" in result.problems[0]
 
 
+@pytest.mark.study
 def test_the_scan_of_another_camera_is_refused_with_a_count(tmp_path: Path) -> None:
     smaller = layout_of([MarkShape(RING_CROSS)] * 4, ((5.6, -5.6), (-5.6, -5.9), (-4.9, 5.6), (5.8, 5.6)))
     result = measured(frame_picture(smaller, pixel_from_camera("0")), ALIKE, tmp_path)
@@ -227,6 +231,7 @@ def test_a_mark_off_the_constellation_is_no_observation(tmp_path: Path) -> None:
     assert result.marks[5].center_px == pytest.approx(matrix @ (0.0, 7.0, 1.0), abs=0.1)
 
 
+@pytest.mark.study
 def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> None:
     mark = MarkShape(cross(0.5, 0.1), "dark")
     index = range(-2, 3)
@@ -250,7 +255,7 @@ def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> No
             assert np.abs(mark_found.center_px - matrix @ (*given.xy_mm, 1.0)).max() < 0.5
 
 
-@pytest.mark.parametrize(
+@parametrize_with_studies(
     ("blot_dn", "said"), [(20000.0, "nothing within"), (500.0, "the ground at its place is so dark")]
 )
 def test_a_missing_mark_is_said_to_be_hidden_only_where_its_ground_hides_it(

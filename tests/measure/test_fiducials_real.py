@@ -55,9 +55,8 @@ def observations(result: FrameMeasurement, layout: FiducialLayout) -> tuple[NDAr
     return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
 
 
-@pytest.mark.parametrize(
-    "name", ["000b3b38", *(pytest.param(n, marks=pytest.mark.slow) for n in ("08320661", "0b50b18e"))]
-)
+@pytest.mark.study
+@pytest.mark.parametrize("name", ["000b3b38", "08320661", "0b50b18e"])
 def test_all_four_corners_of_the_wild_frames(name: str) -> None:
     layout = square(WILD)
     with open_scan(SCANS / "aerial" / f"{name}.jpeg") as scan:
@@ -86,9 +85,8 @@ def middle(scan: Scan) -> tuple[Scan, NDArray[np.int64]]:
     return Scan(scan.path, part, NO_TAGS), first
 
 
-@pytest.mark.parametrize(
-    ("number", "steps"), [(11, 1), *(pytest.param(n, 2, marks=pytest.mark.slow) for n in (11, 15, 16, 17))]
-)
+@pytest.mark.study
+@pytest.mark.parametrize(("number", "steps"), [(11, 1), (11, 2), (15, 2), (16, 2), (17, 2)])
 def test_the_crosses_of_a_reseau_on_a_landscape(number: int, steps: int) -> None:
     """As many crosses as line profiles found, and on the same crosses no larger residuals: on all of them, those too
     that the profiles' affinity left out, and on those that it used."""
@@ -111,7 +109,7 @@ def test_the_crosses_of_a_reseau_on_a_landscape(number: int, steps: int) -> None
     assert affine_rms_px(given[nearest[used]], seen[nearest[used]]) <= affine_rms_px(indices[used], places[used])
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_nearly_black_frame_says_what_became_of_every_mark() -> None:
     layout = lattice()
     with open_scan(SCANS / "reseau" / "apollo-14.jpg") as scan:
@@ -123,7 +121,7 @@ def test_a_nearly_black_frame_says_what_became_of_every_mark() -> None:
     assert len(seen) < 4 or affine_rms_px(given, seen) < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_handwriting_in_two_corners_is_not_taken_for_faint_crosses() -> None:
     """The pixels are longer one way: only where the pitch as given is doubted the crosses are found in their places."""
     layout = square(MarkShape(cross(1.75, 0.12, 0.25, 45.0), "light"))
@@ -136,7 +134,7 @@ def test_handwriting_in_two_corners_is_not_taken_for_faint_crosses() -> None:
     assert distance.min(axis=0).max() < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_reseau_is_not_seen_in_a_frame_of_another_camera() -> None:
     with open_scan(SCANS / "aerial" / "0cec8b13.jpeg") as scan:
         result = measure_fiducials(scan, lattice(), (RESEAU_PITCH_UM, RESEAU_PITCH_UM))

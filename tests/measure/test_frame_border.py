@@ -8,6 +8,7 @@ import pytest
 from drawn import Array, drawn, scan_of, transformed
 from drawn_frames import layout_of, pixel_from_camera
 from scipy.ndimage import gaussian_filter
+from studies import parametrize_with_studies
 
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
@@ -83,7 +84,7 @@ def measured(camera: FiducialLayout, picture: Array) -> list[Measured]:
     return found
 
 
-@pytest.mark.parametrize(
+@parametrize_with_studies(
     ("vertices", "at_mm", "is_notch"),
     [
         (WEDGE, WEDGE_MM, False),
@@ -91,6 +92,7 @@ def measured(camera: FiducialLayout, picture: Array) -> list[Measured]:
         (WEDGE_TO_EDGE, WEDGE_MM, False),
         (NOTCH, HALF_MM, True),
     ],
+    quick=(1, 2),
     ids=["beyond", "with its border", "to the edge", "notch"],
 )
 def test_marks_at_the_border_are_measured_as_if_it_were_not_there(
@@ -101,12 +103,14 @@ def test_marks_at_the_border_are_measured_as_if_it_were_not_there(
         assert mark.chi2 < ONE_IN_8000
 
 
+@pytest.mark.study
 def test_the_border_of_a_soft_scan_reaches_farther_into_the_frame() -> None:
     for mark in measured(layout(WEDGE_TO_EDGE, WEDGE_MM), scanned(WEDGE_MM, False, blur_px=1.8)):
         assert mark.off_px < 0.2
         assert mark.chi2 < ONE_IN_8000
 
 
+@pytest.mark.study
 def test_a_notch_claims_no_more_than_the_landscape_in_it_allows() -> None:
     camera = layout(NOTCH, HALF_MM)
     even, uneven = (measured(camera, scanned(HALF_MM, True, 2.0, landscape)) for landscape in (0.0, 0.05))

@@ -8,6 +8,7 @@ from brute_marks import written_scan
 from drawn import drawn, scan_of, transformed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from studies import parametrize_with_studies
 
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
@@ -59,7 +60,7 @@ def layout(radius_mm: float = 0.0) -> FiducialLayout:
     return FiducialLayout(tuple(marks), (2 * HALF_MM, 2 * HALF_MM))
 
 
-@pytest.mark.parametrize(
+@parametrize_with_studies(
     ("radius_mm", "neighbour", "negative"), [(0.0, False, True), (1.0, False, False), (0.0, True, False)]
 )
 def test_corners_of_the_frame_are_where_its_edges_meet(

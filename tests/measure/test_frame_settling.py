@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from true_marks import KIND, TrueMark, some_mark
 
 from measure.fiducials.constellation import Placement
@@ -44,6 +45,7 @@ def frame_of(rng: np.random.Generator, blur_px: float, share: float) -> tuple[Fr
     return measure_frame(scan, FiducialLayout(layout, (50.0, 50.0)), placement, FiducialOptions()), marks
 
 
+@pytest.mark.study
 def test_faint_marks_are_matched_with_the_others_blur() -> None:
     frame, marks = frame_of(np.random.default_rng(3), 2.5, 0.25)
     squares, to_bound = [], []

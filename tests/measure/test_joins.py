@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import tifffile
 from numpy.typing import NDArray
 
@@ -61,6 +62,7 @@ def off_and_sigma(joins: Joins, move: Array) -> tuple[Array, Array]:
     return np.array(off), np.sqrt(np.array(variance))[:, None]
 
 
+@pytest.mark.study
 def test_errors_of_joins_are_as_large_as_their_standard_deviations(tmp_path: Path) -> None:
     parts, move = scanned(tmp_path, 1500.0)
     joins = measure_joins(parts, 30)
@@ -70,6 +72,7 @@ def test_errors_of_joins_are_as_large_as_their_standard_deviations(tmp_path: Pat
     assert np.abs(off.mean(axis=0)).max() < 0.02
 
 
+@pytest.mark.study
 def test_without_noise_what_lies_between_pixels_is_left(tmp_path: Path) -> None:
     """A hundredth of a pixel, and no less is claimed."""
     parts, move = scanned(tmp_path, 1.0)
@@ -83,9 +86,13 @@ def test_without_noise_what_lies_between_pixels_is_left(tmp_path: Path) -> None:
 
 
 def test_marks_that_are_known_are_no_joins(tmp_path: Path) -> None:
-    (first, second), _ = scanned(tmp_path, 500.0)
+    (first, second), move = scanned(tmp_path, 500.0)
     taken = np.array([[300.0, 230.0, 60.0]])
-    for mark in measure_joins([replace(first, taken_px=taken), second], 30).marks["a"]:
+    joins = measure_joins([replace(first, taken_px=taken), second], 8)
+    off, sigma = off_and_sigma(joins, move)
+    assert len(off) == 8
+    assert (np.abs(off) < 3.5 * sigma).all()
+    for mark in joins.marks["a"]:
         assert mark.center_px is not None
         assert np.hypot(*(mark.center_px - (300.0, 230.0))) > 60.0
 

@@ -78,6 +78,7 @@ def weak(frames: tuple[FrameMeasurement, ...]) -> set[tuple[str, str]]:
     return {(frame.image, mark.point) for frame in frames for mark in frame.marks if mark.status is Status.WEAK}
 
 
+@pytest.mark.study
 def test_good_marks_are_doubted_no_more_often_than_stated() -> None:
     """Two tests of one per cent each: of 40 cameras one may lose a mark, whatever their marks' true places."""
     rng = np.random.default_rng(1)
@@ -86,6 +87,7 @@ def test_good_marks_are_doubted_no_more_often_than_stated() -> None:
     assert lost <= 4  # 0.8 are expected at most, more than 4 in one run of 700
 
 
+@pytest.mark.study
 def test_good_marks_of_a_frame_of_less_noise_than_the_others_are_not_doubted() -> None:
     """What the others' noise does to their median is no fault of that frame, on film that does not scatter."""
     rng = np.random.default_rng(6)
@@ -107,6 +109,7 @@ def test_a_mark_that_only_one_frame_has_elsewhere_is_weak() -> None:
     np.testing.assert_allclose(np.sqrt(mark.covariance_px2[0, 0]), 1.5, rtol=0.3)
 
 
+@pytest.mark.study
 def test_a_mark_ten_standard_deviations_off_is_mostly_found_in_six_frames() -> None:
     """A distance of ten standard deviations of a coordinate, film included."""
     rng = np.random.default_rng(3)

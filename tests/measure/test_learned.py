@@ -62,6 +62,7 @@ def test_a_learned_template_measures_as_its_standard_deviations_say() -> None:
     assert 0.7 < float(np.sqrt(np.mean(np.square(scores)))) < 1.35
 
 
+@pytest.mark.study
 def test_pictures_of_unlike_blur_show_an_unsymmetric_mark_at_one_place() -> None:
     """Whichever is the sharp one, and however soft the others: 2 x 5 x 2 coordinates. With a mean of them as template
     the sharp one lies 1 px off the others."""
@@ -76,6 +77,7 @@ def test_pictures_of_unlike_blur_show_an_unsymmetric_mark_at_one_place() -> None
     assert 0.6 < float(np.sqrt(np.mean(np.square(scores)))) < 1.35
 
 
+@pytest.mark.study
 def test_noise_in_the_template_is_not_taken_for_slopes_of_the_mark() -> None:
     """A fifth of the contrast: of 2 x 5 x 2 coordinates, twice what is claimed where it is."""
     scores = []

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from brute_marks import Array, brute_picture, placed
 from scipy.ndimage import gaussian_filter
+from studies import parametrize_with_studies
 
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
 from measure.matching.match import MatchOptions, match
@@ -61,7 +62,7 @@ def errors_and_sigmas(name: str, blur_px: float, snr: float, count: int) -> tupl
     return np.array(errors), np.array(sigmas)
 
 
-@pytest.mark.parametrize(
+@parametrize_with_studies(
     ("name", "blur_px", "count"),
     [
         ("cross", 0.7, 54),
@@ -69,6 +70,7 @@ def errors_and_sigmas(name: str, blur_px: float, snr: float, count: int) -> tupl
         ("ring-dot", 1.0, 54),
         ("dot", 0.8, 54),
     ],
+    quick=(3,),
 )
 def test_sigmas_are_those_of_the_errors(name: str, blur_px: float, count: int) -> None:
     errors, sigmas = errors_and_sigmas(name, blur_px, 25.0, count)
@@ -131,7 +133,7 @@ def test_the_windows_origin_counts() -> None:
     np.testing.assert_allclose(there.center_px - here.center_px, [1000, 2000], atol=1e-6)
 
 
-@pytest.mark.parametrize("disturbance", ["dark mark", "gradient", "8 bit"])
+@parametrize_with_studies("disturbance", ["dark mark", "gradient", "8 bit"])
 def test_disturbances_that_cost_nothing(disturbance: str) -> None:
     rng = np.random.default_rng(11)
     ratios = []
@@ -184,7 +186,7 @@ def test_a_large_speck_costs_what_it_covers() -> None:
         assert np.hypot(*(found.center_px - told.center_px)) < told.sigma_px
 
 
-@pytest.mark.parametrize("grain_px", [0.8, 1.3])
+@parametrize_with_studies("grain_px", [0.8, 1.3])
 def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
     rng = np.random.default_rng(17)
     ratios = []

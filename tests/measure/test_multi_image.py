@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from studies import parametrize_with_studies
 
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Piece, match_pieces
 
@@ -55,7 +56,7 @@ def pieces(rng: np.random.Generator, noise: float) -> list[Piece]:
     return made
 
 
-@pytest.mark.parametrize(("radius_px", "limit_px", "rounds"), [(RADIUS_PX, 0.06, 16), (21, 0.035, 30)])
+@parametrize_with_studies(("radius_px", "limit_px", "rounds"), [(RADIUS_PX, 0.06, 16), (21, 0.035, 30)])
 def test_errors_are_as_large_as_their_covariances_say(radius_px: int, limit_px: float, rounds: int) -> None:
     rng = np.random.default_rng(1)
     errors, normalised = [], []

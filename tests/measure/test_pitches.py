@@ -63,6 +63,7 @@ def test_wrong_resolution_tags_are_named_with_the_pitch_of_the_marks(tmp_path: P
         assert pitch_problem(result, ALIKE, pitch_um, "the scan's file") is None  # once is enough
 
 
+@pytest.mark.study
 def test_marks_outside_of_the_scan_are_named_where_the_others_are_too_few(tmp_path: Path) -> None:
     """Four side marks, of which the upper and the lower one are cut off."""
     layout = layout_of(
@@ -89,6 +90,7 @@ def test_pixels_given_as_longer_one_way_need_no_look(tmp_path: Path) -> None:
     assert not any("film is never stretched so much" in problem for problem in result.problems)
 
 
+@pytest.mark.study
 def test_three_of_many_marks_that_lie_as_the_cameras_are_no_frame(tmp_path: Path) -> None:
     """With pixels longer one way three of sixty strewn marks fit, which is no wonder; three of three are a frame."""
     places = ((10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0))

@@ -73,6 +73,7 @@ def block_picture(pose: str) -> tuple[Array, Array]:
     return light * ground + (1 - light) * border + rng.normal(0, 200, (size, size)), matrix
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("pose", ["90m", "180"])
 def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(pose: str) -> None:
     grey, matrix = block_picture(pose)
@@ -87,6 +88,7 @@ def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(po
             assert mark.center_px == pytest.approx(place, abs=0.25)
 
 
+@pytest.mark.study
 def test_marks_that_were_found_are_renamed_and_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """From the pose opposite, where the given coordinates are 0.3 mm off; only their settling may look about them."""
     grey, matrix = block_picture("180")
@@ -105,6 +107,7 @@ def test_marks_that_were_found_are_renamed_and_not_sought_again(monkeypatch: pyt
         np.testing.assert_allclose(fit.center_px, true.center_px, atol=0.02)
 
 
+@pytest.mark.study
 def test_half_wedges_of_any_pose(tmp_path: Path) -> None:
     for seed, pose in enumerate(("90", "180m")):
         matrix = pixel_from_camera(pose)

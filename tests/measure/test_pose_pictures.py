@@ -31,7 +31,7 @@ def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
         steady=cv2.dilate(BLOCK, np.ones((5, 5))) > 0,
     )
     turned = [np.diag([x, y]).astype(float) for x in (1, -1) for y in (-1, 1)]
-    for seed in range(2):
+    for seed in range(1):
         for index, linear in enumerate(turned):
             for slid_px in (0.0, 4.0):
                 site = among_landscape(template, linear, seed, slid_px)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drawn import scan_of
+from studies import parametrize_with_studies
 from true_marks import (
     ALL_MOVES,
     KIND,
@@ -39,7 +40,7 @@ def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, rounding
     return fit
 
 
-@pytest.mark.parametrize(("name", "grain_px"), [("ring-dot", 0.0), ("wing", 0.0), ("dot", 1.0)])
+@parametrize_with_studies(("name", "grain_px"), [("ring-dot", 0.0), ("wing", 0.0), ("dot", 1.0)])
 def test_marks_are_at_the_bound_with_honest_sigmas_in_white_noise_and_in_grain(name: str, grain_px: float) -> None:
     rng = np.random.default_rng(1)
     correlation = grain_correlation(grain_px) if grain_px else None

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from brute_marks import Array, written_scan
+from studies import parametrize_with_studies
 
 from measure.annotations import detect_text as networks_module
 from measure.annotations.detect_text import Networks, networks
@@ -46,7 +47,7 @@ def read(grey: Array, folder: Path, frame_px: Array | None = None) -> tuple[Line
         return read_writing(scan, required(), frame_px)
 
 
-@pytest.mark.parametrize("pose", ["0", "90", "270", "180m"])
+@parametrize_with_studies("pose", ["0", "90", "270", "180m"], quick=(3,))
 def test_title_and_plate_are_read_whichever_way_the_scan_lies(pose: str, tmp_path: Path) -> None:
     title, plate = read(posed(written_film(), pose), tmp_path)
     assert (title.text.replace(" ", ""), title.pose) == (TITLE.replace(" ", ""), pose)

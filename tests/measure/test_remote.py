@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 from range_server import RangeServer, range_server
+from studies import parametrize_with_studies
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
 from measure.scans import remote
@@ -44,7 +45,7 @@ def server(tmp_path: Path) -> Iterator[RangeServer]:
         yield server
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+@parametrize_with_studies("layout", LAYOUTS, quick=(1, 2))
 def test_windows_are_those_of_the_local_file(tmp_path: Path, server: RangeServer, layout: str) -> None:
     picture = noise((3,) if layout == "planes" else ())
     tifffile.imwrite(tmp_path / "s.tif", picture, **LAYOUTS[layout])
@@ -110,7 +111,7 @@ def with_overviews(path: Path, picture: Any, below: bool = False) -> None:
             file.write(one, subfiletype=1, **tiles)
 
 
-@pytest.mark.parametrize(("factor", "below"), [(3, False), (4, True), (5, False), (8, True), (20, False)])
+@parametrize_with_studies(("factor", "below"), [(3, False), (4, True), (5, False), (8, True), (20, False)], quick=(4,))
 def test_a_scan_is_looked_at_small_by_its_overviews(
     tmp_path: Path, server: RangeServer, factor: int, below: bool
 ) -> None:
@@ -138,6 +139,7 @@ def test_a_scan_is_looked_at_small_by_its_overviews(
         assert np.abs(middle - place).max() * factor < 0.1 * factor + 1.0
 
 
+@pytest.mark.study
 def test_a_thumbnail_of_another_form_is_no_overview(tmp_path: Path, server: RangeServer) -> None:
     picture, _ = spotted()
     with tifffile.TiffWriter(tmp_path / "s.tif") as file:

@@ -33,10 +33,7 @@ def results(folder: Path) -> dict[str, Row]:
     turned, wedges = frame_picture(NUMBERED, pixel_from_camera("90m")), frame_picture(WEDGES, pixel_from_camera("0"))
     frames = {
         "ring-crosses in a pose that is not known": measured(turned, NUMBERED, folder),
-        "wedges": measured(wedges, WEDGES, folder),
-        "wedges in coarse steps, the pitch not known": measured(
-            np.rint(wedges / 800) * 800, WEDGES, folder, FiducialOptions("0"), pitch=False
-        ),
+        "wedges in coarse steps": measured(np.rint(wedges / 800) * 800, WEDGES, folder, FiducialOptions("0")),
     }
     marks = {f"{kind}: {mark.point}": mark for kind, frame in frames.items() for mark in frame.marks}
     poses = {f"{kind}: pose {frame.pose.name}": ("", ()) for kind, frame in frames.items() if frame.pose}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from brute_marks import written_scan
 from drawn_frames import ALIKE, FRAME_PX, PITCH_UM, frame_picture, pixel_from_camera
+from studies import parametrize_with_studies
 
 from measure.fiducials.measurement import measure_fiducials, second_frame
 from measure.fiducials.options import FiducialOptions
@@ -14,7 +15,7 @@ from measure.results import moved_frame
 from measure.scans.opening import crop_scan
 
 
-@pytest.mark.parametrize(("second", "is_named"), [("0", True), ("90", True), (None, False)])
+@parametrize_with_studies(("second", "is_named"), [("0", True), ("90", True), (None, False)])
 def test_a_second_frame_is_named_with_the_windows_of_both(second: str | None, is_named: bool, tmp_path: Path) -> None:
     """Above the one that was measured, in any pose; bare ground is none."""
     first = frame_picture(ALIKE, pixel_from_camera("0"))

@@ -4,9 +4,9 @@ mark is damaged, and nearer the truth where its paint slopes."""
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from brute_marks import Array, brute_picture, placed
 from drawn import drawn, ellipse
+from studies import parametrize_with_studies
 
 from measure.marks.shapes import Mark, MarkShape, polygon, ring_cross
 from measure.matching.covariance import across_edges
@@ -56,7 +56,7 @@ def assert_as_likely(found: Array) -> None:
     assert found.min() > 1e-4
 
 
-@pytest.mark.parametrize(("mark", "options"), [(RING_CROSS, OPTIONS), (WING, replace(OPTIONS, freedom="shift"))])
+@parametrize_with_studies(("mark", "options"), [(RING_CROSS, OPTIONS), (WING, replace(OPTIONS, freedom="shift"))])
 def test_noise_alone_makes_every_probability_of_edges_as_likely(mark: MarkShape, options: MatchOptions) -> None:
     place = placed(10.0, (20.2, 19.7))
     assert_as_likely(edge_chances(mark, brute_picture(mark, place, SIZE, SIZE, 1.0), place, options, 40))

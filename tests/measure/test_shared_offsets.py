@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from studies import parametrize_with_studies
 
 from measure.targets.consistency import TargetPlaces, compared
 
@@ -23,7 +24,7 @@ def field(rng: np.random.Generator, count: int, sigma_px: Array) -> tuple[Target
     return TargetPlaces(places, parallax, covariances, np.zeros(count, bool)), seen
 
 
-@pytest.mark.parametrize("count", [40, 80, 200])
+@parametrize_with_studies("count", [40, 80, 200], quick=(2,))
 def test_wrong_ones_are_told_and_right_ones_as_seldom_as_said(count: int) -> None:
     rng = np.random.default_rng(count)
     chances, wrong_chances = [], []
@@ -41,6 +42,7 @@ def test_wrong_ones_are_told_and_right_ones_as_seldom_as_said(count: int) -> Non
     assert 0.01 < (right < 0.1).mean() < 0.12  # neighbours that scatter more make it less than said
 
 
+@pytest.mark.study
 def test_right_ones_among_few_are_doubted_as_seldom_as_said() -> None:
     """A lens whose middle is not the image's bends the corners of the image, where few targets lie beside one another:
     unless that is thought of, seven times as many right ones as should lie as far off as one of a thousand."""
@@ -64,6 +66,7 @@ def test_points_known_less_well_may_lie_farther_off() -> None:
     assert np.median(compared(targets, seen, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).chance[:20]) < 1e-6
 
 
+@pytest.mark.study
 def test_how_far_off_right_ones_lie_is_as_well_known_as_said() -> None:
     """The squares of what they are off, in the covariances said of that, have the mean 2 of two coordinates: what the
     others say is uncertain, too, and makes 2.15 of it where that is left out."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from studies import parametrize_with_studies
 
 from measure.targets.sheets import Dots, Naming, name_dots
 
@@ -73,7 +74,9 @@ def spins(rng: np.random.Generator, count: int) -> Array:
     return np.stack([about(2, angle)[:2, :2] for angle in rng.uniform(0, 2 * np.pi, count)])
 
 
-@pytest.mark.parametrize(("columns", "rows", "codes", "views"), [(10, 10, 4, 8), (10, 10, 2, 8), (23, 21, 6, 2)])
+@parametrize_with_studies(
+    ("columns", "rows", "codes", "views"), [(10, 10, 4, 8), (10, 10, 2, 8), (23, 21, 6, 2)], quick=(2,)
+)
 def test_a_fifth_missing_and_a_fifth_false(columns: int, rows: int, codes: int, views: int) -> None:
     rng = np.random.default_rng(columns + codes)
     for _ in range(views):
@@ -85,6 +88,7 @@ def test_a_fifth_missing_and_a_fifth_false(columns: int, rows: int, codes: int, 
         assert not naming.misread
 
 
+@pytest.mark.study
 def test_codes_misread_are_outvoted_or_nothing_is_named() -> None:
     rng = np.random.default_rng(3)
     for _ in range(2):

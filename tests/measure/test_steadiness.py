@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from drawn import scan_of
+from studies import parametrize_with_studies
 from true_marks import KIND, some_mark, whitened_rms
 
 from measure.matching.match import match
@@ -34,7 +35,7 @@ def test_noise_that_is_alike_everywhere_says_nothing_else() -> None:
     assert np.all(steadiness(residuals, 0.5 * np.ones((30, 30)), same, same) == 1.0)
 
 
-@pytest.mark.parametrize("alike_in", ["code", "light"])
+@parametrize_with_studies("alike_in", ["code", "light"])
 def test_a_light_mark_is_not_damaged_for_its_noise(alike_in: str) -> None:
     """Noise that is alike in grey values is in light several times as large on the mark as about it."""
     rng = np.random.default_rng(4)

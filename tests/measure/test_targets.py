@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from drawn import drawn, ellipse, scan_of, transformed, whitened
 from numpy.typing import NDArray
+from studies import parametrize_with_studies
 
 from measure.flags import Status
 from measure.results import MarkMeasurement
@@ -55,7 +56,7 @@ class Field:
         return {mark.point: mark for mark in measure_disks(self.scan(), self.predictions, options)}
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@parametrize_with_studies("sign", [1.0, -1.0])
 def test_all_targets_with_their_names_and_honest_sigmas(sign: float) -> None:
     field = Field(2, np.array([9.0, -7.0]), sign=sign)
     marks = field.measured()
@@ -69,6 +70,7 @@ def test_all_targets_with_their_names_and_honest_sigmas(sign: float) -> None:
     assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25  # three standard deviations of 70 numbers
 
 
+@pytest.mark.study
 def test_a_hidden_target_is_not_taken_for_its_neighbour() -> None:
     field = Field(2, np.array([20.0, 15.0]), search_px=110.0)
     hidden = ("t0", "t10", "t24")

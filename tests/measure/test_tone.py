@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drawn import scan_of
+from studies import parametrize_with_studies
 from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 
 from measure.detection.localisation import MarkPrediction
@@ -131,7 +132,7 @@ def test_a_declared_curve_holds_until_pictures_contradict_it() -> None:
     assert "contradict" in believed.source
 
 
-@pytest.mark.parametrize("curve", CURVES)
+@parametrize_with_studies("curve", CURVES, quick=(1,))
 def test_the_tip_of_a_wedge_is_where_it_was_drawn_whatever_the_curve(curve: float | str) -> None:
     rng = np.random.default_rng(3)
     errors, covariances, off = [], [], []
@@ -180,6 +181,7 @@ def test_a_cross_does_not_move_by_the_curve() -> None:
     assert np.abs(fit.tone.on_place).max() < 0.02
 
 
+@pytest.mark.study
 def test_marks_that_contradict_one_another_on_the_curve_are_known_no_better_than_that() -> None:
     rng = np.random.default_rng(6)
     marks = [some_mark(TIP, 1.0, rng) for _ in range(4)]
@@ -228,6 +230,7 @@ def test_what_a_picture_says_of_a_curve_of_its_own_has_the_variance_of_that_besi
     assert loose.sum_of_squares == pytest.approx(float(np.arange(5.0) @ loose.matrix @ np.arange(5.0)))
 
 
+@pytest.mark.study
 def test_what_is_wrong_alike_in_all_pictures_of_a_scanner_does_not_average() -> None:
     """By simulation: twenty pictures each say the curve with noise of their own, and all of them the same wrong of it;
     five of them are the scan's own, fifteen of other scans."""

@@ -54,6 +54,7 @@ def weak(frames: list[FrameMeasurement], sigma_mm: float = 0.02, pitch_mm: float
     return {image: points for image, points in found.items() if points}
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("mirror", [False, True])
 def test_good_triangles_are_doubted_no_more_often_than_stated(mirror: bool) -> None:
     """Two tests of one per cent each, and film of this kind stretches less than is allowed for."""

@@ -45,6 +45,7 @@ def test_noise_alone_hardly_is_hardly_taken_for_it(is_grain: bool) -> None:
     assert np.mean(shares) < 0.1
 
 
+@pytest.mark.study
 def test_ragged_lines_are_known_as_badly_as_they_are() -> None:
     """Each pixel's length of them lies elsewhere by 0.08 px, one standard deviation. The ground is clear, and would let
     a cross be known three times as well as it is."""

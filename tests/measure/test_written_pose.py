@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from brute_marks import Array, written_scan
 from drawn_frames import PITCH_UM, RING_CROSS, frame_picture, layout_of, pixel_from_camera
+from studies import parametrize_with_studies
 
 from measure.annotations.fields import KnownLine, Line, Reading, read_from_one_face
 from measure.annotations.orientation_from_text import main_pose, side_in_camera, writing_likelihoods
@@ -142,7 +143,7 @@ def measured(
         return measure_fiducials(scan, replace(LAYOUT, writing=places), (PITCH_UM, PITCH_UM), options)
 
 
-@pytest.mark.parametrize("pose", ["270", "90m"])
+@parametrize_with_studies("pose", ["270", "90m"])
 def test_the_pose_of_a_frame_with_marks_alike_is_decided_by_its_writing(pose: str, tmp_path: Path) -> None:
     found = measured(pose, tmp_path, WILD).pose
     assert found is not None
@@ -151,6 +152,7 @@ def test_the_pose_of_a_frame_with_marks_alike_is_decided_by_its_writing(pose: st
     assert "log-odds 8.0" in found.evidence[-1]
 
 
+@pytest.mark.study
 def test_where_no_place_is_known_frames_are_named_so_that_their_writing_is_upright(tmp_path: Path) -> None:
     found = measured("180m", tmp_path, ()).pose
     assert found is not None
@@ -179,6 +181,7 @@ def test_a_frame_that_lies_as_others_of_its_roll_is_read_only_where_their_line_s
     assert (alike.pose.name, alike.pose.decided) == ("0", True)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("pose", ["180", "0m"])
 def test_a_frame_that_lies_otherwise_is_read_as_a_whole(pose: str, tmp_path: Path) -> None:
     """The plate lies where the title is looked for, or the title itself in a mirror."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from studies import parametrize_with_studies
 from test_judgement import EIGHT, FOUR, layout_of
 
 from measure.fiducials.across_frames import CheckedFrames, check_frames
@@ -72,7 +73,7 @@ def test_a_lone_frame_with_a_wrong_mark_is_flagged_and_its_marks_cover_the_error
         assert np.sqrt(known[0, 0]) < 1.5 * PX_PER_MM
 
 
-@pytest.mark.parametrize("count", [1, 10])
+@parametrize_with_studies("count", [1, 10])
 def test_of_four_good_marks_on_bent_film_none_is_called_wrong(count: int) -> None:
     rng = np.random.default_rng(5)
     for _ in range(5):

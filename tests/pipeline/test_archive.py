@@ -18,6 +18,7 @@ import pytest
 import tifffile
 from drawn_frames import PITCH_UM, layout_of
 from drawn_project import CAMERA, write_project
+from studies import parametrize_with_studies
 
 from measure.marks.shapes import MarkShape, polygon
 from pipeline.archive.measurement import picture_sizes_mm
@@ -76,6 +77,7 @@ def measure(folder: Path, *options: str) -> int:
     return run(["measure", str(folder / "project.toml"), *options])
 
 
+@pytest.mark.study
 def test_the_size_of_a_picture_is_that_of_its_scan(done: Path) -> None:
     digest = measurement_of(done / "comparator.csv")
     height, width = tifffile.imread(done / "a.tif").shape[:2]
@@ -129,7 +131,7 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("change", CHANGES)
+@parametrize_with_studies("change", CHANGES, quick=(0, 2, 5, 6, 9, 10, 12))
 def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> None:
     act, again = CHANGES[change]
     act(folder)
@@ -156,6 +158,7 @@ def test_what_was_measured_with_other_options_comes_back_without_measuring(folde
     assert marks(folder) == before
 
 
+@pytest.mark.study
 def test_a_new_revision_of_measuring_measures_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.provenance.result_key.__defaults__", (-1,))
     measure(folder)
@@ -225,6 +228,7 @@ def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, caps
     assert "Traceback" not in err
 
 
+@pytest.mark.study
 def test_copies_count_once(folder: Path) -> None:
     shutil.copyfile(folder / "a.tif", folder / "z.tif")
     near = tifffile.imread(folder / "a.tif")
@@ -323,6 +327,7 @@ def test_a_shard_that_is_none_is_refused(folder: Path, shard: str, capsys: SAID)
     assert "is not K/N" in capsys.readouterr().err
 
 
+@pytest.mark.study
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_gives_the_same_marks(folder: Path, three: Path, tmp_path: Path) -> None:
     shutil.copytree(three, tmp_path / "cluster")
@@ -374,6 +379,7 @@ def without_targets(task: ScanTask) -> MeasuredFile:
     return measure_file(replace(task, options=replace(task.options, targets=None)))
 
 
+@pytest.mark.study
 def test_of_many_scans_only_the_lot_of_a_new_one_is_judged_again(
     folder: Path, three: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -420,6 +426,7 @@ LEARNED = (
 )
 
 
+@pytest.mark.study
 def test_learned_marks_stay_when_a_scan_comes(three: Path, tmp_path: Path) -> None:
     shutil.copytree(three, tmp_path / "p")
     (tmp_path / "p" / "c.tif").unlink()
@@ -438,6 +445,7 @@ def test_learned_marks_stay_when_a_scan_comes(three: Path, tmp_path: Path) -> No
 TIP_MM = ((0.0, 0.0), (0.8, -1.0), (0.8, 1.0))  # of a wedge, whose sides lean on the tone curve
 
 
+@pytest.mark.study
 def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, capsys: SAID) -> None:
     folder = tmp_path / "p"
     write_project(folder, ["a", "b"], layout=layout_of([MarkShape(polygon(TIP_MM))] * 4))

@@ -42,6 +42,7 @@ def test_a_bent_board_from_the_project_file_to_the_report(tmp_path: Path) -> Non
     assert "The board of 70 points is bent" in page
 
 
+@pytest.mark.study
 def test_a_prior_holds_the_bend(tmp_path: Path) -> None:
     assert run(["adjust", str(project_of(tmp_path, "0.001"))]) in (DONE, LOOK)
     result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))

@@ -212,6 +212,7 @@ def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> N
     assert {mark.image for mark in read_comparator(own.comparator) if mark.kind == "target"} <= {"f1l", "f1r"}
 
 
+@pytest.mark.study
 def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
     """A spot of light at a known place of the camera, in a mirrored scan, through resampling into the picture."""
     place = np.array([[31.37, -22.81]])

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from reference_cases import CASES, CAUSES, DROPPED
+from studies import parametrize_with_studies
 
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.cli import run
@@ -15,11 +16,11 @@ from pipeline.results.adjustment_content import adjustment_record
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.record_json import plain_json
 
-USUAL = ("F5-F9", "F7-F9")  # what is not left to the slow tests
+USUAL = ("F5-F9", "F7-F9")  # what is not left to the studies
 NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@parametrize_with_studies("name", NAMES, quick=(5, 6))
 def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
     case = json.loads((CASES / f"{name}.json").read_text(encoding="utf-8"))
     write_project(case, tmp_path)
@@ -46,9 +47,9 @@ def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "priors", [each if each in USUAL else pytest.param(each, marks=pytest.mark.slow) for each in DROPPED]
+    "priors", [each if each in USUAL else pytest.param(each, marks=pytest.mark.study) for each in DROPPED]
 )
-@pytest.mark.parametrize("name", sorted(path.stem for path in CASES.glob("v_*.json")))
+@parametrize_with_studies("name", sorted(path.stem for path in CASES.glob("v_*.json")), quick=(0, 2))
 def test_singular_case_through_files(name: str, priors: str, tmp_path: Path) -> None:
     """The number and the kinds of the null directions, from the case's own orientations as approximations."""
     case = json.loads((CASES / f"{name}.json").read_text(encoding="utf-8"))

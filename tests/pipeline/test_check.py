@@ -11,6 +11,7 @@ import pytest
 from lens_networks import LENSES, network_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
@@ -258,7 +259,7 @@ def test_a_strong_lens_agrees_by_way_of_the_same_model(family: str) -> None:
     assert max(row.difference_sigmas for row in check.rows) > 1.0
 
 
-@pytest.mark.parametrize("skew", [True, False], ids=["skew", "no skew"])
+@parametrize_with_studies("skew", [True, False], ids=["skew", "no skew"])
 def test_a_fisheye_agrees_with_opencvs_fisheye(skew: bool) -> None:
     """Which estimates both focal lengths or none: one of them free here is two for the comparison."""
     network = network_of("opencv_fisheye", np.random.default_rng(2))
@@ -323,6 +324,7 @@ def test_every_run_gets_the_same_digits_of_opencv(monkeypatch: pytest.MonkeyPatc
     assert len(digits) == 1
 
 
+@pytest.mark.study
 def test_what_robust_estimation_set_aside_is_left_out() -> None:
     network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
     xy_mm = network.observations.xy_mm.copy()

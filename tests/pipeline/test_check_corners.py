@@ -185,7 +185,7 @@ def test_both_figures_stand_in_file_terminal_and_report(
     assert "OpenCV's own (findChessboardCorners and cornerSubPix, half a window of 11 px)" in said
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_digital_camera_has_the_frame_of_its_pictures(folder: Path) -> None:
     assert run(["run", str(project_in(folder))]) in (0, 1)
     adjusted = json.loads((folder / "out" / "adjustment.json").read_text(encoding="utf-8"))["cameras"]["D"]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from simulated import Truth, field_points, simulated
 from simulated_project import write_project
+from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Distortion, Prior
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
@@ -15,7 +16,7 @@ from pipeline.results.choice_file import read_choice
 from pipeline.results.record_json import plain_json
 
 
-@pytest.mark.parametrize("given", ["none", "torlegard"])
+@parametrize_with_studies("given", ["none", "torlegard"])
 def test_the_project_is_told_what_its_data_ask_for(
     given: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

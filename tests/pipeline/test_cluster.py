@@ -24,6 +24,7 @@ def process(number: int, seconds: float = 0.0) -> tuple[int, int]:
     return number, os.getpid()
 
 
+@pytest.mark.study
 def test_a_killed_worker_loses_nothing_and_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "scan.tif").write_bytes(b"scan")
     with cluster_executor("local", [str(tmp_path / "scan.tif")], workers=2) as executor:

@@ -135,6 +135,7 @@ def table(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
+@pytest.mark.study
 def test_a_drawn_sheet_with_a_fifth_missing_and_a_fifth_false(tmp_path: Path) -> None:
     shots = {"coded": shot(1), "plain": shot(3, coded=False)}
     assert run(["measure", str(project(tmp_path, {name: one.picture for name, one in shots.items()}))]) == 1

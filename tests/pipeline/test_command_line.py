@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import tifffile
 from kept_scans import content
+from studies import parametrize_with_studies
 
 from pipeline import stages
 from pipeline.cli import run
@@ -311,6 +312,7 @@ def test_singular_network_is_named_in_words(project: Path, capsys: SAID) -> None
         assert word in what
 
 
+@pytest.mark.study
 def test_scan_of_another_camera_is_said_to_be_one(project: Path, capsys: SAID) -> None:
     rng = np.random.default_rng(1)
     picture = (20000 + 3000 * rng.standard_normal((678, 678))).astype(np.uint16)
@@ -347,6 +349,7 @@ def test_the_help_groups_all_commands_and_cuts_no_line_short(capsys: pytest.Capt
     assert len(re.findall(r"^  [a-z]+  +\S", text, flags=re.MULTILINE)) == 21
 
 
+@pytest.mark.study
 def test_the_help_does_not_wait_for_what_commands_need() -> None:
     heavy = ("numpy", "scipy", "cv2", "pipeline.stages", "pipeline.files.project_file")
     program = f"import sys, pipeline.cli; print(*set(sys.modules) & set({heavy}))"
@@ -356,7 +359,7 @@ def test_the_help_does_not_wait_for_what_commands_need() -> None:
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
-@pytest.mark.parametrize(("arguments", "code"), [(["template", "scene"], 0), (["template", "nothing"], 2)])
+@parametrize_with_studies(("arguments", "code"), [(["template", "scene"], 0), (["template", "nothing"], 2)], quick=(1,))
 def test_a_reader_that_stops_reading_does_not_change_the_exit_code(arguments: list[str], code: int) -> None:
     """As `head` does. 1 would say that something needs a look."""
     reading, writing = os.pipe()

@@ -72,6 +72,7 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
     assert not (tmp_path / "mixed").exists()
 
 
+@pytest.mark.study
 def test_a_converted_calibration_is_taken_in(tmp_path: Path) -> None:
     project = write_project(network_of("australis", np.random.default_rng(7)), tmp_path)
     run(["adjust", str(project)])

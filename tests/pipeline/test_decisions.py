@@ -140,6 +140,7 @@ def test_a_typing_error_in_the_last_line_is_named(line: str, tmp_path: Path) -> 
     assert path.read_bytes() == before
 
 
+@pytest.mark.study
 def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     project = write_project(tmp_path / "p", ["a", "b"])
     path = project.with_name("decisions.jsonl")
@@ -181,7 +182,7 @@ def test_status_is_stale_until_a_decision_is_taken_in(tmp_path: Path, capsys: py
     assert "old" not in {one["verdict"] for one in json.loads(capsys.readouterr().out)["images"].values()}
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_million_lines_are_read_in_five_seconds(tmp_path: Path) -> None:
     line = '{{"image": "box/{0:05d}", "point": "{1}", "kind": "fiducial", "decision": "reject", "who": "ann"}}'
     path = tmp_path / "decisions.jsonl"
@@ -343,6 +344,7 @@ def test_a_target_that_is_placed_counts_as_well_as_one_points() -> None:
     np.testing.assert_array_equal(mark.center_px, (50.0, 60.0))
 
 
+@pytest.mark.study
 def test_decisions_that_were_not_taken_in_are_told_until_measure_takes_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

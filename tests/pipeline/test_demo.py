@@ -47,6 +47,7 @@ def test_its_frames_agree_with_opencv_and_are_reported(finished: tuple[Path, int
     assert_agrees_with_opencv_and_reports(finished[0], f"frame{FRAMES}")
 
 
+@pytest.mark.study
 def test_the_order_of_points_csv_changes_no_digit(finished: tuple[Path, int], tmp_path: Path) -> None:
     shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("out", "comparator.csv"))
     head, *rows = (tmp_path / "points.csv").read_text(encoding="utf-8").splitlines()
@@ -65,7 +66,7 @@ def marks_of(image: str, comparator: list[str]) -> list[str]:
     return [line for line in comparator if line.startswith(f"{image},")]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_demonstration_as_it_is_shown(tmp_path: Path) -> None:
     """All five frames, by the command that shows them."""
     assert run(["demo", str(tmp_path / "demo")]) == DONE

@@ -90,6 +90,7 @@ def over_points() -> Swept:
     return juhl_with("field.points", (75, 100, 150, 200), layouts=10)
 
 
+@pytest.mark.study
 @once
 def test_juhls_table(over_points: Swept) -> None:
     step = next(step for step in over_points.steps if step.value == 150)
@@ -193,6 +194,7 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert words in table
 
 
+@pytest.mark.study
 def test_a_singular_plan_names_what_is_missing_and_keeps_the_rest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,6 +31,7 @@ from exported_project import (
 from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_affine, micmac_px, opencv_px, values
 from numpy.typing import NDArray
 from simulated import affine, rotation, simulated
+from studies import parametrize_with_studies
 
 from adjust.functional_model.line_of_sight import LineOfSight
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
@@ -88,7 +89,7 @@ def test_frames_with_their_lens_are_off_by_no_more_than_is_told(format: str, pro
         assert off.max() < 1.05 * told + SAME_PX  # the told one is of a grid
 
 
-@pytest.mark.parametrize("format", PINHOLES)
+@parametrize_with_studies("format", PINHOLES, quick=(2,))
 def test_half_a_pixel_and_the_y_axis_are_seen(
     format: str, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -435,6 +436,7 @@ def test_without_an_adjustment_the_marks_go_out(tmp_path: Path, capsys: pytest.C
     assert "Run `reseau adjust` first" in capsys.readouterr().err
 
 
+@pytest.mark.study
 def test_resampled_frames_lie_where_the_export_says(finished: tuple[Path, int], tmp_path: Path) -> None:
     """The demonstration's frames, turned and mirrored: the first pixel of `reseau resample` and that of the export."""
     import tifffile

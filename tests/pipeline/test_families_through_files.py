@@ -8,12 +8,14 @@ import pytest
 from lens_networks import LENSES, network_of
 from simulated import Truth, field_points, simulated
 from simulated_project import write_project
+from studies import parametrize_with_studies
 
 from pipeline.cli import DONE, LOOK, run
 
 EBNER = {"b3": 0.02, "b5": -0.03, "b6": 0.015, "b7": 0.04, "b10": -0.02, "b11": 0.03}
 
 
+@pytest.mark.study
 def test_ebners_set_from_the_camera_file_to_the_report(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     free = {f"b{i}": np.inf for i in range(3, 13)}
@@ -36,7 +38,7 @@ def test_ebners_set_from_the_camera_file_to_the_report(tmp_path: Path) -> None:
     assert "effect in the frame (µm)" in page
 
 
-@pytest.mark.parametrize("name", list(LENSES))
+@parametrize_with_studies("name", list(LENSES), quick=(2,))
 def test_a_lens_from_the_camera_file_to_the_report(name: str, tmp_path: Path) -> None:
     """Noisy images, nothing known of the lens; what OpenCV can and cannot compare is said."""
     project = write_project(network_of(name, np.random.default_rng(4)), tmp_path)

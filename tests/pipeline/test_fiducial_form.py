@@ -84,6 +84,7 @@ def form(kind: str, seed: int) -> Figure:
     return found
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("kind", "taken_up"), [("similarity", 4), ("affine", 6), ("projective", 8)])
 def test_the_sigmas_of_the_form_hold_against_realisations(kind: str, taken_up: int) -> None:
     found = [form(kind, seed) for seed in range(RUNS)]

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from simulated import Truth, field_points, film_parameters, simulated
+from studies import parametrize_with_studies
 
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import Network, Transformation
@@ -16,7 +17,9 @@ from pipeline.files.project_file import read_project
 SCANS = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
 
 
-@pytest.mark.parametrize("kind", ["congruent", "projective", "bilinear", "conformal(2)", "polynomial(2)"])
+@parametrize_with_studies(
+    "kind", ["congruent", "projective", "bilinear", "conformal(2)", "polynomial(2)"], quick=(0, 1)
+)
 def test_films_of_every_kind_are_adjusted_from_files(kind: Transformation, tmp_path: Path) -> None:
     points = field_points(np.random.default_rng(7), 16)
     network, _ = simulated(np.random.default_rng(4), SCANS, kind, points)

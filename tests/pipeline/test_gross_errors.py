@@ -10,6 +10,7 @@ import pytest
 from reference_cases import CASES
 from simulated import field_points, simulated
 from simulated_project import write_project as write_network
+from studies import parametrize_with_studies
 from test_cases import write_project
 
 from adjust.problem.parameter import Parameter
@@ -33,7 +34,7 @@ def spoilt_project(folder: Path, adjust: str) -> Path:
     return file
 
 
-@pytest.mark.parametrize(
+@parametrize_with_studies(
     ("adjust", "removed"),
     [("", False), ("snooping = true\nvariance_components = true", True), ('robust = "igg3"', True)],
 )
@@ -61,6 +62,7 @@ def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, t
         assert "Variance components: what the variances" in report
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("adjust", ["", "snooping = true\n"])
 def test_a_control_point_with_exchanged_coordinates_is_named(adjust: str, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
@@ -97,6 +99,7 @@ def test_wrong_keys_are_told(line: str, words: str, tmp_path: Path) -> None:
         read_project(project)
 
 
+@pytest.mark.study
 def test_an_image_without_orientation_is_left_out_and_named(tmp_path: Path) -> None:
     """The targets of one of four frames have one another's numbers: the other three are adjusted."""
     network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 15))
@@ -121,7 +124,7 @@ def test_an_image_without_orientation_is_left_out_and_named(tmp_path: Path) -> N
     assert "Left out of the adjustment: image f2" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(("frame_mm", "level"), [(228.0, 0), (600.0, 1)])
+@parametrize_with_studies(("frame_mm", "level"), [(228.0, 0), (600.0, 1)])
 def test_a_lens_known_in_the_middle_alone_needs_a_look(frame_mm: float, level: int, tmp_path: Path) -> None:
     """Targets within some 110 mm of the principal point: most of a picture of 228 mm, a quarter of one of 600 mm."""
     free = {"k3": np.inf, "k5": np.inf}

@@ -350,7 +350,7 @@ def test_hostile_inputs_end_in_the_right_result_or_in_a_message(
     assert study(kind, 12, 1, measured, adjusted, tmp_path) == {GOOD: 12}
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("kind", KINDS)
 def test_thousands_of_hostile_inputs(kind: str, measured: Path, adjusted: Path, tmp_path: Path) -> None:
     assert study(kind, 600, 36, measured, adjusted, tmp_path) == {GOOD: 600}

@@ -1,7 +1,7 @@
 """The pattern of the targets is recognised under a wrong prediction, missing and false marks; noise is not."""
 
 import numpy as np
-import pytest
+from studies import parametrize_with_studies
 
 from pipeline.measuring.target_identification import assign, log10_of_chance, recognise
 
@@ -26,7 +26,7 @@ def test_pattern_is_named_right_with_targets_missing_and_marks_that_are_none() -
         assert right >= 0.8 * len(kept)
 
 
-@pytest.mark.parametrize(("targets", "strays"), [(4, 0), (8, 16), (25, 0), (25, 50)])
+@parametrize_with_studies(("targets", "strays"), [(4, 0), (8, 16), (25, 0), (25, 50)], quick=(1,))
 def test_agreement_by_chance_is_told_from_a_pattern(targets: int, strays: int) -> None:
     """A fifth of the pattern's marks missing; the other marks are placed as well as chance allows."""
     rng = np.random.default_rng([2, targets, strays])

@@ -12,6 +12,7 @@ import pytest
 from exported_project import PITCH_MM, TRUTH, adjusted_project, camera_mm
 from numpy.typing import NDArray
 from simulated import FIDUCIALS
+from studies import parametrize_with_studies
 
 from pipeline.cli import DONE, WRONG_INPUT, run
 from pipeline.exchange.certificate import balanced_mm, fit, read_certificate
@@ -48,7 +49,7 @@ def adjusted(project: Path) -> dict[str, Any]:
     return dict(json.loads((project.parent / "out" / "adjustment.json").read_text(encoding="utf-8")))
 
 
-@pytest.mark.parametrize("format", ["mmvii", "micmac"])
+@parametrize_with_studies("format", ["mmvii", "micmac"], quick=(1,))
 def test_marks_come_back_as_they_went(format: str, project: Path, tmp_path: Path) -> None:
     out = exported(project, format, tmp_path)
     files = {"mmvii": out.rglob("MesIm-*.xml"), "micmac": (out / "Ori-InterneScan").glob("*.xml")}[format]

@@ -49,6 +49,7 @@ def changed(project: Path) -> None:
     camera.write_text(text.replace("principal_distance_mm = 1.0", "principal_distance_mm = 0.5"), encoding="utf-8")
 
 
+@pytest.mark.study
 def test_a_share_of_the_kills(tmp_path: Path) -> None:
     old = tmp_path / "old"
     old.mkdir()
@@ -61,7 +62,7 @@ def test_a_share_of_the_kills(tmp_path: Path) -> None:
     assert not [what for what in found if "WRONG" in what], found
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_two_hundred_kills(rendered_demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     old = tmp_path / "old"
     shutil.copytree(rendered_demo, old)

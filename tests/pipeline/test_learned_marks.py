@@ -149,6 +149,7 @@ def assert_off_alike(frames: list[FrameMeasurement], true: dict[str, Array]) -> 
     assert np.abs(off).max() < 24.0  # half of size_mm
 
 
+@pytest.mark.study
 def test_marks_learned_from_clicks_lie_off_the_true_ones_alike_in_all_frames(
     rendered: Path, shown: tuple[Project, Project]
 ) -> None:
@@ -156,6 +157,7 @@ def test_marks_learned_from_clicks_lie_off_the_true_ones_alike_in_all_frames(
     assert_off_alike([measure_scan(shown[1], name).frame for name in ("f0", "f1")], truth(rendered))
 
 
+@pytest.mark.study
 def test_marks_that_recur_lie_off_the_true_ones_alike_in_all_frames(rendered: Path) -> None:
     project = project_of(rendered, LEARNED)
     frames = measured(project, "f0", "f2")
@@ -163,6 +165,7 @@ def test_marks_that_recur_lie_off_the_true_ones_alike_in_all_frames(rendered: Pa
     assert_measured_alike(project, frames[0])
 
 
+@pytest.mark.study
 def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictures(
     rendered: Path, tmp_path: Path
 ) -> None:
@@ -185,6 +188,7 @@ def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictu
     assert_measured_alike(project, turned)
 
 
+@pytest.mark.study
 def test_one_scan_must_be_clicked_and_says_what_it_can_tell(rendered: Path) -> None:
     project = project_of(rendered, LEARNED, '"scans/f1.tif"')
     with pytest.raises(InputError, match="with one scan nothing says what is a mark"):
@@ -229,6 +233,7 @@ def shares_of(project: Project) -> set[frozenset[str]]:
     return {frozenset(mark.shares) for mark in marks if isinstance(mark, MarkTemplate)}
 
 
+@pytest.mark.study
 def test_scans_of_several_folders_that_are_called_alike_have_a_share_each(
     shown: tuple[Project, Project], rendered: Path, tmp_path: Path
 ) -> None:
@@ -347,6 +352,7 @@ def test_clicks_in_a_picture_turned_by_any_orientation_tag_are_asked(
         learned(project_of(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="0"))
 
 
+@pytest.mark.study
 def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_path: Path) -> None:
     """Crosses clicked beside their middles in one frame: no pose is decided, and all frames repeat them."""
     poses = ("0", "90", "180m")

@@ -12,6 +12,7 @@ from exported_project import IMAGES, MIRRORED, PITCH_MM, TRUTH, frame_px, projec
 from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_px, opencv_px
 from numpy.typing import NDArray
 from simulated import affine, comparator_point, simulated
+from studies import parametrize_with_studies
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
@@ -87,7 +88,7 @@ def told_px(folder: Path) -> float:
     return 0.0 if "nothing was fitted" in text else float(text[text.index("off by ") + 7 :].split()[0])
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@parametrize_with_studies("lens", LENSES, quick=(3, 4))
 def test_a_lens_is_the_same_in_a_format_or_off_by_what_is_told_or_refused(
     lens: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -171,6 +171,7 @@ def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(
     assert all(fiducial.x_mm.sigma > 1.0 for fiducial in camera.camera().fiducials.values())
 
 
+@pytest.mark.study
 @one_frame
 def test_the_frame_is_told_from_another_camera(frame: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A ring with a cross holds the plain cross of older cameras too: the ring then counts as damage. No other pitch
@@ -195,6 +196,7 @@ def trial(cameras: tuple[str, ...], score: float, chance: float | None = 0.0) ->
     return Trial(cameras, 4, 4, 0.9, 10.0, score, chance, 1.0, 0.01, "", 2.0, 1e-6)
 
 
+@pytest.mark.study
 @one_frame
 def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras(
     frame: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -231,6 +233,7 @@ def test_a_folder_without_scans_is_told_so(tmp_path: Path, capsys: pytest.Captur
     assert "the folder holds no scan" in capsys.readouterr().err
 
 
+@pytest.mark.study
 @one_frame
 @pytest.mark.parametrize(
     ("at_pitch", "looked_at"), [((1e-3, 5.0), [0]), ((0.5, 5.0), [1]), ((5.0, 0.5), [1, 0])], ids=str
@@ -260,6 +263,7 @@ def test_marks_are_looked_at_once_a_search_answers_that_chance_does_not_make(
     assert seen == looked_at
 
 
+@pytest.mark.study
 @one_frame
 @pytest.mark.parametrize(("found", "measured"), [(25, 1), (9, 2)])
 def test_a_part_of_a_lattice_is_no_other_camera(
@@ -277,6 +281,7 @@ def test_a_part_of_a_lattice_is_no_other_camera(
     assert sum(each.cameras == ("lattice",) for each in identify(scan, two, 100.0, Reporter()).trials) == measured
 
 
+@pytest.mark.study
 @one_frame
 def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     frame: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -298,6 +303,7 @@ def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     assert trials[1]["reason"] == "not measured: nowhere in the scan do its marks answer together"
 
 
+@pytest.mark.study
 def test_what_noise_answers_as_well_is_not_matched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor are marks reckoned with that a constellation puts outside of the scan."""
     grey = np.random.default_rng(3).normal(120.0, 25.0, (600, 600)).clip(0, 255).astype(np.uint8)

@@ -36,6 +36,7 @@ def test_a_killed_process_is_replaced_and_its_task_begun_again(tmp_path: Path) -
         assert list(pool.map(square, range(4))) == [0, 1, 4, 9]
 
 
+@pytest.mark.study
 def test_a_task_that_kills_its_process_twice_is_given_up_and_none_else(tmp_path: Path) -> None:
     with worker_pool(2, workers=2) as pool:
         bad = pool.submit(killed_times, 99, tmp_path, 7)
@@ -67,6 +68,7 @@ def test_a_process_killed_on_its_way_says_nothing_of_the_task(tmp_path: Path) ->
         assert task.result(60) == 7
 
 
+@pytest.mark.study
 def test_where_no_process_stands_tasks_are_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.workers.prepare", os.abort)
     with worker_pool(1, workers=1) as pool:

@@ -155,6 +155,7 @@ def given(folder: Path, images: int) -> Path:
     return folder / "project.toml"
 
 
+@pytest.mark.study
 def test_pages_are_made_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     project = given(tmp_path, MOST_FRAMES + 5)
     assert run(["adjust", str(project)]) in (0, 1)
@@ -209,6 +210,7 @@ def as_written(folder: Path) -> None:
         tell_written(store, measurement_of(folder / "comparator.csv"), folder / "comparator.csv")
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("is_written", [False, True])
 def test_scans_come_from_the_store_one_after_the_other(tmp_path: Path, is_written: bool) -> None:
     project, scans = stored(tmp_path)
@@ -252,6 +254,7 @@ def test_frames_that_need_no_look_are_counted_as_if_each_were_read(tmp_path: Pat
     assert set(few.measurement or {}) == set(every.measurement or {})
 
 
+@pytest.mark.study
 def test_marks_that_somebody_has_changed_are_read_from_the_file(tmp_path: Path) -> None:
     project = stored(tmp_path)[0]
     as_written(tmp_path)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from real_data import DATA, needs
+from studies import parametrize_with_studies
 
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import Mark, MarkShape, Polygon
@@ -21,7 +22,6 @@ Picture = NDArray[np.uint8]
 
 LIBRARY = read_library()
 SCENE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text(encoding="utf-8")
-QUICK = ("wild-18x18-115",)
 GALLERY = DATA / "mark_gallery"
 MM_A_PIXEL = 0.0320
 HALF_PX, SEARCH_PX, RIM_PX = 140, 9, 8
@@ -83,7 +83,7 @@ def likeness(picture: Picture, mark: Mark, dot: Array) -> float:
 
 
 @needs("mark_gallery")
-@pytest.mark.parametrize(("name", "camera", "marks", "least"), SEEN)
+@parametrize_with_studies(("name", "camera", "marks", "least"), SEEN, quick=(6, 9, 11, 12))
 def test_a_drawing_looks_like_the_real_mark(name: str, camera: str, marks: str, least: float) -> None:
     picture = np.asarray(cv2.imread(str(GALLERY / f"{name}.png")))
     given = {mark.id: mark.mark for mark in LIBRARY[camera].layout().marks}
@@ -113,14 +113,12 @@ def scene_of(name: str) -> str:
     return scene[: scene.rindex("[[image]]")]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(each, marks=() if each in QUICK else pytest.mark.slow) for each in DRAWN]
-)
+@pytest.mark.study
+@pytest.mark.parametrize("name", DRAWN)
 def test_a_drawn_camera_is_found_among_all(name: str, tmp_path: Path) -> None:
     """Rendered with another code, turned by half a degree, at 125 um."""
     (tmp_path / "scene.toml").write_text(scene_of(name), encoding="utf-8")
     render_project(tmp_path / "scene.toml", tmp_path)
     (scan,) = (tmp_path / "scans").glob("*.tif")
-    tried = LIBRARY if name not in QUICK else {each: LIBRARY[each] for each in (*QUICK, "wild-rc8-153")}
-    found = identify(scan, tried, None, Reporter())
+    found = identify(scan, LIBRARY, None, Reporter())
     assert name in [each for trial in found.best for each in trial.cameras], found.sentence()

@@ -47,6 +47,7 @@ def tie_frame(geometry: FrameGeometry, folder: Path) -> TieFrame:
     return TieFrame(name, folder / "scans" / f"{name}.tif", pixel_from_camera, (38.0, 38.0), np.zeros((0, 3)))
 
 
+@pytest.mark.study
 def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
     truth = render_scene(SCENE, tmp_path)
     geometry = {frame.geometry.image.name: frame.geometry for frame in truth.frames}
@@ -76,6 +77,7 @@ def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
         assert pdist(np.array(observed)).min() > 26.0, "patches of 31 px overlap"
 
 
+@pytest.mark.study
 def test_a_worker_that_is_ended_costs_its_scan_or_its_point_and_none_else(tmp_path: Path) -> None:
     """One process is ended over scan d, another one over a point; and scan e is gone."""
     images = (*SCENE.images, replace(SCENE.images[0], name="d"), replace(SCENE.images[0], name="e"))

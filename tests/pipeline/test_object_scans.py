@@ -61,6 +61,7 @@ def rows(folder: Path) -> list[str]:
     return [line for line in lines if not line.startswith("#")]
 
 
+@pytest.mark.study
 def test_a_bucket_and_a_server_give_the_rows_of_the_disk(
     store: Any, local: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -142,6 +143,7 @@ def test_an_address_that_does_not_answer_costs_the_others_nothing(
     assert "forbids to read it (403)" in capsys.readouterr().err
 
 
+@pytest.mark.study
 def test_credentials_and_signatures_are_used_and_told_nowhere(
     local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

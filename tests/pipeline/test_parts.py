@@ -273,6 +273,7 @@ def test_scans_that_have_nothing_in_common_are_told(tmp_path: Path) -> None:
     assert "Nothing joins it to the other scans of its frame: with b" in joins.problems["a"]
 
 
+@pytest.mark.study
 def test_fiducials_that_contradict_the_joins_are_rejected(halves: Path) -> None:
     """As if the frame of the right half had been found one mark too far to the right."""
     project = _project(halves)

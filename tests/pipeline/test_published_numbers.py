@@ -117,6 +117,7 @@ def rc30(kind: str) -> tuple[str, str, list[tuple[object, ...]]]:
     return camera + fiducials(marks, 0.0), f'[adjust]\ntransformation = "{kind}"\n', rows
 
 
+@pytest.mark.study
 @needs("coded", "camcal", "camcaldemo")
 def test_a_self_calibration_of_2074_marks(tmp_path: Path) -> None:
     """DBAT's camera calibration demo, as in tests/adjust/test_camcal.py, from files and without any approximation."""

@@ -26,6 +26,7 @@ def names(project: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return made
 
 
+@pytest.mark.study
 def test_the_example_measures_adjusts_and_plots(names: dict[str, Any], tmp_path: Path) -> None:
     frame, result = names["frame"], names["result"]
     truth = pipeline.read_adjustment(tmp_path / "demo" / "out" / "adjustment.json")

@@ -9,6 +9,7 @@ from typing import Any
 
 import made_up_calibration
 import pytest
+from studies import parametrize_with_studies
 
 from measure.flags import CODE_MEANING, STATUS_MEANING, Code, Reason, Status
 from measure.results import FrameMeasurement
@@ -293,7 +294,7 @@ def test_the_file_is_written_whole_and_the_same_each_time(adjusted: ReportData, 
     assert (tmp_path / "report.html").read_bytes() == first
 
 
-@pytest.mark.parametrize("verdict", ["differs", "not possible"])
+@parametrize_with_studies("verdict", ["differs", "not possible"])
 def test_the_verdict_of_the_check_stands_with_its_reason(adjusted: ReportData, verdict: Any) -> None:
     check = Check(verdict=verdict, reason="One flat vertical frame.", cameras={})
     text = rendered(replace(adjusted, check=check)).text

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from studies import parametrize_with_studies
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
@@ -161,7 +162,7 @@ def test_marks_of_both_scans_of_a_frame_lie_where_their_transformations_put_them
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-@pytest.mark.parametrize("turn_deg", [0.4, 90.4, 180.3, 269.7])
+@parametrize_with_studies("turn_deg", [0.4, 90.4, 180.3, 269.7], quick=(1,))
 def test_every_pose_shows_the_formula_where_it_should(
     turn_deg: float, mirrored: bool, scan: Path, tmp_path: Path
 ) -> None:
@@ -271,6 +272,7 @@ def test_a_scan_that_is_gone_is_a_result(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.tif"))
 
 
+@pytest.mark.study
 def test_a_project_through_the_command(project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The fiducials of the demonstration, each in all frames at the pixel that its camera coordinates say."""
     out = tmp_path / "frames"

@@ -243,6 +243,7 @@ def test_an_end_after_measuring_leaves_all_as_it_was(project: Path, monkeypatch:
     assert results(project) == before
 
 
+@pytest.mark.study
 def test_marks_that_cannot_be_adjusted_are_kept_and_the_earlier_adjustment_is_not_shown(
     project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,6 +257,7 @@ def test_marks_that_cannot_be_adjusted_are_kept_and_the_earlier_adjustment_is_no
     assert "it is not shown" in said(told)
 
 
+@pytest.mark.study
 def test_a_scan_that_vanishes_before_the_second_visit_keeps_what_the_first_gave(
     project: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -269,6 +271,7 @@ def test_a_scan_that_vanishes_before_the_second_visit_keeps_what_the_first_gave(
     assert "It could not be looked at again: frame2.tif: there is no scan any more." in said(told)
 
 
+@pytest.mark.study
 def test_a_process_that_is_ended_on_the_second_visit_costs_nothing_that_the_first_gave(
     project: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -164,6 +164,7 @@ def test_a_session_by_keyboard_alone_leads_to_the_right_marks(page: Page, measur
     check_measured_again(measured, rows)
 
 
+@pytest.mark.study
 @needs_browser
 def test_a_session_by_mouse_alone_leads_to_the_same(page: Page, measured: Path) -> None:
     rows = comparator(measured)
@@ -200,6 +201,7 @@ def test_a_click_in_a_marks_picture_places_it(page: Page, measured: Path) -> Non
     assert off_px == pytest.approx((0.1 * one["window"][2], 0.0), abs=1.0)
 
 
+@pytest.mark.study
 @needs_browser
 def test_undo_takes_back_the_last_decision(page: Page, measured: Path) -> None:
     open_entry(page, SCRATCHED)
@@ -216,6 +218,7 @@ def test_undo_takes_back_the_last_decision(page: Page, measured: Path) -> None:
     assert [one["decision"] for one in decisions(measured)] == ["reject", "undo"]
 
 
+@pytest.mark.study
 @needs_browser
 def test_two_windows_see_one_anothers_decisions(page: Page, server: Served, measured: Path) -> None:
     other = page.context.new_page()
@@ -239,6 +242,7 @@ def test_names_are_shown_as_text(page: Page) -> None:
     assert page.locator("main img, nav img").count() == 0
 
 
+@pytest.mark.study
 @needs_browser
 def test_a_server_that_was_killed_goes_on_where_it_stopped(browser: Browser, measured: Path) -> None:
     (measured / "decisions.jsonl").unlink(missing_ok=True)
@@ -316,6 +320,7 @@ def check_measured_again(folder: Path, before: Mapping[tuple[str, str], Mapping[
         np.testing.assert_allclose(place, mark_px(TURNED, point), atol=0.1)
 
 
+@pytest.mark.study
 @needs_browser
 def test_a_marks_frame_shows_how_it_lies_and_takes_another_pose_and_that_back(page: Page, measured: Path) -> None:
     open_entry(page, SCRATCHED)
@@ -333,6 +338,7 @@ def test_a_marks_frame_shows_how_it_lies_and_takes_another_pose_and_that_back(pa
     assert told == [(SCRATCHED, "pose", "90"), (SCRATCHED, "undo", None)]
 
 
+@pytest.mark.study
 @needs_browser
 def test_filters_and_search_show_only_what_they_let_through(page: Page) -> None:
     page.locator("summary").click()

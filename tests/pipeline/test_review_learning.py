@@ -54,6 +54,7 @@ def server(project: Path) -> Iterator[Served]:
         yield one
 
 
+@pytest.mark.study
 @needs_browser
 def test_marks_are_shown_in_one_scan_by_keys_tried_at_once_and_learned_from_there(
     project: Path, capsys: pytest.CaptureFixture[str], browser: Browser, server: Served

@@ -225,6 +225,7 @@ def rows_of(project: Path, images: str) -> list[str]:
     return [line for line in lines if line[1:2] == "," and line[0] in images]
 
 
+@pytest.mark.study
 def test_damaged_and_missing_scans_cost_the_others_nothing(tmp_path: Path, capsys: SAID) -> None:
     """Of six scans one is damaged, one a text and one a link that leads nowhere; images.csv names another."""
     whole = write_project(tmp_path / "whole", ["a", "b", "c"])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from studies import parametrize_with_studies
 
 from measure.boards.specs import ChessboardSpec, CircleGridSpec
 from measure.marks import shapes
@@ -72,13 +73,13 @@ def true_frames(name: str) -> tuple[FrameTruth, ...]:
     return tuple(frame_truth(scene, index) for index in range(len(scene.images)))
 
 
-@pytest.mark.parametrize("name", [name for name in READY if name not in ADJUSTED])
+@parametrize_with_studies("name", [name for name in READY if name not in ADJUSTED], quick=(0, 3))
 def test_the_last_frame_of_a_ready_scene_shows_its_marks_and_enough_targets(name: str) -> None:
     scene = read_scene(scene_path(name)).scene
     assert_shown(name, frame_truth(scene, len(scene.images) - 1))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", READY)
 def test_every_frame_of_a_ready_scene_shows_its_marks_and_enough_targets(name: str) -> None:
     for truth in true_frames(name):
@@ -310,7 +311,7 @@ def test_a_folder_that_cannot_be_made_is_an_input_error(tmp_path: Path) -> None:
         render_project(path, path / "out")
 
 
-@pytest.mark.parametrize("name", ADJUSTED)
+@parametrize_with_studies("name", ADJUSTED, quick=(1,))
 def test_the_adjustment_finds_the_scenes_camera(tmp_path: Path, name: str) -> None:
     """Renderer and adjustment share no formula: a sign or a unit that one of them has wrong would show here."""
     scene_file = read_scene(scene_path(name))

@@ -121,6 +121,7 @@ def test_pictures_follow_results_that_are_moved_or_merged(folder: Path) -> None:
         assert thumbnails.of(before["a"], "1", "fiducial") is None
 
 
+@pytest.mark.study
 def test_stores_of_shards_bring_their_pictures(measured: Path, tmp_path: Path) -> None:
     parts = tmp_path / "parts"
     shutil.copytree(measured, parts, ignore=lambda *_: ["out", "comparator.csv"])

@@ -81,6 +81,7 @@ def error(mark: MarkMeasurement, place: Array) -> Array:
     return mark.center_px - place
 
 
+@pytest.mark.study
 def test_crosses_in_space_with_no_principal_distance(scenes: dict[str, Path], tmp_path: Path) -> None:
     project, places = rendered(scenes[CROSSES], tmp_path)
     camera = tmp_path / "camera.toml"
@@ -92,6 +93,7 @@ def test_crosses_in_space_with_no_principal_distance(scenes: dict[str, Path], tm
     assert max(np.abs(one).max() for one in off.values()) < 0.03
 
 
+@pytest.mark.study
 def test_an_orientation_that_does_not_fit_is_not_used(scenes: dict[str, Path], tmp_path: Path) -> None:
     project, places = rendered(scenes[CROSSES], tmp_path)
     turned = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,-1.2,0.9,2.0,-25.0,-30.0,-90.0\n"
@@ -103,6 +105,7 @@ def test_an_orientation_that_does_not_fit_is_not_used(scenes: dict[str, Path], t
     assert any("orientation in images.csv was not used" in problem for problem in scan.frame.problems)
 
 
+@pytest.mark.study
 def test_ring_codes_in_space_and_two_that_are_confused(scenes: dict[str, Path], tmp_path: Path) -> None:
     project, places = rendered(scenes[RINGS], tmp_path)
     off = errors(measure_scan(read_project(project), "a"), places)

@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.workers import worker_pool
 
-WAIT_S = 5.0
+WAIT_S = 60.0
 
 
 def count_up(told: Path) -> None:

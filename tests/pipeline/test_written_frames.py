@@ -360,6 +360,7 @@ pose = "90m"
 """
 
 
+@pytest.mark.study
 def test_a_rendered_frame_is_read_and_its_pose_decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "scene.toml").write_text(SCENE, encoding="utf-8")
     render_project(tmp_path / "scene.toml", tmp_path / "p")

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from small_scene import OBLIQUE, PLACES, SCANNER, rendered, scene
+from studies import parametrize_with_studies
 from test_render import CENTER_PX, centroid
 
 from synthetic_images.film import frame_geometry
@@ -25,7 +26,7 @@ def displaced_mm(x: float, y: float) -> tuple[float, float]:
     return 0.060 * (3 * u * u - 1) / 2 + 0.020 * (5 * v**3 - 3 * v) / 2, -0.050 * u * v + 0.002 * p6
 
 
-@pytest.mark.parametrize("pose", ["0", "90", "180m"])
+@parametrize_with_studies("pose", ["0", "90", "180m"])
 def test_a_mark_lies_where_film_and_scanner_put_it(tmp_path: Path, pose: str) -> None:
     """The bend stays in the scanner's axes however the frame is laid."""
     image = replace(OBLIQUE, pose=pose)

@@ -115,6 +115,7 @@ def test_the_border_and_what_was_not_exposed_within_the_frame_have_one_texture(t
     assert exposed.std() < 1e-4
 
 
+@pytest.mark.study
 def test_the_same_scene_gives_the_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
     film = Film(grain=0.02, dust=5, scratches=1, hairs=1)
     made = scene(film=film, background="terrain", tones=Tones())
@@ -126,6 +127,7 @@ def test_the_same_scene_gives_the_same_bytes_and_another_seed_others(tmp_path: P
     assert (tmp_path / "a" / "truth.json").read_bytes() == (tmp_path / "b" / "truth.json").read_bytes()
 
 
+@pytest.mark.study
 def test_memory_does_not_grow_with_the_scans_length(tmp_path: Path) -> None:
     peaks = []
     for height_mm in (40.0, 160.0):
@@ -151,7 +153,7 @@ def test_a_failed_rendering_leaves_the_earlier_scan(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "scans").iterdir()) == ["f.tif"]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_frame_of_real_size_needs_little_memory(tmp_path: Path) -> None:
     """23 x 23 cm at 20 um, 16 bit, grain, dust, in a process of its own. Linux's getrusage would tell of pytest too."""
     program = """
