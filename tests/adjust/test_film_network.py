@@ -41,7 +41,7 @@ def test_perfect_data_leave_nothing_and_give_the_truth_back(kind: Transformation
     assert result.mirrored == {"f1"}
 
 
-@pytest.mark.parametrize("kind", [pytest.param("polynomial(3)", marks=pytest.mark.slow), "polynomial(5)"])
+@pytest.mark.parametrize("kind", [pytest.param("polynomial(3)", marks=pytest.mark.study), "polynomial(5)"])
 def test_the_origin_of_the_comparator_does_not_matter(kind: Transformation) -> None:
     """A metre and a half off, as on a film strip; with exact observations, which are moved without a rounding."""
     network, _ = simulated(

@@ -149,7 +149,7 @@ CASES = (
     fiducials_fixed_free_and_given,
     *(partial(bent_films, kind) for kind in ("projective", "conformal(2)")),
     *(
-        pytest.param(partial(bent_films, kind), marks=pytest.mark.slow)
+        pytest.param(partial(bent_films, kind), marks=pytest.mark.study)
         for kind in ("bilinear", "conformal(3)", "polynomial(2)", "polynomial(3)")
     ),
 )

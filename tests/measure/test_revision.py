@@ -43,8 +43,8 @@ def results(folder: Path) -> dict[str, Row]:
 
 
 def chessboard() -> tuple[MarkMeasurement, ...]:
-    squares = np.kron(np.indices((4, 5)).sum(axis=0) % 2, np.ones((40, 40)))
-    sharp = np.pad(squares, 40, constant_values=1.0)
+    squares = np.kron(np.indices((4, 5)).sum(axis=0) % 2, np.ones((24, 24)))
+    sharp = np.pad(squares, 24, constant_values=1.0)
     grey = gaussian_filter(sharp, 1.0) * 40000.0 + 5000.0 + np.random.default_rng(3).normal(0.0, 300.0, sharp.shape)
     return measure_board(scan_of(grey), ChessboardSpec(4, 3, 10.0)).marks
 
