@@ -15,9 +15,8 @@ from measure.results import Pose
 from pipeline.archive.status import NAMED, ArchiveStatus, archive_status, worst_named
 from pipeline.archive.verdicts import NEXT_STEP, Verdict
 from pipeline.files.project_file import Project
-from pipeline.report.camera_views import fiducial_form
 from pipeline.report.data import Problem, ReportData
-from pipeline.report.fiducials import Figure
+from pipeline.report.fiducials import Figure, figure
 from pipeline.report.marks import current_scans
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.verdict import Level, ReportVerdict, judge
@@ -74,7 +73,7 @@ def _forms(data: ReportData) -> dict[str, Figure]:
     if stored is None or covariance is None or not stored.converged:
         return {}
     uncalibrated = [name for name, camera in stored.cameras.items() if not camera.is_calibrated]
-    found = {name: fiducial_form(name, stored, covariance) for name in uncalibrated}
+    found = {name: figure(name, stored, covariance) for name in uncalibrated}
     return {name: form for name, form in found.items() if form is not None}
 
 
@@ -157,8 +156,7 @@ def _form_table(name: str, form: Figure) -> Table:
     after = "" if form.transformation == "none" else f", after a transformation to these ({form.transformation})"
     title = f"Corrections to the given fiducials of {name}{after}"
     table = Table("mark", "x, um", "sigma", "y, um", "sigma", title=title, title_justify="left")
-    sigmas = np.sqrt(np.maximum(np.diag(form.covariance_um2), 0.0)).reshape(-1, 2)
-    for id, change, sigma in zip(form.ids, form.change_um, sigmas, strict=True):
+    for id, change, sigma in zip(form.ids, form.change_um, form.sigmas_um, strict=True):
         table.add_row(Text(id), *(f"{value:.3f}" for pair in zip(change, sigma, strict=True) for value in pair))
     for each in form.distances:
         between = Text(f"{each.start} to {each.end}: {each.length_mm:.4f} mm")

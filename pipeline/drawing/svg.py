@@ -69,6 +69,12 @@ def words(x: float, y: float, content: str, class_: str = "label", anchor: str =
     return tag("text", content, x=x, y=y, class_=class_, text_anchor=anchor)
 
 
+def scale_bar(x: float, y: float, length: float, text: str) -> Markup:
+    """A bar with ends, and what its length stands for."""
+    ends = (x, x, x, x + length, x + length, x + length)
+    return line(ends, (y - 3, y + 3, y, y, y - 3, y + 3), "bar") + words(x + length + 6.0, y + 4.0, text, "tick")
+
+
 def ellipse_axes(covariance: Array) -> tuple[Array, Array]:
     """Semi-axes (n, 2) of the ellipses that hold 95 %, the larger last, and its direction (n,), counter-clockwise from
     x in degrees; covariance (n, 2, 2)."""

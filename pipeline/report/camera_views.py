@@ -8,80 +8,48 @@ from markupsafe import Markup
 from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import parameter_from_text
 from pipeline.report import fiducials, lens, vectors
-from pipeline.report.certificate import CertificateView, certificate_view
 from pipeline.report.data import ReportData
 from pipeline.report.frame_views import residuals_by_image
-from pipeline.report.lens_map import LensMap, lens_map
-from pipeline.report.numbers import fixed, value_and_sigma
-from pipeline.report.parameters import ParameterRow, axes_sentence, group_sentences, high_correlations, parameter_rows
-from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity, ResidualRecord
-from pipeline.results.check_file import CameraCheck, Row
+from pipeline.report.numbers import fixed
+from pipeline.report.parameters import ParameterRow, high_correlations, parameter_rows
+from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, ResidualRecord
+from pipeline.results.check_file import CameraCheck
 from pipeline.results.covariance_file import Covariance
 
 PLOT_PX = 560.0
 LONGEST_VECTOR_PX = 60.0
 MOST_VECTORS = 10_000  # in the picture of all frames
 CURVE_TABLE_ROWS = 6
-FINE_UM = 0.05  # standard deviation of a form below which tenths of a micrometre do not show it
 
 
 @dataclass(frozen=True)
-class CurveRow:
-    """The distortion at a radius, each value with its sigma, ready to print."""
+class LensView:
+    """The distortion of a camera. rows: of the curves' table, by their positions."""
 
-    radius_mm: str
-    radial: tuple[str, str]
-    asymmetric: tuple[str, str]
-
-
-@dataclass(frozen=True)
-class FiducialRow:
-    """A fiducial: estimated coordinates with sigmas, less the given ones in um, and the change of form in um."""
-
-    id: str
-    x: tuple[str, str]
-    y: tuple[str, str]
-    moved_um: tuple[str, str]
-    form_um: tuple[str, str]
-    form_sigma_um: tuple[str, str]
-
-
-@dataclass(frozen=True)
-class CheckRow:
-    """A parameter in both calibrations."""
-
-    name: str
-    unit: str
-    reseau: tuple[str, str]
-    opencv: tuple[str, str]
-    difference_sigmas: str
+    curves: lens.Curves
+    plot: Markup
+    rows: list[int]
+    certificate: lens.Certificate
+    map: lens.LensMap | None
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera, ready to print; None or empty where the files do not hold what is needed."""
+    """A camera; None or empty where the files do not hold what is needed."""
 
     name: str
-    calibrated: bool
+    record: CameraRecord
+    is_calibrated: bool
     images: int
-    radius_mm: float
+    effect_where: str
     parameters: list[ParameterRow]
-    groups: list[str]
-    axes: str
-    in_given_figure: list[tuple[str, str, str]]
-    distances: tuple[fiducials.Distance, ...]
     correlations: list[tuple[str, str, float]]
     trade_offs: list[str]
-    curves: Markup | None
-    effect_where: str
-    lens_map: LensMap | None
-    curve_rows: list[CurveRow]
-    certificate: CertificateView | None
-    fiducials: list[FiducialRow]
-    figure: Markup | None
+    lens: LensView | None
+    figure: fiducials.Figure | None
+    figure_plot: Markup | None
     vectors: Markup | None
     check: CameraCheck | None
-    check_rows: list[CheckRow]
 
 
 def camera_views(data: ReportData) -> list[CameraView]:
@@ -91,41 +59,29 @@ def camera_views(data: ReportData) -> list[CameraView]:
 
 
 def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraRecord) -> CameraView:
-    images = stored.images_of(name)
-    by_image = residuals_by_image(data)
+    images, by_image = stored.images_of(name), residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
     known = data.covariance if stored.converged else None
     # Where there is no solution, none of what is missing was left out.
-    calibrated = camera.is_calibrated or not stored.converged
-    covariance = known if calibrated else None
+    is_calibrated = camera.is_calibrated or not stored.converged
+    covariance = known if is_calibrated else None
     radius_mm, frame_mm = _observed_radius_mm(camera, rows), data.frame_mm.get(name)
-    form = fiducial_form(name, stored, known) if known else None
-    curve = _curves(name, camera, covariance, radius_mm, frame_mm) if covariance else None
-    check = data.check.cameras.get(name) if data.check else None
+    figure = fiducials.figure(name, stored, known) if known else None
+    over_frame = lens.is_defined_over_frame(camera.lens())
     return CameraView(
         name=name,
-        calibrated=calibrated,
+        record=camera,
+        is_calibrated=is_calibrated,
         images=len(images),
-        radius_mm=radius_mm,
-        parameters=parameter_rows(name, camera, _prior_scale(name, stored), radius_mm) if calibrated else [],
-        groups=group_sentences(camera.significance),
-        axes=axes_sentence(camera),
-        in_given_figure=_interior_in_given_datum(form) if form and calibrated else [],
-        distances=form.distances if form else (),
+        effect_where="in the frame" if over_frame else f"at {fixed(radius_mm, 0)} mm",
+        parameters=list(parameter_rows(name, camera, _prior_scale(name, stored), radius_mm)) if is_calibrated else [],
         correlations=high_correlations(name, camera, covariance) if covariance else [],
         trade_offs=_trade_offs(name, stored),
-        curves=lens.curves_plot(curve, radius_mm) if curve else None,
-        effect_where="in the frame" if lens.is_of_frame(lens.lens(name, camera)) else f"at {fixed(radius_mm, 0)} mm",
-        lens_map=_lens_map(name, camera, covariance, rows, radius_mm, frame_mm) if covariance else None,
-        curve_rows=_curve_rows(curve) if curve else [],
-        certificate=certificate_view(lens.lens(name, camera, covariance), _reach_mm(curve, radius_mm))
-        if curve and covariance
-        else None,
-        fiducials=[_fiducial_row(id, fiducial, form) for id, fiducial in camera.fiducials.items()],
-        figure=fiducials.figure_plot(form) if form else None,
-        vectors=_vectors(rows, frame_mm),
-        check=check,
-        check_rows=[_check_row(row) for row in check.rows] if check else [],
+        lens=_lens_view(name, camera, covariance, rows, radius_mm, frame_mm) if covariance else None,
+        figure=figure,
+        figure_plot=fiducials.figure_plot(figure) if figure else None,
+        vectors=_vectors(rows, frame_mm) if rows else None,
+        check=data.check.cameras.get(name) if data.check else None,
     )
 
 
@@ -152,107 +108,41 @@ def _trade_offs(name: str, stored: AdjustmentRecord) -> list[str]:
     ]
 
 
-def fiducial_form(name: str, stored: AdjustmentRecord, covariance: Covariance) -> fiducials.Figure | None:
-    """The figure of a camera's fiducials, free of its datum: with its interior orientation, or by its films alone."""
-    camera = stored.cameras[name]
-    if camera.is_calibrated:
-        return fiducials.figure(name, camera, covariance)
-    return fiducials.figure_of_films(name, camera.fiducials, covariance, stored.films(stored.images_of(name)))
-
-
-def _interior_in_given_datum(form: fiducials.Figure) -> list[tuple[str, str, str]]:
-    """c, x0' and y0' with their sigmas when the fiducials stand where they were given."""
-    rows = zip(("c", "x₀′", "y₀′"), form.interior_mm.tolist(), form.interior_sigma_mm.tolist(), strict=True)
-    return [(symbol, *value_and_sigma(value, sigma)) for symbol, value, sigma in rows]
-
-
-def _curves(
-    name: str, camera: CameraRecord, covariance: Covariance, radius_mm: float, frame_mm: tuple[float, float] | None
-) -> lens.Curves | None:
-    """Out to the frame's corner where its size is known, else to the outermost target.
-
-    Of a family that is defined over the frame: on circles that lie in it.
-    """
-    corner_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
-    if camera.lens_known is not None and camera.lens_known.corner_mm > 0.0:
-        corner_mm = camera.lens_known.corner_mm
-    largest = max(radius_mm, corner_mm)
-    if not parameter_names(camera.distortion.family) or largest == 0.0:
-        return None
-    of = lens.lens(name, camera, covariance)
-    return lens.curves(of, min(largest, *of.distortion.half_mm) if lens.is_of_frame(of) else largest)
-
-
-def _reach_mm(curve: lens.Curves, observed_mm: float) -> float:
-    """How far a certificate goes: to the outermost target, or as far as the curve."""
-    return min(observed_mm or np.inf, float(curve.radius_mm[-1]))
-
-
-def _lens_map(
+def _lens_view(
     name: str,
     camera: CameraRecord,
     covariance: Covariance,
     rows: list[ResidualRecord],
     radius_mm: float,
     frame_mm: tuple[float, float] | None,
-) -> LensMap | None:
-    if not parameter_names(camera.distortion.family) or not rows:
+) -> LensView | None:
+    """Out to the frame's corner where its size is known, else to the outermost target. Of a family that is defined over
+    the frame: on circles that lie in it."""
+    reach = camera.lens_known
+    corner_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
+    largest = max(radius_mm, reach.corner_mm if reach is not None and reach.corner_mm > 0.0 else corner_mm)
+    if not parameter_names(camera.distortion.family) or largest == 0.0:
         return None
-    if camera.lens_known is not None and camera.lens_known.frame_mm is not None:
-        on = vectors.plane_about(np.array(camera.lens_known.frame_mm), PLOT_PX)
-    else:
+    known = lens.lens(name, camera, covariance)
+    if lens.is_defined_over_frame(known):
+        largest = min(largest, *known.distortion.half_mm)
+    curves = lens.curves(known, largest)
+    lens_map = None
+    if rows:
         on = vectors.plane(vectors.VectorField.of_residuals(rows).places_mm, frame_mm, PLOT_PX)
-    return lens_map(lens.lens(name, camera, covariance), on, radius_mm)
-
-
-def _curve_rows(curve: lens.Curves) -> list[CurveRow]:
-    at = np.linspace(0, len(curve.radius_mm) - 1, CURVE_TABLE_ROWS + 1).round().astype(int)[1:]
-    return [
-        CurveRow(
-            radius_mm=fixed(curve.radius_mm[i], 1),
-            radial=value_and_sigma(float(curve.radial_um[i]), float(curve.radial_sigma_um[i])),
-            asymmetric=value_and_sigma(float(curve.asymmetric_um[i]), float(curve.asymmetric_sigma_um[i])),
-        )
-        for i in at
-    ]
-
-
-def _fiducial_row(id: str, fiducial: FiducialRecord, form: fiducials.Figure | None) -> FiducialRow:
-    x, y = fiducial.x_mm, fiducial.y_mm
-    changed = changed_sigma = (fixed(None), fixed(None))
-    if form and id in form.ids:
-        at = form.ids.index(id)
-        change, sigma = form.change_um[at], np.sqrt(np.maximum(np.diag(form.of_marks_um2[at]), 0.0))
-        digits = 1 if sigma.min() >= FINE_UM else 3
-        changed = (fixed(change[0], digits, sign=True), fixed(change[1], digits, sign=True))
-        changed_sigma = (fixed(sigma[0], digits), fixed(sigma[1], digits))
-    return FiducialRow(
-        id=id,
-        x=value_and_sigma(x.value, x.sigma),
-        y=value_and_sigma(y.value, y.sigma),
-        moved_um=(_moved_um(x), _moved_um(y)),
-        form_um=changed,
-        form_sigma_um=changed_sigma,
+        if reach is not None and reach.frame_mm is not None:
+            on = vectors.plane_about(np.array(reach.frame_mm), PLOT_PX)
+        lens_map = lens.lens_map(known, on, radius_mm)
+    return LensView(
+        curves,
+        lens.curves_plot(curves, radius_mm),
+        np.linspace(0, len(curves.radius_mm) - 1, CURVE_TABLE_ROWS + 1).round().astype(int)[1:].tolist(),
+        lens.certificate(known, min(radius_mm or np.inf, float(curves.radius_mm[-1]))),
+        lens_map,
     )
 
 
-def _moved_um(quantity: Quantity) -> str:
-    return fixed(1e3 * (quantity.value - quantity.given.value) if quantity.given else None, 1, sign=True)
-
-
-def _vectors(rows: list[ResidualRecord], frame_mm: tuple[float, float] | None) -> Markup | None:
-    if not rows:
-        return None
+def _vectors(rows: list[ResidualRecord], frame_mm: tuple[float, float] | None) -> Markup:
     scale = vectors.VectorField.of_residuals(rows).scale(LONGEST_VECTOR_PX)
     residuals = vectors.VectorField.of_residuals(rows[:: -(-len(rows) // MOST_VECTORS)])  # evenly over the frames
     return vectors.all_images_plot(residuals, vectors.plane(residuals.places_mm, frame_mm, PLOT_PX), scale)
-
-
-def _check_row(row: Row) -> CheckRow:
-    return CheckRow(
-        name=row.name,
-        unit=row.unit or "–",
-        reseau=value_and_sigma(row.reseau.value, row.reseau.sigma),
-        opencv=value_and_sigma(row.opencv.value, row.opencv.sigma),
-        difference_sigmas=fixed(row.difference_sigmas, 2, sign=True),
-    )

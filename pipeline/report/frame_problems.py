@@ -23,7 +23,7 @@ Sentence = TypeVar("Sentence", Problem, str)
 
 def problems_of(frame: Frame, with_pose: bool) -> Iterator[Problem]:
     """What one frame has to say. with_pose: also of a pose that nothing decides."""
-    yield from _assumed(frame) if with_pose else ()
+    yield from _assumed_pose(frame) if with_pose else ()
     yield from _measurement_problems(frame)
 
 
@@ -34,17 +34,22 @@ def masked_text(sentence: str) -> str:
 
 def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
     """What the frames have to say, said once where several frames say the same."""
-    for problem, images in said_by(shots, _measurement_problems).items():
-        yield Problem(f"{listed(images)}: {problem.what}", problem.next_step)
+    return _together(shots, _measurement_problems)
 
 
 def assumed_poses(shots: list[Frame]) -> Iterator[Problem]:
     """The poses that nothing decides, said once where several frames say the same."""
-    for problem, images in said_by(shots, _assumed).items():
+    return _together(shots, _assumed_pose)
+
+
+def _together(shots: list[Frame], evidence: Callable[[Frame], Iterable[Problem]]) -> Iterator[Problem]:
+    for problem, images in images_by_sentence(shots, evidence).items():
         yield Problem(f"{listed(images)}: {problem.what}", problem.next_step)
 
 
-def said_by(shots: list[Frame], evidence: Callable[[Frame], Iterable[Sentence]]) -> dict[Sentence, list[str]]:
+def images_by_sentence(
+    shots: list[Frame], evidence: Callable[[Frame], Iterable[Sentence]]
+) -> dict[Sentence, list[str]]:
     """The frames' names by what they say."""
     images: dict[Sentence, list[str]] = {}
     for frame in shots:
@@ -53,7 +58,7 @@ def said_by(shots: list[Frame], evidence: Callable[[Frame], Iterable[Sentence]])
     return images
 
 
-def _assumed(frame: Frame) -> Iterator[Problem]:
+def _assumed_pose(frame: Frame) -> Iterator[Problem]:
     pose = frame.scan.frame.pose if frame.scan else None
     if not pose or pose.decided:
         return

@@ -1,7 +1,7 @@
 """What the report shows of each frame: a line of the summary, its marks, residuals, orientation and writing."""
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,21 +15,20 @@ from pipeline.drawing import svg
 from pipeline.report import mark_pictures, vectors
 from pipeline.report.data import ReportData
 from pipeline.report.marks import Frame, Mark
-from pipeline.report.numbers import fixed, value_and_sigma
+from pipeline.report.numbers import fixed
 from pipeline.report.verdict import suspect_rows
-from pipeline.results.adjustment_record import Quantity, ResidualRecord
+from pipeline.results.adjustment_record import ImageRecord, ResidualRecord
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.results.thumbnail import Thumbnail
 
 _WIDTH_PX = 1000.0  # plates of 20 mm on film of 230 are read
 _LEAST_PX = 7.0  # of letters
 OPEN_FRAMES = 12  # with more frames, only those with a lost mark are unfolded
 PLOT_PX = 330.0
 LONGEST_VECTOR_PX = 42.0
-_LEAST_TOLD_PX = 0.0005
+_LEAST_PART_PX = 0.0005  # a thousandth of a pixel is the last digit that is printed
 
 
-def written(scan: MeasuredScan | None) -> Markup | None:
+def writing_picture(scan: MeasuredScan | None) -> Markup | None:
     """The scan's outline with its lines of writing in place; None where none was read. Those that the pose's evidence
     quotes stand out."""
     if scan is None or not scan.frame.writing:
@@ -42,7 +41,7 @@ def written(scan: MeasuredScan | None) -> Markup | None:
     return svg.picture(width, height, "What is written about the frame, as it lies in the scan", *drawn, class_="film")
 
 
-def _writing_line(line: Line, zoom: float, listed_causes: bool) -> Markup:
+def _writing_line(line: Line, zoom: float, is_evidence: bool) -> Markup:
     """The text over the rectangle in which it was read, turned and mirrored as it lies."""
     outline = [(col * zoom, row * zoom) for col, row in line.outline_px]
     cols, rows = zip(*outline, strict=True)
@@ -56,34 +55,30 @@ def _writing_line(line: Line, zoom: float, listed_causes: bool) -> Markup:
         "text",
         line.text,
         transform=f"matrix({' '.join(f'{value:g}' for value in matrix)})",
-        class_="told" if listed_causes else "read",
+        class_="told" if is_evidence else "read",
         font_size=f"{size:.1f}",
         text_anchor="middle",
         dominant_baseline="central",
         textLength=f"{max(sides):.1f}",
         lengthAdjust="spacingAndGlyphs",
     )
-    return svg.line(cols, rows, "told" if listed_causes else "read", closed=True) + text
+    return svg.line(cols, rows, "told" if is_evidence else "read", closed=True) + text
 
 
 @dataclass(frozen=True)
 class Card:
-    """A mark's picture and numbers. picture: None where there is no scan to cut it from; causes: what sigma consists
-    of; by_edges: how far off the second method puts it."""
+    """A mark of the report. picture: None where there is no scan to cut it from; causes: what its standard deviation in
+    the scan consists of, with sizes and meanings; empty where it has one cause."""
 
     mark: Mark
     picture: Markup | None
-    sigma: str
     causes: tuple[tuple[str, str, str], ...]
-    by_edges: str
-    residual: str
-    w: str
     is_suspect: bool
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """A frame, ready to print. rms_um: of its residuals along x and y; None where it has none."""
+    """A frame of the report. rms_um: of its residuals along x and y; stored: what is adjusted of it; None without."""
 
     frame: Frame
     fiducials: str
@@ -91,11 +86,9 @@ class FrameView:
     rms_um: tuple[float, float] | None
     largest_w: float | None
     cards: tuple[Card, ...]
-    hidden: int
     plot: Markup | None
     writing: Markup | None
-    orientation: tuple[tuple[str, str, str], ...]
-    transformation: tuple[tuple[str, str, str], ...]
+    stored: ImageRecord | None
     is_open: bool
 
 
@@ -106,28 +99,28 @@ def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) 
     by_image = residuals_by_image(data)
     suspects = suspect_rows(data.adjustment) if data.adjustment else frozenset[ResidualRecord]()
     plots = _plots(data, by_image, suspects, [frame.image for frame in shots if frame.image in by_image])
-    views = []
-    for frame in shots:
-        stored = data.adjustment.images.get(frame.image) if data.adjustment else None
-        residuals = by_image.get(frame.image, [])
-        cards = tuple(_card(mark, data.thumbnail, px_per_um, most_px, suspects) for mark in shown[frame.image])
-        views.append(
-            FrameView(
-                frame=frame,
-                fiducials=_observed_share([mark for mark in frame.marks if mark.is_fiducial]),
-                targets=_observed_share([mark for mark in frame.marks if not mark.is_fiducial]),
-                rms_um=_rms_um(residuals),
-                largest_w=max((abs(row.w) for row in residuals if np.isfinite(row.w)), default=None),
-                cards=cards,
-                hidden=len(frame.marks) - len(cards),
-                plot=plots.get(frame.image),
-                writing=written(frame.scan),
-                orientation=_quantities(stored.exterior.elements) if stored else (),
-                transformation=_quantities(stored.transformation.parameters) if stored else (),
-                is_open=len(shots) <= OPEN_FRAMES or (data.totals is None and _lost_fiducial(frame)),
-            )
+
+    def card(mark: Mark) -> Card:
+        thumbnail = data.thumbnail(mark.image, mark.point, mark.kind) if data.thumbnail else None
+        picture = mark_pictures.drawn(mark, thumbnail, px_per_um, most_px) if thumbnail else None
+        return Card(mark, picture, _causes(mark.covariance), mark.residual in suspects)
+
+    return [
+        FrameView(
+            frame=frame,
+            fiducials=_observed_share([mark for mark in frame.marks if mark.is_fiducial]),
+            targets=_observed_share([mark for mark in frame.marks if not mark.is_fiducial]),
+            rms_um=_rms_um(by_image.get(frame.image, [])),
+            largest_w=max((abs(row.w) for row in by_image.get(frame.image, ()) if np.isfinite(row.w)), default=None),
+            cards=tuple(map(card, shown[frame.image])),
+            plot=plots.get(frame.image),
+            writing=writing_picture(frame.scan),
+            stored=data.adjustment.images.get(frame.image) if data.adjustment else None,
+            is_open=len(shots) <= OPEN_FRAMES
+            or (data.totals is None and any(mark.is_fiducial and mark.is_open for mark in frame.marks)),
         )
-    return views
+        for frame in shots
+    ]
 
 
 def thumbnail_scale(shots: list[Frame]) -> float:
@@ -158,53 +151,11 @@ def _plots(
     }
 
 
-def _card(
-    mark: Mark,
-    picture_of: Callable[[str, str, str], Thumbnail | None] | None,
-    px_per_um: float,
-    most_px: float,
-    suspects: Collection[ResidualRecord],
-) -> Card:
-    thumbnail = picture_of(mark.image, mark.point, mark.kind) if picture_of else None
-    residual = mark.residual
-    return Card(
-        mark=mark,
-        picture=mark_pictures.drawn(mark, thumbnail, px_per_um, most_px) if thumbnail else None,
-        sigma=_sigma(mark),
-        causes=_causes(mark.covariance),
-        by_edges=_edge_offset(mark.quality),
-        residual=", ".join(fixed(v, 1, sign=True) for v in residual.v_um) if residual else "",
-        w=fixed(mark.w, 1, sign=True) if mark.w is not None else "no check" if residual else "",
-        is_suspect=residual in suspects,
-    )
-
-
-def _edge_offset(quality: Mapping[str, float]) -> str:
-    if "second_method_sigmas" not in quality:
-        return ""
-    off = (fixed(quality[f"second_method_{axis}_px"], 3, sign=True) for axis in ("col", "row"))
-    return f"{', '.join(off)} px; {fixed(quality['second_method_sigmas'], 1)} σ"
-
-
-def _sigma(mark: Mark) -> str:
-    parts = []
-    if mark.sigma_um is not None:
-        parts.append(" × ".join(fixed(sigma, 1) for sigma in mark.sigma_um) + " µm")
-    if mark.covariance is not None:
-        parts.append(" × ".join(fixed(sigma, 3) for sigma in np.sqrt(np.diag(mark.covariance.px2))) + " px")
-    return "; ".join(parts)
-
-
 def _causes(covariance: Covariance | None) -> tuple[tuple[str, str, str], ...]:
-    """What the standard deviation in the scan consists of: cause, size in px, meaning; nothing where it has one cause.
-    A thousandth of a pixel is the last digit that is told."""
     sigmas = {} if covariance is None else covariance.sigmas_px
-    listed_causes = {cause: sigma for cause, sigma in sigmas.items() if sigma >= _LEAST_TOLD_PX}
-    return (
-        tuple((str(cause), fixed(sigma, 3), CAUSE_MEANING[cause]) for cause, sigma in listed_causes.items())
-        if len(listed_causes) > 1
-        else ()
-    )
+    parts = [(cause, sigma) for cause, sigma in sigmas.items() if sigma >= _LEAST_PART_PX]
+    named = tuple((str(cause), fixed(sigma, 3), CAUSE_MEANING[cause]) for cause, sigma in parts)
+    return named if len(named) > 1 else ()
 
 
 def _observed_share(marks: list[Mark]) -> str:
@@ -222,16 +173,5 @@ def _observed_share(marks: list[Mark]) -> str:
 def _rms_um(residuals: list[ResidualRecord]) -> tuple[float, float] | None:
     if not residuals:
         return None
-    v = np.array([row.v_um for row in residuals])
-    x, y = np.sqrt((v**2).mean(axis=0))
+    x, y = np.sqrt(np.mean(np.square([row.v_um for row in residuals]), axis=0))
     return float(x), float(y)
-
-
-def _quantities(entries: Mapping[str, Quantity]) -> tuple[tuple[str, str, str], ...]:
-    return tuple(
-        (name, *value_and_sigma(each.value, each.sigma)) for name, each in entries.items() if np.isfinite(each.value)
-    )
-
-
-def _lost_fiducial(frame: Frame) -> bool:
-    return any(mark.is_fiducial and mark.is_open for mark in frame.marks)

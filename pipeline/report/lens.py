@@ -1,4 +1,5 @@
-"""The distortion of a camera as curves over the radius, with their standard deviations from the full covariance."""
+"""The distortion of a camera over the radius, as a certificate and over the frame, with standard deviations from the
+full covariance."""
 
 from dataclasses import dataclass, replace
 
@@ -9,6 +10,7 @@ from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
+from pipeline.report.vectors import Plane, grid_mm, longest_vector, strokes_and_dots
 from pipeline.results.adjustment_record import CameraRecord
 from pipeline.results.covariance_file import Covariance
 from pipeline.types import Array
@@ -17,6 +19,16 @@ RADII = 80
 DIRECTIONS = 36
 FRAME_GRID = 17
 BAND = 1.959964  # sigmas to a probability of 95 %
+
+# Of the U.S. Geological Survey's reports, as far as the frame reaches.
+ANGLES_DEG = (7.5, 15.0, 22.7, 30.0, 35.0, 40.0)
+_FEWEST_ANGLES = 5  # from which the principal distance and three powers come back, with one value over
+_CERTIFICATE_RADII = 240
+_NEAR_AXIS = 1e-3  # of the largest radius: there the distortion is linear in it
+
+MAP_GRID = 15  # vectors along the longer side
+LONGEST = 1.5  # of the grid's mesh
+ARCS = 180  # of the circle about what was observed
 
 
 @dataclass(frozen=True)
@@ -34,91 +46,88 @@ class Curves:
     asymmetric_sigma_um: Array
 
 
+@dataclass(frozen=True)
+class CertificateRow:
+    """The distortion at an angle from the axis, positive outwards, each value in um with its sigma."""
+
+    angle_deg: float
+    radius_mm: float
+    radial: tuple[float, float]
+    asymmetric: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """calibrated: the principal distance that makes the largest and the least radial distortion equal, to which the
+    rows refer; equivalent: that near the axis; with their sigmas, mm. reach_mm: how far out it is balanced."""
+
+    calibrated: tuple[float, float]
+    equivalent: tuple[float, float]
+    reach_mm: float
+    rows: list[CertificateRow]
+
+
+@dataclass(frozen=True)
+class LensMap:
+    """The drawing, and the largest displacement in it with its sigma; extrapolated: whether some of it lies beyond the
+    outermost target."""
+
+    plot: Markup
+    extrapolated: bool
+    largest_um: tuple[float, float]
+
+
 def lens(name: str, camera: CameraRecord, covariance: Covariance | None = None) -> Lens:
     """The lens of a camera of adjustment.json, with its covariance where that is known."""
-    of = camera.lens()
+    known = camera.lens()
     if covariance is None:
-        return of
-    return replace(of, covariance=covariance.of(Parameter.interior(name, each) for each in of.quantities))
+        return known
+    return replace(known, covariance=covariance.of(Parameter.interior(name, each) for each in known.quantities))
 
 
-def is_of_frame(of: Lens) -> bool:
+def is_defined_over_frame(lens: Lens) -> bool:
     """Whether the family is defined over the frame, and not over the radius."""
-    return family(of.distortion.family).needs == "half_mm"
+    return family(lens.distortion.family).needs == "half_mm"
 
 
-def displacement_covariance(of: Lens) -> Array:
-    """(1 + k, 1 + k) of c and the parameters, on which a displacement about the principal point depends."""
-    return np.delete(np.delete(of.covariance, [1, 2], axis=0), [1, 2], axis=1)
-
-
-def curves(of: Lens, largest_radius_mm: float) -> Curves:
+def curves(lens: Lens, largest_radius_mm: float) -> Curves:
     """The curves from the principal point out to a radius, or as far as the lens makes an image."""
     radius = np.linspace(0.0, largest_radius_mm, RADII)[1:]
     outward = _directions()
-    imaged = of.displacement((radius[:, None, None] * outward).reshape(-1, 2)).imaged.reshape(len(radius), -1)
+    imaged = lens.displacement((radius[:, None, None] * outward).reshape(-1, 2)).imaged.reshape(len(radius), -1)
     radius = radius[np.logical_and.accumulate(imaged.all(axis=1))]
-    moved = of.displacement((radius[:, None, None] * outward).reshape(-1, 2))
-    value = moved.value_um.reshape(len(radius), DIRECTIONS, 2)
-    by = moved.by_unknowns_um.reshape(len(radius), DIRECTIONS, 2, -1)
-    cofactor = displacement_covariance(of)
-
-    radial = np.einsum("rdi,di->r", value, outward) / DIRECTIONS
-    radial_by = np.einsum("rdik,di->rk", by, outward) / DIRECTIONS
-    rest = value - radial[:, None, None] * outward
-    rest_by = by - radial_by[:, None, None, :] * outward[:, :, None]
+    radial, radial_by, rest, rest_by = _radial_part(lens, radius)
     size = np.hypot(rest[..., 0], rest[..., 1])
     worst = size.argmax(axis=1)
     at = np.arange(len(radius))
     largest = size[at, worst]
     unit = rest[at, worst] / np.maximum(largest, 1e-12)[:, None]
-    return Curves(
-        radius_mm=radius,
-        radial_um=radial,
-        radial_sigma_um=_sigma(radial_by, cofactor),
-        asymmetric_um=largest,
-        asymmetric_sigma_um=_sigma(np.einsum("rik,ri->rk", rest_by[at, worst], unit), cofactor),
-    )
+    by_largest = np.einsum("rik,ri->rk", rest_by[at, worst], unit)
+    return Curves(radius, radial, _sigmas(lens, radial_by), largest, _sigmas(lens, by_largest))
 
 
-def largest_effects_um(of: Lens, radius_mm: float) -> dict[str, float]:
-    """By parameter: the largest displacement that a change of 1 of the parameter makes, at a radius.
-
-    Of a family that is defined over the frame: anywhere in it, for beyond it a polynomial means nothing.
-    """
-    moved = of.displacement(_over_the_frame(of.distortion.half_mm) if is_of_frame(of) else radius_mm * _directions())
-    sizes = np.hypot(moved.by_unknowns_um[:, 0, 1:], moved.by_unknowns_um[:, 1, 1:]).max(axis=0)
-    return dict(zip(parameter_names(of.distortion.family), sizes.tolist(), strict=True))
-
-
-def curves_plot(drawn: Curves, observed_radius_mm: float) -> Markup:
-    """Both curves with their 95 % bands; grey beyond the outermost target, where nothing was observed."""
-    band = BAND * drawn.radial_sigma_um
-    has_asymmetric = bool(np.any(drawn.asymmetric_um > 1e-6))
-    asymmetric_band = BAND * drawn.asymmetric_sigma_um
-    low = float(np.min(drawn.radial_um - band, initial=0.0))
-    high = float(np.max([*(drawn.radial_um + band), *(drawn.asymmetric_um + asymmetric_band), 0.0]))
-    room = 0.06 * max(high - low, 1e-3)
-    axes = svg.Axes((0.0, float(drawn.radius_mm[-1])), (low - room, high + room), height=320.0)
-    x = axes.x(drawn.radius_mm)
-    content = [
-        _extrapolation(axes, observed_radius_mm),
-        axes.drawn("radius from the principal point (mm)", "displacement (µm)"),
-    ]
-    if has_asymmetric:
-        content.append(_band(x, axes, drawn.asymmetric_um, asymmetric_band, "band second"))
-        content.append(svg.line(x, axes.y(drawn.asymmetric_um), "curve second"))
-    content.append(_band(x, axes, drawn.radial_um, band, "band first"))
-    content.append(_band(x, axes, drawn.radial_um, drawn.radial_sigma_um, "band first"))
-    content.append(svg.line(x, axes.y(drawn.radial_um), "curve first"))
-    return svg.picture(axes.width, axes.height, "Distortion over the radius with its 95 % band", *content)
+def _radial_part(lens: Lens, radius_mm: Array) -> tuple[Array, Array, Array, Array]:
+    """The mean outward displacement (r,) in um at radii with its derivatives (r, 1 + k) by c and the parameters, and
+    what is left (r, DIRECTIONS, 2) in each direction, with its derivatives."""
+    outward = _directions()
+    moved = lens.displacement((radius_mm[:, None, None] * outward).reshape(-1, 2))
+    value = moved.value_um.reshape(len(radius_mm), DIRECTIONS, 2)
+    by = moved.by_unknowns_um.reshape(len(radius_mm), DIRECTIONS, 2, -1)
+    radial = np.einsum("rdi,di->r", value, outward) / DIRECTIONS
+    radial_by = np.einsum("rdik,di->rk", by, outward) / DIRECTIONS
+    rest = value - radial[:, None, None] * outward
+    return radial, radial_by, rest, by - radial_by[:, None, None, :] * outward[:, :, None]
 
 
-def _over_the_frame(half_mm: tuple[float, float]) -> Array:
-    """(n, 2) a grid over the frame, its edges included."""
-    along = np.linspace(-1.0, 1.0, FRAME_GRID)
-    x, y = np.meshgrid(half_mm[0] * along, half_mm[1] * along)
-    return np.stack([x.ravel(), y.ravel()], axis=1)
+def _displacement_cofactor(lens: Lens) -> Array:
+    """(1 + k, 1 + k) of c and the parameters, on which a displacement about the principal point depends."""
+    return np.delete(np.delete(lens.covariance, [1, 2], axis=0), [1, 2], axis=1)
+
+
+def _sigmas(lens: Lens, by: Array) -> Array:
+    """Standard deviations (n,) of what has these derivatives (n, 1 + k)."""
+    variance: Array = np.einsum("rk,kl,rl->r", by, _displacement_cofactor(lens), by)
+    return np.sqrt(np.maximum(variance, 0.0))
 
 
 def _directions() -> Array:
@@ -126,14 +135,130 @@ def _directions() -> Array:
     return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
-def _sigma(by: Array, cofactor: Array) -> Array:
-    variance: Array = np.einsum("rk,kl,rl->r", by, cofactor, by)
-    return np.sqrt(np.maximum(variance, 0.0))
+def largest_effects_um(lens: Lens, radius_mm: float) -> dict[str, float]:
+    """By parameter: the largest displacement that a change of 1 of the parameter makes, at a radius.
+
+    Of a family that is defined over the frame: anywhere in it, for beyond it a polynomial means nothing.
+    """
+    along = np.linspace(-1.0, 1.0, FRAME_GRID)
+    in_frame = grid_mm(half * along for half in lens.distortion.half_mm)
+    moved = lens.displacement(in_frame if is_defined_over_frame(lens) else radius_mm * _directions())
+    sizes = np.hypot(moved.by_unknowns_um[:, 0, 1:], moved.by_unknowns_um[:, 1, 1:]).max(axis=0)
+    return dict(zip(parameter_names(lens.distortion.family), sizes.tolist(), strict=True))
 
 
-def _band(x: Array, axes: svg.Axes, middle: Array, half: Array, class_: str) -> Markup:
-    edge = np.concatenate([axes.y(middle + half), axes.y(middle - half)[::-1]])
-    return svg.line(np.concatenate([x, x[::-1]]), edge, class_, closed=True)
+def certificate(lens: Lens, largest_radius_mm: float) -> Certificate:
+    """The lens in the form of a calibration certificate, out to a radius.
+
+    A ray at the angle a is imaged at the radius r with tan a = t(r) = (r - d(r)) / c, d being the radial distortion.
+    Against another principal distance C it is r - C t; C makes its extremes, at h and l, of one size:
+    C = (h + l) / (t(h) + t(l)), and they are extremes still when h and l move a little.
+    """
+    radius = np.linspace(0.0, largest_radius_mm, _CERTIFICATE_RADII)[1:]
+    radius = np.concatenate([[_NEAR_AXIS * largest_radius_mm], radius])
+    radial_um, radial_by, *_ = _radial_part(lens, radius)
+    c = float(lens.interior[0])
+    tangent = (radius - radial_um / 1e3) / c
+    by = -radial_by / (1e3 * c)
+    by[:, 0] -= tangent / c
+    calibrated, high, low = _balanced(radius, tangent)
+    calibrated_by = -calibrated * (by[high] + by[low]) / (tangent[high] + tangent[low])
+    near = float(radius[0] / tangent[0])
+    angles = _angles_deg(float(np.degrees(np.arctan(tangent[-1]))))
+    at = np.tan(np.radians(angles))
+    radii = np.interp(at, tangent, radius)
+    by_at = np.stack([np.interp(at, tangent, column) for column in by.T], axis=1)
+    slope = np.interp(at, tangent, np.gradient(tangent, radius))
+    distortion_by = -by_at / slope[:, None] - at[:, None] * calibrated_by
+    sigmas = _sigmas(lens, np.vstack([calibrated_by, -near * by[0] / tangent[0], distortion_by])).tolist()
+    drawn = curves(lens, largest_radius_mm)
+    asymmetric = zip(
+        np.interp(radii, drawn.radius_mm, drawn.asymmetric_um).tolist(),
+        np.interp(radii, drawn.radius_mm, drawn.asymmetric_sigma_um).tolist(),
+        strict=True,
+    )
+    values = zip((1e3 * (radii - calibrated * at)).tolist(), (1e3 * np.array(sigmas[2:])).tolist(), strict=True)
+    rows = [CertificateRow(*each) for each in zip(angles, radii.tolist(), values, asymmetric, strict=True)]
+    return Certificate((calibrated, sigmas[0]), (near, sigmas[1]), largest_radius_mm, rows)
+
+
+def _angles_deg(largest: float) -> list[float]:
+    """Those of the reports that the frame shows; of a narrower camera six steps, to the tenths that are printed."""
+    usual = [angle for angle in ANGLES_DEG if angle <= largest]
+    if len(usual) >= _FEWEST_ANGLES:
+        return usual
+    return [float(each) for each in np.floor(10.0 * np.linspace(0.0, largest, len(ANGLES_DEG) + 1)[1:]) / 10.0]
+
+
+def _balanced(radius: Array, tangent: Array) -> tuple[float, int, int]:
+    """The principal distance by which the largest and the least distortion are of one size, and where these are: the
+    pair of radii is exchanged until they are the extremes; the axis, without distortion, may be one."""
+    distance, high, low = float(radius[-1] / tangent[-1]), 0, 0
+    for _ in range(50):
+        distortion = radius - distance * tangent
+        high, low = int(distortion.argmax()), int(distortion.argmin())
+        better = float((radius[high] + radius[low]) / (tangent[high] + tangent[low]))
+        if abs(better - distance) < 1e-12 * distance:
+            break
+        distance = better
+    return distance, high, low
+
+
+def lens_map(lens: Lens, on: Plane, observed_radius_mm: float = np.inf) -> LensMap:
+    """The displacement at a grid of observed points over a plane, from the ideal to the observed place; grey beyond the
+    outermost target, where it is extrapolated."""
+    low, high = on.corners_mm
+    mesh_mm = float((high - low).max()) / MAP_GRID
+    counts = np.maximum(np.rint((high - low) / mesh_mm), 1.0).astype(int)
+    sides = zip(low, high, counts, strict=True)
+    xy = grid_mm(first + (last - first) * (np.arange(count) + 0.5) / count for first, last, count in sides)
+    point = lens.interior[1:]
+    xy = xy[lens.displacement(xy - point).imaged]  # a fisheye's image does not fill the corners
+    moved = lens.displacement(xy - point)
+    covariance = np.einsum("nik,kl,njl->nij", moved.by_unknowns_um, _displacement_cofactor(lens), moved.by_unknowns_um)
+    largest = longest_vector(moved.value_um, covariance)
+    beyond = np.hypot(*(xy - point).T) > observed_radius_mm
+    px_per_um = svg.round_step(LONGEST * mesh_mm * on.px_per_mm / largest[0]) if largest[0] > 0.0 else 1.0
+    ends = on.page(xy)
+    starts = ends - px_per_um * moved.value_um * (1.0, -1.0)
+    drawn = [
+        strokes_and_dots(starts[rows], ends[rows], kind, ends[rows])
+        for rows, kind in ((~beyond, "target"), (beyond, "extrapolated"))
+        if rows.any()
+    ]
+    edge = [_circle(point, observed_radius_mm, on)] if beyond.any() else []
+    plot = on.picture("Distortion vectors over the camera frame", px_per_um, *edge, *drawn)
+    return LensMap(plot, bool(beyond.any()), largest)
+
+
+def _circle(center_mm: Array, radius_mm: float, on: Plane) -> Markup:
+    """What of a circle lies on the plane."""
+    angles = np.linspace(0.0, 2.0 * np.pi, ARCS + 1)
+    points = center_mm + radius_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    low, high = on.corners_mm
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    shown = inside[:-1] & inside[1:]
+    return svg.strokes(on.page(points[:-1][shown]), on.page(points[1:][shown]), "reach")
+
+
+def curves_plot(drawn: Curves, observed_radius_mm: float) -> Markup:
+    """Both curves with their 95 % bands; grey beyond the outermost target, where nothing was observed."""
+    curve_of = {"first": (drawn.radial_um, drawn.radial_sigma_um)}
+    if np.any(drawn.asymmetric_um > 1e-6):
+        curve_of = {"second": (drawn.asymmetric_um, drawn.asymmetric_sigma_um), **curve_of}
+    low = min(0.0, *(float((value - BAND * sigma).min()) for value, sigma in curve_of.values()))
+    high = max(0.0, *(float((value + BAND * sigma).max()) for value, sigma in curve_of.values()))
+    room = 0.06 * max(high - low, 1e-3)
+    axes = svg.Axes((0.0, float(drawn.radius_mm[-1])), (low - room, high + room), height=320.0)
+    x = axes.x(drawn.radius_mm)
+    labels = axes.drawn("radius from the principal point (mm)", "displacement (µm)")
+    content = [_extrapolation(axes, observed_radius_mm), labels]
+    for kind, (value, sigma) in curve_of.items():
+        for half in (BAND * sigma, sigma) if kind == "first" else (BAND * sigma,):
+            edge = np.concatenate([axes.y(value + half), axes.y(value - half)[::-1]])
+            content.append(svg.line(np.concatenate([x, x[::-1]]), edge, f"band {kind}", closed=True))
+        content.append(svg.line(x, axes.y(value), f"curve {kind}"))
+    return svg.picture(axes.width, axes.height, "Distortion over the radius with its 95 % band", *content)
 
 
 def _extrapolation(axes: svg.Axes, observed_radius_mm: float) -> Markup:
@@ -141,7 +266,6 @@ def _extrapolation(axes: svg.Axes, observed_radius_mm: float) -> Markup:
     if end - start < 1.0:
         return Markup("")
     height = axes.height - axes.bottom - axes.top
-    label = (
-        svg.words(end - 6.0, axes.top + 14.0, "no targets here", "tick", "end") if end - start > 90.0 else Markup("")
-    )
-    return svg.tag("rect", x=start, y=axes.top, width=end - start, height=height, class_="beyond") + label
+    words = [svg.words(end - 6.0, axes.top + 14.0, "no targets here", "tick", "end")] if end - start > 90.0 else []
+    ground = svg.tag("rect", x=start, y=axes.top, width=end - start, height=height, class_="beyond")
+    return Markup("").join([ground, *words])

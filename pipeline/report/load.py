@@ -61,21 +61,21 @@ def measured(
     if not path.exists():
         return data
     made = made_from_of(path, digest)
+    if made is None and not digest:
+        return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
     if made is None:
-        if not digest:
-            return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
-        return _with_problem(
-            data,
-            f"{path.name} is of other marks than {project.comparator.name}: it is not shown.",
-            "Run `reseau measure`.",
-        )
+        what = f"{path.name} is of other marks than {project.comparator.name}: it is not shown."
+        return _with_problems(data, Problem(what, "Run `reseau measure`."))
     many = rows is not None or (most_frames is not None and frames_of(data) > most_frames)
     scans = {} if many else {scan.frame.image: scan for scan in measured_scans(path, digest)}
-    now = measured_from(project) if project.scans else {}
     data = replace(data, measurement=scans, made_from={**data.made_from, path.name: digest})
-    if project.scans and made.get(PLACES) != now[PLACES]:
-        note = f"The marks were looked for with other {PLACES} than there are now; `reseau measure` looks again."
-        data = replace(data, notes=(*data.notes, note))
+    unlike: list[Problem] = []
+    if project.scans:
+        now = measured_from(project)
+        unlike = list(_unlike(made, now))
+        if made.get(PLACES) != now[PLACES]:
+            note = f"The marks were looked for with other {PLACES} than there are now; `reseau measure` looks again."
+            data = replace(data, notes=(*data.notes, note))
     damaged = [
         Problem(scan.failure.sentence, "Nothing else of this image is shown as measured until then.")
         for scan in scans.values()
@@ -84,7 +84,7 @@ def measured(
     with Store(path) as store:
         lines = inapplicable(store, digest)
     idle = [Problem(f"{project.decisions_path.name}, {line}", "It does not count.") for line in lines]
-    return replace(data, problems=(*data.problems, *damaged, *idle, *(_unlike(made, now) if project.scans else ())))
+    return _with_problems(data, *damaged, *idle, *unlike)
 
 
 def frames_of(data: ReportData) -> int:
@@ -141,15 +141,14 @@ def adjusted(project: Project, at: At, most_frames: int | None = None) -> Report
     if not path.exists():
         return data
     adjustment, covariance, fingerprint = read_adjustment(path), read_covariance(path), of_file(path)
-    made = adjustment.made_from
-    others = differing(made, adjusted_from(project, data.comparator))
-    if others:
+    made, not_shown = adjustment.made_from, ""
+    if others := differing(made, adjusted_from(project, data.comparator)):
         what = f"of other {' and '.join(others)} than there are now" if made else "of what it does not say"
-        return _with_problem(data, f"{path.name} is {what}: it is not shown.", "Run `reseau adjust`.")
-    if covariance.adjustment != fingerprint:
-        return _with_problem(
-            data, f"adjustment.npz belongs to another {path.name}: both are not shown.", "Run `reseau adjust`."
-        )
+        not_shown = f"{path.name} is {what}: it is not shown."
+    elif covariance.adjustment != fingerprint:
+        not_shown = f"adjustment.npz belongs to another {path.name}: both are not shown."
+    if not_shown:
+        return _with_problems(data, Problem(not_shown, "Run `reseau adjust`."))
     made_from = {**data.made_from, path.name: fingerprint}
     data = replace(data, adjustment=adjustment, covariance=covariance, made_from=made_from)
     check_path = at(project.check_path)
@@ -158,9 +157,8 @@ def adjusted(project: Project, at: At, most_frames: int | None = None) -> Report
     except FileNotFoundError:
         return data
     if check.made_from != {path.name: fingerprint}:
-        return _with_problem(
-            data, f"{check_path.name} is of another adjustment: it is not shown.", "Run `reseau check`."
-        )
+        what = f"{check_path.name} is of another adjustment: it is not shown."
+        return _with_problems(data, Problem(what, "Run `reseau check`."))
     return replace(data, check=check, made_from={**data.made_from, check_path.name: of_file(check_path)})
 
 
@@ -190,5 +188,5 @@ def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem
         )
 
 
-def _with_problem(data: ReportData, what: str, next_step: str) -> ReportData:
-    return replace(data, problems=(*data.problems, Problem(what, next_step)))
+def _with_problems(data: ReportData, *problems: Problem) -> ReportData:
+    return replace(data, problems=(*data.problems, *problems))

@@ -4,6 +4,8 @@ from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from heapq import nsmallest
+from operator import itemgetter
 
 import numpy as np
 
@@ -32,7 +34,7 @@ class _Totals:
     marks: dict[str, Counter[str]] = field(default_factory=dict)
     of_targets: Counter[tuple[str, str]] = field(default_factory=Counter)
     verdicts: dict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    said: dict[tuple[str, str], tuple[Problem, list[str]]] = field(default_factory=dict)
+    problems: dict[tuple[str, str], tuple[Problem, list[str]]] = field(default_factory=dict)
     centers_px: "array[float]" = field(default_factory=lambda: array("d"))
     sigmas_um: "array[float]" = field(default_factory=lambda: array("d"))
 
@@ -42,7 +44,7 @@ class _Totals:
         self.of_targets.update((mark.kind, mark.status) for mark in frame.marks if not mark.is_fiducial)
         for problem in problems:
             alike = masked_text(problem.what), problem.next_step
-            self.said.setdefault(alike, (problem, []))[1].append(frame.image)
+            self.problems.setdefault(alike, (problem, []))[1].append(frame.image)
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
         for mark in frame.marks:
@@ -74,7 +76,7 @@ class _Totals:
             marks=self.marks,
             of_targets=self.of_targets,
             verdicts={kind: {v: counts[v] for v in _BEST_FIRST} for kind, counts in sorted(self.verdicts.items())},
-            problems=tuple(_listed(self.said)),
+            problems=tuple(_listed(self.problems)),
             places_px=places_apart(np.array(self.centers_px)),
             sigmas_um={"x": x_um, "y": y_um},
         )
@@ -91,22 +93,26 @@ def reduced(
     scans: of the images of data.comparator, read once, one after the other. stored: of whose plain frames only columns
     are read, the images of data.comparator being all others.
     """
-    totals, worst, needs_look = _Totals(), _Worst(), 0
+    totals, needs_look = _Totals(), 0
     if stored is not None:
         totals.add_plain(stored.plain, stored.columns(), camera_of)
     with_pose = not is_film_alone(data)
     suspect = {row.image for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
-    for one in _one_by_one(data, scans):
-        (frame,) = frames(one)
-        verdict, problems = _verdict(frame, with_pose), list(problems_of(frame, with_pose))
-        kind = camera_of(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
-        totals.add(frame, kind, verdict, problems)
-        if problems or verdict.needs_look or frame.image in suspect:
-            needs_look += 1
-            worst.add(
-                (-_BEST_FIRST.index(verdict), -max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)), one
-            )
-    shown = worst.shown()
+
+    def frames_to_show() -> Iterator[tuple[tuple[float, float], ReportData]]:
+        """Those that need a look, with a key that puts the worst first; all are counted on the way."""
+        nonlocal needs_look
+        for one in _one_by_one(data, scans):
+            (frame,) = frames(one)
+            verdict, problems = _verdict(frame, with_pose), list(problems_of(frame, with_pose))
+            kind = camera_of(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
+            totals.add(frame, kind, verdict, problems)
+            if problems or verdict.needs_look or frame.image in suspect:
+                needs_look += 1
+                largest_w = max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)
+                yield (-_BEST_FIRST.index(verdict), -largest_w), one
+
+    shown = [one for _, one in nsmallest(MOST_FRAMES, frames_to_show(), key=itemgetter(0))]
     return replace(
         data,
         comparator=[row for one in shown for row in one.comparator],
@@ -119,32 +125,15 @@ def _ending(scan: str) -> str:
     return scan.rpartition(".")[2].lower()
 
 
-class _Worst:
-    """The first of all that were added, by their keys; never many more are kept."""
-
-    def __init__(self) -> None:
-        self._kept: list[tuple[tuple[float, ...], int, ReportData]] = []
-        self._count = 0
-
-    def add(self, key: tuple[float, ...], one: ReportData) -> None:
-        self._kept.append((key, self._count, one))
-        self._count += 1
-        if len(self._kept) > 2 * MOST_FRAMES:
-            self._kept = sorted(self._kept, key=lambda each: each[:2])[:MOST_FRAMES]
-
-    def shown(self) -> list[ReportData]:
-        return [one for *_, one in sorted(self._kept, key=lambda each: each[:2])[:MOST_FRAMES]]
-
-
 def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[ReportData]:
     """Of every frame by itself: its rows, its scan, its residuals."""
     rows: dict[str, list[ComparatorPoint]] = defaultdict(list)
     for row in data.comparator:
         rows[row.image].append(row)
     residuals, others = residuals_by_image(data), data.adjustment.images if data.adjustment else {}
-    seen = set[str]()
+    shown = set[str]()
 
-    def of(image: str, scan: MeasuredScan | None) -> ReportData:
+    def frame_data(image: str, scan: MeasuredScan | None) -> ReportData:
         images = {name: known for name, known in [(image, others.get(image))] if known is not None}
         rows_of = tuple(residuals.get(image, ()))
         own = replace(data.adjustment, images=images, residuals=rows_of) if data.adjustment else None
@@ -154,10 +143,10 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
 
     for scan in scans:
         if scan.frame.image in rows or not scan.frame.marks:  # others were taken out of the comparator file
-            seen.add(scan.frame.image)
-            yield of(scan.frame.image, scan)
-    for image in sorted({*rows, *others} - seen):
-        yield of(image, None)
+            shown.add(scan.frame.image)
+            yield frame_data(scan.frame.image, scan)
+    for image in sorted({*rows, *others} - shown):
+        yield frame_data(image, None)
 
 
 def _verdict(frame: Frame, with_pose: bool) -> Verdict:
@@ -177,16 +166,16 @@ def _verdict(frame: Frame, with_pose: bool) -> Verdict:
     )
 
 
-def _listed(said: dict[tuple[str, str], tuple[Problem, list[str]]]) -> Iterator[Problem]:
+def _listed(problems: dict[tuple[str, str], tuple[Problem, list[str]]]) -> Iterator[Problem]:
     """What most frames say first."""
-    ordered = sorted(said.values(), key=lambda each: -len(each[1]))
+    ordered = sorted(problems.values(), key=lambda each: -len(each[1]))
     for problem, images in ordered[:_MOST_PROBLEMS]:
-        of_first = " (The numbers are those of the first.)" if len(images) > 1 and _has_numbers(problem) else ""
+        of_first = (
+            " (The numbers are those of the first.)"
+            if len(images) > 1 and masked_text(problem.what) != problem.what
+            else ""
+        )
         yield Problem(f"{listed(images)}: {problem.what}{of_first}", problem.next_step)
     rest = sum(len(images) for _, images in ordered[_MOST_PROBLEMS:])
     if rest:
         yield Problem(f"{counted(rest, 'more problem')} of frames, all different.", "`reseau status --csv` has them.")
-
-
-def _has_numbers(problem: Problem) -> bool:
-    return masked_text(problem.what) != problem.what

@@ -51,6 +51,11 @@ class Mark:
         return not self.status.is_observation and not {Code.DECIDED, Code.OTHER_PART} & set(self.codes)
 
     @property
+    def sigma_px(self) -> Array | None:
+        """(2,) along columns and rows of the scan."""
+        return None if self.covariance is None else np.sqrt(np.diag(self.covariance.px2))
+
+    @property
     def w(self) -> float | None:
         """The standardised residual; None where nothing checks the mark."""
         return self.residual.w if self.residual and np.isfinite(self.residual.w) else None

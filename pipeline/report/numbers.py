@@ -1,6 +1,7 @@
 """Numbers as a report prints them: true minus signs, and no digit that the standard deviation does not support."""
 
 import math
+from collections.abc import Iterable
 
 NONE = "–"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -13,6 +14,11 @@ def fixed(value: float | None, decimals: int = 2, sign: bool = False) -> str:
     rounded = round(value, decimals) + 0.0  # no minus sign before a zero
     text = f"{rounded:+.{decimals}f}" if sign else f"{rounded:.{decimals}f}"
     return text.replace("-", "−")
+
+
+def fixed_list(values: Iterable[float] | None, decimals: int, separator: str = ", ", sign: bool = False) -> str:
+    """Numbers with so many decimals; a dash where there are none."""
+    return NONE if values is None else separator.join(fixed(value, decimals, sign) for value in values)
 
 
 def value_and_sigma(value: float | None, sigma: float | None) -> tuple[str, str]:

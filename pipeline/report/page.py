@@ -24,12 +24,12 @@ from pipeline.report.fractions import (
 )
 from pipeline.report.frame_views import frame_views, thumbnail_scale
 from pipeline.report.marks import Frame, frames
-from pipeline.report.numbers import fixed, significant, value_and_sigma
-from pipeline.report.parameters import spoken_name
+from pipeline.report.numbers import fixed, fixed_list, significant, value_and_sigma
+from pipeline.report.parameters import axes_sentence, group_sentences, spoken_name
 from pipeline.report.scanner_views import scanner_views
-from pipeline.report.vectors import joined_views
+from pipeline.report.vectors import joined_view
 from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, judge, sigma0_bounds
-from pipeline.results.adjustment_record import AdjustmentRecord, PointRecord
+from pipeline.results.adjustment_record import AdjustmentRecord, FiducialRecord, PointRecord
 from pipeline.text.atomic import write_atomically
 from pipeline.types import Array
 
@@ -70,8 +70,9 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals["drawing_css"] = Markup(svg.style())
-    environment.globals["quantity"] = lambda entry: value_and_sigma(entry.value, entry.sigma)
-    environment.filters |= {"fixed": fixed, "significant": significant}
+    words = (value_and_sigma, axes_sentence, group_sentences, moved_um)
+    environment.globals |= {function.__name__: function for function in words}
+    environment.filters |= {"fixed": fixed, "fixed_list": fixed_list, "significant": significant}
     return environment
 
 
@@ -79,7 +80,7 @@ def _context(data: ReportData) -> dict[str, object]:
     shots = frames(data)
     adjustment = data.adjustment
     cameras = camera_views(data)
-    calibrated = any(camera.calibrated for camera in cameras)
+    calibrated = any(camera.is_calibrated for camera in cameras)
     places = data.totals.places_px if data.totals else places_px(shots)
     return {
         **_common(data),
@@ -94,7 +95,7 @@ def _context(data: ReportData) -> dict[str, object]:
         "measured": bool(data.measurement),
         "cameras": cameras,
         "scanners": scanner_views(data),
-        "joined": joined_views(data),
+        "joined": [(name, joined_view(each)) for name, each in sorted(adjustment.frames.items())] if adjustment else [],
         "fractions": list(_fractions(places)),
         "least_marks": LEAST_MARKS,
         "sigma0_bounds": sigma0_bounds(adjustment.variance_factor.redundancy)
@@ -127,6 +128,11 @@ def _frame_context(data: ReportData, shots: list[Frame], every_mark: bool = Fals
         "reasons": Counter(code for frame in shots for mark in frame.marks for code in mark.codes).most_common(),
         "arrow_bar": _arrow_bar(shots),
     }
+
+
+def moved_um(mark: FiducialRecord) -> tuple[float | None, ...]:
+    """Estimated less given, in x and y."""
+    return tuple(1e3 * (each.value - each.given.value) if each.given else None for each in (mark.x_mm, mark.y_mm))
 
 
 def _points_word(shots: list[Frame]) -> str:

@@ -1,7 +1,7 @@
 """The table of a camera's parameters: value, standard deviation, what was given, and what that says."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,41 +23,40 @@ _SYMBOLS = {"x0": "x₀′", "y0": "y₀′"}
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """A row in words and numbers ready to print. effect: at the outermost target, in um."""
+    """A quantity of the table, what was given of it, and what that says. effect: at the outermost target, in um."""
 
     symbol: str
     unit: str
-    value: str
-    sigma: str
+    quantity: Quantity
     given: str
     effect: str
     meaning: str
 
 
-def parameter_rows(name: str, camera: CameraRecord, prior_scale: float, radius_mm: float) -> list[ParameterRow]:
+def parameter_rows(name: str, camera: CameraRecord, prior_scale: float, radius_mm: float) -> Iterator[ParameterRow]:
     """Principal distance, principal point and distortion. radius_mm: where the distortion's effect is stated;
     prior_scale: what the adjustment has multiplied given standard deviations by."""
-    point, distortion = camera.principal_point_mm, camera.distortion
-    interior = [("c", camera.principal_distance_mm), (_SYMBOLS["x0"], point.x), (_SYMBOLS["y0"], point.y)]
-    family = distortion.family
-    effects = largest_effects_um(lens(name, camera), radius_mm) if parameter_names(family) else {}
-    rows = [_row(symbol, "mm", quantity, "", _origin(quantity, prior_scale)) for symbol, quantity in interior]
-    for parameter in parameter_names(family):
-        quantity = distortion.parameters.get(parameter)
-        if quantity is not None and (quantity.value != 0.0 or quantity.sigma != 0.0):
-            effect = _effect(quantity, effects[parameter])
-            rows.append(_row(parameter, family_of(family).unit(parameter), quantity, effect, _significance(quantity)))
-    return rows
+    family, names = family_of(camera.distortion.family), parameter_names(camera.distortion.family)
+    for parameter, quantity in list(camera.interior.items())[:3]:
+        meaning = _origin(quantity, prior_scale)
+        yield ParameterRow(_SYMBOLS.get(parameter, parameter), "mm", quantity, _given_text(quantity), "", meaning)
+    effects = largest_effects_um(lens(name, camera), radius_mm) if names else {}
+    for parameter, um_per_unit in effects.items():
+        known = camera.distortion.parameters.get(parameter)
+        if known is not None and (known.value != 0.0 or known.sigma != 0.0):
+            effect = significant(um_per_unit * known.value, 3)
+            if known.sigma > 0.0:
+                effect = " ± ".join(value_and_sigma(um_per_unit * known.value, um_per_unit * known.sigma))
+            unit = family.unit(parameter)
+            yield ParameterRow(parameter, unit, known, _given_text(known), effect, _significance(known))
 
 
-def term_rows(terms: Mapping[str, Quantity]) -> list[ParameterRow]:
+def term_rows(terms: Mapping[str, Quantity]) -> Iterator[ParameterRow]:
     """The terms of a scanner's bend, in um."""
-    return [_row(name, "µm", _scale_to_um(quantity), "", _significance(quantity)) for name, quantity in terms.items()]
-
-
-def _scale_to_um(quantity: Quantity) -> Quantity:
-    given = quantity.given and GivenQuantity(1e3 * quantity.given.value, 1e3 * quantity.given.sigma)
-    return replace(quantity, value=1e3 * quantity.value, sigma=1e3 * quantity.sigma, given=given)
+    for name, known in terms.items():
+        given = known.given and GivenQuantity(1e3 * known.given.value, 1e3 * known.given.sigma)
+        in_um = replace(known, value=1e3 * known.value, sigma=1e3 * known.sigma, given=given)
+        yield ParameterRow(name, "µm", in_um, _given_text(in_um), "", _significance(known))
 
 
 def high_correlations(name: str, camera: CameraRecord, covariance: Covariance) -> list[tuple[str, str, float]]:
@@ -79,7 +78,7 @@ def group_sentences(tests: Sequence[GroupTestRecord]) -> list[str]:
     """Which parameters the data need together, as sentences."""
     return [
         f"{test.group[0].upper()}{test.group[1:]} ({', '.join(test.parameters)}) together: "
-        + _verdict(f"F = {significant(test.F, 3)}", test.p)
+        + _tested(f"F = {significant(test.F, 3)}", test.p)
         for test in tests
     ]
 
@@ -108,11 +107,6 @@ def spoken_name(text: str, cameras: Collection[str]) -> str:
     return parameter.label
 
 
-def _row(symbol: str, unit: str, quantity: Quantity, effect: str, meaning: str) -> ParameterRow:
-    value, sigma = value_and_sigma(quantity.value, quantity.sigma)
-    return ParameterRow(symbol, unit, value, sigma, _given_text(quantity), effect, meaning)
-
-
 def _given_text(quantity: Quantity) -> str:
     given = quantity.given
     if given is None:
@@ -124,19 +118,20 @@ def _given_text(quantity: Quantity) -> str:
     return f"{significant(given.value, 6)} ± {significant(given.sigma, 2)}"
 
 
+def _undetermined(sigma: float) -> str:
+    return "not determined" if math.isnan(sigma) else "held at the given value" if sigma == 0.0 else ""
+
+
 def _origin(quantity: Quantity, prior_scale: float) -> str:
     """How far the value moved from the given one, and whether data or prior determined it."""
     given, sigma = quantity.given, quantity.sigma
-    if math.isnan(sigma):
-        return "not determined"
-    if sigma == 0.0:
-        return "held at the given value"
+    if sentence := _undetermined(sigma):
+        return sentence
     if given is None or not given.sigma > 0.0:
         return "determined by the observations alone"
     moved = f"moved by {fixed(1e3 * (quantity.value - given.value), 0, sign=True)} µm"
-    p = quantity.p
-    if p is not None and p < LEVEL:
-        moved += f", more than the given σ allows ({_p_value(p)})"
+    if quantity.p is not None and quantity.p < LEVEL:
+        moved += f", more than the given σ allows ({_p_value(quantity.p)})"
     left = sigma / (prior_scale * given.sigma)
     if left > MOSTLY_PRIOR:
         return f"{moved}; known from the given value, hardly from the observations"
@@ -145,15 +140,13 @@ def _origin(quantity: Quantity, prior_scale: float) -> str:
 
 
 def _significance(quantity: Quantity) -> str:
-    if math.isnan(quantity.sigma):
-        return "not determined"
-    if quantity.sigma == 0.0:
-        return "held at the given value"
+    if sentence := _undetermined(quantity.sigma):
+        return sentence
     size = abs(quantity.value) / quantity.sigma
-    return _verdict(f"{size:.1f} σ" if size < 100.0 else f"{size:.0f} σ", quantity.p)
+    return _tested(f"{size:.1f} σ" if size < 100.0 else f"{size:.0f} σ", quantity.p)
 
 
-def _verdict(found: str, p: float | None) -> str:
+def _tested(found: str, p: float | None) -> str:
     if p is None or math.isnan(p):
         return f"not tested ({found})"
     return f"{'significant' if p < LEVEL else 'not significant'} ({found}, {_p_value(p)})"
@@ -161,9 +154,3 @@ def _verdict(found: str, p: float | None) -> str:
 
 def _p_value(p: float) -> str:
     return f"p = {p:.3f}" if p >= 0.001 else "p < 0.001"
-
-
-def _effect(quantity: Quantity, um_per_unit: float) -> str:
-    if not quantity.sigma > 0.0:
-        return significant(um_per_unit * quantity.value, 3)
-    return " ± ".join(value_and_sigma(um_per_unit * quantity.value, um_per_unit * quantity.sigma))

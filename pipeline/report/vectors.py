@@ -1,14 +1,12 @@
-"""Residuals as vectors over the camera frame, of one image and of all."""
+"""Vectors over the camera frame: residuals of one image and of all, joins of scans, what a lens or a scanner does."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.drawing import svg
-from pipeline.report import vectors
-from pipeline.report.data import ReportData
 from pipeline.report.numbers import fixed
 from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord, ResidualRecord
 from pipeline.types import Array, Mask
@@ -44,9 +42,13 @@ class Plane:
         """The frame's outline with vectors in it, and below a bar of a round length in um, and one of mm."""
         (x0, y0), (x1, y1) = self.page(self.corners_mm)
         outline = svg.tag("rect", x=x0, y=y1, width=x1 - x0, height=y0 - y1, class_="frame")
-        return svg.picture(
-            self.width_px, self.height_px + FOOT_PX, title, outline, *content, _scale_bar(self, px_per_um)
-        )
+        height = self.height_px + FOOT_PX
+        return svg.picture(self.width_px, height, title, outline, *content, self._scale_bars(px_per_um))
+
+    def _scale_bars(self, px_per_um: float) -> Markup:
+        um, mm = svg.round_step(60.0 / px_per_um), svg.round_step(60.0 / self.px_per_mm)
+        um_bar = svg.scale_bar(MARGIN_PX, self.height_px + 4.0, um * px_per_um, f"{um:g} µm (vectors)")
+        return um_bar + svg.scale_bar(MARGIN_PX, self.height_px + 19.0, mm * self.px_per_mm, f"{mm:g} mm (frame)")
 
 
 @dataclass(frozen=True)
@@ -90,11 +92,24 @@ def plane(places_mm: Array, frame_mm: tuple[float, float] | None, width_px: floa
     return plane_about(np.stack([low, high]), width_px)
 
 
-def plane_about(corners_mm: Array, width_px: float) -> Plane:
-    """The rectangle between two corners (2, 2), with a little room about it."""
+def plane_about(corners_mm: Array, width_px: float, share: float = 0.02) -> Plane:
+    """The rectangle between two corners (2, 2), with a little room about it: a share of its longer side."""
     # A single point, or points in a row, still need a plane to stand in.
-    room = 0.02 * max(float(np.ptp(corners_mm, axis=0).max()), 1.0)
+    room = share * max(float(np.ptp(corners_mm, axis=0).max()), 1.0)
     return Plane(corners_mm + np.array([[-room], [room]]), width_px)
+
+
+def grid_mm(axes: Iterable[Array]) -> Array:
+    """(n, 2) the nodes of a grid, by its values along x and along y."""
+    return np.stack([each.ravel() for each in np.meshgrid(*axes)], axis=1)
+
+
+def longest_vector(vectors_um: Array, covariances_um2: Array) -> tuple[float, float]:
+    """The length of the longest of vectors (n, 2), and its standard deviation; covariances_um2 (n, 2, 2)."""
+    size = np.hypot(*vectors_um.T)
+    at = int(size.argmax())
+    along = vectors_um[at] / max(float(size[at]), 1e-12)
+    return float(size[at]), float(np.sqrt(max(along @ covariances_um2[at] @ along, 0.0)))
 
 
 def image_plot(
@@ -108,24 +123,21 @@ def image_plot(
     """The residuals of one image, each with its name and numbers to point at."""
     residuals = VectorField.of_residuals(rows)
     on = plane(residuals.places_mm, frame_mm, width_px)
-    marks = [
-        svg.tag("g", svg.tag("title", _hint(row)), _stroke(start, end, row, suspects))
-        for start, end, row in zip(*residuals.ends(on, px_per_um), rows, strict=True)
-    ]
+    marks = []
+    for start, end, row in zip(*residuals.ends(on, px_per_um), rows, strict=True):
+        kind = "suspect" if row in suspects else "fiducial" if row.kind == "fiducial" else "target"
+        vx, vy = (fixed(v, 1, sign=True) for v in row.v_um)
+        hint = f"{row.kind} {row.point}: v = ({vx}, {vy}) µm in the scan, w = {fixed(row.w, 1)}"
+        marks.append(svg.tag("g", svg.tag("title", hint), strokes_and_dots(start[None], end[None], kind)))
     return on.picture(f"Residual vectors of {image}", px_per_um, *marks)
 
 
 def all_images_plot(residuals: VectorField, on: Plane, px_per_um: float) -> Markup:
     """The residuals of all images in one frame: what they have in common is the camera's, not the film's."""
     starts, ends = residuals.ends(on, px_per_um)
-    return on.picture(
-        "Residual vectors of all images over the camera frame",
-        px_per_um,
-        *(
-            strokes_and_dots(starts[rows], ends[rows], kind)
-            for kind, rows in (("target", ~residuals.is_fiducial), ("fiducial", residuals.is_fiducial))
-        ),
-    )
+    kinds = (("target", ~residuals.is_fiducial), ("fiducial", residuals.is_fiducial))
+    drawn = [strokes_and_dots(starts[rows], ends[rows], kind) for kind, rows in kinds]
+    return on.picture("Residual vectors of all images over the camera frame", px_per_um, *drawn)
 
 
 def strokes_and_dots(starts: Array, ends: Array, kind: str, dots: Array | None = None) -> Markup:
@@ -134,62 +146,24 @@ def strokes_and_dots(starts: Array, ends: Array, kind: str, dots: Array | None =
     return svg.strokes(starts, ends, f"vector {kind}") + svg.strokes(at, at, f"dot {kind}")
 
 
-def _scale_bar(on: Plane, px_per_um: float) -> Markup:
-    um, mm = svg.round_step(60.0 / px_per_um), svg.round_step(60.0 / on.px_per_mm)
-    x = MARGIN_PX
-    bars = Markup("")
-    for y, length, text in (
-        (on.height_px + 4.0, um * px_per_um, f"{um:g} µm (vectors)"),
-        (on.height_px + 19.0, mm * on.px_per_mm, f"{mm:g} mm (frame)"),
-    ):
-        bars += svg.line((x, x, x, x + length, x + length, x + length), (y - 3, y + 3, y, y, y - 3, y + 3), "bar")
-        bars += svg.words(x + length + 6.0, y + 4.0, text, "tick")
-    return bars
-
-
-def _stroke(start: Array, end: Array, row: ResidualRecord, suspects: Collection[ResidualRecord]) -> Markup:
-    kind = "suspect" if row in suspects else "fiducial" if row.kind == "fiducial" else "target"
-    return strokes_and_dots(start[None], end[None], kind)
-
-
-def _hint(row: ResidualRecord) -> str:
-    vx, vy = (fixed(v, 1, sign=True) for v in row.v_um)
-    return f"{row.kind} {row.point}: v = ({vx}, {vy}) µm in the scan, w = {fixed(row.w, 1)}"
-
-
 @dataclass(frozen=True)
 class JoinedView:
-    """A frame, ready to print. rms_um: of what is between both sights of a join, in x' and y'; largest: of them, with
-    its name. parts: the scans, with the standard deviation of each one's film transformation at its corners."""
+    """A frame that was scanned in parts. rms_um: of the differences of both scans of a join, in x' and y'; largest: of
+    them, with its name."""
 
-    frame: str
-    parts: list[tuple[str, str]]
-    joins: int
-    rms_um: tuple[str, str]
+    record: JoinedFrameRecord
+    rms_um: tuple[float | None, float | None]
     largest: str
     plot: Markup | None
 
 
-def joined_views(data: ReportData) -> list[JoinedView]:
-    """All frames that were scanned in parts; none where there is no solution."""
-    frames = data.adjustment.frames if data.adjustment else {}
-    return [_joined_view(name, frame) for name, frame in sorted(frames.items())]
-
-
-def _joined_view(name: str, frame: JoinedFrameRecord) -> JoinedView:
-    parts = [(part, fixed(known.corner_sigma_um, 1)) for part, known in frame.parts.items()]
-    joins = frame.joins
-    if not joins:
-        return JoinedView(name, parts, 0, ("–", "–"), "–", None)
-    apart = vectors.VectorField.of_joins(joins)
+def joined_view(frame: JoinedFrameRecord) -> JoinedView:
+    """The joins of a frame."""
+    if not frame.joins:
+        return JoinedView(frame, (None, None), "–", None)
+    apart = VectorField.of_joins(frame.joins)
     lengths_um = np.hypot(*apart.vectors_um.T)
-    rms = np.sqrt(np.mean(apart.vectors_um**2, axis=0))
-    on = vectors.plane(apart.places_mm, None, JOINED_PLOT_PX)
-    return JoinedView(
-        name,
-        parts,
-        len(joins),
-        (fixed(float(rms[0]), 2), fixed(float(rms[1]), 2)),
-        f"{joins[int(lengths_um.argmax())].point}: {fixed(float(lengths_um.max()), 1)} µm",
-        vectors.all_images_plot(apart, on, apart.scale(LONGEST_JOIN_PX)),
-    )
+    x_um, y_um = np.sqrt(np.mean(apart.vectors_um**2, axis=0)).tolist()
+    largest = f"{frame.joins[int(lengths_um.argmax())].point}: {fixed(float(lengths_um.max()), 1)} µm"
+    on = plane(apart.places_mm, None, JOINED_PLOT_PX)
+    return JoinedView(frame, (x_um, y_um), largest, all_images_plot(apart, on, apart.scale(LONGEST_JOIN_PX)))

@@ -12,7 +12,7 @@ from adjust.problem.parameter import description, parameter_from_text
 from measure.flags import Status
 from pipeline.report.data import Problem, ReportData
 from pipeline.report.fractions import places_px
-from pipeline.report.frame_problems import assumed_poses, frame_problems, pixel_locking, said_by
+from pipeline.report.frame_problems import assumed_poses, frame_problems, images_by_sentence, pixel_locking
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import spoken_name
@@ -29,7 +29,7 @@ from pipeline.results.check_file import Check, PixelCalibration
 from pipeline.text.wording import counted, listed
 
 Level = Literal["good", "look", "failed"]
-Look = Callable[[ReportData, list[Frame]], Iterable[Problem]]
+Evidence = Callable[[ReportData, list[Frame]], Iterable[Problem]]
 
 A_PRIORI = (
     "Standard deviations are a priori ones, as the given sigmas make them: the observations have no redundancy of "
@@ -40,28 +40,16 @@ MOST_QUANTITIES = 3  # of it that are named
 LEAST_SHARE = 0.5  # of the corner's radius within which an estimated lens is known
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
 
-# Observations other than marks, by their key in adjustment.json: what is said of one and of many, and what to do.
-FURTHER = (
-    (
-        "distances",
-        "{} distance beyond chance",
-        "{} distances beyond chance",
-        "Look for a wrong point or unit in the file of distances; two distances that contradict each other are both "
-        "named.",
-    ),
-    (
-        "calibrations",
-        "The images contradict the earlier calibration",
-        "The images contradict the earlier calibration",
-        "The camera has changed since, or the earlier adjustment lacked something; calibrate without it and compare.",
-    ),
-    (
-        "antennas",
-        "{} coordinate of antennas beyond chance",
-        "{} coordinates of antennas beyond chance",
-        "Look for a wrong image or time, and at the antenna's offset and its sign.",
-    ),
+# Observations other than marks: how a list of them is headed, and what to do.
+DISTANCES = (
+    "beyond chance",
+    "Look for a wrong point or unit in the file of distances; two distances that contradict each other are both named.",
 )
+CALIBRATION = (
+    "The images contradict the earlier calibration",
+    "The camera has changed since, or the earlier adjustment lacked something; calibrate without it and compare.",
+)
+ANTENNAS = ("beyond chance", "Look for a wrong image or time, and at the antenna's offset and its sign.")
 
 
 @dataclass(frozen=True)
@@ -81,7 +69,7 @@ class ReportVerdict:
 def judge(data: ReportData) -> ReportVerdict:
     """Judge what is there: the measurement, the adjustment, the check against OpenCV."""
     shots = frames(data)
-    problems = tuple(problem for check_rows in NEEDS_A_LOOK.values() for problem in check_rows(data, shots))
+    problems = tuple(problem for found in NEEDS_A_LOOK.values() for problem in found(data, shots))
     is_fatal = data.adjustment is not None and any(_no_solution(data.adjustment))
     level: Level = "failed" if is_fatal or not _observed(data, shots) else "look" if problems else "good"
     return ReportVerdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
@@ -109,23 +97,15 @@ def _no_solution(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         together = description(parameter_from_text(text, adjustment.cameras) for text in null.parameters)
         yield Problem(f"{null.cause} The observations do not see it (together move {together}).", null.remedy)
     if not adjustment.converged and not adjustment.singular:
+        is_practically = any(warning.startswith("Practically singular") for warning in adjustment.warnings)
         yield Problem(
             f"The iteration did not come to rest ({adjustment.termination}, {adjustment.iterations} iterations).",
-            _why_no_rest(adjustment),
-        )
-
-
-def _why_no_rest(adjustment: AdjustmentRecord) -> str:
-    """What to look at where an iteration does not come to rest."""
-    if any(warning.startswith("Practically singular") for warning in adjustment.warnings):
-        return (
             "The images hardly determine what is named below as practically singular: add what is advised there, or "
             "fix it."
+            if is_practically
+            else "Look for wrong point numbers and gross errors among the largest residuals, at the approximate "
+            "orientations, and at the units: [object] unit of points and stations, mm in the camera's file.",
         )
-    return (
-        "Look for wrong point numbers and gross errors among the largest residuals, at the approximate orientations, "
-        "and at the units: [object] unit of points and stations, mm in the camera's file."
-    )
 
 
 def _unchecked(adjustment: AdjustmentRecord) -> Iterator[Problem]:
@@ -136,18 +116,19 @@ def _unchecked(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         )
 
 
-def _suspects(rows: Sequence[SuspectRecord]) -> Iterator[Problem]:
-    kept, removed = ([row for row in rows if row.removed is removed] for removed in (False, True))
+def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
+    rows = adjustment.suspects
+    kept, removed = ([_suspect(row) for row in rows if row.removed is removed] for removed in (False, True))
     if kept:
         yield Problem(
-            f"{counted(len(kept), 'observation')} beyond chance: {listed([_suspect(row) for row in kept])}.",
+            f"{counted(len(kept), 'observation')} beyond chance: {listed(kept)}.",
             "Look at the picture or the records: a wrong point number or a disturbed mark is rejected in "
             "comparator.csv (status rejected), a wrong given coordinate corrected, and the adjustment run again; "
             "snooping = true under [adjust] leaves them out.",
         )
     if removed:
         yield Problem(
-            f"Left out, for beyond chance: {listed([_suspect(row) for row in removed])}.",
+            f"Left out, for beyond chance: {listed(removed)}.",
             "The adjustment does without them. Look at the picture or the records, and reject or correct them there.",
         )
 
@@ -159,23 +140,23 @@ def _suspect(row: SuspectRecord) -> str:
 
 def _further_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     """Distances, earlier calibrations and antennas that the images contradict."""
-    further: dict[str, Sequence[DistanceRecord | ObservedQuantity]] = {
-        "distances": adjustment.distances,
-        "calibrations": adjustment.calibrations,
-        "antennas": adjustment.antennas,
-    }
-    for group, one, many, remedy in FURTHER:
-        whole = [test for test in adjustment.calibration_tests if test.p < CONTRADICTED]
-        if group == "calibrations" and whole:
-            for test in whole:
-                yield Problem(f"{one}: {contradiction(test, adjustment.cameras)}.", remedy)
-            continue
-        bad = _outlying(adjustment, further[group])
-        if bad:
-            heading = (one if len(bad) == 1 else many).format(len(bad))
-            names = [spoken_name(row.name, adjustment.cameras) if group == "calibrations" else row.name for row in bad]
-            named = [f"{name} (v = {row.v:.4g}, w = {fixed(row.w, 1)})" for name, row in zip(names, bad, strict=True)]
-            yield Problem(f"{heading}: {listed(named)}.", remedy)
+    heading, remedy = DISTANCES
+    if bad := _outlying(adjustment, adjustment.distances):
+        yield Problem(f"{counted(len(bad), 'distance')} {heading}: {_named(bad, [row.name for row in bad])}.", remedy)
+    heading, remedy = CALIBRATION
+    tests = [test for test in adjustment.calibration_tests if test.p < CONTRADICTED]
+    yield from (Problem(f"{heading}: {contradiction(test, adjustment.cameras)}.", remedy) for test in tests)
+    if not tests and (bad := _outlying(adjustment, adjustment.calibrations)):
+        names = [spoken_name(row.name, adjustment.cameras) for row in bad]
+        yield Problem(f"{heading}: {_named(bad, names)}.", remedy)
+    heading, remedy = ANTENNAS
+    if bad := _outlying(adjustment, adjustment.antennas):
+        count = counted(len(bad), "coordinate of antennas", "coordinates of antennas")
+        yield Problem(f"{count} {heading}: {_named(bad, [row.name for row in bad])}.", remedy)
+
+
+def _named(rows: Sequence[DistanceRecord | ObservedQuantity], names: Sequence[str]) -> str:
+    return listed([f"{n} (v = {row.v:.4g}, w = {fixed(row.w, 1)})" for n, row in zip(names, rows, strict=True)])
 
 
 def contradiction(test: ContradictionRecord, cameras: Mapping[str, CameraRecord]) -> str:
@@ -242,18 +223,9 @@ def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
 def _lens_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     """Lenses that were estimated in less than half of the picture: from half the radius to the corner the seventh power
     of k3 grows by 128, so that a hundredth of a pixel inside is more than a pixel there."""
-    for name, known in adjustment.estimated_lenses():
-        if known.share < LEAST_SHARE:
-            yield Problem(
-                known.sentence(name),
-                "Observe targets out to the corners of the picture, or use the lens within that radius only.",
-            )
-
-
-def _lens_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
-    for name, known in adjustment.estimated_lenses():
-        if known.share >= LEAST_SHARE:
-            yield known.sentence(name)
+    remedy = "Observe targets out to the corners of the picture, or use the lens within that radius only."
+    lenses = adjustment.estimated_lenses()
+    yield from (Problem(known.sentence(name), remedy) for name, known in lenses if known.share < LEAST_SHARE)
 
 
 def _check_problems(check: Check) -> Iterator[Problem]:
@@ -277,8 +249,8 @@ def _corners_notes(check: Check) -> Iterator[str]:
             )
 
 
-def _pixel_figures(of: PixelCalibration) -> str:
-    return f"fx {of.fx:.2f}, fy {of.fy:.2f}, cx {of.cx:.2f}, cy {of.cy:.2f} px, rms {of.rms:.3f} px a point"
+def _pixel_figures(px: PixelCalibration) -> str:
+    return f"fx {px.fx:.2f}, fy {px.fy:.2f}, cx {px.cx:.2f}, cy {px.cy:.2f} px, rms {px.rms:.3f} px a point"
 
 
 def _is_solved(data: ReportData) -> bool:
@@ -290,14 +262,14 @@ def is_film_alone(data: ReportData) -> bool:
     return data.adjustment is not None and not any(camera.is_calibrated for camera in data.adjustment.cameras.values())
 
 
-def _solution_check(check_rows: Callable[[AdjustmentRecord], Iterator[Problem]], checked: bool = False) -> Look:
+def _solution_check(found: Callable[[AdjustmentRecord], Iterator[Problem]], checked: bool = False) -> Evidence:
     """What an adjustment needs a look at where it has a solution, and redundancy if that is asked for."""
 
-    def of(data: ReportData, _: list[Frame]) -> Iterator[Problem]:
+    def problems(data: ReportData, _: list[Frame]) -> Iterator[Problem]:
         if data.adjustment is not None and _is_solved(data) and (not checked or data.adjustment.has_sigma0):
-            yield from check_rows(data.adjustment)
+            yield from found(data.adjustment)
 
-    return of
+    return problems
 
 
 def _frame_check(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
@@ -310,7 +282,7 @@ def _frame_check(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
 
 
 # All that makes exit code 1, with the names that docs/how-to/read-the-report.md tells them by.
-NEEDS_A_LOOK: dict[str, Look] = {
+NEEDS_A_LOOK: dict[str, Evidence] = {
     "solution": lambda data, _: _no_solution(data.adjustment) if data.adjustment else (),
     "made from": lambda data, _: data.problems,
     "frames": _frame_check,
@@ -320,7 +292,7 @@ NEEDS_A_LOOK: dict[str, Look] = {
     "redundancy": _solution_check(_unchecked),
     "reach of the lens": _solution_check(_lens_problems),
     "distances, calibrations, antennas": _solution_check(_further_problems),
-    "gross errors": _solution_check(lambda adjustment: _suspects(adjustment.suspects)),
+    "gross errors": _solution_check(_suspects),
     "OpenCV": lambda data, _: _check_problems(data.check) if data.check else (),
 }
 
@@ -343,7 +315,8 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield from _corners_notes(data.check)
     if data.adjustment:
         yield from data.adjustment.notes
-        yield from _lens_notes(data.adjustment)
+        lenses = data.adjustment.estimated_lenses()
+        yield from (known.sentence(name) for name, known in lenses if known.share >= LEAST_SHARE)
         yield from _weight_notes(data.adjustment)
         if _is_solved(data) and data.adjustment.has_sigma0:
             yield from _too_small(data.adjustment)
@@ -355,7 +328,7 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield (
             "Fiducial marks are the same in every frame: if two scans bear each other's names, nothing here shows it."
         )
-    for note, images in said_by(shots, lambda frame: frame.scan.notes if frame.scan else ()).items():
+    for note, images in images_by_sentence(shots, lambda frame: frame.scan.notes if frame.scan else ()).items():
         yield f"{listed(images)}: {note}"
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
         for kind, *words in (("target", "target"), ("tie", "sight of a tie point", "sights of tie points")):
@@ -397,15 +370,15 @@ def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int)
     if level == "failed":
         why = "the network is singular" if data.adjustment.singular else "the iteration did not come to rest"
         return f"There is no calibration: {why}."
-    calibrated = {name: each for name, each in data.adjustment.cameras.items() if each.is_calibrated}
-    if not calibrated:
+    constants = []
+    for name, camera in data.adjustment.cameras.items():
+        if camera.is_calibrated:
+            value, sigma = value_and_sigma(camera.principal_distance_mm.value, camera.principal_distance_mm.sigma)
+            known = f"{value} mm, fixed" if sigma == "fixed" else f"{value} ± {sigma} mm"
+            constants.append(f"{name} has c = {known}")
+    if not constants:
         return f"Film transformations from {found}; no frame is oriented, and no camera calibrated{ending}"
-    constants = "; ".join(
-        f"{name} has c = {value} ± {sigma} mm" if sigma != "fixed" else f"{name} has c = {value} mm, fixed"
-        for name, camera in calibrated.items()
-        for value, sigma in [value_and_sigma(camera.principal_distance_mm.value, camera.principal_distance_mm.sigma)]
-    )
-    return f"Calibrated from {found}: {constants}{ending}"
+    return f"Calibrated from {found}: {'; '.join(constants)}{ending}"
 
 
 def _observed(data: ReportData, shots: list[Frame]) -> int:

@@ -28,7 +28,7 @@ from pipeline.measuring.roll import known_lines, poses_of_roll, with_known_lines
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
-from pipeline.report.frame_views import written
+from pipeline.report.frame_views import writing_picture
 from pipeline.results.frames_file import for_images, write_frames
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.tables import Table
@@ -294,7 +294,7 @@ def test_the_report_draws_lines_in_place_and_those_that_told_stand_out() -> None
     outline = ((10.0, 10.0), (20.0, 10.0), (20.0, 90.0), (10.0, 90.0))
     lines = [replace(line(text, "90m"), outline_px=outline) for text in ("RUN 7", "8617")]
     pose = Pose("0", True, ('of 2 lines of writing "RUN 7" speak most',))
-    drawn = written(replace(scan("a", lines, pose), height_px=200))
+    drawn = writing_picture(replace(scan("a", lines, pose), height_px=200))
     assert drawn is not None
     assert 'transform="matrix(' in drawn
     # 5 page pixels a pixel. Right in its own frame is up in the scan after mirror and turn: down the page.
@@ -302,8 +302,8 @@ def test_the_report_draws_lines_in_place_and_those_that_told_stand_out() -> None
     assert matrix == pytest.approx([0.0, 1.0, 1.0, 0.0, 75.0, 250.0])
     assert 'class="told"' in drawn.split(">RUN 7<")[0].rsplit("<text", 1)[1]
     assert 'class="read"' in drawn.split(">8617<")[0].rsplit("<text", 1)[1]
-    assert written(scan("a", None)) is None
-    assert written(None) is None
+    assert writing_picture(scan("a", None)) is None
+    assert writing_picture(None) is None
 
 
 SCENE = """
