@@ -18,8 +18,9 @@ from tempfile import TemporaryDirectory
 
 from benchmarks.archive_stand_ins import USE, write_project
 from benchmarks.harness import ROOT, START, Row, table
-from pipeline.archive.checked_statuses import judged_records, latest
+from pipeline.archive.checked_statuses import checked_scans, latest
 from pipeline.archive.results_database import Store
+from pipeline.results.measured_record import mark_row, scan_detail
 
 _SCANS, _SCAN_S, _WORKERS = 200, 0.2, 2
 
@@ -95,7 +96,8 @@ def content(folder: Path) -> list[str]:
         judging = latest(store)
         assert judging is not None
         keys = sorted(store.fingerprints())
-        return [*keys, *(f"{name} {record}" for name, record in judged_records(store, judging))]
+        scans = checked_scans(store, judging, folder)
+        return [*keys, *(f"{scan_detail(scan, '')} {list(map(mark_row, scan.frame.marks))}" for scan in scans)]
 
 
 def marks(folder: Path) -> bytes:

@@ -15,8 +15,8 @@ import numpy as np
 
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
-from pipeline.archive.checked_statuses import JudgedScan, judge, judged_marks, judging_of, tell_written
-from pipeline.archive.measurement import pitches, tell_place
+from pipeline.archive.checked_statuses import CheckedResult, checked_marks, find_judging, judge, remember_written
+from pipeline.archive.measurement import pitches, remember_place
 from pipeline.archive.results_database import Kept, Store
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile
@@ -24,7 +24,7 @@ from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.provenance import Identity, file_state, parts_hash
 from pipeline.publishing.made_from import measured_from
 from pipeline.results.comparator_file import write_comparator
-from pipeline.results.measured_record import MeasuredScan, record_of
+from pipeline.results.measured_record import MeasuredScan
 
 FIDUCIALS = ((-106, -106), (106, -106), (106, 106), (-106, 106), (0, -110), (110, 0), (0, 110), (-110, 0))
 _PITCH_UM = 20.0
@@ -81,20 +81,20 @@ def keep_results(project: Project) -> None:
     """Put results into the database as `reseau measure` would; every hundredth frame has lost a fiducial."""
     home = project.path.resolve().parent
     with Store(project.measurement_path) as store:
-        tell_place(store, home)
+        remember_place(store, home)
         digest = judge(store, measured_from(project), "kept", _frames(project, store, home))
-        judging = judging_of(store, digest)
+        judging = find_judging(store, digest)
         assert judging is not None
-        write_comparator(project.comparator, judged_marks(store, judging), pitches(store, digest), digest)
-        tell_written(store, digest, project.comparator)
+        write_comparator(project.comparator, checked_marks(store, judging), pitches(store, digest), digest)
+        remember_written(store, digest, project.comparator)
 
 
-def _frames(project: Project, store: Store, home: Path) -> Iterator[JudgedScan]:
+def _frames(project: Project, store: Store, home: Path) -> Iterator[CheckedResult]:
     for number, task in enumerate(scan_tasks(project, tuple(project.scans))):
         scan = stand_in(task).scan
-        record, path = record_of(_with_loss(scan) if number % _LOSES == 1 else scan, home), Path(task.scan)
+        scan, path = _with_loss(scan) if number % _LOSES == 1 else scan, Path(task.scan)
         identity = Identity(file_state(path, home), parts_hash(path))
-        yield JudgedScan(task.name, store.keep(Kept(identity, "{}", record), task.name, current=True), record)
+        yield CheckedResult(store.keep(Kept(identity, "{}", scan), task.name, current=True), scan)
 
 
 def _with_loss(scan: MeasuredScan) -> MeasuredScan:

@@ -13,12 +13,12 @@ from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.archive.checked_statuses import (
+    checked_marks,
     drop_all_but,
-    judged_marks,
-    judging_of,
+    find_judging,
     marks_as_written,
     rejudge,
-    tell_written,
+    remember_written,
 )
 from pipeline.archive.measurement import (
     decisions_by,
@@ -27,7 +27,7 @@ from pipeline.archive.measurement import (
     picture_sizes_mm,
     pitches,
     read_measurement,
-    tell_place,
+    remember_place,
     written_scans,
 )
 from pipeline.archive.merge import Merged, merge
@@ -54,7 +54,7 @@ from pipeline.results.comparator_file import (
 )
 from pipeline.results.covariance_file import covariance_path
 from pipeline.results.frames_file import for_images, write_frames
-from pipeline.results.measured_record import MeasuredScan, record_of
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.record_json import write_record
 from pipeline.summary import Summary, archive_summary, shard_summary, summarise
 from pipeline.workers import NotMeasured, WorkOptions
@@ -196,7 +196,7 @@ def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkO
     with Store(project.measurement_path) as store:
 
         def measured_and_written(options: WorkOptions | None) -> str:
-            tell_place(store, project.path.parent)
+            remember_place(store, project.path.parent)
             learned = new.place(project.output / "learned")
             digest = measure_archive(project, store, lambda: measured_from(project), learned, reporter, options)
             if not marks_as_written(store, digest, project.comparator):
@@ -250,23 +250,22 @@ def _comparator(project: Project, new: Unpublished) -> Path:
 
 def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublished) -> None:
     """What a second visit found, in the place of what was judged before it."""
-    folder = project.path.resolve().parent
     with Store(project.measurement_path) as store:
-        before = judging_of(store, measurement_of(new.at(project.comparator)))
+        before = find_judging(store, measurement_of(new.at(project.comparator)))
         assert before is not None
-        digest = rejudge(store, before, {scan.frame.image: record_of(scan, folder) for scan in scans})
+        digest = rejudge(store, before, scans)
         _write_marks(project, store, digest, new)
 
 
 def _write_marks(project: Project, store: Store, digest: str, new: Unpublished) -> None:
-    judging = judging_of(store, digest)
+    judging = find_judging(store, digest)
     assert judging is not None
     decisions = decisions_by(store, digest)
     for camera in project.cameras.values():
         if camera.clicks is not None and camera.clicks.who:  # one decision more: how its marks look
             who = camera.path.name, camera.clicks.who
             decisions[who] = decisions.get(who, 0) + 1
-    marks = judged_marks(store, judging)
+    marks = checked_marks(store, judging)
     write_comparator(new.place(project.comparator), marks, pitches(store, digest), digest, decisions)
     if not write_frames(new.place(project.frames_path), written_scans(store, digest)):
         new.remove(project.frames_path)
@@ -279,9 +278,9 @@ def _publish(project: Project, new: Unpublished) -> None:
         return
     digest = measurement_of(project.comparator)
     with Store(project.measurement_path) as store:
-        if judging_of(store, digest) is not None:
+        if find_judging(store, digest) is not None:
             drop_all_but(store, digest)
-            tell_written(store, digest, project.comparator)
+            remember_written(store, digest, project.comparator)
 
 
 def _fill_images(project: Project, scans: Iterable[MeasuredScan]) -> None:

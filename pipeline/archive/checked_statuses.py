@@ -1,4 +1,4 @@
-"""What all scans of a project together make of what each gave: kept beside it, made anew and dropped at will.
+"""Statuses after the cross-scan checks: stored beside the raw results; they can be rebuilt.
 
 A judging is written whole and named by its digest, which comparator.csv names too: so both belong together whenever a
 process is ended. The one before is dropped when the files that name this one are in their places.
@@ -13,7 +13,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.results_database import MARK_COLUMNS, Json, Store, mark_of, places, row_of
+from measure.flags import Code, Reason
+from measure.results import FrameMeasurement
+from pipeline.archive.results_database import MARKS, Store, places
 from pipeline.archive.results_integrity import (
     IS_JUDGING_SOUND,
     DamagedError,
@@ -25,9 +27,19 @@ from pipeline.archive.results_integrity import (
     seal,
     seal_judging,
 )
-from pipeline.archive.verdicts import Verdict, verdict_of
+from pipeline.archive.verdicts import scan_verdict
 from pipeline.provenance import of_file
 from pipeline.results.comparator_file import MarkRow
+from pipeline.results.measured_record import (
+    Failure,
+    FailureCode,
+    MeasuredScan,
+    mark_row,
+    read_mark_row,
+    read_scan,
+    scan_detail,
+    scan_location,
+)
 
 _AT_A_TIME = 500  # frames in a transaction
 _WRITTEN = "comparator.csv"
@@ -45,26 +57,25 @@ class Judging:
 
 
 @dataclass(frozen=True)
-class JudgedScan:
-    """name: of the image. result: the row of what was measured. record: as it is now, beside all others. decisions: a
-    hash of those about the image that were taken in."""
+class CheckedResult:
+    """result: the row of what was measured. scan: as it is now, beside all others. decisions: a hash of those about the
+    image that were taken in."""
 
-    name: str
     result: int
-    record: Json
+    scan: MeasuredScan
     decisions: str = ""
 
 
 @dataclass(frozen=True)
 class Lot:
     """Frames that are judged beside one another, and beside no others. input: SHA-256 of all that this starts from, ""
-    where that is not known; frames: gives them judged, if that is asked for."""
+    where that is not known; frames: gives them judged, when they are needed."""
 
     input: str
-    frames: Callable[[], Iterable[JudgedScan]]
+    frames: Callable[[], Iterable[CheckedResult]]
 
 
-def judge(store: Store, made_from: Mapping[str, str], input_hash: str, frames: Iterable[JudgedScan]) -> str:
+def judge(store: Store, made_from: Mapping[str, str], input_hash: str, frames: Iterable[CheckedResult]) -> str:
     """`judge_lots` of a single one, which is taken from no other judging."""
     return judge_lots(store, made_from, input_hash, [Lot("", lambda: frames)])
 
@@ -80,7 +91,7 @@ def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots
         row = db.execute("insert into judging (digest, made_from, input) values (?, ?, ?)", values).lastrowid
         assert row is not None
     for number, lot in enumerate(lots):
-        output = _taken(store, row, number, lot) or _judged(store, row, number, lot.frames())
+        output = _copy_lot(store, row, number, lot) or _write_lot(store, row, number, lot.frames())
         hasher.update(output.encode())
         with store.writing():
             db.execute("insert into judged_lot values (?, ?, ?, ?)", (row, number, lot.input, output))
@@ -92,8 +103,8 @@ def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots
     return digest
 
 
-def _taken(store: Store, judging: int, number: int, lot: Lot) -> str:
-    """Take a lot from an earlier judging, and give what is told of it; "" where none has it."""
+def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
+    """Take a lot from an earlier judging, and give the hash of its content; "" where none has it."""
     if not lot.input:
         return ""
     db = store.connection
@@ -116,7 +127,7 @@ def _taken(store: Store, judging: int, number: int, lot: Lot) -> str:
         )
         db.execute(f"{seal('judged_frame')} where judging = ? and lot = ?", (judging, number))
         db.execute(
-            f"insert into judged (judging, result, number, {MARK_COLUMNS}) select ?, result, number, {MARK_COLUMNS} "
+            f"insert into judged (judging, result, number, {MARKS}) select ?, result, number, {MARKS} "
             "from judged where judging = ? and result in "
             "(select result from judged_frame where judging = ? and lot = ? and own_marks)",
             (judging, before, before, old),
@@ -139,17 +150,17 @@ def _is_lot_sound(db: sqlite3.Connection, judging: int, lot: int) -> bool:
 
 def _own_marks(db: sqlite3.Connection, judging: int, result: int) -> list[tuple[Any, ...]]:
     """The rows of the marks of a frame that are other ones than were measured."""
-    query = f"select number, {MARK_COLUMNS} from judged where judging = ? and result = ? order by number"
+    query = f"select number, {MARKS} from judged where judging = ? and result = ? order by number"
     return db.execute(query, (judging, result)).fetchall()
 
 
-def _judged(store: Store, judging: int, number: int, frames: Iterable[JudgedScan]) -> str:
-    """Judge a lot, and give what is told of it."""
+def _write_lot(store: Store, judging: int, number: int, frames: Iterable[CheckedResult]) -> str:
+    """Judge a lot, and give the hash of its content."""
     hasher, left = hashlib.sha256(), iter(frames)
     while some := list(islice(left, _AT_A_TIME)):  # what makes them may have to measure, and write, meanwhile
         with store.writing():
             for frame in some:
-                hasher.update(_write(store.connection, judging, number, frame, store.record(frame.result)))
+                hasher.update(_write_frame(store, judging, number, frame))
     return hasher.hexdigest()
 
 
@@ -159,7 +170,7 @@ def drop_all_but(store: Store, digest: str) -> None:
         store.connection.execute("delete from judging where digest <> ?", (digest,))
 
 
-def judging_of(store: Store, digest: str) -> Judging | None:
+def find_judging(store: Store, digest: str) -> Judging | None:
     """The judging of that digest. Raises DamagedError where it is not as it was written."""
     query = f"select {IS_JUDGING_SOUND}, id, digest, made_from, input from judging where digest = ?"
     found = store.connection.execute(query, (digest,)).fetchone()
@@ -171,12 +182,17 @@ def judging_of(store: Store, digest: str) -> Judging | None:
     return Judging(row, digest, json.loads(made_from), input_hash)
 
 
-def rejudge(store: Store, before: Judging, records: Mapping[str, Json]) -> str:
-    """Keep another judging of the same results, after a look that a later `measure` does not take; give its digest."""
+def rejudge(store: Store, before: Judging, scans: Sequence[MeasuredScan]) -> str:
+    """Keep another judging of the same results, after a second pass that a later `measure` does not make; give its
+    digest."""
     check_judging(store.connection, before.row, store.path)
-    query = "select name, result, decisions from judged_frame where judging = ? order by name"
-    rows = store.connection.execute(query, (before.row,)).fetchall()
-    frames = [JudgedScan(name, result, records[name], decisions) for name, result, decisions in rows]
+    query = "select name, result, decisions from judged_frame where judging = ?"
+    rows = {name: known for name, *known in store.connection.execute(query, (before.row,))}
+    frames = (
+        CheckedResult(result, scan, decisions)
+        for scan in sorted(scans, key=lambda scan: scan.frame.image)
+        for result, decisions in [rows[scan.frame.image]]
+    )
     return judge(store, before.made_from, f"looked again {before.input}", frames)
 
 
@@ -186,15 +202,18 @@ def latest(store: Store) -> Judging | None:
     found = store.connection.execute(
         f"select digest from judging where not {_UNFINISHED} order by id desc limit 1"
     ).fetchone()
-    return None if found is None else judging_of(store, found[0])
+    return None if found is None else find_judging(store, found[0])
 
 
-def judged_records(
-    store: Store, judging: Judging, images: Collection[str] | None = None
-) -> Iterator[tuple[str, Json | DamagedError]]:
-    """Name and record of every frame, by name: where its file is now, and as all scans together show it; in the place
-    of a record that is not as it was written what is to be said of it. images: of these alone. Raises DamagedError
-    where the list of the frames is not as it was written."""
+def checked_scans(
+    store: Store, judging: Judging, folder: Path, images: Collection[str] | None = None
+) -> Iterator[MeasuredScan]:
+    """Every scan, by name: where its file is now, and as all scans together show it. One that is not as it was written
+    is a failure.
+
+    folder: that the paths of scans count from. images: of these alone. Raises DamagedError where the list of the frames
+    is not as it was written.
+    """
     db = store.connection
     if images is None:
         check_judging(db, judging.row, store.path)
@@ -205,41 +224,40 @@ def judged_records(
         "order by f.name",
         (judging.row, *([] if images is None else [json.dumps(sorted(images))])),
     )
-    for name, result, own_marks, detail, uri, digest, is_whole in frames:
+    for name, result, own_marks, changed, uri, digest, is_whole in frames:
+        own = _own_marks(db, judging.row, result) if own_marks else []
         try:
-            record = store.record(result)
-        except DamagedError:
-            is_whole = False
-        marks = _own_marks(db, judging.row, result) if own_marks else []
-        if not is_whole or (own_marks and marks_digest(marks) != digest):
-            yield name, DamagedError.of_image(name, store.path)
-            continue
-        if own_marks:
-            record["marks"] = [mark_of(row) for _, *row in marks]
-        record.update(json.loads(detail) if detail else {})
-        yield name, {**record, "scan": uri}
+            if not is_whole or (own_marks and marks_digest(own) != digest):
+                raise DamagedError.of_image(name, store.path)
+            detail = json.loads(store.detail(result)) | (json.loads(changed) if changed else {})
+            rows = [row for _, *row in own] if own_marks else store.mark_rows(result)
+            yield read_scan(name, detail, list(map(read_mark_row, rows)), scan_location(uri, folder))
+        except (DamagedError, ValueError, TypeError, KeyError):
+            sentence = str(DamagedError.of_image(name, store.path))
+            frame = FrameMeasurement(name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
+            yield MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, sentence))
 
 
-def tell_written(store: Store, digest: str, comparator: Path) -> None:
+def remember_written(store: Store, digest: str, comparator: Path) -> None:
     """The file has the marks of that judging now."""
-    store.tell(_WRITTEN, _written(digest, comparator))
+    store.remember(_WRITTEN, _written(digest, comparator))
 
 
 def marks_as_written(store: Store, digest: str, comparator: Path) -> bool:
     """Whether the file has the marks of that judging, and nobody has changed it since."""
-    return store.told(_WRITTEN) == _written(digest, comparator)
+    return store.recall(_WRITTEN) == _written(digest, comparator)
 
 
-def _written(digest: str, comparator: Path) -> dict[str, Any]:
+def _written(digest: str, comparator: Path) -> dict[str, str]:
     return {"digest": digest, "file": of_file(comparator) if comparator.exists() else ""}
 
 
-def judged_marks(store: Store, judging: Judging, images: Collection[str] | None = None) -> Iterator[MarkRow]:
+def checked_marks(store: Store, judging: Judging, images: Collection[str] | None = None) -> Iterator[MarkRow]:
     """Every mark of every frame, by the frames' names, as all scans together show it. images: of these alone. Raises
     DamagedError where one of them is not as it was written."""
     db = store.connection
     check_judging(db, judging.row, store.path)
-    as_measured = f"select number, {MARK_COLUMNS} from mark where result = ? order by number"
+    as_measured = f"select number, {MARKS} from mark where result = ? order by number"
     frames = db.execute(
         "select f.name, f.result, own_marks, case when own_marks then f.marks_digest else result.marks_digest end, "
         f"{is_sound('judged_frame', 'f')} and {is_sound('result')} from judged_frame f "
@@ -268,26 +286,28 @@ def _covariance(spread: Sequence[float | None], causes: str | None) -> tuple[flo
     return float(first), float(third), float(second)
 
 
-def _write(db: sqlite3.Connection, judging: int, lot: int, frame: JudgedScan, measured: Json) -> bytes:
+def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> bytes:
     """Write what of a frame is another than it was measured, and give all that was written."""
-    now = frame.record
-    changed = {k: v for k, v in now.items() if k not in ("marks", "scan") and v != measured.get(k)}
-    own_marks = now["marks"] != measured["marks"]
+    db, measured = store.connection, json.loads(store.detail(frame.result))
+    now = scan_detail(frame.scan, measured["scan"])
+    changed = {key: value for key, value in now.items() if value != measured.get(key)}
     detail = json.dumps(changed, ensure_ascii=False) if changed else None
-    verdict: Verdict = verdict_of(now)
+    rows = [mark_row(mark) for mark in frame.scan.frame.marks]
+    own_marks = rows != store.mark_rows(frame.result)
+    rows = rows if own_marks else []
     scan, key = db.execute("select scan, fingerprint from result where id = ?", (frame.result,)).fetchone()
+    name, verdict = frame.scan.frame.image, str(scan_verdict(frame.scan))
     db.execute(
         "insert into judged_frame (judging, lot, scan, result, name, verdict, own_marks, detail, decisions) "
         f"values ({places(9)})",
-        (judging, lot, scan, frame.result, frame.name, str(verdict), own_marks, detail, frame.decisions),
+        (judging, lot, scan, frame.result, name, verdict, own_marks, detail, frame.decisions),
     )
-    rows: list[tuple[Any, ...]] = [row_of(mark) for mark in now["marks"]] if own_marks else []
     db.executemany(
-        f"insert into judged (judging, result, number, {MARK_COLUMNS}) values ({places(15)})",
+        f"insert into judged (judging, result, number, {MARKS}) values ({places(15)})",
         ((judging, frame.result, number, *row) for number, row in enumerate(rows)),
     )
     digest = marks_digest(_own_marks(db, judging, frame.result) if own_marks else [])
     where = "where judging = ? and scan = ?"
     db.execute(f"update judged_frame set marks_digest = ? {where}", (digest, judging, scan))
     db.execute(f"{seal('judged_frame')} {where}", (judging, scan))
-    return json.dumps([frame.name, key, detail, rows]).encode()
+    return json.dumps([name, key, detail, rows]).encode()

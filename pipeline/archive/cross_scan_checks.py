@@ -11,7 +11,7 @@ from importlib.metadata import version
 from measure.flags import Code, Reason, Status
 from measure.results import MEASURE_REVISION
 from measure.scans.remote import scan_path
-from pipeline.archive.checked_statuses import JudgedScan, Lot
+from pipeline.archive.checked_statuses import CheckedResult, Lot
 from pipeline.archive.results_database import Store
 from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
@@ -20,7 +20,7 @@ from pipeline.measuring.camera_identification import with_plates
 from pipeline.measuring.roll import CheckedScan, checked, roll_of, with_same_frames
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.provenance import content_hash, fingerprint, shard_of
-from pipeline.results.measured_record import MeasuredScan, record_of
+from pipeline.results.measured_record import MeasuredScan
 
 _TOGETHER = 2000  # frames of a camera that are checked beside one another: more would only take memory
 OfCamera = tuple[CameraFile, Sequence[ScanTask]]
@@ -50,7 +50,7 @@ def judged_lots(
         ]
         made_by = [version("reseau"), MEASURE_REVISION]
         return Lot(
-            fingerprint([results, depends_on, made_by]), lambda: (_judged(scan, work, project) for scan in scans())
+            fingerprint([results, depends_on, made_by]), lambda: (_checked_result(scan, work) for scan in scans())
         )
 
     def checked_lot(of_cameras: Sequence[OfCamera]) -> Iterable[MeasuredScan]:
@@ -164,10 +164,9 @@ def _with_said(scan: MeasuredScan, remarks: Said) -> MeasuredScan:
     return replace(scan, frame=frame, notes=(*scan.notes, *notes))
 
 
-def _judged(scan: MeasuredScan, work: Work, project: Project) -> JudgedScan:
+def _checked_result(scan: MeasuredScan, work: Work) -> CheckedResult:
     name = scan.frame.image
-    record = record_of(work.decided(scan), project.path.resolve().parent)
-    return JudgedScan(name, work.results[name], record, work.decisions_hash(name))
+    return CheckedResult(work.results[name], work.decided(scan), work.decisions_hash(name))
 
 
 def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:

@@ -12,22 +12,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.flags import Code, Reason
-from measure.results import FrameMeasurement
 from pipeline.archive.checked_statuses import (
     Judging,
-    judged_marks,
-    judged_records,
-    judging_of,
+    checked_marks,
+    checked_scans,
+    find_judging,
     latest,
     marks_as_written,
 )
 from pipeline.archive.results_database import Store
-from pipeline.archive.results_integrity import DamagedError, check_judging, damaged_frames
+from pipeline.archive.results_integrity import check_judging, damaged_frames
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
 from pipeline.results.comparator_file import ComparatorPoint, DecidedBy, comparator_points, measurement_of
-from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan, scan_of
+from pipeline.results.measured_record import MeasuredScan
 
 _PLACE = "project folder"
 Array = NDArray[np.float64]
@@ -46,7 +44,7 @@ def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
 def made_from_of(path: Path, digest: str) -> Mapping[str, str] | None:
     """What a judging was made from; None where the store has not that one."""
     with Store(path) as store:
-        judging = judging_of(store, digest)
+        judging = find_judging(store, digest)
     return None if judging is None else judging.made_from
 
 
@@ -112,11 +110,11 @@ def fingerprints_of(path: Path, digest: str, images: Collection[str]) -> dict[st
     return {image: row[0] for image, row in found.items() if row is not None}
 
 
-def tell_place(store: Store, project_folder: Path) -> None:
+def remember_place(store: Store, project_folder: Path) -> None:
     """Let the store know where the paths of its scans begin, seen from itself: so a whole project can be moved."""
     relative = os.path.relpath(project_folder.resolve(), store.path.resolve().parent)
-    if store.told(_PLACE) != {"path": relative}:
-        store.tell(_PLACE, {"path": relative})
+    if store.recall(_PLACE) != {"path": relative}:
+        store.remember(_PLACE, {"path": relative})
 
 
 def measured_scans(path: Path, digest: str = "", images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
@@ -124,18 +122,11 @@ def measured_scans(path: Path, digest: str = "", images: Collection[str] | None 
     if not path.exists():
         raise InputError(f"{path}: there is no such file. Run `reseau measure` first.")
     with Store(path) as store:
-        judging = judging_of(store, digest) if digest else latest(store)
+        judging = find_judging(store, digest) if digest else latest(store)
         if judging is None:
             raise InputError(f"{path}: its scans are not judged yet. Run `reseau measure`, which goes on with them.")
-        folder = path.parent / (store.told(_PLACE) or {"path": ".."})["path"]
-        for name, record in judged_records(store, judging, images):
-            yield _damaged(name, record) if isinstance(record, DamagedError) else scan_of(name, record, folder)
-
-
-def _damaged(image: str, error: DamagedError) -> MeasuredScan:
-    """A scan of which nothing stored is used."""
-    frame = FrameMeasurement(image, (), problems=(Reason(str(error), Code.FAILED_SCAN),))
-    return MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, str(error)))
+        folder = path.parent / (store.recall(_PLACE) or {"path": ".."})["path"]
+        yield from checked_scans(store, judging, folder, images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +164,7 @@ class StoredMarks:
         if not path.exists() or not comparator.exists() or not (digest := measurement_of(comparator)):
             return None
         with Store(path) as store:
-            judging = judging_of(store, digest)
+            judging = find_judging(store, digest)
             is_written = judging is not None and marks_as_written(store, digest, comparator)
             if judging is not None and is_written:
                 check_judging(store.connection, judging.row, path)
@@ -190,7 +181,7 @@ class StoredMarks:
     def rows(self, images: Collection[str]) -> list[ComparatorPoint]:
         """The marks of some images as comparator.csv has them."""
         with Store(self._path) as store:
-            marks = judged_marks(store, self._judging, images)
+            marks = checked_marks(store, self._judging, images)
             return list(comparator_points(marks, pitches(store, self._judging.digest)))
 
     def scans(self, images: Collection[str]) -> Iterator[MeasuredScan]:
@@ -209,7 +200,7 @@ class StoredMarks:
         kinds, statuses = dict[str, int](), dict[str, int]()
         parts: list[Array] = [np.empty((0, 7))]
         with Store(self._path) as store:
-            found = store.connection.execute(_MARKS, {"judging": self._judging.row, "good": str(Verdict.GOOD)})
+            found = store.connection.execute(_MARKS, (self._judging.row, str(Verdict.GOOD)))
             while rows := found.fetchmany(_AT_A_TIME):
                 numbers = [
                     (place[result], kinds.setdefault(kind, len(kinds)), statuses.setdefault(status, len(statuses)), *px)
@@ -223,26 +214,13 @@ class StoredMarks:
 
 
 _PLAIN = """
-with lost as (
-    select f.result from judged_frame f join mark m on m.result = f.result
-    where f.judging = ?1 and not f.own_marks and m.kind <> 'fiducial'
-    group by f.result having not sum(m.status in ('measured', 'weak'))
-    union all
-    select f.result from judged_frame f join judged m on m.judging = f.judging and m.result = f.result
-    where f.judging = ?1 and f.own_marks and m.kind <> 'fiducial'
-    group by f.result having not sum(m.status in ('measured', 'weak'))
-)
 select f.name, scan.uri, f.result from judged_frame f join scan on scan.id = f.scan
-where f.judging = ?1 and f.verdict = ?2 and f.result not in (select result from lost) order by f.name
+where f.judging = ?1 and f.verdict = ?2 and f.result not in (
+    select result from checked_mark where judging = ?1 and kind <> 'fiducial'
+    group by result having not sum(status in ('measured', 'weak'))
+) order by f.name
 """
 _MARKS = """
-with frame as (
-    select f.result, f.judging, f.own_marks, r.pitch_x_um as px, r.pitch_y_um as py
-    from judged_frame f join result r on r.id = f.result where f.judging = :judging and f.verdict = :good
-)
-select m.result, kind, status, col_px, row_px, sqrt(var_col) * px, sqrt(var_row) * py
-from frame join mark m on m.result = frame.result where not own_marks
-union all
-select m.result, kind, status, col_px, row_px, sqrt(var_col) * px, sqrt(var_row) * py
-from frame join judged m on m.judging = frame.judging and m.result = frame.result where own_marks
+select m.result, kind, status, col_px, row_px, sqrt(var_col) * r.pitch_x_um, sqrt(var_row) * r.pitch_y_um
+from checked_mark m join result r on r.id = m.result where judging = ? and m.verdict = ?
 """

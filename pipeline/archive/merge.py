@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.archive.results_database import Store, seal_result
+from pipeline.archive.results_database import MARKS, Store, seal_result
 from pipeline.archive.results_integrity import damaged_results, is_sound, seal
 from pipeline.errors import InputError
 
@@ -13,7 +13,7 @@ _SCAN = (
     "uri, bytes, mtime_ns, etag, identity_hash, content_hash, width_px, height_px, bits, pitch_x_um, pitch_y_um, camera"
 )
 _RESULT = "pose, pose_decided, a, b, c, d, e, f, pitch_x_um, pitch_y_um, verdict, seconds, bytes_read, finished, detail"
-_MARK = "number, point, kind, col_px, row_px, var_col, var_row, cov, causes, status, reason_code, reason, quality"
+_MARK = f"number, {MARKS}"
 
 
 @dataclass(frozen=True)

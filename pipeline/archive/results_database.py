@@ -6,7 +6,7 @@ One process writes it, each scan in a transaction of its own; any other may read
 import json
 import platform
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -25,32 +25,33 @@ from pipeline.archive.results_integrity import (
     seal,
 )
 from pipeline.archive.schema import STORE_ERRORS, opened, store_error
-from pipeline.archive.verdicts import Verdict, verdict_of
+from pipeline.archive.verdicts import Verdict, scan_verdict
 from pipeline.provenance import FileState, Identity, options_hash, result_key
+from pipeline.results.measured_record import (
+    MARK_COLUMNS,
+    MeasuredScan,
+    finite_or_none,
+    mark_row,
+    read_mark_row,
+    read_scan,
+    scan_detail,
+    scan_location,
+)
 
-Json = dict[str, Any]
-
-_MARK = (
-    "point", "kind", "col_px", "row_px", "var_col", "var_row", "cov", "causes", "status", "reason_code", "reason",
-    "quality",
-)  # fmt: skip
-MARK_COLUMNS = ", ".join(_MARK)
+MARKS = ", ".join(MARK_COLUMNS)
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "imagecodecs")
-_NO_NUMBER = (None, None, None)
 
 
 @dataclass(frozen=True)
 class Kept:
-    """A result to be kept: of which scan, by which options, its record as `measured_record` has it, and what it took.
-    camera: the name of the camera's file."""
+    """A result to be kept: what a scan gave by which options, and the bytes that were read for it. camera: the name of
+    the camera's file."""
 
     identity: Identity
     options_json: str
-    record: Json
-    seconds: float = 0.0
+    scan: MeasuredScan
     bytes_read: int = 0
     camera: str = ""
-    bits: int | None = None
 
     @property
     def fingerprint(self) -> str:
@@ -119,29 +120,34 @@ class Store:
             self._db.execute(f"{seal('scan')} where id = ?", (scan,))
             return result
 
-    def record(self, result: int) -> Json:
-        """The record of a result, as it was kept. Raises DamagedError where that was changed since."""
-        detail, digest = self._detail(result)
-        rows = self._db.execute(
-            f"select number, {MARK_COLUMNS} from mark where result = ? order by number", (result,)
-        ).fetchall()
-        if marks_digest(rows) != digest:
-            raise self._damaged(result)
+    def scan(self, result: int, image: str, folder: Path, with_marks: bool = True) -> MeasuredScan:
+        """The scan of a result, as it was kept. folder: that its path counts from. Raises DamagedError where what is
+        stored was changed since."""
+        rows = self.mark_rows(result) if with_marks else []
         try:
-            return {**json.loads(detail), "marks": [mark_of(row) for _, *row in rows]}
+            detail = json.loads(self.detail(result))
+            return read_scan(image, detail, list(map(read_mark_row, rows)), scan_location(detail["scan"], folder))
         except (ValueError, TypeError, KeyError):  # of a file that was damaged before its rows had digests
             raise self._damaged(result) from None
 
-    def detail(self, result: int) -> Json:
-        """All of its record but the marks. Raises DamagedError as `record`."""
-        return dict(json.loads(self._detail(result)[0]))
+    def mark_rows(self, result: int) -> list[tuple[Any, ...]]:
+        """The rows of its marks. Raises DamagedError as `scan`."""
+        rows = self._db.execute(f"select number, {MARKS} from mark where result = ? order by number", (result,))
+        numbered = rows.fetchall()
+        digest = self._db.execute(
+            f"select marks_digest from result where id = ? and {is_sound('result')}", (result,)
+        ).fetchone()
+        if digest is None or marks_digest(numbered) != digest[0]:
+            raise self._damaged(result)
+        return [tuple(row) for _, *row in numbered]
 
-    def _detail(self, result: int) -> tuple[str, str]:
-        query = f"select detail, marks_digest from result where id = ? and {is_sound('result')}"
+    def detail(self, result: int) -> str:
+        """All else that it gave, as JSON. Raises DamagedError as `scan`."""
+        query = f"select detail from result where id = ? and {is_sound('result')}"
         found = self._db.execute(query, (result,)).fetchone()
         if found is None:
             raise self._damaged(result)
-        return str(found[0]), str(found[1])
+        return str(found[0])
 
     def _damaged(self, result: int) -> DamagedError:
         found = self._db.execute(
@@ -182,10 +188,6 @@ class Store:
         rows = self._db.execute("select id from result where coalesce(detail ->> '$.writing', '[]') <> '[]'")
         return {row for (row,) in rows}
 
-    def seconds(self, result: int) -> float:
-        """What measuring it took."""
-        return float(self._db.execute("select seconds from result where id = ?", (result,)).fetchone()[0])
-
     def forget_failed(self) -> int:
         """Of the scans of the project those results that are failures, so that they are tried again; how many."""
         with self.writing():
@@ -206,8 +208,8 @@ class Store:
         for verdict, name, detail in rows:
             if verdict != Verdict.FAILED:
                 return None
-            record = json.loads(detail)
-            failures.append((str(name), str(record["scan"]), str(record["failure"]["sentence"])))
+            failure = json.loads(detail)
+            failures.append((str(name), str(failure["scan"]), str(failure["failure"]["sentence"])))
         return failures
 
     # --- the content of whole files
@@ -273,8 +275,8 @@ class Store:
 
     # --- what scans of a project tell the others
 
-    def told(self, key: str) -> Json | None:
-        """What was kept by `tell`. Raises DamagedError where that was changed since."""
+    def recall(self, key: str) -> Mapping[str, Any] | None:
+        """What was kept by `remember`. Raises DamagedError where that was changed since."""
         row = self._db.execute(f"select value, {is_sound('kept')} from kept where key = ?", (key,)).fetchone()
         if row is not None and not row[1]:
             raise DamagedError(
@@ -283,7 +285,8 @@ class Store:
             )
         return None if row is None else json.loads(row[0])
 
-    def tell(self, key: str, value: Json) -> None:
+    def remember(self, key: str, value: Mapping[str, object]) -> None:
+        """Keep what some scans of the project say, for others."""
         with self.writing():
             self._db.execute("insert or replace into kept (key, value) values (?, ?)", (key, json.dumps(value)))
             self._db.execute(f"{seal('kept')} where key = ?", (key,))
@@ -303,7 +306,7 @@ class Store:
                 self._db.execute("rollback")
             raise
 
-    def pose_of(self, result: int) -> str | None:
+    def pose_name(self, result: int) -> str | None:
         """The name of the pose in which a result's marks have their names."""
         found = self._db.execute("select pose from result where id = ?", (result,)).fetchone()
         return None if found is None else found[0]
@@ -311,49 +314,57 @@ class Store:
     # --- the inside
 
     def _scan(self, kept: Kept, name: str | None) -> int:
-        state, record = kept.identity.state, kept.record
+        state, scan = kept.identity.state, kept.scan
         if name is not None:  # another scan may have had it
             self._db.execute("update scan set name = null where name = ? and uri <> ?", (name, state.uri))
-        across, down = (_number(value) for value in record["pitch_um"])
         values = (
             name, state.uri, state.bytes, state.mtime_ns, state.etag, kept.identity.parts_hash,
-            record["width_px"], record["height_px"], kept.bits, across, down, kept.camera,
+            scan.width_px, scan.height_px, *map(finite_or_none, scan.pitch_um), kept.camera,
         )  # fmt: skip
+        columns = (
+            "bytes",
+            "mtime_ns",
+            "etag",
+            "identity_hash",
+            "width_px",
+            "height_px",
+            "pitch_x_um",
+            "pitch_y_um",
+            "camera",
+        )
+        names = ", ".join(columns)
+        updates = ", ".join(f"{column} = excluded.{column}" for column in columns)
         row = self._db.execute(
-            "insert into scan (name, uri, bytes, mtime_ns, etag, identity_hash, width_px, height_px, bits, pitch_x_um, "
-            "pitch_y_um, camera) values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) on conflict (uri) do update set "
+            f"insert into scan (name, uri, {names}) values ({places(len(values))}) on conflict (uri) do update set "
             "name = coalesce(excluded.name, name), content_hash = case when (bytes, mtime_ns, etag, identity_hash) = "
             "(excluded.bytes, excluded.mtime_ns, excluded.etag, excluded.identity_hash) then content_hash else '' end, "
-            "bytes = excluded.bytes, mtime_ns = excluded.mtime_ns, etag = excluded.etag, "
-            "identity_hash = excluded.identity_hash, width_px = excluded.width_px, height_px = excluded.height_px, "
-            "bits = excluded.bits, pitch_x_um = excluded.pitch_x_um, pitch_y_um = excluded.pitch_y_um, "
-            "camera = excluded.camera returning id",
+            f"{updates} returning id",
             values,
         ).fetchone()
         return int(row[0])
 
     def _result(self, kept: Kept, scan: int) -> int:
-        record, pose = kept.record, kept.record["pose"]
-        matrix = record["pixel_from_camera"] or ((None,) * 3,) * 2
-        pitch = (_number(value) for value in record["pitch_um"])
-        detail = json.dumps({key: value for key, value in record.items() if key != "marks"}, ensure_ascii=False)
-        values = (
-            scan, kept.fingerprint, self._program, self._options(kept.options_json),
-            pose and pose["name"], pose and pose["decided"], *map(_number, (*matrix[0], *matrix[1])), *pitch,
-            str(verdict_of(record)), kept.seconds, kept.bytes_read, datetime.now(UTC).isoformat(timespec="seconds"),
-            detail,
-        )  # fmt: skip
         known = self._db.execute("select id from result where fingerprint = ?", (kept.fingerprint,)).fetchone()
         if known is not None:
             return int(known[0])
+        measured, pose = kept.scan, kept.scan.frame.pose
+        matrix = measured.frame.pixel_from_camera
+        uri = kept.identity.state.uri if measured.scan else ""
+        values = (
+            scan, kept.fingerprint, self._program, self._options(kept.options_json),
+            pose and pose.name, pose and pose.decided,
+            *([None] * 6 if matrix is None else map(finite_or_none, matrix.ravel().tolist())),
+            *map(finite_or_none, measured.pitch_um), str(scan_verdict(measured)), measured.seconds, kept.bytes_read,
+            datetime.now(UTC).isoformat(timespec="seconds"), json.dumps(scan_detail(measured, uri), ensure_ascii=False),
+        )  # fmt: skip
         result = self._db.execute(
             "insert into result (scan, fingerprint, program, options, pose, pose_decided, a, b, c, d, e, f, "
             f"pitch_x_um, pitch_y_um, verdict, seconds, bytes_read, finished, detail) values ({places(19)})",
             values,
         ).lastrowid
         assert result is not None
-        rows = ((result, number, *row_of(mark)) for number, mark in enumerate(record["marks"]))
-        self._db.executemany(f"insert into mark (result, number, {MARK_COLUMNS}) values ({places(14)})", rows)
+        rows = ((result, number, *mark_row(mark)) for number, mark in enumerate(measured.frame.marks))
+        self._db.executemany(f"insert into mark (result, number, {MARKS}) values ({places(14)})", rows)
         seal_result(self._db, result)
         return result
 
@@ -383,49 +394,10 @@ def known_identities(path: Path) -> dict[str, Identity]:
 
 def seal_result(db: sqlite3.Connection, result: int) -> None:
     """Set the digests of a result that was written with its marks, as the table has them now."""
-    rows = db.execute(f"select number, {MARK_COLUMNS} from mark where result = ? order by number", (result,))
+    rows = db.execute(f"select number, {MARKS} from mark where result = ? order by number", (result,))
     db.execute("update result set marks_digest = ? where id = ?", (marks_digest(rows), result))
     db.execute(f"{seal('result')} where id = ?", (result,))
 
 
 def places(count: int) -> str:
     return ", ".join("?" * count)
-
-
-def _number(value: Any) -> float | None:
-    """SQLite has no number that is not finite: a record has it by its name."""
-    return None if value is None or isinstance(value, str) else float(value)
-
-
-def row_of(mark: Mapping[str, Any]) -> tuple[Any, ...]:
-    """A mark of a record as a row. The sum of the causes is for those who read the table."""
-    covariance = mark["covariance_px2"]
-    variances = _NO_NUMBER if covariance is None else (covariance[0][0], covariance[1][1], covariance[0][1])
-    causes = None if mark["causes_px2"] is None else json.dumps({"sum": covariance, "of": mark["causes_px2"]})
-    ends = (mark["status"], mark["reason_code"], mark["reason"], json.dumps(mark["quality"]))
-    return (
-        mark["point"],
-        mark["kind"],
-        mark["col_px"],
-        mark["row_px"],
-        *map(_number, variances),
-        causes,
-        *ends,
-    )
-
-
-def mark_of(row: Sequence[Any]) -> Json:
-    values = dict(zip(_MARK, row, strict=True))
-    causes = values["causes"] and json.loads(values["causes"])
-    return {
-        "point": values["point"],
-        "kind": values["kind"],
-        "col_px": values["col_px"],
-        "row_px": values["row_px"],
-        "covariance_px2": causes and causes["sum"],
-        "causes_px2": causes and causes["of"],
-        "status": values["status"],
-        "reason": values["reason"],
-        "reason_code": values["reason_code"],
-        "quality": json.loads(values["quality"]),
-    }

@@ -7,12 +7,10 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from pipeline.errors import InputError
+from pipeline.results.measured_record import MARK_COLUMNS
 
 _BYTES = 16
-MARK_ROW = (
-    "number", "point", "kind", "col_px", "row_px", "var_col", "var_row", "cov", "causes", "status", "reason_code",
-    "reason", "quality",
-)  # fmt: skip
+_MARK_ROW = ", ".join(("number", *MARK_COLUMNS))
 _SCAN = (
     "id", "name", "uri", "bytes", "mtime_ns", "etag", "identity_hash", "content_hash", "width_px", "height_px", "bits",
     "pitch_x_um", "pitch_y_um", "camera", "result", "is_current", "duplicate_of", "asked",
@@ -67,7 +65,7 @@ def row_digest(*values: Any) -> str:
 
 
 def marks_digest(rows: Iterable[Sequence[Any]]) -> str:
-    """That of all marks of a result, in their order, each with the columns MARK_ROW."""
+    """That of all marks of a result, in their order, each with its number and MARK_COLUMNS."""
     return row_digest(*map(tuple, rows))
 
 
@@ -75,7 +73,7 @@ def add_digests(db: sqlite3.Connection) -> None:
     """Of every row of a store that has none yet."""
     for table, key in (("mark", "result"), ("judged", "judging, result")):
         parent = "result" if table == "mark" else "judged_frame"
-        rows = db.execute(f"select {key}, {', '.join(MARK_ROW)} from {table} order by {key}, number")
+        rows = db.execute(f"select {key}, {_MARK_ROW} from {table} order by {key}, number")
         marks = dict[tuple[int, ...], list[Sequence[Any]]]()
         keys = len(key.split(","))
         for row in rows:
@@ -162,7 +160,7 @@ def _results(db: sqlite3.Connection) -> dict[int, bool]:
 
 def _digests(db: sqlite3.Connection, table: str, where: str) -> Iterable[tuple[int, str]]:
     """The digest of the marks of every result that has some."""
-    query = f"select result, {', '.join(MARK_ROW)} from {table} where {where} order by result, number"
+    query = f"select result, {_MARK_ROW} from {table} where {where} order by result, number"
     result, marks = None, list[Sequence[Any]]()
     for of, *row in db.execute(query):
         if of != result:

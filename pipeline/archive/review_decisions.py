@@ -1,5 +1,6 @@
 """Review decisions as input of measuring: which count for a scan, what they change, which lines change nothing."""
 
+import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ import numpy as np
 from measure.fiducials.options import CLICK_SIGMA_PX, Click
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import MEASURE_REVISION, Covariance, MarkMeasurement
-from pipeline.archive.checked_statuses import judging_of
+from pipeline.archive.checked_statuses import find_judging
 from pipeline.archive.results_database import Store
 from pipeline.archive.results_integrity import row_digest
 from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, put_on, standing
@@ -26,7 +27,7 @@ PoseOf = Callable[[str], str | None]
 if TYPE_CHECKING:
     from pipeline.archive.work import Work
 
-_TOLD = "decisions that do not apply"
+_INAPPLICABLE = "decisions that do not apply"
 _NAMED = 10
 
 Marks = Mapping[tuple[str, str], bool]  # by point and kind whether something was measured
@@ -164,13 +165,15 @@ def _decided(mark: MarkMeasurement, decision: Decision | None) -> MarkMeasuremen
 
 def tell_inapplicable(project: Project, store: Store, digest: str, work: "Work") -> None:
     """Keep, beside a judging, what is to be said of decisions that it could not take in."""
-    lines = [*unknown_images(project), *_of_known(project, store, digest, work)]
-    store.tell(_TOLD, {"digest": digest, "lines": [f"line {number}: {why}" for number, why in sorted(lines)]})
+    lines = [*unknown_images(project), *_known_images(project, store, digest, work)]
+    store.remember(
+        _INAPPLICABLE, {"digest": digest, "lines": [f"line {number}: {why}" for number, why in sorted(lines)]}
+    )
 
 
 def inapplicable(store: Store, digest: str) -> tuple[str, ...]:
     """What is to be said of the decisions that a judging could not take in; the first of them, if they are many."""
-    kept = store.told(_TOLD) or {}
+    kept = store.recall(_INAPPLICABLE) or {}
     return shortened(kept["lines"]) if kept.get("digest") == digest else ()
 
 
@@ -191,13 +194,22 @@ def unknown_images(project: Project) -> Iterator[tuple[int, str]]:
             yield one.line, f"the project has no image {one.image!r}.{hints.get(one.image, '')}"
 
 
-def _of_known(project: Project, store: Store, digest: str, work: "Work") -> Iterator[tuple[int, str]]:
-    for image, decisions in work.decisions.items():
-        if image in project.scans:
-            yield from _of_image(decisions, work.counting_of(image), _marks(store, digest, image))
+def _known_images(project: Project, store: Store, digest: str, work: "Work") -> Iterator[tuple[int, str]]:
+    """Lines about images of the project that change nothing."""
+    decisions = {image: own for image, own in work.decisions.items() if image in project.scans}
+    judging, marks = find_judging(store, digest), defaultdict[str, dict[tuple[str, str], bool]](dict)
+    assert judging is not None  # it was made just now
+    query = (
+        "select image, point, kind, causes is not null from checked_mark "
+        "where judging = ? and image in (select value from json_each(?))"
+    )
+    for image, *mark, is_measured in store.connection.execute(query, (judging.row, json.dumps(list(decisions)))):
+        marks[image][mark[0], mark[1]] = bool(is_measured)
+    for image, own in decisions.items():
+        yield from _idle_lines(own, work.counting_of(image), marks[image])
 
 
-def _of_image(
+def _idle_lines(
     decisions: Sequence[Decision], counting: Mapping[About, Decision], marks: Marks
 ) -> Iterator[tuple[int, str]]:
     stacks = dict[About, list[Decision]]()
@@ -225,14 +237,3 @@ def _why(one: Decision, counted: Decision | None, marks: Marks) -> str:
 
 def _named(one: Decision) -> str:
     return f"{one.about[2]} {one.point!r} of image {one.image!r}" if one.point else f"image {one.image!r}"
-
-
-def _marks(store: Store, digest: str, image: str) -> Marks:
-    judging = judging_of(store, digest)
-    assert judging is not None  # it was made just now
-    db = store.connection
-    query = "select result, own_marks from judged_frame where judging = ? and name = ?"
-    result, own_marks = db.execute(query, (judging.row, image)).fetchone()
-    table, where = ("judged", f"judging = {judging.row:d} and") if own_marks else ("mark", "")
-    rows = db.execute(f"select point, kind, causes is not null from {table} where {where} result = ?", (result,))
-    return {(point, kind): bool(is_measured) for point, kind, is_measured in rows}

@@ -126,7 +126,27 @@ alter table judged_frame add column digest text;
 alter table kept add column digest text;
 """
 
-MIGRATIONS: tuple[str, ...] = (_FIRST, _LOTS, _ASKED, _DIGESTS)
+# The marks of every judging as the checks left them: those of the result where the checks changed none.
+_CHECKED_MARKS = """
+create view checked_mark as
+select f.judging, f.name as image, f.scan, f.verdict, m.* from judged_frame f
+join mark m on m.result = f.result where not f.own_marks
+union all
+select f.judging, f.name, f.scan, f.verdict, m.result, m.number, m.point, m.kind, m.col_px, m.row_px, m.var_col,
+    m.var_row, m.cov, m.causes, m.status, m.reason_code, m.reason, m.quality from judged_frame f
+join judged m on m.judging = f.judging and m.result = f.result where f.own_marks;
+drop view mark_view;
+create view mark_view as
+with pitch as (select id, pitch_x_um / 1000.0 as px_mm, pitch_y_um / 1000.0 as py_mm from result)
+select image, point, kind, col_px * px_mm as x_mm, -row_px * py_mm as y_mm,
+    sqrt(var_col) * px_mm as sx_mm, sqrt(var_row) * py_mm as sy_mm,
+    case when var_col > 0 and var_row > 0 then -cov / sqrt(var_col) / sqrt(var_row) end as rho,
+    col_px, row_px, status, reason
+from checked_mark join pitch on pitch.id = result
+where judging = (select max(id) from judging where digest not like 'unfinished%') order by image, number;
+"""
+
+MIGRATIONS: tuple[str, ...] = (_FIRST, _LOTS, _ASKED, _DIGESTS, _CHECKED_MARKS)
 VERSION = len(MIGRATIONS)
 
 

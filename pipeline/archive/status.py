@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.archive.checked_statuses import judged_records, latest
+from pipeline.archive.checked_statuses import checked_scans, latest
 from pipeline.archive.results_database import Store
-from pipeline.archive.results_integrity import DamagedError, check_judging, is_sound
+from pipeline.archive.results_integrity import check_judging, is_sound
 from pipeline.archive.review_decisions import (
     asked_of,
     by_image,
@@ -77,7 +77,7 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     rows, idle = {}, tuple[str, ...]()
     if path.exists():
         with Store(path) as store:
-            rows = {row[0]: row for row in _checked(store)}
+            rows = {row[0]: row for row in _status_rows(store)}
             judging = latest(store)
             idle = inapplicable(store, judging.digest) if judging is not None else ()
     files, cameras = FileStates(project.path.resolve().parent), project.cameras.values()
@@ -100,15 +100,17 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     return ArchiveStatus(tuple(sorted(scans, key=itemgetter(0))), tuple(dict.fromkeys((*unknown, *idle))))
 
 
-def _checked(store: Store) -> Iterator[Sequence[Any]]:
+def _status_rows(store: Store) -> Iterator[Sequence[Any]]:
     """The rows of the query; one that is not as it was written says that, and nothing else. Of frames of which a mark's
     reason may be told, the marks are checked, too."""
-    rows, judging = store.connection.execute(_QUERY).fetchall(), latest(store)
+    judging = latest(store)
+    rows = store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)).fetchall()
+    damaged = set[str]()
     if judging is not None:
         check_judging(store.connection, judging.row, store.path)
-    names_to_check = {row[-2] for row in rows if row[6] and row[-2]}
-    records = judged_records(store, judging, names_to_check) if judging is not None and names_to_check else ()
-    damaged = {name for name, record in records if isinstance(record, DamagedError)}
+        names_to_check = {row[-2] for row in rows if row[6] and row[-2]}
+        scans = checked_scans(store, judging, store.path.parent, names_to_check) if names_to_check else ()
+        damaged = {scan.frame.image for scan in scans if scan.failure and scan.failure.code is FailureCode.DAMAGED}
     why = "what is stored of it is not what was measured: `reseau measure --retry` measures it again"
     for *row, name, is_whole in rows:
         if is_whole and name not in damaged:
@@ -120,39 +122,38 @@ def _checked(store: Store) -> Iterator[Sequence[Any]]:
 _VERDICTS = {str(verdict): verdict for verdict in Verdict}
 # Of most scans, which are good, there is nothing to say.
 _QUERY = """
-with latest as (select max(id) as id from judging where digest not like 'unfinished%'),
-seen as (
+with frame as (
     select scan.uri, scan.bytes, scan.mtime_ns, scan.etag, scan.is_current, scan.asked,
-        coalesce(judged_frame.verdict, result.verdict) as verdict, result.seconds, result.finished,
-        latest.id as judging, scan.id as scan, result.id as result, scan.duplicate_of as original,
-        judged_frame.decisions, judged_frame.name,
+        coalesce(f.verdict, result.verdict) as verdict, result.seconds, result.finished, result.id as result,
+        result.detail as measured, f.detail as changed, result.pose, result.pose_decided,
+        scan.duplicate_of as original, f.decisions, f.name,
         {scan} and (scan.result is null or {result} and result.scan = scan.id)
-        and (judged_frame.result is null or {frame}) as is_whole
-    from scan left join latest left join result on result.id = scan.result
-    left join judged_frame on judged_frame.judging = latest.id and judged_frame.scan = scan.id
-        and judged_frame.result = scan.result
+        and (f.result is null or {frame}) as is_whole
+    from scan left join result on result.id = scan.result
+    left join judged_frame f on f.judging = ?1 and f.scan = scan.id and f.result = scan.result
+),
+doubt as (
+    select result, min(number), point || ': ' || reason as why from checked_mark
+    where judging = ?1 and verdict not in ('good', 'decided') and reason <> '' and reason_code not like 'decided%'
+    group by result
 )
 select uri, bytes, mtime_ns, etag, is_current, verdict,
     case when verdict not in ('good', 'decided') then coalesce(
-        (select detail ->> '$.problems[0]' from judged_frame f where f.judging = seen.judging and f.scan = seen.scan
-         and f.result = seen.result),
-        (select detail ->> '$.problems[0]' from result where id = seen.result),
-        (select 'pose ' || coalesce(f.detail ->> '$.pose.name', r.pose) || ' is assumed' from result r
-         left join judged_frame f on f.judging = seen.judging and f.scan = seen.scan and f.result = r.id
-         where r.id = seen.result and not coalesce(f.detail ->> '$.pose.decided', r.pose_decided)),
-        'its file is a copy of that of ' || (select name from scan where id = seen.original),
-        (select point || ': ' || reason from judged where judged.judging = seen.judging and judged.result = seen.result
-         and reason <> '' and reason_code not like 'decided%' order by number limit 1),
-        (select point || ': ' || reason from mark where mark.result = seen.result and reason <> ''
+        changed ->> '$.problems[0]', measured ->> '$.problems[0]',
+        case when not coalesce(changed ->> '$.pose.decided', pose_decided)
+            then 'pose ' || coalesce(changed ->> '$.pose.name', pose) || ' is assumed' end,
+        'its file is a copy of that of ' || (select name from scan where id = frame.original),
+        (select why from doubt where doubt.result = frame.result),
+        (select point || ': ' || reason from mark where mark.result = frame.result and reason <> ''
          order by number limit 1)
     ) end,
-    case when verdict = 'failed' then (select detail ->> '$.failure.code' from result where id = seen.result) end,
+    case when verdict = 'failed' then measured ->> '$.failure.code' end,
     seconds, finished, asked, decisions, name, is_whole
-from seen
-""".format(scan=is_sound("scan"), result=is_sound("result"), frame=is_sound("judged_frame"))
+from frame
+""".format(scan=is_sound("scan"), result=is_sound("result"), frame=is_sound("judged_frame", "f"))
 
 
-def status_json(status: ArchiveStatus) -> dict[str, Any]:
+def status_json(status: ArchiveStatus) -> dict[str, object]:
     """For programs: the totals, and every scan that needs a look."""
     return {
         "scans": len(status.scans),

@@ -1,10 +1,10 @@
 """What became of a scan, in one table: the documentation and `reseau status` are made from it."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Sequence
 from enum import StrEnum
-from typing import Any
 
 from measure.flags import Code, Status
+from pipeline.results.measured_record import MeasuredScan
 
 
 class Verdict(StrEnum):
@@ -43,52 +43,44 @@ NEXT_STEP = {
     Verdict.OLD: "Run `reseau measure`: it measures or judges these anew, and no others.",
 }
 
-_OF_MARK = {
-    Status.MEASURED: Verdict.GOOD,
-    Status.WEAK: Verdict.LOOK,
-    Status.PREDICTED: Verdict.LOOK,
-    Status.REJECTED: Verdict.LOOK,
-    Status.ABSENT: Verdict.LOOK,
-}
+_MARK_VERDICTS = {status: Verdict.GOOD if status is Status.MEASURED else Verdict.LOOK for status in Status}
 _ANSWERED = frozenset((Code.DECIDED, Code.CLICKED))
 _LEAST_FIDUCIALS = 3  # two give a frame, and nothing to check it by
+MarkState = tuple[str, Status, Collection[str]]  # kind, status, codes of the reason
 
 
-def verdict_of(record: Mapping[str, Any]) -> Verdict:
-    """The verdict of a scan's record, as `pipeline.results.measured_record` has it."""
-    if record["failure"]:
+def scan_verdict(scan: MeasuredScan) -> Verdict:
+    """The verdict of a scan."""
+    frame, marks = scan.frame, [(mark.kind, mark.status, mark.reason.codes) for mark in scan.frame.marks]
+    if scan.failure:
         return Verdict.FAILED
-    marks = record["marks"]
-    fiducials = [mark for mark in marks if mark["kind"] == "fiducial" and not _is_elsewhere(mark)]
-    observed = [mark for mark in marks if Status(mark["status"]).is_observation]
-    seen = sum(mark["kind"] == "fiducial" for mark in observed)
-    too_few = seen < min(_LEAST_FIDUCIALS, len(fiducials))
-    if not observed or too_few or (fiducials and record["pixel_from_camera"] is None):
+    has_problem = bool(frame.problems) or (frame.pose is not None and not frame.pose.decided)
+    return frame_verdict(marks, frame.pixel_from_camera is not None, has_problem, bool(scan.decided_by))
+
+
+def frame_verdict(marks: Sequence[MarkState], has_frame: bool, has_problem: bool, has_decisions: bool) -> Verdict:
+    """The verdict of a frame that was measured. has_frame: whether its fiducials tell where it lies."""
+    fiducials = [mark for mark in marks if mark[0] == "fiducial" and Code.OTHER_PART not in mark[2]]
+    observed = [kind for kind, status, _ in marks if status.is_observation]
+    too_few = observed.count("fiducial") < min(_LEAST_FIDUCIALS, len(fiducials))
+    if not observed or too_few or (fiducials and not has_frame):
         return Verdict.POOR
-    pose = record["pose"]
-    needs_look = record["problems"] or (pose and not pose["decided"])
-    of_marks = max((_of_mark(mark) for mark in marks), key=list(Verdict).index)
-    if needs_look or of_marks is Verdict.LOOK:
+    worst = max((_mark_verdict(*mark) for mark in marks), key=list(Verdict).index)
+    if has_problem or worst is Verdict.LOOK:
         return Verdict.LOOK
-    return Verdict.DECIDED if record.get("decided_by") else of_marks
+    return Verdict.DECIDED if has_decisions else worst
 
 
-def is_answered(reason_code: str) -> bool:
-    """Whether a person has decided about the mark that has this reason."""
-    return not _ANSWERED.isdisjoint(reason_code.split())
+def is_answered(codes: Collection[str]) -> bool:
+    """Whether a person has decided about the mark whose reason has these codes."""
+    return not _ANSWERED.isdisjoint(codes)
 
 
-def _is_elsewhere(mark: Mapping[str, Any]) -> bool:
-    """Whether another scan of the same frame shows it."""
-    return Code.OTHER_PART in mark["reason_code"].split()
-
-
-def _of_mark(mark: Mapping[str, Any]) -> Verdict:
-    """A target that was not seen costs the others nothing; a fiducial is in every frame of its camera. What a person
-    has said of a mark is not asked again."""
-    if is_answered(mark["reason_code"]):
+def _mark_verdict(kind: str, status: Status, codes: Collection[str]) -> Verdict:
+    """A target that was not seen costs the others nothing; a fiducial is in every frame of its camera, be it in another
+    scan of it. What a person has decided of a mark is not asked again."""
+    if is_answered(codes):
         return Verdict.DECIDED
-    if _is_elsewhere(mark):
+    if Code.OTHER_PART in codes or (status is Status.PREDICTED and kind != "fiducial"):
         return Verdict.GOOD
-    status = Status(mark["status"])
-    return Verdict.GOOD if status is Status.PREDICTED and mark["kind"] != "fiducial" else _OF_MARK[status]
+    return _MARK_VERDICTS[status]

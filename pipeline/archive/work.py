@@ -5,6 +5,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from functools import lru_cache
 
 from measure.scans.remote import scan_path
@@ -17,7 +18,7 @@ from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measur
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 from pipeline.provenance import FileState, FileStates, Identity, options_hash, parts_hash, result_key
-from pipeline.results.measured_record import MeasuredScan, record_of, scan_of
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import counted, listed, without_file
 from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, results_of
 
@@ -134,7 +135,7 @@ class Work:
 
     def read(self, name: str) -> MeasuredScan:
         """What was asked for last of an image, without the marks that are none by decision."""
-        scan = scan_of(name, self._store.record(self.results[name]), self._folder)
+        scan = self._store.scan(self.results[name], name, self._folder)
         return before_checks(scan, self._counting.get(name, {}))
 
     def written(self, names: Sequence[str]) -> list[str]:
@@ -144,8 +145,8 @@ class Work:
 
     def read_writing(self, name: str) -> MeasuredScan:
         """What was asked for last of an image, without its marks, problems and notes."""
-        bare = {"marks": (), "problems": (), "problem_codes": (), "notes": ()}
-        return scan_of(name, {**self._store.detail(self.results[name]), **bare}, self._folder)
+        scan = self._store.scan(self.results[name], name, self._folder, with_marks=False)
+        return replace(scan, frame=replace(scan.frame, problems=()), notes=())
 
     @property
     def decisions(self) -> Mapping[str, Sequence[Decision]]:
@@ -188,9 +189,9 @@ class Work:
             for done, (task, row, kept) in enumerate(self._measured(tasks, as_scans=True), 1):
                 measured = scans - len(tasks) + done
                 self.results[task.name] = row
-                expected.is_done(task.name, kept.seconds, kept.bytes_read)
-                if kept.record["failure"]:
-                    same = without_file(kept.record["failure"]["sentence"], task.shown_scan)
+                expected.is_done(task.name, kept.scan.seconds, kept.bytes_read)
+                if kept.scan.failure:
+                    same = without_file(kept.scan.failure.sentence, task.shown_scan)
                     if same not in failed:  # that of many others would be the same
                         reporter.say(f"failed: {task.name}: {same}")
                     failed[same].append(task.name)
@@ -219,7 +220,7 @@ class Work:
             task,
             decisions,
             lambda one: result_key(identity, _hash_of(_options_json(one))),
-            lambda key: None if (row := self._rows.get(key)) is None else self._store.pose_of(row),
+            lambda key: None if (row := self._rows.get(key)) is None else self._store.pose_name(row),
         )
         self._counting[task.name] = now.counting
         return now.task
@@ -259,8 +260,7 @@ class Work:
         return Kept(
             Identity(state, parts),
             _options_json(task),
-            record_of(file.scan, self._folder),
-            file.scan.seconds,
+            file.scan,
             file.bytes_read,
             self._project.camera_of(task.name).path.name,
         )

@@ -22,7 +22,7 @@ from pipeline.files.camera_text import camera_text
 from pipeline.files.mark_table import saved_in
 from pipeline.files.project_file import Project
 from pipeline.measuring.first_pictures import digest, first_pictures
-from pipeline.measuring.scan_task import Json, Measure, Memory, ScanTask, scan_tasks
+from pipeline.measuring.scan_task import Measure, Memory, ScanTask, scan_tasks
 from pipeline.progress import Reporter
 from pipeline.provenance import fingerprint, of_file
 from pipeline.text.atomic import write_atomically
@@ -45,14 +45,14 @@ def learn_marks(
             place = folder / f"{files[camera.path]}.toml"
             cameras[name] = _learned(project, camera, place, reporter, measure, workers)
             if place.exists():
-                memory.tell(_key(project, camera), {"file": place.name, "sha256": of_file(place)})
+                memory.remember(_key(project, camera), {"file": place.name, "sha256": of_file(place)})
     return replace(project, cameras=cameras)
 
 
 def with_learned(project: Project, memory: Memory) -> Project:
     """The project with what was learned of its marks before; of other cameras they are yet to be learned."""
     cameras = {
-        name: (_kept(project, camera, memory.told(_key(project, camera))) or camera)
+        name: (_stored_earlier(project, camera, memory.recall(_key(project, camera))) or camera)
         if camera.learned
         else _known(project, camera)
         for name, camera in project.cameras.items()
@@ -66,10 +66,10 @@ def _key(project: Project, camera: CameraFile) -> str:
     return f"learned {fingerprint([camera.fiducials, camera.frame_mm, camera.clicks, settings])}"
 
 
-def _kept(project: Project, camera: CameraFile, told: Json | None) -> CameraFile | None:
+def _stored_earlier(project: Project, camera: CameraFile, kept: Mapping[str, str] | None) -> CameraFile | None:
     """The camera with the marks that were learned before, where their files still stand as they were written."""
-    path = _learned_folder(project) / (told or {}).get("file", "")
-    if told is None or not path.is_file() or of_file(path) != told["sha256"]:
+    path = _learned_folder(project) / (kept or {}).get("file", "")
+    if kept is None or not path.is_file() or of_file(path) != kept["sha256"]:
         return None
     learned = read_camera(path)
     return _known(project, replace(camera, fiducials=learned.fiducials, learned_from=learned.learned_from))

@@ -20,7 +20,6 @@ from pipeline.files.project_file import Project
 from pipeline.provenance import canonical_json
 from pipeline.results.measured_record import MeasuredScan
 
-Json = dict[str, Any]
 if TYPE_CHECKING:
     from measure.scans.scan import Scan
     from pipeline.measuring.target_stage import SoughtTargets
@@ -31,10 +30,10 @@ _NO_SCAN = "images.csv names it, and the project has no scan of that name. Look 
 class Memory(Protocol):
     """Values by keys, which name all that a value depends on."""
 
-    def told(self, key: str) -> Json | None:
-        """What was told by that key; None: nothing yet."""
+    def recall(self, key: str) -> Mapping[str, Any] | None:
+        """The value of that key; None: there is none yet."""
 
-    def tell(self, key: str, value: Json) -> None:
+    def remember(self, key: str, value: Mapping[str, object]) -> None:
         """Keep a value."""
 
 

@@ -41,7 +41,7 @@ def said_of_tones(
     for name in names:
         kinds.setdefault(_kind(project, name), []).append(name)
     keys = {kind: _key(project, kind, of_kind) for kind, of_kind in kinds.items() if len(of_kind) > 1}
-    before = {kind: memory.told(key) for kind, key in keys.items()}
+    before = {kind: memory.recall(key) for kind, key in keys.items()}
     samples = {kind: few_of(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
     said = {name: read_tone_information(one) for kept in before.values() for name, one in (kept or {}).items()}
@@ -51,7 +51,7 @@ def said_of_tones(
             if scan.frame.tone is not None and scan.frame.tone.information is not None:
                 said[scan.frame.image] = scan.frame.tone.information
     for kind, names_of in samples.items():
-        memory.tell(keys[kind], {name: tone_information_record(said[name]) for name in names_of if name in said})
+        memory.remember(keys[kind], {name: tone_information_record(said[name]) for name in names_of if name in said})
     by_image = dict[str, tuple[ToneInformation, ...]]()
     for kind, kept in before.items():
         of_kind = samples[kind] if kept is None else list(kept)

@@ -11,7 +11,7 @@ import numpy as np
 
 from measure.flags import Status
 from pipeline.archive.measurement import MarkColumns, StoredFrame, StoredMarks
-from pipeline.archive.verdicts import Verdict, verdict_of
+from pipeline.archive.verdicts import Verdict, frame_verdict
 from pipeline.report.data import FrameTotals, Problem, ReportData
 from pipeline.report.fractions import centers_px, places_apart
 from pipeline.report.frame_problems import masked_text, problems_of
@@ -19,7 +19,7 @@ from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.marks import Frame, frames
 from pipeline.report.verdict import is_film_alone, suspect_rows
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.measured_record import MeasuredScan, pose_record
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import counted, listed
 
 MOST_FRAMES = 200  # that a report shows with their marks
@@ -151,19 +151,14 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
 
 def _verdict(frame: Frame, with_pose: bool) -> Verdict:
     """As `reseau status` has it, of the marks as the comparator file has them now."""
-    measured = frame.scan.frame if frame.scan else None
-    return verdict_of(
-        {
-            "failure": frame.scan.failure if frame.scan else None,
-            "marks": [
-                {"kind": mark.kind, "status": mark.status, "reason_code": " ".join(mark.codes)} for mark in frame.marks
-            ],
-            "pixel_from_camera": measured.pixel_from_camera if measured else (),
-            "pose": pose_record(measured.pose) if measured and measured.pose and with_pose else None,
-            "problems": measured.problems if measured else (),
-            "decided_by": frame.scan.decided_by if frame.scan else {},
-        }
-    )
+    scan, marks = frame.scan, [(mark.kind, mark.status, mark.codes) for mark in frame.marks]
+    if scan is None:
+        return frame_verdict(marks, True, False, False)
+    if scan.failure:
+        return Verdict.FAILED
+    pose = scan.frame.pose if with_pose else None
+    has_problem = bool(scan.frame.problems) or (pose is not None and not pose.decided)
+    return frame_verdict(marks, scan.frame.pixel_from_camera is not None, has_problem, bool(scan.decided_by))
 
 
 def _listed(problems: dict[tuple[str, str], tuple[Problem, list[str]]]) -> Iterator[Problem]:

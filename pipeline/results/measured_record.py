@@ -1,25 +1,29 @@
-"""What one scan gave: the value that measuring hands on, and that files keep."""
+"""What one scan gave: the value that measuring hands on, and the JSON and the rows that the results database keeps."""
 
+import json
 import math
-import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from measure.annotations.fields import Line, Reading
 from measure.flags import Cause, Reason, Status
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, Kind, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, srgb
 from measure.tone.estimate import FrameTone
 from pipeline.types import Array
 
-Json = dict[str, Any]
-
 _SRGB = "srgb"
+MARK_COLUMNS = (
+    "point", "kind", "col_px", "row_px", "var_col", "var_row", "cov", "causes", "status", "reason_code", "reason",
+    "quality",
+)  # fmt: skip
+_KINDS: Mapping[str, Kind] = {kind: kind for kind in get_args(Kind)}
+_TONE_NUMBERS = ("least", "greatest", "scatter", "apart")
 
 
 class FailureCode(StrEnum):
@@ -83,16 +87,14 @@ class MeasuredScan:
         return cls(scan, 0, 0, (math.nan, math.nan), frame, failure=failure)
 
 
-# What one scan gave as JSON, without loss: one writer and one reader, whatever file it stands in.
-#
 # Numbers that are not finite, which JSON has not, stand there by their names, as `float` reads them.
 
 
-def record_of(measured: MeasuredScan, folder: Path) -> Json:
-    """A scan as JSON. folder: that the paths of scans are relative to, so that a whole project can be moved."""
+def scan_detail(measured: MeasuredScan, uri: str) -> dict[str, object]:
+    """All that a scan gave but its marks, as values of JSON. uri: of its file, as the database has it."""
     frame = measured.frame
-    return {
-        "scan": measured.scan if _is_address(measured.scan) else _relative(Path(measured.scan), folder),
+    detail: dict[str, object] = {
+        "scan": uri,
         "width_px": measured.width_px,
         "height_px": measured.height_px,
         "pitch_um": _numbers(measured.pitch_um),
@@ -105,38 +107,69 @@ def record_of(measured: MeasuredScan, folder: Path) -> Json:
         "problems": list(frame.problems),
         "problem_codes": [problem.code for problem in frame.problems],
         "notes": list(measured.notes),
-        **({"decided_by": dict(measured.decided_by)} if measured.decided_by else {}),
-        "marks": [_mark(mark) for mark in frame.marks],
     }
+    return detail | ({"decided_by": dict(measured.decided_by)} if measured.decided_by else {})
 
 
-def scan_of(image: str, record: Mapping[str, Any], folder: Path) -> MeasuredScan:
-    """The scan of a record; image: its name. Raises KeyError, TypeError or ValueError for what is no such record."""
-    across, down = record["pitch_um"]
+def read_scan(image: str, detail: Mapping[str, Any], marks: Sequence[MarkMeasurement], scan: str) -> MeasuredScan:
+    """The scan of a detail and its marks. image: its name; scan: the path or the address of its file.
+
+    Raises KeyError, TypeError or ValueError for what is no such detail.
+    """
+    across, down = detail["pitch_um"]
     frame = FrameMeasurement(
         image=image,
-        marks=tuple(_read_mark(mark) for mark in record["marks"]),
-        pose=record["pose"] and _read_pose(record["pose"]),
-        pixel_from_camera=_array(record["pixel_from_camera"]),
-        problems=tuple(map(Reason.read, record["problems"], record["problem_codes"])),
-        weights=None if record["weights"] is None else tuple(map(float, record["weights"])),
-        tone=record["tone"] and _read_frame_tone(record["tone"]),
-        writing=None if record["writing"] is None else tuple(_read_line(line) for line in record["writing"]),
+        marks=tuple(marks),
+        pose=detail["pose"] and _read_pose(detail["pose"]),
+        pixel_from_camera=None if detail["pixel_from_camera"] is None else _array(detail["pixel_from_camera"]),
+        problems=tuple(map(Reason.read, detail["problems"], detail["problem_codes"])),
+        weights=None if detail["weights"] is None else tuple(map(float, detail["weights"])),
+        tone=detail["tone"] and _read_frame_tone(detail["tone"]),
+        writing=None if detail["writing"] is None else tuple(_read_line(line) for line in detail["writing"]),
     )
-    failure = record["failure"] and Failure(FailureCode(record["failure"]["code"]), record["failure"]["sentence"])
-    scan = record["scan"] if _is_address(record["scan"]) else str(folder / record["scan"])
-    size = (int(record["width_px"]), int(record["height_px"]))
-    pitch_um, notes = (float(across), float(down)), tuple(record["notes"])
-    return MeasuredScan(scan, *size, pitch_um, frame, notes, failure, decided_by=record.get("decided_by", {}))
+    failure = detail["failure"] and Failure(FailureCode(detail["failure"]["code"]), detail["failure"]["sentence"])
+    size = (int(detail["width_px"]), int(detail["height_px"]))
+    pitch_um, notes = (float(across), float(down)), tuple(detail["notes"])
+    return MeasuredScan(scan, *size, pitch_um, frame, notes, failure, decided_by=detail.get("decided_by", {}))
 
 
-def _is_address(scan: str) -> bool:
-    """Of an object in a store or on a server; "" names none at all."""
-    return "://" in scan or not scan
+def scan_location(uri: str, folder: Path) -> str:
+    """The path of a scan's file whose uri counts from the folder; an address, and "" of none, as it is."""
+    return uri if "://" in uri or not uri else str(folder / uri)
 
 
-def _relative(scan: Path, folder: Path) -> str:
-    return Path(os.path.relpath(scan.resolve(), folder.resolve())).as_posix()
+def mark_row(mark: MarkMeasurement) -> tuple[object, ...]:
+    """A mark as a row of MARK_COLUMNS. The sum of the causes is for those who read the table."""
+    col, row = (None, None) if mark.center_px is None else mark.center_px.tolist()
+    causes, variances = None, list[float | None]([None] * 3)
+    if mark.covariance is not None:
+        px2 = mark.covariance.px2
+        variances = [finite_or_none(value) for value in (px2[0, 0], px2[1, 1], px2[0, 1])]
+        parts = {str(cause): _numbers(part) for cause, part in mark.covariance.parts.items()}
+        causes = json.dumps({"sum": _numbers(px2), "of": parts})
+    quality = json.dumps({name: _numbers(value) for name, value in mark.quality.items()})
+    reason = mark.reason
+    return (mark.point, mark.kind, col, row, *variances, causes, str(mark.status), reason.code, str(reason), quality)
+
+
+def read_mark_row(row: Sequence[Any]) -> MarkMeasurement:
+    """The mark of a row. Raises KeyError, TypeError or ValueError for what is none."""
+    point, kind, col, row_px, _, _, _, causes, status, code, reason, quality = row
+    parts = json.loads(causes)["of"] if causes else None
+    return MarkMeasurement(
+        point=point,
+        kind=_KINDS[kind],
+        center_px=None if col is None else _array([col, row_px]),
+        covariance=None if parts is None else Covariance({Cause(name): _array(px2) for name, px2 in parts.items()}),
+        status=Status(status),
+        reason=Reason.read(reason, code),
+        quality={name: float(value) for name, value in json.loads(quality).items()},
+    )
+
+
+def finite_or_none(value: float) -> float | None:
+    """A number for SQLite, which has none that is not finite."""
+    return float(value) if math.isfinite(value) else None
 
 
 def _numbers(values: Any) -> Any:
@@ -149,65 +182,22 @@ def _numbers(values: Any) -> Any:
     return number if np.isfinite(number) else repr(number)
 
 
-def _array(values: Any) -> Array | None:
-    return None if values is None else np.array(values, dtype=np.float64)
-
-
-def _some(values: Any) -> Array:
+def _array(values: Any) -> Array:
     return np.array(values, dtype=np.float64)
 
 
-def _mark(mark: MarkMeasurement) -> Json:
-    col, row = (None, None) if mark.center_px is None else _numbers(mark.center_px)
-    causes = mark.covariance and {str(cause): _numbers(part) for cause, part in mark.covariance.parts.items()}
-    return {
-        "point": mark.point,
-        "kind": mark.kind,
-        "col_px": col,
-        "row_px": row,
-        "covariance_px2": _numbers(mark.covariance_px2),
-        "causes_px2": causes,
-        "status": str(mark.status),
-        "reason": mark.reason,
-        "reason_code": mark.reason.code,
-        "quality": {name: _numbers(value) for name, value in mark.quality.items()},
-    }
-
-
-def _read_mark(mark: Mapping[str, Any]) -> MarkMeasurement:
-    """The sum of the causes is written for others than this reader."""
-    causes = mark["causes_px2"]
-    return MarkMeasurement(
-        point=mark["point"],
-        kind=mark["kind"],
-        center_px=None if mark["col_px"] is None else _some([mark["col_px"], mark["row_px"]]),
-        covariance=None if causes is None else Covariance({Cause(name): _some(px2) for name, px2 in causes.items()}),
-        status=Status(mark["status"]),
-        reason=Reason.read(mark["reason"], mark["reason_code"]),
-        quality={name: float(value) for name, value in mark["quality"].items()},
-    )
-
-
-def pose_record(pose: Pose) -> Json:
+def pose_record(pose: Pose) -> dict[str, object]:
     """A pose with its evidence as JSON."""
-    return {
-        "name": pose.name,
-        "decided": pose.decided,
-        "evidence": list(pose.evidence),
-        "written": {name: _numbers(value) for name, value in pose.written.items()},
-        "writing": pose.writing,
-        "roll": pose.roll,
-        "rivals": list(pose.rivals),
-    }
+    return {**asdict(pose), "written": {name: _numbers(value) for name, value in pose.written.items()},
+            "evidence": list(pose.evidence), "rivals": list(pose.rivals)}  # fmt: skip
 
 
 def _read_pose(pose: Mapping[str, Any]) -> Pose:
     written = {name: float(value) for name, value in pose["written"].items()}
-    evidence, rivals = tuple(pose["evidence"]), tuple(pose["rivals"])
-    return Pose(pose["name"], pose["decided"], evidence, written, pose["writing"], pose["roll"], rivals)
+    return Pose(**{**pose, "written": written, "evidence": tuple(pose["evidence"]), "rivals": tuple(pose["rivals"])})
 
 
-def _line(line: Line) -> Json:
+def _line(line: Line) -> dict[str, object]:
     """The text of the way that is taken for the right one is written for others than this reader."""
     ways = {pose: {"text": one.text, "confidence": _numbers(one.confidence), "legible": _numbers(one.legible)}
             for pose, one in line.ways.items()}  # fmt: skip
@@ -224,28 +214,24 @@ def _read_line(line: Mapping[str, Any]) -> Line:
     return Line(ways, line["pose"], outline, line["side"])
 
 
-def _frame_tone(tone: FrameTone) -> Json:
-    believed = tone.tone
+def _frame_tone(tone: FrameTone) -> dict[str, object]:
     return {
-        "base": _base(believed.base),
-        "mean": _numbers(believed.mean),
-        "covariance": _numbers(believed.covariance),
-        "source": believed.source,
-        "is_declared": believed.is_declared,
+        "base": _base(tone.tone.base),
+        "mean": _numbers(tone.tone.mean),
+        "covariance": _numbers(tone.tone.covariance),
+        "source": tone.tone.source,
+        "is_declared": tone.tone.is_declared,
         "said": tone.information and tone_information_record(tone.information),
-        "least": _numbers(tone.least),
-        "greatest": _numbers(tone.greatest),
-        "scatter": _numbers(tone.scatter),
-        "apart": _numbers(tone.apart),
+        **{name: _numbers(getattr(tone, name)) for name in _TONE_NUMBERS},
     }
 
 
 def _read_frame_tone(tone: Mapping[str, Any]) -> FrameTone:
-    mean, covariance = _some(tone["mean"]), _some(tone["covariance"])
-    believed = Tone(_read_base(tone["base"]), mean, covariance, tone["source"], tone["is_declared"])
-    said = tone["said"] and read_tone_information(tone["said"])
-    numbers = (float(tone[name]) for name in ("least", "greatest", "scatter", "apart"))
-    return FrameTone(believed, said, *numbers)
+    prior = Tone(
+        _read_base(tone["base"]), _array(tone["mean"]), _array(tone["covariance"]), tone["source"], tone["is_declared"]
+    )
+    information = tone["said"] and read_tone_information(tone["said"])
+    return FrameTone(prior, information, *(float(tone[name]) for name in _TONE_NUMBERS))
 
 
 def _base(base: Array) -> Any:
@@ -260,19 +246,21 @@ def _base(base: Array) -> Any:
 def _read_base(base: Any) -> Array:
     if base == _SRGB:
         return srgb()
-    return _some(base) if isinstance(base, list) else power(float(base))
+    return _array(base) if isinstance(base, list) else power(float(base))
 
 
-def tone_information_record(said: ToneInformation) -> Json:
+def tone_information_record(tone: ToneInformation) -> dict[str, object]:
+    """What a scan says of its scanner's curve, as JSON."""
     return {
-        "information": _numbers(said.matrix),
-        "right": _numbers(said.right_side),
-        "square": _numbers(said.sum_of_squares),
-        "count": said.count,
-        "alike": _numbers(said.common_variance),
+        "information": _numbers(tone.matrix),
+        "right": _numbers(tone.right_side),
+        "square": _numbers(tone.sum_of_squares),
+        "count": tone.count,
+        "alike": _numbers(tone.common_variance),
     }
 
 
-def read_tone_information(said: Mapping[str, Any]) -> ToneInformation:
-    information, right = _some(said["information"]), _some(said["right"])
-    return ToneInformation(information, right, float(said["square"]), int(said["count"]), float(said["alike"]))
+def read_tone_information(tone: Mapping[str, Any]) -> ToneInformation:
+    """What `tone_information_record` wrote."""
+    information, right = _array(tone["information"]), _array(tone["right"])
+    return ToneInformation(information, right, float(tone["square"]), int(tone["count"]), float(tone["alike"]))

@@ -13,7 +13,7 @@ from measure.fiducials.options import Click
 from measure.flags import CAUSE_MEANING
 from measure.marks.shapes import Bar, Disk, FrameCorner, LayoutMark, Mark, MarkShape, Part, Polygon, Ring
 from measure.results import MarkMeasurement
-from pipeline.archive.checked_statuses import Judging, judged_records, latest
+from pipeline.archive.checked_statuses import Judging, checked_scans, latest
 from pipeline.archive.results_database import Store
 from pipeline.archive.results_integrity import DamagedError
 from pipeline.errors import InputError
@@ -23,7 +23,7 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.first_pictures import first_pictures
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
-from pipeline.results.measured_record import MeasuredScan, scan_of
+from pipeline.results.measured_record import FailureCode, MeasuredScan
 
 Array = NDArray[np.float64]
 
@@ -182,15 +182,15 @@ class Looking:
             row = store.connection.execute(_ONE, (image, -1 if judging is None else judging.row)).fetchone()
             if row is None or judging is None:
                 raise KeyError(image)
-            ((_, record),) = judged_records(store, judging, {image})
-        if isinstance(record, DamagedError):
-            raise record
-        return LookedAt(scan_of(image, record, self._folder), str(row[0]), str(row[1]), self._camera_of(image))
+            (scan,) = checked_scans(store, judging, self._folder, {image})
+        if scan.failure and scan.failure.code is FailureCode.DAMAGED:
+            raise DamagedError(scan.failure.sentence)
+        return LookedAt(scan, str(row[0]), str(row[1]), self._camera_of(image))
 
     def others(self, image: str, point: str, kind: str) -> Sequence[str]:
         """Frames beside which the mark is shown: of the same camera, where it was measured."""
         with Store(self._store) as store:
-            sql_parameters = (image, _NEAR, _NEAR, image, point, kind, _OTHERS)
+            sql_parameters = (image, _NEAR, point, kind, _OTHERS)
             rows = store.connection.execute(_BESIDE, sql_parameters).fetchall()
         return [name for (name,) in rows]
 
@@ -202,13 +202,14 @@ select f.verdict, r.fingerprint from judged_frame f join result r on r.id = f.re
 _BESIDE = """
 with own as (
     select s.camera, s.id from judged_frame f join scan s on s.id = f.scan
-    where f.name = ? and f.judging = (select max(id) from judging)
+    where f.name = ?1 and f.judging = (select max(id) from judging)
 )
-select f.name from own join scan s on s.id between own.id - ? and own.id + ? and s.camera = own.camera
+select f.name from own join scan s on s.id between own.id - ?2 and own.id + ?2 and s.camera = own.camera
 join judged_frame f on f.scan = s.id
 join mark m on m.result = f.result
-where f.judging = (select max(id) from judging) and f.name <> ? and m.point = ? and m.kind = ? and m.status = 'measured'
-order by abs(s.id - own.id) limit ?
+where f.judging = (select max(id) from judging) and f.name <> ?1 and m.point = ?3 and m.kind = ?4
+    and m.status = 'measured'
+order by abs(s.id - own.id) limit ?5
 """
 
 

@@ -114,35 +114,27 @@ class _Frame:
 
 
 _FRAMES = """
-select f.name, f.result, r.fingerprint, coalesce(s.camera, ''), f.verdict, f.own_marks,
+select f.name, f.result, r.fingerprint, coalesce(s.camera, ''), f.verdict,
     coalesce(json_extract(f.detail, '$.pose'), json_extract(r.detail, '$.pose')),
     coalesce(json_extract(f.detail, '$.problems[0]'), json_extract(r.detail, '$.problems[0]'), '')
 from judged_frame f join result r on r.id = f.result join scan s on s.id = f.scan
 where f.judging = ? and f.verdict <> 'failed' and s.duplicate_of is null
 """
 
-_MARKS = """
-select f.result, m.point, m.kind, m.status, m.reason_code, m.reason
-from judged_frame f join {table} m on m.result = f.result {of_judging}
-where f.judging = :judging and {own} f.own_marks and m.status <> 'measured'
-    and m.reason_code not like '{decided}%' and m.reason_code not like '{clicked}%'
-order by f.result, m.number
+_MARKS = f"""
+select result, point, kind, status, reason_code, reason from checked_mark
+where judging = ? and status <> 'measured' and reason_code not like '{Code.DECIDED}%'
+    and reason_code not like '{Code.CLICKED}%' order by result, number
 """
 
 _FOUND = """
-select f.result, count(*) from judged_frame f join {table} m on m.result = f.result {of_judging}
-where f.judging = :judging and {own} f.own_marks and m.status in ('measured', 'weak') group by f.result
+select result, count(*) from checked_mark where judging = ? and status in ('measured', 'weak') group by result
 """
-_ANSWERED = {"decided": Code.DECIDED, "clicked": Code.CLICKED}
-_OWN = {"table": "judged", "of_judging": "and m.judging = f.judging", "own": "", **_ANSWERED}
-_AS_MEASURED = {"table": "mark", "of_judging": "", "own": "not", **_ANSWERED}
 
 
 def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
-    found = dict[int, int]()
-    for source in (_OWN, _AS_MEASURED):
-        found |= dict(db.execute(_FOUND.format(**source), {"judging": judging}).fetchall())
-    for image, result, key, camera, verdict, _, pose_json, problem in db.execute(_FRAMES, (judging,)):
+    found: dict[int, int] = dict(db.execute(_FOUND, (judging,)).fetchall())
+    for image, result, key, camera, verdict, pose_json, problem in db.execute(_FRAMES, (judging,)):
         pose = json.loads(pose_json) if pose_json else None
         name, is_decided = ("", True) if pose is None else (pose["name"], bool(pose["decided"]))
         evidence = "" if pose is None else " ".join(pose["evidence"])
@@ -176,12 +168,11 @@ def _poses(frames: Sequence[_Frame]) -> Iterator[Entry]:
 
 
 def _marks(db: sqlite3.Connection, judging: int, frames: dict[int, _Frame]) -> Iterator[Entry]:
-    for source in (_OWN, _AS_MEASURED):
-        for result, point, kind, status, code, reason in db.execute(_MARKS.format(**source), {"judging": judging}):
-            frame = frames.get(result)
-            if frame is not None and frame.marks:
-                where = ((frame.image,), (frame.key,), frame.camera, frame.verdict, frame.marks)
-                yield Entry(Question.MARK, *where, reason, code, point, kind, status, frame.pose)
+    for result, point, kind, status, code, reason in db.execute(_MARKS, (judging,)):
+        frame = frames.get(result)
+        if frame is not None and frame.marks:
+            where = ((frame.image,), (frame.key,), frame.camera, frame.verdict, frame.marks)
+            yield Entry(Question.MARK, *where, reason, code, point, kind, status, frame.pose)
 
 
 def _badness(entry: Entry) -> tuple[int, bool, int, str]:

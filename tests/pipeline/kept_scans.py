@@ -3,24 +3,24 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pipeline.archive.checked_statuses import JudgedScan, judge, judged_records, judging_of
-from pipeline.archive.measurement import tell_place
+from pipeline.archive.checked_statuses import CheckedResult, checked_scans, find_judging, judge
+from pipeline.archive.measurement import remember_place
 from pipeline.archive.results_database import Kept, Store
 from pipeline.provenance import Identity, file_state, parts_hash
 from pipeline.results.comparator_file import measurement_of
-from pipeline.results.measured_record import MeasuredScan, record_of
+from pipeline.results.measured_record import MeasuredScan, mark_row, scan_detail
 
 
 def keep_scans(path: Path, scans: Sequence[MeasuredScan], made_from: Mapping[str, str] | None = None) -> str:
     """In the store at `path` of the project whose folder is above its own; the digest of their judging."""
     folder = path.parent.parent.resolve()
     with Store(path) as store:
-        tell_place(store, folder)
+        remember_place(store, folder)
         frames = []
         for scan in scans:
-            record, name = record_of(scan, folder), scan.frame.image
             identity = Identity(file_state(Path(scan.scan), folder), parts_hash(Path(scan.scan)))
-            frames.append(JudgedScan(name, store.keep(Kept(identity, "{}", record), name, current=True), record))
+            row = store.keep(Kept(identity, "{}", scan), scan.frame.image, current=True)
+            frames.append(CheckedResult(row, scan))
         return judge(store, made_from or {}, "kept", frames)
 
 
@@ -33,5 +33,7 @@ def content(file: Path) -> bytes:
         return file.read_bytes()
     comparator = file.parents[1] / "comparator.csv"
     with Store(file) as store:
-        judging = judging_of(store, measurement_of(comparator)) if comparator.exists() else None
-        return b"" if judging is None else repr([judging.digest, *judged_records(store, judging)]).encode()
+        judging = find_judging(store, measurement_of(comparator)) if comparator.exists() else None
+        scans = () if judging is None else checked_scans(store, judging, file.parent)
+        kept = [[scan_detail(scan, ""), *map(mark_row, scan.frame.marks)] for scan in scans]
+        return b"" if judging is None else repr([judging.digest, *kept]).encode()

@@ -21,6 +21,7 @@ from drawn_project import CAMERA, write_project
 from studies import parametrize_with_studies
 
 from measure.marks.shapes import MarkShape, polygon
+from measure.results import Pose
 from pipeline.archive.measurement import picture_sizes_mm
 from pipeline.archive.results_integrity import add_digests
 from pipeline.archive.schema import opened
@@ -33,7 +34,7 @@ from pipeline.measuring.roll import CheckedScan, checked
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
 from pipeline.results.comparator_file import measurement_of
-from pipeline.results.measured_record import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, pose_record
 
 SAID = pytest.CaptureFixture[str]
 
@@ -358,8 +359,9 @@ def test_status_says_why_a_scan_needs_a_look(folder: Path) -> None:
     with closing(db):
         db.execute("update result set pose_decided = 0")
         db.execute("update judged_frame set verdict = 'look'")
-        db.execute("""update judged_frame set detail = '{"pose": {"name": "90", "decided": false}}' where name = 'b'""")
-        db.execute("""update judged_frame set detail = '{"pose": {"name": "90", "decided": true}}' where name = 'c'""")
+        for image, is_decided in (("b", False), ("c", True)):
+            detail = json.dumps({"pose": pose_record(Pose("90", is_decided))})
+            db.execute("update judged_frame set detail = ? where name = ?", (detail, image))
         add_digests(db)
     status = archive_status(read_project(folder / "project.toml"))
     whys = {scan.image: scan.why for scan in status.scans}

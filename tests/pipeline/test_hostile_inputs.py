@@ -4,6 +4,7 @@ Every trial ends in the right result or in one message. Counted are tracebacks, 
 outside of the folder that a command was given.
 """
 
+import os
 import random
 import shutil
 import sqlite3
@@ -32,7 +33,7 @@ from pipeline.exchange.import_stage import run_import
 from pipeline.exchange.incoming import ImportOptions
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions
 from pipeline.files.project_file import read_project
-from pipeline.results.measured_record import FailureCode, record_of
+from pipeline.results.measured_record import FailureCode, mark_row, scan_detail
 from pipeline.review.queue import queue_of
 from pipeline.text.names import names_below
 
@@ -81,7 +82,11 @@ def readings(folder: Path) -> dict[str, Any]:
 
     def scans() -> Any:
         scans = measured_scans(path)
-        return {s.frame.image: record_of(s, folder) for s in scans if s.failure is None or _is_own(s.failure.code)}
+        kept = [scan for scan in scans if scan.failure is None or _is_own(scan.failure.code)]
+        return {
+            s.frame.image: [scan_detail(s, os.path.relpath(s.scan, folder)), *map(mark_row, s.frame.marks)]
+            for s in kept
+        }
 
     def questions() -> Any:
         with Store(path) as store:

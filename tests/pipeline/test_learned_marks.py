@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from shutil import copy, copytree
@@ -23,7 +23,7 @@ from pipeline.files.project_file import Project, read_project
 from pipeline.measuring import learn_stage
 from pipeline.measuring.learn_stage import learn_marks
 from pipeline.measuring.scan_measurement import measure_scans
-from pipeline.measuring.scan_task import Json, scan_tasks
+from pipeline.measuring.scan_task import scan_tasks
 from pipeline.progress import Reporter
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene
@@ -98,10 +98,10 @@ def clicks(folder: Path) -> str:
 class Forgetful:
     """A memory that keeps nothing."""
 
-    def told(self, key: str) -> Json | None:
+    def recall(self, key: str) -> None:
         return None
 
-    def tell(self, key: str, value: Json) -> None:
+    def remember(self, key: str, value: Mapping[str, object]) -> None:
         pass
 
 

@@ -13,7 +13,7 @@ from kept_scans import keep_scans
 
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
-from pipeline.archive.checked_statuses import tell_written
+from pipeline.archive.checked_statuses import remember_written
 from pipeline.archive.results_database import Store
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
@@ -207,7 +207,7 @@ def stored(folder: Path) -> tuple[Path, list[MeasuredScan]]:
 def as_written(folder: Path) -> None:
     """As `reseau measure` says it at its end."""
     with Store(folder / "out" / "measurement.db") as store:
-        tell_written(store, measurement_of(folder / "comparator.csv"), folder / "comparator.csv")
+        remember_written(store, measurement_of(folder / "comparator.csv"), folder / "comparator.csv")
 
 
 @pytest.mark.study

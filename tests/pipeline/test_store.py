@@ -8,32 +8,43 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
-from made_records import dump, failed, kept, record
+from made_records import FOLDER, changed, content, dump, failed, kept, measured, stored
 
+from measure.flags import Code, Reason, Status
 from pipeline.archive.checked_statuses import (
-    JudgedScan,
+    CheckedResult,
+    Judging,
     Lot,
+    checked_marks,
+    checked_scans,
     drop_all_but,
+    find_judging,
     judge,
     judge_lots,
-    judged_marks,
-    judged_records,
-    judging_of,
     latest,
 )
 from pipeline.archive.merge import merge
 from pipeline.archive.results_database import Store
 from pipeline.archive.schema import MIGRATIONS, VERSION, opened
-from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, verdict_of
+from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, scan_verdict
 from pipeline.errors import InputError
 from pipeline.provenance import content_hash, file_state, options_hash, parts_hash, result_key, shard_of
 from pipeline.results.comparator_file import mark_rows
-from pipeline.results.measured_record import scan_of
+from pipeline.results.measured_record import MeasuredScan
+
+LOOK = Reason("look", Code.PITCH)
+LOOKED_AT = measured(problems=(LOOK,))
+
+
+def contents(store: Store, judging: Judging) -> list[tuple[object, ...]]:
+    """Of every scan after the checks."""
+    return [content(scan) for scan in checked_scans(store, judging, FOLDER)]
 
 
 @pytest.fixture
@@ -46,8 +57,8 @@ def test_a_record_comes_back_without_loss(path: Path) -> None:
         row = store.keep(kept(3), "box/3")
         other = store.keep(kept(4))
     with Store(path) as store:
-        assert store.record(row) == record(3)
-        assert store.record(other) == record(4)
+        assert stored(store, row, "3") == content(measured(3))
+        assert stored(store, other, "4") == content(measured(4))
         assert store.fingerprints() == {kept(3).fingerprint: row, kept(4).fingerprint: other}
         assert store.identities() == {"scans/3.tif": kept(3).identity, "scans/4.tif": kept(4).identity}
 
@@ -62,17 +73,19 @@ def test_a_result_that_is_there_is_not_kept_twice(path: Path) -> None:
 def test_the_view_has_the_columns_and_numbers_of_comparator_csv(path: Path) -> None:
     with Store(path) as store:
         row = store.keep(kept(3), "box/3")
-        judge(store, {}, "input", [JudgedScan("box/3", row, record(3))])
+        judge(store, {}, "input", [CheckedResult(row, measured(3, image="box/3"))])
     with sqlite3.connect(path) as db:
         view = db.execute("select * from mark_view")
         names = [column[0] for column in view.description]
         rows = view.fetchall()
     assert names == ["image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status",
                      "reason"]  # fmt: skip
-    mark = record(3)["marks"][0]
-    (variance_x, covariance), (_, variance_y) = mark["covariance_px2"]
+    mark = measured(3).frame.marks[0]
+    assert mark.center_px is not None
+    assert mark.covariance_px2 is not None
+    (variance_x, covariance), (_, variance_y) = mark.covariance_px2.tolist()
     assert rows[0][:3] == ("box/3", "1", "fiducial")
-    assert rows[0][3:5] == pytest.approx((mark["col_px"] * 0.020, -mark["row_px"] * 0.0205), rel=1e-12)
+    assert rows[0][3:5] == pytest.approx(mark.center_px * (0.020, -0.0205), rel=1e-12)
     assert rows[0][5:7] == pytest.approx((variance_x**0.5 * 0.020, variance_y**0.5 * 0.0205), rel=1e-12)
     assert rows[0][7] == pytest.approx(-covariance / (variance_x * variance_y) ** 0.5, rel=1e-12)
     assert len(rows) == 8
@@ -81,15 +94,18 @@ def test_the_view_has_the_columns_and_numbers_of_comparator_csv(path: Path) -> N
 def test_a_judging_changes_what_is_seen_and_not_what_was_measured(path: Path) -> None:
     with Store(path) as store:
         rows = [store.keep(kept(seed), str(seed)) for seed in (1, 2)]
-        now = [record(1), record(2, problems=["it is the frame of 1."])]
-        now[0]["marks"][2] |= {"status": "weak", "reason": "the others say otherwise"}
-        frames = [JudgedScan(name, row, what) for name, row, what in zip("12", rows, now, strict=True)]
+        doubted = changed(measured(1), [2], Status.WEAK, Reason("the others say otherwise", Code.OFF_GIVEN))
+        now = [doubted, measured(2, problems=(Reason("it is the frame of 1.", Code.COPY),))]
+        frames = [CheckedResult(row, scan) for row, scan in zip(rows, now, strict=True)]
         digest = judge(store, {"settings": "a"}, "input", frames)
-        judging = judging_of(store, digest)
+        judging = find_judging(store, digest)
         assert judging is not None
         assert judging.made_from == {"settings": "a"}
-        assert list(judged_records(store, judging)) == [("1", now[0]), ("2", now[1])]
-        assert [store.record(row) for row in rows] == [record(1), record(2)]
+        assert contents(store, judging) == [content(scan) for scan in now]
+        assert [stored(store, row, name) for row, name in zip(rows, "12", strict=True)] == [
+            content(measured(1)),
+            content(measured(2)),
+        ]
         seen = store.connection.execute("select image, status from mark_view where status = 'weak'").fetchall()
         assert seen == [("1", "weak")]
         assert store.connection.execute("select count(*) from judged").fetchone() == (8,)  # of the first alone
@@ -99,12 +115,11 @@ def test_a_lot_whose_input_was_judged_is_not_judged_again(path: Path) -> None:
     asked = list[str]()
 
     def lot(input_hash: str, *seeds: int) -> Lot:
-        def frames() -> Iterator[JudgedScan]:
+        def frames() -> Iterator[CheckedResult]:
             asked.append(input_hash)
             for seed in seeds:
-                now = record(seed)
-                now["marks"][seed] |= {"status": "weak", "reason": f"by {input_hash}"}
-                yield JudgedScan(str(seed), store.keep(kept(seed), str(seed)), now)
+                now = changed(measured(seed), [seed], Status.WEAK, Reason(f"by {input_hash}", Code.OFF_GIVEN))
+                yield CheckedResult(store.keep(kept(seed), str(seed)), now)
 
         return Lot(input_hash, frames)
 
@@ -114,43 +129,36 @@ def test_a_lot_whose_input_was_judged_is_not_judged_again(path: Path) -> None:
         assert asked == ["a", "b", "c"]
         assert first != second
         drop_all_but(store, second)
-        judging = judging_of(store, second)
+        judging = find_judging(store, second)
         assert judging is not None
-        records = {name: one for name, one in judged_records(store, judging) if isinstance(one, dict)}
-        said = {name: [mark["reason"] for mark in one["marks"] if mark["reason"]] for name, one in records.items()}
-        assert {name: reasons[-1] for name, reasons in said.items()} == {
-            "1": "by a",
-            "2": "by a",
-            "3": "by c",
-            "4": "by c",
-        }
+        scans = list(checked_scans(store, judging, FOLDER))
+        reasons = {scan.frame.image: [str(mark.reason) for mark in scan.frame.marks if mark.reason] for scan in scans}
+        assert reasons == {"1": ["by a"], "2": ["by a"], "3": ["by c"], "4": ["by c"]}
     other = path.parent / "other.db"
     with Store(other) as store:  # the same, all of it judged anew
         assert judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)]) == second
-        judging = judging_of(store, second)
+        judging = find_judging(store, second)
         assert judging is not None
-        anew = list(judged_records(store, judging))
-        rows = list(judged_marks(store, judging))
+        anew = contents(store, judging)
+        rows = list(checked_marks(store, judging))
     with Store(path) as store:
-        judging = judging_of(store, second)
+        judging = find_judging(store, second)
         assert judging is not None
-        assert list(judged_records(store, judging)) == anew
-        assert list(judged_marks(store, judging)) == rows
-        records = {name: one for name, one in anew if isinstance(one, dict)}
-        scans = [scan_of(name, {**one, "problem_codes": []}, Path()).frame for name, one in records.items()]
-        assert list(mark_rows(scans)) == rows
+        assert contents(store, judging) == anew
+        assert list(checked_marks(store, judging)) == rows
+        assert list(mark_rows(scan.frame for scan in checked_scans(store, judging, FOLDER))) == rows
 
 
 def test_one_judging_takes_the_place_of_another(path: Path) -> None:
     with Store(path) as store:
         row = store.keep(kept(1), "1")
-        first = judge(store, {}, "a", [JudgedScan("1", row, record(1))])
-        same = judge(store, {}, "a", [JudgedScan("1", row, record(1))])
-        second = judge(store, {}, "a", [JudgedScan("1", row, record(1, problems=["look"]))])
+        first = judge(store, {}, "a", [CheckedResult(row, measured())])
+        same = judge(store, {}, "a", [CheckedResult(row, measured())])
+        second = judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
         assert first == same != second
-        assert judging_of(store, first) is not None
+        assert find_judging(store, first) is not None
         drop_all_but(store, second)
-        assert judging_of(store, first) is None
+        assert find_judging(store, first) is None
         assert (found := latest(store)) is not None
         assert found.digest == second
 
@@ -168,7 +176,7 @@ def test_a_store_of_an_earlier_version_is_brought_to_this_one(path: Path, versio
     with Store(path) as store:
         assert store.connection.execute("pragma user_version").fetchone() == (VERSION,)
         row = store.keep(kept(1), "1")
-        assert store.record(row) == record(1)
+        assert stored(store, row) == content(measured())
         assert store.connection.execute("select count(*) from options").fetchone() == (1 + bool(version),)
 
 
@@ -178,34 +186,36 @@ def test_results_of_an_earlier_version_get_their_digests(has_secret: bool, path:
     is noticed."""
     with Store(path) as store:
         row = store.keep(kept(1), "1", current=True)
-        digest = judge(store, {}, "a", [JudgedScan("1", row, record(1, problems=["look"]))])
+        digest = judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
     secret = "https://ann:hunter2@h.org/2.tif?sig=hunter2"
     with Store(path) as store:
         if has_secret:
             store.keep(kept(2), "2", current=True)
     with sqlite3.connect(path) as db:
         db.execute("update scan set uri = ? where name = '2'", (secret,))
+        db.execute("drop view mark_view")
+        db.execute("drop view checked_mark")
         for table, columns in (
             ("scan", ["digest"]), ("result", ["digest", "marks_digest"]), ("kept", ["digest"]),
             ("judging", ["frames_digest", "seal"]), ("judged_frame", ["decisions", "marks_digest", "digest"]),
         ):  # fmt: skip
             for column in columns:
                 db.execute(f"alter table {table} drop column {column}")
+        db.execute("create view mark_view as select 1")
         db.execute("pragma user_version = 3")
     with Store(path) as store:
-        assert store.record(row) == record(1)
-        judging = judging_of(store, digest)
+        assert stored(store, row) == content(measured())
+        judging = find_judging(store, digest)
         assert (judging is None) == has_secret  # it is made anew
         if judging is not None:
-            ((_, told),) = judged_records(store, judging)
-            assert isinstance(told, dict)
-            assert told["problems"] == ["look"]
+            (scan,) = checked_scans(store, judging, FOLDER)
+            assert scan.frame.problems == (LOOK,)
         assert [uri for (uri,) in store.connection.execute("select uri from scan")] == ["scans/1.tif"]
     with sqlite3.connect(path) as db:
         db.execute("update mark set col_px = col_px + 5 where number = 0")
     with Store(path) as store:
         with pytest.raises(InputError, match=r"image '1' is not what was measured.*measure --retry"):
-            store.record(row)
+            stored(store, row)
         assert store.forget_damaged() == 1
         assert store.fingerprints() == {}
 
@@ -221,7 +231,7 @@ def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monke
     with Store(path) as store:
         assert store.connection.execute("select name, box from scan").fetchall() == [("1", "a")]
         assert store.connection.execute("pragma user_version").fetchone() == (VERSION + 1,)
-        assert store.record(row) == record(1)
+        assert stored(store, row) == content(measured())
 
 
 def test_a_file_of_another_kind_or_of_a_later_version_is_refused(path: Path) -> None:
@@ -270,14 +280,14 @@ def test_what_was_kept_survives_a_kill_and_nothing_is_half(path: Path) -> None:
         found = store.fingerprints()
         complete = sum(line.endswith(b"\n") for line in told)
         assert complete <= len(found) <= complete + 1
-        assert all(store.record(row)["marks"] for row in found.values())
+        assert all(store.scan(row, "", FOLDER).frame.marks for row in found.values())
         assert store.connection.execute("pragma integrity_check").fetchone() == ("ok",)
 
 
 def test_failed_scans_are_tried_again_only_when_asked(path: Path) -> None:
     with Store(path) as store:
         store.keep(kept(1), "1")
-        row = store.keep(kept(2, **failed(2)), "2")
+        row = store.keep(kept(2, scan=failed(2)), "2")
         assert store.connection.execute("select verdict from result where id = ?", (row,)).fetchone() == ("failed",)
         assert store.forget_failed() == 1
         assert list(store.fingerprints()) == [kept(1).fingerprint]
@@ -314,25 +324,24 @@ def test_shards_are_the_same_everywhere() -> None:
 
 
 def test_verdicts_of_scans() -> None:
-    assert verdict_of(record()) == Verdict.GOOD
-    assert verdict_of(record(status="weak")) == Verdict.LOOK
-    assert verdict_of(record(problems=["the pitch is not known"])) == Verdict.LOOK
-    assumed = record()
-    assumed["pose"]["decided"] = False
-    assert verdict_of(assumed) == Verdict.LOOK
-    assert verdict_of(record(status="absent")) == Verdict.POOR
-    assert verdict_of(record(pixel_from_camera=None)) == Verdict.POOR
-    few = record()
-    for mark in few["marks"][2:]:
-        mark["status"] = "rejected"
-    assert verdict_of(few) == Verdict.POOR
-    assert verdict_of(failed()) == Verdict.FAILED
-    answered = record()
-    answered["marks"][0] |= {"status": "rejected", "reason_code": "decided"}
-    assert verdict_of({**answered, "decided_by": {"ann": 1}}) == Verdict.DECIDED
-    assert verdict_of({**answered, "decided_by": {"ann": 1}, "problems": ["bent"]}) == Verdict.LOOK
-    assert verdict_of({**record(), "decided_by": {"ann": 1}}) == Verdict.DECIDED
-    assert verdict_of({**record(status="weak"), "decided_by": {"ann": 1}}) == Verdict.LOOK
+    good, decided = measured(), {"ann": 1}
+    answered = changed(good, [0], Status.REJECTED, Reason("rejected by ann", Code.DECIDED))
+    assert good.frame.pose is not None
+    verdicts: list[tuple[MeasuredScan, Verdict]] = [
+        (good, Verdict.GOOD),
+        (measured(status=Status.WEAK), Verdict.LOOK),
+        (measured(problems=(LOOK,)), Verdict.LOOK),
+        (measured(pose=replace(good.frame.pose, decided=False)), Verdict.LOOK),
+        (measured(status=Status.ABSENT), Verdict.POOR),
+        (measured(pixel_from_camera=None), Verdict.POOR),
+        (changed(good, range(2, 8), Status.REJECTED, LOOK), Verdict.POOR),
+        (failed(), Verdict.FAILED),
+        (replace(answered, decided_by=decided), Verdict.DECIDED),
+        (replace(answered, frame=replace(answered.frame, problems=(LOOK,)), decided_by=decided), Verdict.LOOK),
+        (replace(good, decided_by=decided), Verdict.DECIDED),
+        (replace(measured(status=Status.WEAK), decided_by=decided), Verdict.LOOK),
+    ]
+    assert [scan_verdict(scan) for scan, _ in verdicts] == [verdict for _, verdict in verdicts]
     assert set(MEANING) == set(NEXT_STEP) == set(Verdict)
 
 
@@ -342,7 +351,7 @@ def test_the_key_depends_on_all_that_it_names() -> None:
     keys = {base.fingerprint, *(other.fingerprint for other in others)}
     keys.add(result_key(base.identity, options_hash("{}"), revision=-1))
     assert len(keys) == 5
-    assert base.fingerprint == kept(1, problems=["another result"]).fingerprint
+    assert base.fingerprint == kept(1, scan=failed()).fingerprint
 
 
 def test_parts_tell_scans_apart_that_share_head_and_tables(rendered_demo: Path, tmp_path: Path) -> None:
@@ -378,7 +387,7 @@ def test_a_store_in_a_folder_that_cannot_be_written_is_read(path: Path, monkeypa
         row = store.keep(kept(3), "box/3")
     monkeypatch.setattr("pipeline.archive.schema.os.access", lambda *_: False)
     with Store(path) as store:
-        assert store.record(row)["marks"]
+        assert store.scan(row, "box/3", FOLDER).frame.marks
         assert [file.name for file in path.parent.iterdir()] == [path.name]  # SQLite would put two files beside it
         with pytest.raises(sqlite3.OperationalError, match="readonly"):
             store.keep(kept(4), "box/4")
@@ -391,7 +400,7 @@ def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -
     """Else what each scan gave would stand for what all together say of it."""
     with Store(path) as store:
         row = store.keep(kept(1), "1", current=True)
-        judge(store, {}, "a", [JudgedScan("1", row, record(1, problems=["look"]))])
+        judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
     with sqlite3.connect(path) as db:
         db.execute(change)
     with Store(path) as store:
@@ -399,4 +408,4 @@ def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -
             latest(store)
         store.forget_damaged()
         assert latest(store) is None
-        assert store.record(row) == record(1)
+        assert stored(store, row) == content(measured())
