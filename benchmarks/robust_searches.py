@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.initial_values.model_formation import relative_poses
 from adjust.initial_values.pose import Pose
-from adjust.initial_values.relative_orientation import relative_poses
 from adjust.initial_values.resection import resect
 
 Array = NDArray[np.float64]

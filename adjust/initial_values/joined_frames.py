@@ -37,11 +37,7 @@ def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:
     """The film transformations of the parts of one frame. Raises AdjustmentError where parts have too little in common,
     or the frame has too few fiducial marks."""
     marks_by_part = {part.name: _marks(network, part) for part in parts}
-    first_from = _placed(parts[0].part_of, marks_by_part)
-    place: dict[Mark, Array] = {}
-    for name, film in first_from.items():
-        moved = film_kind("similarity", film[1]).apply(film[0], np.array(list(marks_by_part[name].values())))
-        place |= {mark: xy for mark, xy in zip(marks_by_part[name], moved, strict=True) if mark not in place}
+    first_from, place = _placed(parts[0].part_of, marks_by_part)
     given = network.camera_by_name[parts[0].camera].fiducials
     marks = sorted(point for kind, point in place if kind == "fiducial")
     camera_mm = np.array([[given[mark].x_mm.value, given[mark].y_mm.value] for mark in marks]).reshape(-1, 2)
@@ -71,32 +67,27 @@ def _marks(network: Network, part: Image) -> dict[Mark, Array]:
     }
 
 
-def _placed(frame: str, marks_by_part: Mapping[str, Mapping[Mark, Array]]) -> dict[str, Film]:
-    """Similarities from every part's comparator to that of the first; the part that has most in common comes next."""
-    names = list(marks_by_part)
-    films: dict[str, Film] = {names[0]: (np.array([0.0, 0.0, 1.0, 0.0]), False)}
-    place = dict(marks_by_part[names[0]])
-    while len(films) < len(names):
-        left = [name for name in names if name not in films]
+def _placed(frame: str, marks_by_part: Mapping[str, Mapping[Mark, Array]]) -> tuple[dict[str, Film], dict[Mark, Array]]:
+    """Similarities from every part's comparator to that of the first, and where the marks lie there; the part that has
+    most in common comes next."""
+    left = list(marks_by_part)
+    films: dict[str, Film] = {left[0]: (np.array([0.0, 0.0, 1.0, 0.0]), False)}
+    place = dict(marks_by_part[left.pop(0)])
+    while left:
         name = max(left, key=lambda name: len(place.keys() & marks_by_part[name].keys()))
-        common = sorted(place.keys() & marks_by_part[name].keys())
+        own, common = marks_by_part[name], sorted(place.keys() & marks_by_part[name].keys())
         if len(common) < FEWEST_COMMON:
-            raise AdjustmentError(_why_not_joined(frame, name, list(films), len(common)))
-        own, there = (np.array([where[mark] for mark in common]) for where in (marks_by_part[name], place))
-        films[name] = fit_transformation("similarity", own, there)
-        moved = film_kind("similarity", films[name][1]).apply(
-            films[name][0], np.array(list(marks_by_part[name].values()))
-        )
-        place |= {mark: xy for mark, xy in zip(marks_by_part[name], moved, strict=True) if mark not in place}
-    return films
-
-
-def _why_not_joined(frame: str, name: str, others: Sequence[str], common: int) -> str:
-    return (
-        f"frame {frame}: its scan {name} has {common} points in common with {', '.join(others)}; joining them takes "
-        f"{FEWEST_COMMON}, and more to be checked. Scan the frame in parts that overlap, measure crosses that both "
-        "show, or leave the scan out."
-    )
+            raise AdjustmentError(
+                f"frame {frame}: its scan {name} has {len(common)} points in common with {', '.join(films)}; joining "
+                f"them takes {FEWEST_COMMON}, and more to be checked. Scan the frame in parts that overlap, measure "
+                "crosses that both show, or leave the scan out."
+            )
+        in_part, in_first = (np.array([where[mark] for mark in common]) for where in (own, place))
+        films[name] = fit_transformation("similarity", in_part, in_first)
+        moved = film_kind("similarity", films[name][1]).apply(films[name][0], np.array(list(own.values())))
+        place |= {mark: xy for mark, xy in zip(own, moved, strict=True) if mark not in place}
+        left.remove(name)
+    return films, place
 
 
 def joined_frames(network: Network) -> Iterator[JoinedFrame]:

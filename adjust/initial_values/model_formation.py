@@ -1,19 +1,298 @@
-"""Exterior orientations without known points: a model from the images alone, brought to what coordinates are known."""
+"""Exterior orientations without known points: two images oriented relatively, a model of all that resection and
+intersection add to them, and its absolute orientation by what coordinates are known.
+"""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from adjust.array_types import Array
+from adjust.array_types import Array, Mask
+from adjust.functional_model.rotation import rotation_from_vector
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.absolute_orientation import Similarity, absolute_orientation, levelled
-from adjust.initial_values.block import Block, extend
-from adjust.initial_values.pose import Pose, image_distances
-from adjust.initial_values.relative_orientation import relative_poses
+from adjust.initial_values.intersection import intersect
+from adjust.initial_values.pose import KnownField, Pose, image_distances
+from adjust.initial_values.resection import resect_images
 
+SAMPLES = 150
+CANDIDATES = 4  # poses handed on: the two interpretations of a flat scene must both be among them
+REAL = 1e-6  # imaginary part, relative, of a root that is real
+
+# The monomials in x, y, z of Stewénius's elimination: ten cubic ones, then the basis of the quotient ring.
+CUBIC = ((3, 0, 0), (2, 1, 0), (1, 2, 0), (0, 3, 0), (2, 0, 1), (1, 1, 1), (0, 2, 1), (1, 0, 2), (0, 1, 2), (0, 0, 3))
+BASIS = ((2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))
+POWERS = np.array([*CUBIC, *BASIS])
+CUBIC_TIMES_X = (0, 1, 2, 4, 5, 7)  # x times the first six of the basis: which cubic monomial it is
+BASIS_TIMES_X = (0, 1, 3, 6)  # x times x, y, z, 1: which of the basis it is
+STARTS = 400  # attitudes tried, some 25 degrees apart
+REFINED = 12
+AS_GOOD = 1e-5  # sum of squares, relative to that of the coordinates: a solution as good as the best
+REWEIGHTINGS = 6  # of least distances
+SINGULAR = 1e-6  # smallest over largest singular value of the derivatives by a turn
+SURE_RESECTION = 6  # points that make a resection trustworthy; with fewer it waits until nothing better comes
+WELL_DETERMINED = 1e-3  # determination (see intersect) from which an intersected point may orient further images
 FEWEST_SHARED = 8  # common points from which the relative orientation of two images has some redundancy
 PAIRS = 3
+
+
+def relative_poses(first: Array, second: Array, rng: np.random.Generator) -> list[Pose]:
+    """Poses of the second image, the first one at the origin with rotation I and a base of length 1, the best first.
+
+    first, second (n, 3): rays to the same points in the two camera frames, n >= 5. Essential matrices of samples of
+    five (Stewénius, Engels and Nistér 2006) ranked by the smaller half of the coplanarity errors, so that gross errors
+    do no harm; of the four poses of each, the one with most points in front of both cameras.
+    """
+    first, second = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
+    samples = np.array([rng.choice(len(first), 5, replace=False) for _ in range(SAMPLES)])
+    essential = _essential_matrices(first[samples], second[samples])
+    if not len(essential):
+        return []
+    half = (len(first) + 6) // 2
+    cost = np.sort(_coplanarity(essential, first, second), axis=1)[:, :half].sum(axis=1)
+    poses: list[Pose] = []
+    for number in np.argsort(cost, kind="stable"):
+        pose = _pose(essential[number], first, second)
+        if all(_angle(pose, other) > 0.05 for other in poses):
+            poses.append(pose)
+        if len(poses) == CANDIDATES:
+            break
+    return poses
+
+
+def _essential_matrices(first: Array, second: Array) -> Array:
+    """All real solutions (k, 3, 3) of samples (m, 5, 3): second' E first = 0."""
+    coplanarity = np.einsum("msi,msj->msij", second, first).reshape(len(first), 5, 9)
+    null = np.linalg.svd(coplanarity)[2][:, 5:].reshape(-1, 4, 3, 3)
+    coefficients = _constraint_coefficients(null)
+    regular = np.abs(np.linalg.det(coefficients[:, :, :10])) > np.finfo(float).tiny
+    null, coefficients = null[regular], coefficients[regular]
+    reduced = np.linalg.solve(coefficients[:, :, :10], coefficients[:, :, 10:])
+    action = np.zeros((len(null), 10, 10))
+    action[:, :6] = -reduced[:, CUBIC_TIMES_X]
+    action[:, [6, 7, 8, 9], BASIS_TIMES_X] = 1.0
+    vectors = np.asarray(np.linalg.eig(action)[1], dtype=np.complex128)  # (m, 10, 10), a column a solution
+    with np.errstate(divide="ignore", invalid="ignore"):
+        unknowns = vectors[:, 6:9] / vectors[:, 9:]
+    real = np.logical_and.reduce(np.abs(unknowns.imag) <= REAL * (1.0 + np.abs(unknowns.real)), axis=1)
+    weights = np.concatenate([unknowns.real, np.ones((len(null), 1, 10))], axis=1)
+    matrices = np.einsum("mws,mwij->msij", np.where(real[:, np.newaxis], weights, 0.0), null)[real]
+    return np.asarray(matrices / np.linalg.norm(matrices, axis=(1, 2), keepdims=True))
+
+
+def _constraint_coefficients(null: Array) -> Array:
+    """Coefficients (m, 10, 20) of det E = 0 and 2 E E' E - tr(E E') E = 0, E = x N1 + y N2 + z N3 + N4.
+
+    Found by interpolation: the constraints are evaluated at twenty places and the monomials' matrix is inverted.
+    """
+    places = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 3))
+    monomials = (places[:, None, :] ** POWERS).prod(axis=2)
+    weights = np.column_stack([places, np.ones(20)])
+    essential = np.einsum("pw,mwij->mpij", weights, null)
+    product = essential @ np.swapaxes(essential, 2, 3)
+    trace = np.trace(product, axis1=2, axis2=3)[..., None, None]
+    cubic = (2.0 * product @ essential - trace * essential).reshape(len(null), 20, 9)
+    values = np.concatenate([cubic, np.linalg.det(essential)[..., None]], axis=2)
+    return np.asarray(np.swapaxes(np.linalg.solve(monomials, values), 1, 2))
+
+
+def _coplanarity(essential: Array, first: Array, second: Array) -> Array:
+    """Squared angles (k, n), nearly, by which rays miss the epipolar planes (Sampson's distance on the sphere)."""
+    right, left = first @ np.swapaxes(essential, 1, 2), second @ essential
+    error = (second * right).sum(axis=2)
+    slope = ((right - error[..., None] * second) ** 2).sum(axis=2) + ((left - error[..., None] * first) ** 2).sum(
+        axis=2
+    )
+    return np.asarray(error**2 / np.maximum(slope, np.finfo(float).tiny))
+
+
+def _pose(essential: Array, first: Array, second: Array) -> Pose:
+    """Of the four poses of an essential matrix, that with most points in front of both cameras."""
+    u, _, vt = np.linalg.svd(essential)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    rotations = [u @ w @ vt * np.sign(np.linalg.det(u @ vt)) for w in (turn, turn.T)]
+    poses = [Pose(rotation, sign * rotation.T @ u[:, 2]) for rotation in rotations for sign in (1.0, -1.0)]
+    return max(poses, key=lambda pose: _pairs_in_front(pose, first, second))
+
+
+def _pairs_in_front(pose: Pose, first: Array, second: Array) -> int:
+    """How many pairs of rays meet at positive distances from both cameras."""
+    turned = second @ pose.rotation
+    cosine = (first * turned).sum(axis=1)
+    along_first, along_second = first @ pose.center, turned @ pose.center
+    # least squares of s first - t turned = center, times the positive determinant 1 - cosine²
+    s = along_first - cosine * along_second
+    t = cosine * along_first - along_second
+    return int(((s > 0) & (t > 0)).sum())
+
+
+def _angle(pose: Pose, other: Pose) -> float:
+    """How different two poses are: the turn between them and the angle between their bases, in rad."""
+    turn = np.arccos(np.clip((np.trace(pose.rotation @ other.rotation.T) - 1) / 2, -1.0, 1.0))
+    return float(turn + np.arccos(np.clip(pose.center @ other.center, -1.0, 1.0)))
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """object = scale rotation model + shift."""
+
+    scale: float
+    rotation: Array
+    shift: Array
+
+    def apply(self, xyz: Array) -> Array:
+        return np.asarray(self.scale * xyz @ self.rotation.T + self.shift)
+
+
+def absolute_orientation(model: Array, known: Array, stations: Array) -> Similarity | None:
+    """The similarity that brings model points (n, 3) to their known coordinates (n, 3), nan where one is not known.
+
+    stations (k, 3): the cameras in the model. A minimal datum, two points and the height of a third say, has two
+    solutions, mirrored about the line of the two: that with the cameras higher above the points is taken. None where
+    the known coordinates do not determine the similarity. Once the attitude is given, scale and shift are linear; so
+    the attitude is sought from starts all over.
+    """
+    from scipy.optimize import least_squares  # takes longer to import than most adjustments
+
+    given = ~np.isnan(known)
+    if given.sum() < 7 or not given.any(axis=0).all():
+        return None
+    target = _centred(known, given)
+    starts = Rotation.from_quat(np.random.default_rng(0).normal(size=(STARTS, 4))).as_matrix()  # even over all turns
+    costs = np.array([(_misfit(start, model, target, given) ** 2).sum() for start in starts])
+    found = []
+    for start in starts[np.argsort(costs, kind="stable")[:REFINED]]:
+        near = least_squares(
+            lambda turn, start=start: _misfit(rotation_from_vector(turn) @ start, model, target, given), np.zeros(3)
+        )
+        is_determined = np.linalg.svd(near.jac, compute_uv=False)[2] > SINGULAR * np.linalg.norm(target)
+        found.append((2.0 * float(near.cost), is_determined, rotation_from_vector(near.x) @ start))
+    most = min(cost for cost, _, _ in found) + AS_GOOD * (target**2).sum()
+    candidates = [
+        _similarity(rotation, model, known, given)
+        for cost, is_determined, rotation in found
+        if cost <= most and is_determined
+    ]
+    return max(
+        candidates, key=lambda s: float(s.apply(stations)[:, 2].mean() - s.apply(model)[:, 2].mean()), default=None
+    )
+
+
+def levelled(model: Array, heights: Array, stations: Array) -> Similarity | None:
+    """The similarity that brings model points (n, 3) to their heights (n,), gross errors tolerated; X and Y are level
+    axes through the model's middle, whichever.
+
+    stations (k, 3): the cameras in the model, which stand above the points. None where heights do not tell the scale:
+    over a flat field they are alike, and in a model of poor images they may fall where it rises.
+    """
+    weights = np.ones(len(model))
+    for _ in range(REWEIGHTINGS):
+        middle, height = np.average(model, axis=0, weights=weights), float(np.average(heights, weights=weights))
+        offsets, relief = model - middle, heights - height
+        squares = float((weights * relief**2).sum())
+        if squares == 0.0:
+            return None
+        rise = (weights * relief) @ offsets / squares
+        left = offsets - np.outer(relief, rise)
+        up = np.linalg.svd(np.sqrt(weights)[:, np.newaxis] * left, full_matrices=False)[2][2]
+        distance = np.abs(left @ up)
+        weights = 1.0 / np.maximum(distance, 0.1 * np.median(distance) + np.finfo(float).tiny)
+    up = up if np.mean((stations - middle) @ up) > 0 else -up
+    if rise @ up <= 0.0:
+        return None
+    right = np.cross(np.eye(3)[np.argmin(np.abs(up))], up)
+    right /= np.linalg.norm(right)
+    scale, rotation = 1.0 / float(rise @ up), np.stack([right, np.cross(up, right), up])
+    return Similarity(scale, rotation, np.array([0.0, 0.0, height]) - scale * rotation @ middle)
+
+
+def _centred(xyz: Array, given: Mask) -> Array:
+    """Each axis less its mean over the given coordinates; 0 where not given."""
+    mean = np.where(given, xyz, 0.0).sum(axis=0) / given.sum(axis=0)
+    return np.where(given, xyz - mean, 0.0)
+
+
+def _misfit(rotation: Array, model: Array, target: Array, given: Mask) -> Array:
+    """What the best scale and shift leave of the coordinates with this attitude."""
+    turned = _centred(model @ rotation.T, given)
+    return np.asarray((_scale(turned, target) * turned - target)[given])
+
+
+def _scale(turned: Array, target: Array) -> float:
+    """A negative one is no solution."""
+    return max(float((turned * target).sum() / (turned**2).sum()), 0.0)
+
+
+def _similarity(rotation: Array, model: Array, known: Array, given: Mask) -> Similarity:
+    turned = model @ rotation.T
+    scale = _scale(_centred(turned, given), _centred(known, given))
+    return Similarity(scale, rotation, np.nanmean(np.where(given, known - scale * turned, np.nan), axis=0))
+
+
+@dataclass
+class Block:
+    """What is known and what is oriented so far, by image and point name."""
+
+    sights: Mapping[str, Sight]
+    firm: Mapping[str, Array]  # coordinates (3,) with a standard deviation, nan where there is none
+    rough: Mapping[str, Array]  # the same with mere approximations filled in
+    poses: dict[str, Pose] = field(default_factory=dict)
+    points: dict[str, Array] = field(default_factory=dict)  # intersected
+
+
+def extend(block: Block) -> None:
+    """Orient and intersect in turn until nothing more comes; the images with the surest points first."""
+    while True:
+        block.points = intersected(block, WELL_DETERMINED)
+        waiting = [name for name in sorted(block.sights) if name not in block.poses]
+        new: dict[str, Pose] = {}
+        for fewest in (SURE_RESECTION, 4, 3):
+            new = new or _resected(block, waiting, fewest)
+        if not new:
+            return
+        block.poses.update(new)
+
+
+def _resected(block: Block, images: Sequence[str], fewest: int) -> dict[str, Pose]:
+    """The poses of those images whose points give one: of firm points where there are enough, else of all that have
+    coordinates by now."""
+    poses: dict[str, Pose] = {}
+    for coordinates in (block.firm, {**block.rough, **block.points}):
+        fields = {name: known_field(block.sights[name], coordinates) for name in images if name not in poses}
+        enough = {name: field for name, field in fields.items() if len(field.xyz) >= fewest}
+        found = resect_images(list(enough.values()), [block.sights[name].principal_distance_mm for name in enough])
+        poses |= {name: pose for name, pose in zip(enough, found, strict=True) if pose is not None}
+    return poses
+
+
+def known_field(sight: Sight, coordinates: Mapping[str, Array]) -> KnownField:
+    """The points of an image whose three coordinates are known."""
+    xyz = np.array([coordinates[name] for name in sight.points]).reshape(-1, 3)
+    usable = ~np.isnan(xyz).any(axis=1)
+    return KnownField(xyz[usable], sight.xy_mm[usable], sight.sigma_mm)
+
+
+def intersected(block: Block, weakest: float) -> dict[str, Array]:
+    """Coordinates (3,) of the points that the oriented images determine, given coordinates kept."""
+    names = [name for name in sorted(block.firm) if np.isnan(block.firm[name]).any()]
+    position = {name: i for i, name in enumerate(names)}
+    rows = [
+        (image, k, position[name])
+        for image in sorted(block.poses)
+        for k, name in enumerate(block.sights[image].points)
+        if name in position
+    ]
+    if not rows:
+        return {}
+    directions = {image: block.sights[image].rays @ pose.rotation for image, pose in block.poses.items()}
+    points, determination = intersect(
+        np.array([block.poses[image].center for image, _, _ in rows]),
+        np.array([directions[image][k] for image, k, _ in rows]),
+        np.array([point for _, _, point in rows], dtype=np.intp),
+        np.array([block.firm[name] for name in names]),
+    )
+    return {names[i]: points[i] for i in np.flatnonzero(determination > weakest)}
 
 
 def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -> dict[str, Pose]:
@@ -31,16 +310,19 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
     if all(np.isnan(xyz).all() for xyz in known.values()):
         return best.poses
     names = sorted(best.points)
-    model, stations = (np.array(each) for each in ([best.points[name] for name in names], _stations(best)))
-    xyz = np.array([known[name] for name in names])
+    model, xyz = (np.array([each[name] for name in names]) for each in (best.points, known))
+    stations = np.array([best.poses[image].center for image in sorted(best.poses)])
     with_height = ~np.isnan(xyz[:, 2])
     if np.isnan(xyz[:, :2]).all() and with_height.sum() > FEWEST_SHARED:
         similarity = levelled(model[with_height], xyz[with_height, 2], stations)
     else:
         similarity = absolute_orientation(model, xyz, stations)
-    return (
-        {} if similarity is None else {image: _transformed_pose(pose, similarity) for image, pose in best.poses.items()}
-    )
+    if similarity is None:
+        return {}
+    return {
+        image: Pose(pose.rotation @ similarity.rotation.T, similarity.apply(pose.center[None])[0])
+        for image, pose in best.poses.items()
+    }
 
 
 def _pairs(sights: Mapping[str, Sight]) -> list[tuple[str, str]]:
@@ -70,10 +352,6 @@ def _rays(sight: Sight, points: list[str]) -> Array:
     return sight.rays[[rows[name] for name in points]]
 
 
-def _stations(model: Block) -> list[Array]:
-    return [model.poses[image].center for image in sorted(model.poses)]
-
-
 def typical_residual(model: Block) -> float:
     """Median distance in mm of projected from observed points; a point that was not intersected counts as gross."""
     distances = []
@@ -84,7 +362,3 @@ def typical_residual(model: Block) -> float:
         distances.append(image_distances(pose, xyz, sight.xy_mm[held], sight.principal_distance_mm))
         distances.append(np.full(len(sight.points) - len(held), np.inf))
     return float(np.median(np.concatenate(distances)))
-
-
-def _transformed_pose(pose: Pose, similarity: Similarity) -> Pose:
-    return Pose(pose.rotation @ similarity.rotation.T, similarity.apply(pose.center[None])[0])

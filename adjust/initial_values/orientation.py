@@ -10,8 +10,14 @@ from adjust.errors import AdjustmentError, UnorientedError
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.block import Block, extend, intersected, known_field
-from adjust.initial_values.model_formation import orient_free_model, typical_residual
+from adjust.initial_values.model_formation import (
+    Block,
+    extend,
+    intersected,
+    known_field,
+    orient_free_model,
+    typical_residual,
+)
 from adjust.initial_values.pose import Pose, image_distances
 from adjust.initial_values.resection import resect_images
 from adjust.initial_values.vertical_block import orient_vertical_block

@@ -14,8 +14,7 @@ import numpy as np
 
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.model_selection.candidates import Candidate, Nested, nested_tests, simplest_sufficient
-from adjust.model_selection.choice_reasons import reasons, verdict
+from adjust.model_selection.candidates import Candidate, Nested, nested_tests, reasons, simplest_sufficient, verdict
 from adjust.model_selection.cross_validation import adjusted_values, cross_validate, folds
 from adjust.model_selection.models import Bends, Model, given_model, lenses, remaining_bends, transformations
 from adjust.model_selection.scanner_choice import choose_bends

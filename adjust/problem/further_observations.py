@@ -6,7 +6,6 @@ the unknowns in f, the observed values with their covariance, computed values an
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -17,34 +16,29 @@ from adjust.problem.parameter import Parameter
 from adjust.problem.unknowns import Unknowns
 
 
-class FurtherObservation(Protocol):
-    """Correlated observations (m,) of functions of some unknowns.
+@dataclass(frozen=True)
+class FurtherObservation:
+    """Correlated observations (m,) of functions of some unknowns; of these themselves, if it is of no other class.
 
     group: what they are called in the result's groups. names (m,): what each is called in files, labels (m,): in
     messages. positions (k,) of the unknowns that take part. observed (m,) and covariance (m, m) in the units of the
     unknowns.
     """
 
-    @property
-    def group(self) -> str: ...
-    @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def labels(self) -> tuple[str, ...]: ...
-    @property
-    def positions(self) -> Indices: ...
-    @property
-    def observed(self) -> Array: ...
-    @property
-    def covariance(self) -> Array: ...
+    group: str
+    names: tuple[str, ...]
+    labels: tuple[str, ...]
+    positions: Indices
+    observed: Array
+    covariance: Array
 
     def computed(self, values: Array) -> Array:
         """What the functions (m,) give for the values (n,) of all unknowns."""
-        ...
+        return np.asarray(values[self.positions])
 
     def jacobian(self, values: Array) -> Array:
         """Their derivatives (m, k) by the unknowns at `positions`."""
-        ...
+        return np.eye(len(self.positions))
 
 
 def further_observations(network: Network, unknowns: Unknowns) -> tuple[FurtherObservation, ...]:
@@ -52,23 +46,12 @@ def further_observations(network: Network, unknowns: Unknowns) -> tuple[FurtherO
     return (
         *_distances(network, unknowns),
         *_calibrations(network, unknowns),
-        *_antennas(network, unknowns),
+        *(antenna for _, antenna in _antennas(network, unknowns)),
     )
 
 
-@dataclass(frozen=True)
-class ObservedDistance:
+class ObservedDistance(FurtherObservation):
     """A distance between two points or stations; positions (6,): the coordinates of one and of the other."""
-
-    names: tuple[str, ...]
-    positions: Indices
-    observed: Array
-    covariance: Array
-    group: str = "distance"
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return self.names
 
     def computed(self, values: Array) -> Array:
         return np.array([np.linalg.norm(self._difference(values))])
@@ -86,37 +69,15 @@ class ObservedDistance:
 def _distances(network: Network, unknowns: Unknowns) -> Iterator[ObservedDistance]:
     place = {image: positions[:3] for image, positions in unknowns.exterior.items()} | unknowns.point
     for each in network.distances:
-        yield ObservedDistance(
-            names=(f"{each.start} to {each.end}",),
-            positions=np.concatenate([place[each.start], place[each.end]]),
-            observed=np.array([each.value]),
-            covariance=np.array([[each.sigma**2]]),
-        )
+        name, positions = (f"{each.start} to {each.end}",), np.concatenate([place[each.start], place[each.end]])
+        yield ObservedDistance("distance", name, name, positions, np.array([each.value]), np.array([[each.sigma**2]]))
 
 
 @dataclass(frozen=True)
-class ObservedCalibration:
-    """An earlier calibration; parameters, positions (m,): the quantities that it gives."""
+class ObservedCalibration(FurtherObservation):
+    """An earlier calibration; parameters (m,): the quantities that it gives."""
 
     parameters: tuple[Parameter, ...]
-    positions: Indices
-    observed: Array
-    covariance: Array
-    group: str = "calibration"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(each.text for each in self.parameters)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(each.label for each in self.parameters)
-
-    def computed(self, values: Array) -> Array:
-        return np.asarray(values[self.positions])
-
-    def jacobian(self, values: Array) -> Array:
-        return np.eye(len(self.positions))
 
 
 def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCalibration]:
@@ -125,38 +86,29 @@ def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCali
     for each in network.calibrations:
         free = [i for i, key in enumerate(each.parameters) if key in number and unknowns.sigma[number[key]] > 0.0]
         if free:
+            parameters = tuple(each.parameters[i] for i in free)
             yield ObservedCalibration(
-                parameters=tuple(each.parameters[i] for i in free),
-                positions=np.array([number[each.parameters[i]] for i in free], dtype=np.intp),
-                observed=each.values[free],
-                covariance=each.covariance[np.ix_(free, free)],
+                "calibration",
+                tuple(key.text for key in parameters),
+                tuple(key.label for key in parameters),
+                np.array([number[key] for key in parameters], dtype=np.intp),
+                each.values[free],
+                each.covariance[np.ix_(free, free)],
+                parameters,
             )
 
 
 @dataclass(frozen=True)
-class ObservedAntenna:
+class ObservedAntenna(FurtherObservation):
     """Coordinates of a point that is fixed to the camera; positions (6,): the exterior orientation of the frame.
 
     axes (m,): which coordinates are observed; offset (3,) from the projection centre along the camera's axes;
     keeps_angles: whether the attitude moves by its angles and not by a rotation vector.
     """
 
-    frame: str
-    positions: Indices
-    observed: Array
-    covariance: Array
     axes: Indices
     offset: Array
     keeps_angles: bool
-    group: str = "antenna"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(f"{self.frame} {'XYZ'[axis]}" for axis in self.axes)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return self.names
 
     def computed(self, values: Array) -> Array:
         rotation = rotation_from_angles(values[self.positions[3:]])
@@ -171,22 +123,18 @@ class ObservedAntenna:
         return np.hstack([np.eye(3), by_attitude])[self.axes]
 
 
-def _antennas(network: Network, unknowns: Unknowns) -> Iterator[ObservedAntenna]:
+def _antennas(network: Network, unknowns: Unknowns) -> Iterator[tuple[str, ObservedAntenna]]:
+    """By frame."""
     for image in {image.frame: image for image in network.images}.values():
         exterior = image.exterior
         if exterior is None or not exterior.has_antenna or image.name in network.unoriented:
             continue
         axes = np.flatnonzero(np.isfinite(exterior.sigmas[:3]))
         if len(axes):
-            yield ObservedAntenna(
-                frame=image.frame,
-                positions=unknowns.exterior[image.name],
-                observed=exterior.values[axes],
-                covariance=np.diag(exterior.sigmas[axes] ** 2),
-                axes=axes,
-                offset=np.array(exterior.antenna),
-                keeps_angles=unknowns.keeps_angles(image.name),
-            )
+            names = tuple(f"{image.frame} {'XYZ'[axis]}" for axis in axes)
+            given = unknowns.exterior[image.name], exterior.values[axes], np.diag(exterior.sigmas[axes] ** 2)
+            of_frame = axes, np.array(exterior.antenna), unknowns.keeps_angles(image.name)
+            yield image.frame, ObservedAntenna("antenna", names, names, *given, *of_frame)
 
 
 def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
@@ -200,7 +148,7 @@ def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
         replace(each, values=np.array([values[number[key]] for key in each.parameters]))
         for each in network.calibrations
     )
-    antennas = {each.frame: each for each in _antennas(network, unknowns)}
+    antennas = dict(_antennas(network, unknowns))
     images = tuple(
         replace(image, exterior=_error_free_antenna(image.exterior, antennas[image.frame], values))
         if image.exterior is not None and image.frame in antennas

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from adjust.array_types import Array, Indices
 
@@ -31,8 +32,6 @@ class Probabilities:
         Of one coordinate 4.13 with the usual probabilities. Source: W. Baarda, A Testing Procedure for Use in Geodetic
         Networks, 1968.
         """
-        from scipy import special
-
         return float(np.sqrt(special.chndtrinc(special.chdtri(size, self.alpha), size, 1.0 - self.power)))
 
     def critical(self, sizes: Indices, tests: int) -> Array:
@@ -40,8 +39,6 @@ class Probabilities:
 
         The probability `family` is shared out evenly (Sidak).
         """
-        from scipy import special
-
         return np.asarray(special.chdtri(np.maximum(sizes, 1), _sidak(self.family, tests)), dtype=np.float64)
 
     def critical_tau(self, redundancy: int, tests: int = 1) -> float:
@@ -53,8 +50,6 @@ class Probabilities:
         if redundancy < 2:
             return np.inf
         alpha = self.alpha if tests == 1 else _sidak(self.family, tests)
-        from scipy import special
-
         t = special.stdtrit(redundancy - 1, 1.0 - 0.5 * alpha)
         return float(t * np.sqrt(redundancy / (redundancy - 1 + t**2)))
 

@@ -12,7 +12,9 @@ the same with any, and the growing finds the right one.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import comb
+from operator import attrgetter
 
 import numpy as np
 
@@ -77,11 +79,7 @@ def name_marks(
     n, m = len(xyz), len(xy_mm)
     if min(n, m) < LEAST_POINTS:
         return f"{m} marks and {n} points are too few: {LEAST_POINTS} that agree are needed"
-    unit = _Unit.from_points(xyz)
-    own = unit.scaled(xyz)
-    tried = clusters(own, normals, m / n)
-    assumed = _assumed(xy_mm, frame_mm, principal_distance_mm, sigma_mm)
-    search, found = _first([_Search(own, normals, marks, tried) for marks in assumed])
+    search, found = _first(_searches(xyz, normals, xy_mm, frame_mm, principal_distance_mm, sigma_mm))
     if found is None:
         return f"the {m} marks found do not make the pattern that the {n} points would from any side"
     found, alike = search.likeliest(found)
@@ -90,7 +88,7 @@ def name_marks(
             f"the points look the same from another side, or moved on, as a regular grid does: {len(found.mark)} marks "
             f"agree with one naming, {len(alike.mark)} with another one, and about as closely"
         )
-    return unit.names(found, search.marks.c)
+    return search.names(found)
 
 
 def name_coded(
@@ -108,14 +106,13 @@ def name_coded(
     """
     if len(codes) < LEAST_CODES:
         return f"{len(codes)} coded targets were recognised, and {LEAST_CODES} are needed"
-    unit = _Unit.from_points(xyz)
-    assumed = _assumed(xy_mm, frame_mm, principal_distance_mm, sigma_mm)
-    grown = [(marks, one) for marks in assumed if (one := _grown_from_codes(unit, xyz, normals, marks, codes))]
+    searches = _searches(xyz, normals, xy_mm, frame_mm, principal_distance_mm, sigma_mm)
+    grown = [(search, one) for search in searches if (one := search.grow_codes(codes)) is not None]
     if not grown:
         return f"the {len(codes)} coded targets recognised lie on one line and do not orient the image"
-    marks, best = min(grown, key=lambda one: one[1].log10_chance)
-    right = sum(best.mark.get(point) == mark for mark, point in codes.items())
-    if best.log10_chance + np.log10(len(assumed)) > MOST_LOG10_CHANCE_OF_CODES:
+    search, best = min(grown, key=lambda one: one[1].log10_chance)
+    if best.log10_chance + np.log10(len(searches)) > MOST_LOG10_CHANCE_OF_CODES:
+        right = _right_codes(best, codes)
         return f"{right} of the {len(codes)} coded targets recognised lie as their points would, which may be chance"
     numbers = set(codes.values())
     named = {
@@ -123,65 +120,49 @@ def name_coded(
         for point, mark in best.mark.items()
         if codes.get(mark, point) == point and (mark in codes or point not in numbers)
     }
-    return unit.names(replace(best, mark=named), marks.c)
+    return search.names(replace(best, mark=named))
 
 
-def _grown_from_codes(
-    unit: "_Unit", xyz: Array, normals: Array, marks: Marks, codes: Mapping[int, int]
-) -> Grown | None:
-    """What the pose that most codes agree with grows to, and how likely the codes would agree by chance; None where
-    they are on one line."""
-    coded, points = np.array(list(codes)), np.array(list(codes.values()))
-    resection = resect(xyz[points], marks.places[coded], 1.0, marks.sigma)
-    if resection is None:
-        return None
-    shift = -resection.pose.rotation @ ((resection.pose.center - unit.origin) / unit.size)
-    view, agree = View(resection.pose.rotation, shift), resection.inliers
-    grown = grow(view, points[agree], coded[agree], unit.scaled(xyz), normals, marks)
-    right = sum(grown.mark.get(point) == mark for mark, point in codes.items())
-    area = float(np.prod(marks.greatest - marks.least))
-    chance = min(np.pi * (2.0 * grown.gate) ** 2 / area, 1.0)
-    return replace(grown, log10_chance=log10_of_chance(right, len(codes), chance, float(comb(len(codes), OF_POSE))))
-
-
-def _assumed(
-    xy_mm: Array, frame_mm: tuple[Array, Array], principal_distance_mm: float | None, sigma_mm: float
-) -> list[Marks]:
-    """The marks in units of the principal distance, or of each that is tried where it is not known."""
-    if principal_distance_mm is not None:
-        return [Marks.from_mm(xy_mm, *frame_mm, sigma_mm, principal_distance_mm, KNOWN_SIGMA)]
-    diagonal = float(np.linalg.norm(frame_mm[1] - frame_mm[0]))
-    return [Marks.from_mm(xy_mm, *frame_mm, sigma_mm, share * diagonal, UNKNOWN_SIGMA) for share in UNKNOWN]
-
-
-@dataclass(frozen=True, eq=False)
-class _Unit:
-    """The field's middle and its size, in which the search reckons."""
-
-    origin: Array
-    size: float
-
-    @classmethod
-    def from_points(cls, xyz: Array) -> "_Unit":
-        return cls(xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0))))
-
-    def scaled(self, xyz: Array) -> Array:
-        return np.asarray((xyz - self.origin) / self.size)
-
-    def names(self, found: Grown, c: float) -> Names:
-        pose = Pose(found.view.rotation, self.origin - self.size * found.view.rotation.T @ found.view.shift)
-        scaled = c * (1.0 + found.view.scale)
-        return Names(found.mark, pose, scaled, found.view.radial, found.expected, found.log10_chance, found.gate * c)
+def _right_codes(grown: Grown, codes: Mapping[int, int]) -> int:
+    """How many codes agree with a naming."""
+    return sum(grown.mark.get(point) == mark for mark, point in codes.items())
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """xyz, normals (n, 3) in units of the field's size about its middle; the marks; clusters to begin with."""
+    """xyz, normals (n, 3) in units of the field's size about its middle, origin; the marks, in units of a principal
+    distance."""
 
+    origin: Array
+    size: float
     xyz: Array
     normals: Array
     marks: Marks
-    clusters: Sequence[Cluster]
+
+    @cached_property
+    def clusters(self) -> list[Cluster]:
+        """To begin with."""
+        return clusters(self.xyz, self.normals, len(self.marks.places) / len(self.xyz))
+
+    def names(self, found: Grown) -> Names:
+        """In the units of the object and mm."""
+        view, c = found.view, self.marks.c
+        pose = Pose(view.rotation, self.origin - self.size * view.rotation.T @ view.shift)
+        of_view = pose, c * (1.0 + view.scale), view.radial
+        return Names(found.mark, *of_view, found.expected, found.log10_chance, found.gate * c)
+
+    def grow_codes(self, codes: Mapping[int, int]) -> Grown | None:
+        """What the pose that most codes agree with grows to, and how likely the codes would agree by chance; None where
+        they are on one line."""
+        marks, coded, points = self.marks, np.array(list(codes)), np.array(list(codes.values()))
+        found = resect(self.xyz[points], marks.places[coded], 1.0, marks.sigma)
+        if found is None:
+            return None
+        view, agree = View(found.pose.rotation, -found.pose.rotation @ found.pose.center), found.inliers
+        grown = grow(view, points[agree], coded[agree], self.xyz, self.normals, marks)
+        chance = min(np.pi * (2.0 * grown.gate) ** 2 / float(np.prod(marks.greatest - marks.least)), 1.0)
+        tests = float(comb(len(codes), OF_POSE))
+        return replace(grown, log10_chance=log10_of_chance(_right_codes(grown, codes), len(codes), chance, tests))
 
     def grow_cluster(self, cluster: Cluster) -> tuple[Grown | None, int]:
         """The likeliest naming that one cluster leads to, if it leads to any, and how many poses were tried."""
@@ -193,7 +174,7 @@ class _Search:
         """Of a naming and the others that the image may have the one that chance makes least likely; and another one
         that explains the image as well, if there is one."""
         others = self._others(found)
-        best = min([found, *others], key=_log10_chance)
+        best = min([found, *others], key=attrgetter("log10_chance"))
         rivals = others if best is found else [found, *self._others(best)]
         return best, next((one for one in rivals if _is_alike(one, best)), None)
 
@@ -203,8 +184,7 @@ class _Search:
         others = []
         for cluster in named[:OTHER_CLUSTERS]:
             named_marks = np.array([[found.mark[int(point)] for point in cluster.triple]])
-            points = point_triples(cluster, self.xyz)
-            poses = promising(self.xyz, self.normals, self.marks, points, named_marks)
+            poses = promising(self.xyz, self.normals, self.marks, point_triples(cluster, self.xyz), named_marks)
             for grown in self._grown(poses):
                 same = sum(found.mark.get(point) == mark for point, mark in grown.mark.items())
                 if same < 0.5 * len(grown.mark):
@@ -217,7 +197,25 @@ class _Search:
             for rotation, shift, named in zip(poses.rotations, poses.shifts, poses.named, strict=True)
         ]
         enough = [one for one in grown if len(one.mark) >= LEAST_SHARE * one.expected and len(one.mark) >= LEAST_POINTS]
-        return sorted(enough, key=_log10_chance)
+        return sorted(enough, key=attrgetter("log10_chance"))
+
+
+def _searches(
+    xyz: Array,
+    normals: Array,
+    xy_mm: Array,
+    frame_mm: tuple[Array, Array],
+    principal_distance_mm: float | None,
+    sigma_mm: float,
+) -> list[_Search]:
+    """One with the principal distance, or with each that is tried where it is not known."""
+    origin, size = xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0)))
+    diagonal = float(np.linalg.norm(frame_mm[1] - frame_mm[0]))
+    tried = [(share * diagonal, UNKNOWN_SIGMA) for share in UNKNOWN]
+    if principal_distance_mm is not None:
+        tried = [(principal_distance_mm, KNOWN_SIGMA)]
+    assumed = (Marks.from_mm(xy_mm, *frame_mm, sigma_mm, c, c_sigma) for c, c_sigma in tried)
+    return [_Search(origin, size, (xyz - origin) / size, normals, marks) for marks in assumed]
 
 
 def _is_alike(other: Grown, best: Grown) -> bool:
@@ -225,10 +223,6 @@ def _is_alike(other: Grown, best: Grown) -> bool:
     grid moved on by a step, what chance left out at one end is as many as what it left out anywhere."""
     closer = 2 * len(other.mark) * np.log10(other.gate / best.gate)  # likelihood of two coordinates each
     return len(other.mark) >= ALIKE_SHARE * len(best.mark) and bool(closer < TOLD_LOG10)
-
-
-def _log10_chance(grown: Grown) -> float:
-    return grown.log10_chance
 
 
 def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
@@ -244,7 +238,7 @@ def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
             if found is not None and found.log10_chance < most:
                 believed.append((search, found))
         if believed:
-            return min(believed, key=lambda one: _log10_chance(one[1]))
+            return min(believed, key=lambda one: one[1].log10_chance)
         if tried > MOST_POSES * len(searches):
             break
     return searches[0], None

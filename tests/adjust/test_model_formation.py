@@ -6,10 +6,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from studies import parametrize_with_studies
 
-from adjust.initial_values.absolute_orientation import absolute_orientation
 from adjust.initial_values.intersection import intersect
+from adjust.initial_values.model_formation import absolute_orientation, relative_poses
 from adjust.initial_values.pose import Pose
-from adjust.initial_values.relative_orientation import relative_poses
 
 Array = NDArray[np.float64]
 
