@@ -7,7 +7,6 @@ import numpy as np
 
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError, UnorientedError
-from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.model_formation import (
@@ -71,13 +70,11 @@ def _relative_residual(block: Block, poses: Mapping[str, Pose]) -> float:
 
 def _coordinates(network: Network, firm: bool) -> dict[str, Array]:
     """What is known of every point (3,), nan where nothing is."""
+    priors = {point.id: (point.X, point.Y, point.Z) for point in network.points}
     return {
-        point.id: np.array([_value(prior, firm) for prior in (point.X, point.Y, point.Z)]) for point in network.points
+        name: np.array([np.nan if p is None or (firm and np.isinf(p.sigma)) else p.value for p in three])
+        for name, three in priors.items()
     }
-
-
-def _value(prior: Prior | None, firm: bool) -> float:
-    return np.nan if prior is None or (firm and np.isinf(prior.sigma)) else prior.value
 
 
 def _given_or_resected(exterior: Exterior, block: Block, image: str) -> Pose:

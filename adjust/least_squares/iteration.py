@@ -14,7 +14,7 @@ from adjust.linear_algebra.factor import Factor
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.estimates import Termination
 from adjust.problem.further_observations import square_sum
-from adjust.problem.problem import Problem, State
+from adjust.problem.problem import State
 
 STANDSTILL_SIGMAS = 1e-8  # a step below this, in standard deviations, is none
 FORESEEN = 0.1  # of that: a next step that would be smaller if it shrank as the last two did need not be taken
@@ -83,15 +83,11 @@ def linearise(numbering: Numbering, covariance_mm2: Array, state: State) -> Line
     v = computed.xy_mm - problem.network.observations.xy_mm
     at = derivatives(problem, state, computed)
     rows = whitened_rows(numbering, state.values, at, covariance_mm2, v)
-    return Linearised(state, computed.xy_mm, v, at.by_observation, rows, _square_sum(problem, state, rows))
-
-
-def _square_sum(problem: Problem, state: State, rows: WhitenedRows) -> float:
-    """v'Pv of the observations, of the priors and of further observations; of pseudo-observations too."""
     sigma = problem.prior_sigma
     prior = (sigma > 0.0) & np.isfinite(sigma)
     normalised = prior_differences(problem, state)[prior] / sigma[prior]
-    return float((rows.right**2).sum() + (normalised**2).sum()) + square_sum(problem.further, state.values)
+    vpv = float((rows.right**2).sum() + (normalised**2).sum()) + square_sum(problem.further, state.values)
+    return Linearised(state, computed.xy_mm, v, at.by_observation, rows, vpv)
 
 
 def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera_priors: bool = True) -> Factor:

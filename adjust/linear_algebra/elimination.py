@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from adjust.array_types import Array, Indices
+from adjust.array_types import Array
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, column_values
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.multifrontal import factorise_normal_equations, qr_triangle, reflected, reflections_cost
@@ -56,7 +56,9 @@ def eliminate(
     squares = sparse.column_squares(count) if sparse is not None and is_large else _column_squares(blocks, count)
     squares += prior_root_weight**2
     scale = np.where(squares > 0.0, np.sqrt(squares), 1.0)
-    priors = _prior_rows(prior_root_weight / scale, prior_right, damping)
+    # One row an unknown holds its prior's and its damping's together: its coefficient and its right side.
+    together = np.hypot(prior_root_weight / scale, np.sqrt(damping))
+    priors = together, prior_root_weight / scale * prior_right / np.where(together > 0.0, together, 1.0)
     if sparse is not None and fronts is not None and is_large:
         factor = _eliminate_normally(sparse, scale, priors, fronts, 0.0 if sharp else SAFE)
         least = SAFE if cost > REFLECTED else TEN_DIGITS
@@ -74,12 +76,6 @@ def _column_squares(blocks: Iterable[Blocks], count: int) -> Array:
     return squares
 
 
-def _prior_rows(root_weight: Array, right: Array, damping: float) -> tuple[Array, Array]:
-    """One row an unknown that holds its prior's and its damping's together: its coefficient and its right side."""
-    together = np.hypot(root_weight, np.sqrt(damping))
-    return together, root_weight * right / np.where(together > 0.0, together, 1.0)
-
-
 def _reflect_all(blocks: Iterable[Blocks], scale: Array, priors: tuple[Array, Array], fronts: Fronts | None) -> Factor:
     factors = []
     rests = []
@@ -92,22 +88,14 @@ def _reflect_all(blocks: Iterable[Blocks], scale: Array, priors: tuple[Array, Ar
     return Factor(DenseBlocks(tuple(factors)), triangle, right, scale)
 
 
-def _prior_blocks(priors: tuple[Array, Array], unknowns: Indices) -> Array:
-    """The prior rows (..., k, k + 1) of some unknowns (..., k), the right side behind."""
-    root_weight, right = priors
-    rows = root_weight[unknowns][..., None] * np.eye(unknowns.shape[-1])
-    return np.concatenate([rows, right[unknowns][..., None]], axis=-1)
-
-
 def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array]) -> tuple[BlockFactors, Array]:
     """The blocks' triangles, and their remaining rows (b, k, s + 1) in the shared unknowns, right side behind."""
     (count, height, width), own_count = blocks.matrix.shape, blocks.own.shape[1]
     rows = np.zeros((count, height + own_count, width + 1))
     np.divide(blocks.matrix, column_values(scale, blocks)[:, None, :], out=rows[:, :height, :-1])
     rows[:, :height, -1] = blocks.right
-    prior_rows = _prior_blocks(priors, blocks.own)
-    rows[:, height:, :own_count] = prior_rows[..., :-1]
-    rows[:, height:, -1] = prior_rows[..., -1]
+    rows[:, height:, :own_count] = priors[0][blocks.own][..., None] * np.eye(own_count)
+    rows[:, height:, -1] = priors[1][blocks.own]
     triangle = qr_triangle(rows)
     own = triangle[:, :own_count]
     factor = BlockFactors(blocks.own, blocks.shared, own[..., :own_count], own[..., own_count:-1], own[..., -1])

@@ -132,13 +132,13 @@ def reasons(candidates: Sequence[Candidate], chosen: Candidate | None) -> tuple[
     transformation or bends."""
     if chosen is None:
         return tuple(f"{each.model.name}: {each.problem}" for each in candidates)
-    near = [each for each in candidates if _differences(each.model, chosen.model) == 1]
+    own, near = chosen.model, []
+    for each in candidates:
+        model = each.model
+        lens = (model.family, model.parameters) != (own.family, own.parameters)
+        if lens + (model.transformation != own.transformation) + (model.bends != own.bends) == 1:
+            near.append(each)
     return tuple(_reason(each, chosen) for each in near)
-
-
-def _differences(one: Model, other: Model) -> int:
-    lens = (one.family, one.parameters) != (other.family, other.parameters)
-    return lens + (one.transformation != other.transformation) + (one.bends != other.bends)
 
 
 def _reason(other: Candidate, chosen: Candidate) -> str:

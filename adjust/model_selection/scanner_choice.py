@@ -71,7 +71,12 @@ def choose_bends(
     candidates = (*smooth, *carriage_terms(films))
     trial = adjusted(network_with_terms(network, dict.fromkeys(_scanners(network), candidates), WEAK_MM))
     if not trial.converged:
-        return ScannerChoice(network_with_terms(network, {}), (_no_trial(trial),))
+        causes = "".join(f" {each.cause}" for each in trial.singular)
+        remark = (
+            "A bend of the scanner was not looked for: the adjustment with all of its terms ended with "
+            f"{trial.termination}.{causes}"
+        )
+        return ScannerChoice(network_with_terms(network, {}), (remark,))
     chosen: dict[str, tuple[str, ...]] = {}
     remarks: list[str] = []
     for scanner in trial.network.scanners:
@@ -179,11 +184,3 @@ def _needed(equations: _Equations, smooth: Collection[str]) -> tuple[str, ...]:
         while (best := equations.next(taken, among)) is not None and best[1] < level:
             taken.append(best[0])
     return tuple(term for term in equations.terms if term in taken)
-
-
-def _no_trial(trial: Adjustment) -> str:
-    causes = " ".join(each.cause for each in trial.singular)
-    return (
-        f"A bend of the scanner was not looked for: the adjustment with all of its terms ended with "
-        f"{trial.termination}.{causes and f' {causes}'}"
-    )

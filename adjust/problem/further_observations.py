@@ -11,7 +11,7 @@ import numpy as np
 
 from adjust.array_types import Array, Indices
 from adjust.functional_model.rotation import cross_matrix, rotation_from_angles, vector_by_angles
-from adjust.problem.network import Exterior, Network
+from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.problem.unknowns import Unknowns
 
@@ -149,19 +149,14 @@ def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
         for each in network.calibrations
     )
     antennas = dict(_antennas(network, unknowns))
-    images = tuple(
-        replace(image, exterior=_error_free_antenna(image.exterior, antennas[image.frame], values))
-        if image.exterior is not None and image.frame in antennas
-        else image
-        for image in network.images
-    )
-    return replace(network, distances=distances, calibrations=calibrations, images=images)
-
-
-def _error_free_antenna(exterior: Exterior, antenna: ObservedAntenna, values: Array) -> Exterior:
-    computed = exterior.values.copy()
-    computed[antenna.axes] = antenna.computed(values)
-    return replace(exterior, values=computed)
+    images = []
+    for image in network.images:
+        if image.exterior is not None and image.frame in antennas:
+            exterior, antenna = image.exterior.values.copy(), antennas[image.frame]
+            exterior[antenna.axes] = antenna.computed(values)
+            image = replace(image, exterior=replace(image.exterior, values=exterior))
+        images.append(image)
+    return replace(network, distances=distances, calibrations=calibrations, images=tuple(images))
 
 
 def square_sum(further: tuple[FurtherObservation, ...], values: Array) -> float:

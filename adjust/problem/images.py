@@ -1,4 +1,4 @@
-"""The images of a network as they were adjusted, or as they are known before: models that project points."""
+"""The images of a network as they were adjusted: models that project points."""
 
 from collections.abc import Sequence
 
@@ -10,10 +10,10 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import INTERIOR_NAMES, Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.functional_model.scanner import NO_BEND, Bend
+from adjust.functional_model.scanner import NO_BEND
 from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.estimates import Estimates
-from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network
+from adjust.problem.network import EXTERIOR_NAMES
 from adjust.problem.parameter import Kind, Parameter
 
 
@@ -27,12 +27,13 @@ def adjusted_image(estimates: Estimates, name: str) -> ImageModel:
 
     exterior = values("exterior", image.frame, EXTERIOR_NAMES)
     parameters = values("film", name, film_parameter_names(image.transformation))
-    bend = scanner_bend(network, image)
+    middle_mm, mirrored = network.extent_by_image[name].center_mm, name in estimates.mirrored
+    bend = network.scanner_by_name[image.scanner].bend if image.scanner else NO_BEND
     return ImageModel(
         lens=adjusted_lens(estimates, image.camera),
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
-        film=_film(network, image, parameters, name in estimates.mirrored),
+        film=Film(image.transformation, parameters, middle_mm, mirrored),
         line_of_sight=network.line_of_sight,
         bend=bend,
         bend_parameters=values("scanner", image.scanner, bend.terms),
@@ -62,29 +63,3 @@ def lifted(estimates: Estimates, points: Sequence[str]) -> Array:
             if point in board.places:
                 offsets[row] = bends @ board.lift_directions[point]
     return offsets
-
-
-def scanner_bend(network: Network, image: Image) -> Bend:
-    """That of the image's scanner."""
-    return network.scanner_by_name[image.scanner].bend if image.scanner else NO_BEND
-
-
-def approximate_image(network: Network, approximations: Approximations, name: str) -> ImageModel:
-    """An image with its approximations and the given distortion."""
-    image = network.image_by_name[name]
-    camera = network.camera_by_name[image.camera]
-    exterior = approximations.exterior[name]
-    film_parameters = approximations.transformation.get(name, np.empty(0))
-    return ImageModel(
-        lens=Lens(camera.distortion, approximations.interior[camera.name], camera.distortion.values),
-        rotation=rotation_from_angles(exterior[3:]),
-        station=exterior[:3],
-        film=_film(network, image, film_parameters, name in approximations.mirrored),
-        line_of_sight=network.line_of_sight,
-        bend=scanner_bend(network, image),
-        bend_parameters=network.scanner_by_name[image.scanner].given if image.scanner else np.empty(0),
-    )
-
-
-def _film(network: Network, image: Image, parameters: Array, mirrored: bool) -> Film:
-    return Film(image.transformation, parameters, network.extent_by_image[image.name].center_mm, mirrored)

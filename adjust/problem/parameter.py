@@ -145,7 +145,7 @@ def description(parameters: Iterable[Parameter]) -> str:
     quantities: dict[str, list[str]] = {}
     for each in parameters:
         quantities.setdefault(each._owner_label, []).append(each.quantity)
-    return "; ".join(f"{_enumeration(names)} of {owner}" for owner, names in quantities.items())
+    return "; ".join(f"{enumeration(names)} of {owner}" for owner, names in quantities.items())
 
 
 def parameter_from_text(text: str, cameras: Collection[str] = ()) -> Parameter:
@@ -208,5 +208,6 @@ def _unescape_dots(name: str) -> str:
     return re.sub(r"%(2E|25)", lambda found: "." if found[1] == "2E" else "%", name)
 
 
-def _enumeration(names: list[str]) -> str:
+def enumeration(names: Sequence[str]) -> str:
+    """Words as a sentence lists them: with commas, and `and` before the last one."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

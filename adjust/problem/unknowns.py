@@ -80,84 +80,64 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
     camera, the exterior one of an image that has none. Raises AdjustmentError where a quantity has neither a value nor
     an approximation.
     """
-    listing = _Listing()
+    rows: list[tuple[Parameter, Prior | None, float | None]] = []
+
+    def add(kind: Kind, owner: str, id: str, quantities: Sequence[Quantity]) -> Indices:
+        rows.extend((Parameter(kind, owner, id, name), prior, start) for name, prior, start in quantities)
+        return np.arange(len(rows) - len(quantities), len(rows))
+
     used = {image.camera for image in network.images}
-    camera = {}
-    fiducial = {}
+    camera, fiducial = dict[str, Indices](), dict[tuple[str, str], Indices]()
     for each in network.cameras:
-        if each.name not in used:
-            continue
-        idle = each.name in network.idle_cameras
-        quantities = _camera_quantities(each, approximations)
-        camera[each.name] = listing.add("interior", each.name, "", _stopped(quantities) if idle else quantities)
-        for id_, mark in each.fiducials.items():
-            priors = (mark.x_mm, mark.y_mm)
-            if (each.name, id_) not in observed:
-                priors = (_hold(mark.x_mm), _hold(mark.y_mm))
-            pair: list[Quantity] = [("x", priors[0], None), ("y", priors[1], None)]
-            fiducial[each.name, id_] = listing.add("fiducial", each.name, id_, pair)
+        if each.name in used:
+            quantities = _camera_quantities(each, approximations)
+            idle = each.name in network.idle_cameras
+            camera[each.name] = add("interior", each.name, "", _stopped(quantities) if idle else quantities)
+            for id_, mark in each.fiducials.items():
+                hold = (each.name, id_) not in observed
+                pair = [
+                    (axis, _hold(prior) if hold else prior, None)
+                    for axis, prior in zip("xy", (mark.x_mm, mark.y_mm), strict=True)
+                ]
+                fiducial[each.name, id_] = add("fiducial", each.name, id_, pair)
     scanner = {
-        each.name: listing.add("scanner", each.name, "", [(name, prior, None) for name, prior in each.terms.items()])
+        each.name: add("scanner", each.name, "", [(name, prior, None) for name, prior in each.terms.items()])
         for each in network.scanners
     }
     board = {
-        each.name: listing.add("board", each.name, "", list(zip(BOARD_NAMES, each.bends, (None, None), strict=True)))
+        each.name: add("board", each.name, "", list(zip(BOARD_NAMES, each.bends, (None, None), strict=True)))
         for each in network.boards
     }
     point = {
-        each.id: listing.add("point", "", each.id, _point_quantities(each, approximations))
+        each.id: add("point", "", each.id, _point_quantities(each, approximations))
         for each in network.points
         if ("", each.id) in observed
     }
-    transformation = {}
-    exterior: dict[str, Indices] = {}
+    transformation, exterior = dict[str, Indices](), dict[str, Indices]()
     of_frame: dict[str, Indices] = {}
     for image in network.images:
         if image.frame not in of_frame:
             quantities = _exterior_quantities(image, approximations)
             stopped = image.name in network.unoriented
-            of_frame[image.frame] = listing.add(
-                "exterior", image.frame, "", _stopped(quantities) if stopped else quantities
-            )
+            of_frame[image.frame] = add("exterior", image.frame, "", _stopped(quantities) if stopped else quantities)
         exterior[image.name] = of_frame[image.frame]
-        film = _transformation_quantities(image, approximations)
-        transformation[image.name] = listing.add("film", image.name, "", film)
-    join = {}
-    for (frame, id_), (x_mm, y_mm) in approximations.joins.items():
-        place: list[Quantity] = [("x", None, float(x_mm)), ("y", None, float(y_mm))]
-        join[frame, id_] = listing.add("join", frame, id_, place)
-    given, sigma, start = listing.values()
+        transformation[image.name] = add("film", image.name, "", _transformation_quantities(image, approximations))
+    join = {
+        (frame, id_): add("join", frame, id_, [("x", None, float(x_mm)), ("y", None, float(y_mm))])
+        for (frame, id_), (x_mm, y_mm) in approximations.joins.items()
+    }
+    parameters, priors, starts = zip(*rows, strict=True)
+    given = np.array([np.nan if prior is None else prior.value for prior in priors])
+    sigma = np.array([np.inf if prior is None else prior.sigma for prior in priors])
+    start = np.array(starts, dtype=np.float64)
+    start = np.where(np.isfinite(start) & (sigma > 0.0), start, given)  # what is fixed stays at its value
+    for missing in np.flatnonzero(np.isnan(start)):
+        raise AdjustmentError(
+            f"{parameters[missing].label} has neither a value nor an approximation. Give one of them, or observe it in "
+            f"images whose orientation can be found."
+        )
     owned = camera, fiducial, scanner, point, transformation, exterior, join, board
-    return Unknowns(tuple(listing.parameters), given, sigma, start, *owned)
-
-
-class _Listing:
-    """Takes the quantities down one after the other."""
-
-    def __init__(self) -> None:
-        self.parameters: list[Parameter] = []
-        self.quantities: list[Quantity] = []
-
-    def add(self, kind: Kind, owner: str, id: str, quantities: Sequence[Quantity]) -> Indices:
-        first = len(self.parameters)
-        self.parameters += [Parameter(kind, owner, id, quantity[0]) for quantity in quantities]
-        self.quantities += quantities
-        return np.arange(first, len(self.parameters))
-
-    def values(self) -> tuple[Array, Array, Array]:
-        """What is given, its standard deviation, and where to start (n,): what is fixed stays at its value."""
-        _, priors, starts = zip(*self.quantities, strict=True)
-        given = np.array([np.nan if prior is None else prior.value for prior in priors])
-        sigma = np.array([np.inf if prior is None else prior.sigma for prior in priors])
-        start = np.array(starts, dtype=np.float64)
-        start = np.where(np.isfinite(start) & (sigma > 0.0), start, given)
-        missing = np.flatnonzero(np.isnan(start))
-        if len(missing):
-            raise AdjustmentError(
-                f"{self.parameters[missing[0]].label} has neither a value nor an approximation. Give one of them, or "
-                f"observe it in images whose orientation can be found."
-            )
-        return given, sigma, start
+    return Unknowns(parameters, given, sigma, start, *owned)
 
 
 def _hold(prior: Prior) -> Prior:

@@ -191,15 +191,12 @@ def free_motion(problem: Problem, state: State) -> Array:
 def held_as_known(network: Network, coordinates: Sequence[str]) -> Network:
     """The network for approximations: coordinates that are to be held, and have a value, count as known."""
     held = {object_coordinate(text) for text in coordinates}
-    return replace(network, points=tuple(_known_point(point, held) for point in network.points))
-
-
-def _known_point(point: ObjectPoint, held: set[Parameter]) -> ObjectPoint:
-    priors = [
-        Prior(prior.value) if prior is not None and Parameter.point(point.id, axis) in held else prior
-        for axis, prior in zip("XYZ", (point.X, point.Y, point.Z), strict=True)
-    ]
-    return ObjectPoint(point.id, *priors)
+    points = []
+    for point in network.points:
+        priors = zip("XYZ", (point.X, point.Y, point.Z), strict=True)
+        known = (p and Prior(p.value) if Parameter.point(point.id, axis) in held else p for axis, p in priors)
+        points.append(ObjectPoint(point.id, *known))
+    return replace(network, points=tuple(points))
 
 
 def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:

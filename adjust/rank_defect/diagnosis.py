@@ -68,13 +68,10 @@ def weak_directions(
     found = _named_directions(problem, state, free, factor, blind, np.linalg.qr(unsettled)[0], MIXED)
     again = {_motion(each) for each in singular}
     named, left = (tuple(each for each in some if _motion(each) not in again) for some in found)
-    return (*named, *(left if len(left) <= NAMES_SHOWN else (_merged_direction(left),)))
-
-
-def _merged_direction(directions: Sequence[NullDirection]) -> NullDirection:
-    """Many directions that have no name, as one."""
-    moved = tuple(dict.fromkeys(moved for each in directions for moved in each.parameters))
-    return NullDirection(_collapsed(moved), *many_sentence(len(directions), followers(moved)))
+    if len(left) > NAMES_SHOWN:  # many directions that have no name, as one
+        moved = tuple(dict.fromkeys(moved for each in left for moved in each.parameters))
+        left = (NullDirection(_collapsed(moved), *many_sentence(len(left), followers(moved))),)
+    return (*named, *left)
 
 
 def _motion(direction: NullDirection) -> str:
@@ -141,7 +138,9 @@ def _named_directions(
         return (), ()
     parameters = [problem.unknowns.parameters[i] for i in free]
     datum, sentences, rest = _datum_part(problem, state, free, factor, blind, null)
-    still = _points_fixed(problem, free, datum, rest)
+    # As much of the free datum added to the rest as leaves the object points where they are.
+    points = np.isin(free, free_coordinates(problem))
+    still = np.asarray(rest - datum @ np.linalg.lstsq(datum[points], rest[points])[0])
     leads = [*scanner_directions(problem, state), *camera_directions(problem, state)]
     functionals = np.array([lead.functional[free] for lead in leads]).reshape(len(leads), len(free)) / factor.scale
     lengths = np.linalg.norm(functionals, axis=1, keepdims=True)
@@ -193,13 +192,6 @@ def _datum_part(
     chosen = _independent_rows(datum.free, PURE, np.zeros(7, dtype=np.intp))
     vectors = motion @ np.linalg.pinv(datum.free[chosen])
     return vectors, [datum_sentence(i) for i in chosen], null @ left[:, count:]
-
-
-def _points_fixed(problem: Problem, free: Indices, datum: Array, vectors: Array) -> Array:
-    """Null vectors (n, d) with as much of the free datum (n, k) added as leaves the object points where they are."""
-    points = np.isin(free, free_coordinates(problem))
-    amounts = np.linalg.lstsq(datum[points], vectors[points])[0]
-    return np.asarray(vectors - datum @ amounts)
 
 
 def _object_fixed(parameters: Sequence[Parameter], vectors: Array, ranks: Indices) -> Array:

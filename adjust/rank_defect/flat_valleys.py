@@ -18,8 +18,8 @@ from adjust.array_types import Array, Indices
 from adjust.functional_model.families import family
 from adjust.least_squares.iteration import Linearised
 from adjust.problem.condition_equations import observed_in_camera
+from adjust.problem.parameter import enumeration
 from adjust.problem.problem import Problem, State
-from adjust.rank_defect.named_directions import enumeration
 
 REACHES = (0.3, 1.0, 3.0, 10.0)  # parts of the radius, the first that the observations do not contradict
 CONTRADICTED = 0.01  # probability of so large parameters, below which a pseudo-observation is contradicted

@@ -1,6 +1,6 @@
 """The directions in which a network's unknowns are known to move together: a table with the words for each."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ import numpy as np
 from adjust.array_types import Array, Indices
 from adjust.functional_model.families import family
 from adjust.functional_model.transformation import follows_tilts
-from adjust.problem.parameter import Kind, Parameter
+from adjust.problem.parameter import Kind, Parameter, enumeration
 from adjust.problem.problem import Problem, State
 
 FLAT = 0.01  # least over largest extent of the field, below which there is no relief to speak of
@@ -75,11 +75,6 @@ def followers(moved: Iterable[Parameter], motion: str = "") -> str:
         if not (own and own in motion) and any(k == kind and (not quantities or q in quantities) for k, q in kinds)
     ]
     return f", followed by {enumeration(words)}" if words else ""
-
-
-def enumeration(words: Sequence[str]) -> str:
-    """Words as a sentence lists them: with commas, and `and` before the last one."""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 # The free directions of the object space: motion, and what known coordinates end it.

@@ -66,7 +66,9 @@ def null_space(factor: Factor, blind: Sequence[BlindBlock], below: float) -> tup
     count = factor.shared_count
     if count == 0:
         return np.zeros((len(factor.scale), 0)), np.zeros(0)
-    singular, shared = _smallest(_shared_triangle(factor, blind), below)
+    # Of blocks with null vectors of their own the rows that these leave over count as well.
+    rows = [(block.shared, block.left.T @ block.border) for block in blind]
+    singular, shared = _smallest(append_rows(factor.triangle, rows) if rows else factor.triangle, below)
     vectors = np.zeros((len(factor.scale), len(singular)))
     vectors[:count] = shared
     first_of_blind = [block.own[0] for block in blind]
@@ -77,13 +79,6 @@ def null_space(factor: Factor, blind: Sequence[BlindBlock], below: float) -> tup
     for block in blind:
         vectors[block.own] = -np.linalg.pinv(block.triangle, rcond=SINGULAR) @ block.border @ shared[block.shared]
     return np.linalg.qr(vectors)[0], singular / np.linalg.norm(vectors, axis=0)
-
-
-def _shared_triangle(factor: Factor, blind: Sequence[BlindBlock]) -> Triangle:
-    """The shared triangle, where blocks have null vectors together with the rows that these leave over."""
-    if not blind:
-        return factor.triangle
-    return append_rows(factor.triangle, [(block.shared, block.left.T @ block.border) for block in blind])
 
 
 def _smallest(triangle: Triangle, below: float) -> tuple[Array, Array]:

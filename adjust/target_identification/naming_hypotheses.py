@@ -101,12 +101,9 @@ def _ranks(xyz: Array, normals: Array, near: Indices) -> Array:
             continue
         flat = xyz @ np.linalg.svd(direction[None])[2][1:].T
         own = np.linalg.norm(flat[near] - flat[:, None], axis=2)
-        ranks.append(np.stack([_neighbour_counts(flat, own[:, k]) for k in range(near.shape[1])], axis=1))
+        tree = cKDTree(flat)
+        ranks.append(np.stack([tree.query_ball_point(flat, reach, return_length=True) for reach in own.T], axis=1))
     return np.quantile(ranks, _RANK_SHARE, axis=0) if ranks else np.full(near.shape, float(n - 1))
-
-
-def _neighbour_counts(flat: Array, reach: Array) -> Indices:
-    return np.asarray(cKDTree(flat).query_ball_point(flat, reach, return_length=True), dtype=np.intp)
 
 
 def _directions() -> Array:

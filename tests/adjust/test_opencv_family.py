@@ -18,7 +18,7 @@ from adjust.functional_model.rotation import angles_from_rotation, rotation_from
 from adjust.functional_model.transformation import Film
 from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Camera
-from adjust.problem.images import adjusted_image, approximate_image
+from adjust.problem.images import adjusted_image
 from adjust.problem.network import Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 from adjust.solution.adjustment import adjust
@@ -71,16 +71,10 @@ def board() -> Array:
 def test_projection_is_opencvs() -> None:
     angles, station = np.array([0.2, -0.3, 0.5]), np.array([300.0, -200.0, 1500.0])
     xyz = np.random.default_rng(2).uniform(-400, 400, (50, 3))
-    image = Image("a", "D", "none")
-    observations = Observations((), (), (), np.empty((0, 2)), np.empty((0, 2, 2)))
-    network = Network((camera(False),), (image,), (), observations)
-    start = Approximations(
-        {"D": np.array([FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM])},
-        {"a": np.concatenate([station, angles])},
-        {},
-        {},
-    )
-    projected, visible = approximate_image(network, start, "a").comparator_from_object(xyz)
+    interior = np.array([FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM])
+    lens = Lens(camera(False).distortion, interior, camera(False).distortion.values)
+    image = ImageModel(lens, rotation_from_angles(angles), station, Film("none", np.empty(0), np.zeros(2)))
+    projected, visible = image.comparator_from_object(xyz)
     assert visible.all()
     np.testing.assert_allclose(projected, mm(opencv_pixels(angles, station, xyz)), atol=1e-11)
 
