@@ -7,13 +7,13 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from measure.array_types import Array, Mask, Single
-from measure.geometry import linear_scale
+from measure.geometry import Affine, linear_scale
 from measure.marks.coverage import CELLS, cell_coverage
 from measure.marks.frame_border import drawn_outline_mm, known_outline_mm
-from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Point
+from measure.marks.shapes import Mark, MarkShape, MarkTemplate
 
 Integers = NDArray[np.int_]
 
@@ -81,11 +81,7 @@ def known_picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, b
 
 def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
     """(2,) least and (2,) greatest column and row that the mark reaches."""
-    return _extent_px(_outline_mm(mark), pixel_from_mark)
-
-
-def _extent_px(outline: Array, pixel_from_mark: Array) -> tuple[Array, Array]:
-    points = outline @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]
+    points = Affine(pixel_from_mark).apply(_outline_mm(mark))
     return points.min(axis=0), points.max(axis=0)
 
 
@@ -97,12 +93,10 @@ def reach_px(mark: Mark, linear: Array) -> float:
 @lru_cache(maxsize=_DRAWINGS)
 def _outline_mm(mark: Mark) -> Array:
     """(n, 2) corners of a region that holds the mark, as far as it is known."""
-    if isinstance(mark, MarkTemplate):
-        rows, cols = mark.image.shape
-        corners = np.array([(0, 0), (cols - 1, 0), (cols - 1, rows - 1), (0, rows - 1)], dtype=float)
-        chip_from_mark = _chip_from_mark(mark)
-        return np.asarray((corners - chip_from_mark[:, 2]) @ np.linalg.inv(chip_from_mark[:, :2]).T)
-    return known_outline_mm(mark)
+    if not isinstance(mark, MarkTemplate):
+        return known_outline_mm(mark)
+    rows, cols = mark.image.shape
+    return _chip_from_mark(mark).inverse.apply(np.array([(0, 0), (cols - 1, 0), (cols - 1, rows - 1), (0, rows - 1)]))
 
 
 def true_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> Mask:
@@ -110,23 +104,14 @@ def true_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margi
     shown = known_mask(mark, pixel_from_mark, width, height, margin_px)
     if isinstance(mark, MarkTemplate) or mark.true_mm is None:
         return shown
-    return shown & _rectangle_mask(mark.true_mm, pixel_from_mark, width, height, margin_px)
+    return shown & _rectangle_mask(mark.true_mm, pixel_from_mark, (width, height), margin_px)
 
 
 def known_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> Mask:
     """(height, width): in which pixels anything is known of the mark, and in all within margin_px of them."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None:
         return np.ones((height, width), dtype=bool)
-    return _rectangle_mask(mark.known_mm, pixel_from_mark, width, height, margin_px)
-
-
-def _rectangle_mask(
-    rectangle_mm: tuple[Point, Point], pixel_from_mark: Array, width: int, height: int, margin_px: float
-) -> Mask:
-    """(height, width): which pixels lie in a rectangle of the mark's plane, margin_px from its sides."""
-    places, margin_mm = _places_mm(pixel_from_mark, width, height), margin_px / _px_per_mm(pixel_from_mark)
-    least, greatest = np.add(rectangle_mm, [[margin_mm], [-margin_mm]])
-    return np.asarray(np.all((places >= least) & (places <= greatest), axis=-1))
+    return _rectangle_mask(mark.known_mm, pixel_from_mark, (width, height), margin_px)
 
 
 def frame_pixel_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> Mask:
@@ -134,20 +119,17 @@ def frame_pixel_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int
     margin_px from the frame's edge; none beside other marks."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None or np.isfinite(mark.known_mm).all():
         return np.zeros((height, width), dtype=bool)
-    places, margin_mm = _places_mm(pixel_from_mark, width, height), margin_px / _px_per_mm(pixel_from_mark)
-    least, greatest = np.add(mark.known_mm, [[-margin_mm], [margin_mm]])
-    inner = (np.isinf(least) | (places < least)) & (np.isinf(greatest) | (places > greatest))
-    return np.asarray(np.all(inner, axis=-1))
+    least, greatest = np.array(mark.known_mm)  # the frame lies beyond each of these that is finite
+    beyond = np.where(np.isfinite(greatest), greatest, -np.inf), np.where(np.isfinite(least), least, np.inf)
+    return _rectangle_mask(beyond, pixel_from_mark, (width, height), margin_px)
 
 
-def _places_mm(pixel_from_mark: Array, width: int, height: int) -> Array:
-    """(height, width, 2) where in the mark's plane the pixels lie."""
-    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - pixel_from_mark[:, 2]
-    return np.asarray(pixels @ np.linalg.inv(pixel_from_mark[:, :2]).T)
-
-
-def _px_per_mm(pixel_from_mark: Array) -> float:
-    return linear_scale(pixel_from_mark)
+def _rectangle_mask(corners: ArrayLike, pixel_from_mark: Array, size: tuple[int, int], margin_px: float) -> Mask:
+    """(height, width): which pixels lie in a rectangle of the mark's plane, mm, and margin_px from its sides."""
+    mark_from_pixel = Affine(np.asarray(pixel_from_mark, float)).inverse
+    places = mark_from_pixel.apply(np.stack(np.meshgrid(*map(np.arange, size)), axis=-1))
+    least, greatest = np.add(corners, np.array([[1.0], [-1.0]]) * margin_px * mark_from_pixel.scale)
+    return np.asarray(np.all((places >= least) & (places <= greatest), axis=-1))
 
 
 def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> Mask:
@@ -156,8 +138,7 @@ def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: in
     rows, cols = mark.image.shape
     inside = (col >= 1) & (col <= cols - 2) & (row >= 1) & (row <= rows - 2)
     if mark.steady is not None:
-        nearest = np.clip(np.rint(row), 0, rows - 1).astype(int), np.clip(np.rint(col), 0, cols - 1).astype(int)
-        inside &= mark.steady[nearest]
+        inside &= _sampled(mark.steady.astype(float), np.stack([col, row]), 0) > 0.5
     return np.asarray(inside)
 
 
@@ -165,10 +146,7 @@ def chip_steadiness(mark: MarkTemplate, pixel_from_mark: Array, width: int, heig
     """(height, width): the chip's steadiness, 1 where it is not known."""
     if mark.steadiness is None:
         return np.ones((height, width))
-    col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
-    from scipy import ndimage
-
-    return np.asarray(ndimage.map_coordinates(mark.steadiness, [row, col], order=1, mode="nearest"))
+    return _sampled(mark.steadiness, _chip_positions(mark, pixel_from_mark, width, height, 1), 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +209,8 @@ def _sharp_cells(mark: MarkShape, linear: bytes, origin_px: tuple[float, float],
     """The mark's cells, its origin so far right and down of a pixel's centre; and which pixel (col, row) that is. Marks
     of a camera that are drawn alike share them."""
     place = np.column_stack([np.frombuffer(linear).reshape(2, 2), origin_px])
-    least, greatest = _extent_px(drawn_outline_mm(mark), place)
+    points = Affine(place).apply(drawn_outline_mm(mark))
+    least, greatest = points.min(axis=0), points.max(axis=0)
     low, high = np.floor(least + 0.5).astype(int), np.ceil(greatest + 0.5).astype(int)
     place[:, 2] -= low
     width, height = np.maximum(high - low, 1).tolist()
@@ -242,9 +221,10 @@ def _chip_drawing(mark: MarkTemplate, pixel_from_mark: Array, size: tuple[int, i
     pad = int(np.ceil(4 * blur_px)) + 2
     shifted = pixel_from_mark.copy()
     shifted[:, 2] += pad
-    cells = max(1, round(_pixels_per_sample(mark, pixel_from_mark) ** -1))
-    sharp = _sampled(mark, shifted, size[0] + 2 * pad, size[1] + 2 * pad, cells).astype(np.float32)
-    return _Drawing(sharp, cells, np.array([-pad, -pad]), np.zeros(2))
+    cells = max(1, round(1 / max(linear_scale(pixel_from_mark) * mark.pitch_um / 1000, 1e-3)))  # to a pixel of the chip
+    sampled = _sampled(mark.image, _chip_positions(mark, shifted, size[0] + 2 * pad, size[1] + 2 * pad, cells), 3)
+    sharp = (sampled - mark.image.min()) / max(np.ptp(mark.image), 1e-12)
+    return _Drawing(sharp.astype(np.float32), cells, np.array([-pad, -pad]), np.zeros(2))
 
 
 class _Average:
@@ -308,36 +288,21 @@ def _kernels(sigma: float, shift: float) -> Array:
     return kernels
 
 
-def _pixels_per_sample(mark: MarkTemplate, pixel_from_mark: Array) -> float:
-    """How many pixels of the scan one pixel of the chip spans."""
-    scale = linear_scale(pixel_from_mark)
-    return max(scale * mark.pitch_um / 1000, 1e-3)
-
-
-def _sampled(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int) -> Array:
-    col, row = _chip_positions(mark, pixel_from_mark, width, height, cells)
+def _sampled(image: Array, positions: Array, order: int) -> Array:
+    """An image of a chip at positions (2, height, width) of its columns and rows, by splines of an order."""
     from scipy import ndimage
 
-    sampled = ndimage.map_coordinates(mark.image, [row, col], order=3, mode="nearest")
-    return np.asarray((sampled - mark.image.min()) / max(np.ptp(mark.image), 1e-12), dtype=float)
+    return np.asarray(ndimage.map_coordinates(image, positions[::-1], order=order, mode="nearest"), dtype=float)
 
 
-def _chip_positions(
-    mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int
-) -> tuple[Array, Array]:
-    """Column and row in the chip of every cell's centre."""
+def _chip_positions(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int) -> Array:
+    """(2, rows, columns) column and row in the chip of every cell's centre."""
     place = [(np.arange(size * cells) + 0.5) / cells - 0.5 for size in (width, height)]
-    offset = np.stack(np.meshgrid(*place)) - pixel_from_mark[:, 2, None, None]
-    chip_from_mark = _chip_from_mark(mark)
-    chip_from_pixel = chip_from_mark[:, :2] @ np.linalg.inv(pixel_from_mark[:, :2])
-    col, row = np.tensordot(chip_from_pixel, offset, axes=1) + chip_from_mark[:, 2, None, None]
-    return col, row
+    chip_from_pixel = _chip_from_mark(mark).compose(Affine(pixel_from_mark).inverse)
+    return np.moveaxis(chip_from_pixel.apply(np.stack(np.meshgrid(*place), axis=-1)), -1, 0)
 
 
-def _chip_from_mark(mark: MarkTemplate) -> Array:
-    """(2, 3) affine matrix from the mark's mm to the chip's column and row; a turned mark is turned back first."""
-    angle = np.deg2rad(mark.turn_deg)
-    c, s = np.cos(angle), np.sin(angle)
-    scale = 1000 / mark.pitch_um
-    linear = scale * np.array([[1.0, 0.0], [0.0, -1.0]]) @ np.array([[c, s], [-s, c]])
-    return np.column_stack([linear, mark.origin_px])
+def _chip_from_mark(mark: MarkTemplate) -> Affine:
+    """From the mark's mm to the chip's column and row; a turned mark is turned back first."""
+    c, s = np.cos(np.deg2rad(mark.turn_deg)), np.sin(np.deg2rad(mark.turn_deg))
+    return Affine.from_linear(1000 / mark.pitch_um * np.array([[c, s], [s, -c]]), mark.origin_px)
