@@ -54,15 +54,6 @@ class Surroundings:
         contrast = np.sqrt(variance + faint_dn**2)
         return np.asarray(np.clip(detail / contrast, -_CLIP, _CLIP), np.float32)
 
-    def correlated(self, image: Map, template: Array, detail_px: float) -> Map:
-        """The normalised correlation with a flattened picture, wherever the template lies inside of it. Only pixels
-        about the drawing count: beside it may lie the frame's edge, or writing.
-
-        OpenCV's own correlation under a mask gives the same for three times the price.
-        """
-        chip, about = self.pattern(template, detail_px, image)
-        return correlation(image, chip, about, variation(image, about))
-
     def pattern(self, template: Array, detail_px: float, image: Map) -> tuple[Map, Map]:
         """What a flattened picture is correlated with, of mean 0, and how much each of its pixels counts: one that is
         nan in the template does not."""
@@ -91,9 +82,21 @@ def variation(image: Map, about: Map) -> Map:
     return np.asarray(np.subtract(squares, sums, out=squares), np.float32)
 
 
-def correlation(image: Map, chip: Map, about: Map, varied: Map) -> Map:
-    """The normalised correlation of a picture with a pattern, the picture's variation about the drawing being known:
-    patterns of which the same pixels count share it."""
+def correlation(image: Map, chip: Map, about: Map, varied: Map | None = None) -> Map:
+    """Correlate a picture with a pattern, wherever that lies inside of it: the normalised cross-correlation (NCC).
+
+    OpenCV's own correlation under a mask gives the same for three times the price.
+
+    Parameters
+    ----------
+    image : (rows, columns)
+        Flattened.
+    chip, about : (rows, columns)
+        As `Surroundings.pattern` gives them: beside the drawing may lie the frame's edge, or writing.
+    varied : optional
+        The picture's variation about the drawing: patterns of which the same pixels count share it.
+    """
+    varied = variation(image, about) if varied is None else varied
     products = cv2.matchTemplate(image, chip, cv2.TM_CCORR)
     power = np.sum(chip**2)
     spread = varied * power

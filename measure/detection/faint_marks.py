@@ -58,21 +58,27 @@ class FaintMark:
 
 
 def detect_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
-    """The strongest response to the mark within the search radius of its predicted place, None where there is no
-    contrast by any curve that the scan's may be.
+    """Find the strongest response to a mark within the search radius of its predicted place.
 
-    extreme_dn: the lightest or darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as
-    light or as dark it does not show.
+    Parameters
+    ----------
+    extreme_dn : float
+        The lightest or darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as light or
+        as dark it does not show.
+    blur_px : float
+        Of the scan.
+
+    Returns
+    -------
+    FaintMark, or None where there is no contrast by any curve that the scan's may be.
     """
-    by_curve = [
-        _detect_by_curve(scan.replace_tone(curve), expected, extreme_dn, blur_px)
-        for curve in scan.tone.plausible_curves
-    ]
-    both = [each for each in by_curve if each is not None]
-    if len(both) < len(by_curve):
+    curves = scan.tone.plausible_curves
+    fields = (_Field(scan.replace_tone(curve), expected, extreme_dn, blur_px) for curve in curves)
+    found = [mark for field in fields if (mark := field.detect(expected.search_px)) is not None]
+    if len(found) < len(curves):
         return None
-    less_sure = max(both, key=lambda each: each.false_alarms)
-    centers = np.array([each.fit.center_px for each in both])
+    less_sure = max(found, key=lambda each: each.false_alarms)
+    centers = np.array([each.fit.center_px for each in found])
     half, center = (centers[0] - centers[-1]) / 2, centers.mean(axis=0)
     fit = replace(
         less_sure.fit,
@@ -81,90 +87,6 @@ def detect_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_p
         place_covariance=less_sure.fit.place_covariance.plus(Cause.TONE, np.outer(half, half)),
     )
     return FaintMark(fit, less_sure.false_alarms)
-
-
-def _detect_by_curve(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
-    """By the scan's one curve."""
-    field = _Field(scan, expected, extreme_dn, blur_px)
-    first = field.response(field.predicted)
-    center = first.highest(field.predicted, expected.search_px / field.step)
-    if center is None:
-        return None
-    for _ in range(_ROUNDS):
-        response = field.response(center)
-        top = response.top(center)
-        if np.hypot(*(top - center)) < _SETTLED_PX:
-            return field.faint_mark(response, center)
-        center = top
-    return field.faint_mark(field.response(center), center)
-
-
-@dataclass(frozen=True, eq=False)
-class _Response:
-    """What a field answers to a mark whose centre is off the pixel's by fraction."""
-
-    field: "_Field"
-    fraction: Array
-
-    @cached_property
-    def template(self) -> Array:
-        """The mark as it looks so."""
-        return self.field.template(self.fraction)
-
-    @cached_property
-    def templates(self) -> Array:
-        """(3, 3, rows, columns): the same with its centre _STEP_PX less, not, and as much more off in row and column: a
-        line may be finer than the pixels are far apart, and how its picture changes between them no picture of whole
-        pixels tells."""
-        off = (-_STEP_PX, 0.0, _STEP_PX)
-        moved = [[self.field.template(self.fraction + np.array([col, row])) for col in off] for row in off]
-        return np.array(moved)
-
-    @cached_property
-    def norm(self) -> Array:
-        """Of the weighted template at every pixel."""
-        return np.sqrt(np.maximum(_correlated(self.field.room**2, self.template**2), 0.0) + _LEAST_NORM)
-
-    @cached_property
-    def value(self) -> Array:
-        """The weighted correlation at every pixel."""
-        return _correlated(self.field.weighted, self.template) / self.norm
-
-    def pixel(self, center: Array) -> tuple[int, int]:
-        """Row and column of the value for a mark at a centre."""
-        col, row = np.rint(center - self.fraction)
-        return int(row), int(col)
-
-    def patch(self, center: Array) -> tuple[slice, slice]:
-        (row, col), half = self.pixel(center), self.template.shape[0] // 2
-        return slice(row - half, row + half + 1), slice(col - half, col + half + 1)
-
-    def highest(self, center: Array, reach_px: float) -> Array | None:
-        """The pixel of the highest value within reach of the centre; None where it is no mark of that polarity."""
-        rows, cols = np.indices(self.value.shape)
-        near = np.hypot(cols + self.fraction[0] - center[0], rows + self.fraction[1] - center[1]) <= reach_px
-        row, col = np.unravel_index(int(np.where(near, self.value, -np.inf).argmax()), self.value.shape)
-        return np.array([col, row]) + self.fraction if self.value[row, col] > 0 else None
-
-    def top(self, center: Array) -> Array:
-        """Of the paraboloid through the responses about a centre, as near as it tells."""
-        gradient, hessian = self.bend(self.field.weighted, center)
-        if not np.all(np.linalg.eigvalsh(hessian) < 0):
-            return center
-        return np.asarray(center + np.clip(-np.linalg.solve(hessian, gradient), -_STEP_PX, _STEP_PX))
-
-    def bend(self, weighted: Array, center: Array) -> tuple[Array, Array]:
-        """Gradient and Hessian of what a weighted picture answers to a mark at a centre that moves."""
-        patch = self.patch(center)
-        answers = np.einsum("rcij,ij->rc", self.templates, weighted[patch])
-        norm = np.sqrt(((self.field.room[patch] * self.template) ** 2).sum() + _LEAST_NORM)
-        gradient, hessian = _paraboloid(answers / norm)
-        return gradient / _STEP_PX, hessian / _STEP_PX**2
-
-    def slopes(self) -> Array:
-        """(2, rows, cols) by column and row, of the values."""
-        by_col, by_row = (self.templates[1, 2] - self.templates[1, 0], self.templates[2, 1] - self.templates[0, 1])
-        return np.stack([_correlated(self.field.weighted, by) / (2 * _STEP_PX) / self.norm for by in (by_col, by_row)])
 
 
 class _Field:
@@ -178,9 +100,7 @@ class _Field:
         self.coarse_px = _BACKGROUND * detail_px(self.mark, self.linear)
         least, greatest = extent_px(self.mark, np.column_stack([self.linear, np.zeros(2)]))
         self.half = int(np.ceil(max(-least.min(), greatest.max()) + 2 * self.coarse_px)) + 1
-        moves_px = (
-            _ROUNDS * _STEP_PX + 1.0
-        )  # between the pixels its place may come to lie farther off than was searched
+        moves_px = _ROUNDS * _STEP_PX + 1.0  # between the pixels its place may lie farther off than was searched
         side = self.half + int(np.ceil(max(expected.search_px / step, _RING) + moves_px))
         first = np.floor(expected.center_px).astype(int) - side * step - step // 2
         self.origin = first + (step - 1) / 2
@@ -194,16 +114,29 @@ class _Field:
         least_dn = np.abs(self.coding.light_of_step_dn(ground, FAINT * scan.full_scale_dn))
         self.texture_dn: Array = np.sqrt(spread + least_dn**2)
         extreme = float(scan.tone.light(np.array(extreme_dn), scan.full_scale_dn))
-        room_dn = np.maximum(self.polarity * (extreme - ground), 0.0)
         inside = _reduced(scan.inside(*window).astype(np.float32), step) == 1.0
+        room_dn = np.maximum(self.polarity * (extreme - ground), 0.0)
         self.room_dn = np.where(inside, room_dn, 0.0).astype(np.float32)
         self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
         self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
         self.weighted = self.detail * self.room
 
-    def response(self, center: Array) -> _Response:
-        """The response to the mark as it looks with its centre where given between the pixels."""
-        return _Response(self, center - np.rint(center))
+    def detect(self, search_px: float) -> FaintMark | None:
+        """The mark where the response is highest about its predicted place, None where nothing of its polarity is."""
+        response = _Response(self, self.predicted)
+        rows, cols = np.indices(response.value.shape)
+        fraction = self.predicted - np.rint(self.predicted)
+        near = search_px / self.step >= np.hypot(*(np.stack([cols, rows], axis=-1) + fraction - self.predicted).T).T
+        row, col = np.unravel_index(int(np.where(near, response.value, -np.inf).argmax()), near.shape)
+        if response.value[row, col] <= 0:
+            return None
+        response = _Response(self, np.array([col, row]) + fraction)
+        for _ in range(_ROUNDS):
+            top = response.top()
+            if np.hypot(*(top - response.center)) < _SETTLED_PX:
+                break
+            response = _Response(self, top)
+        return self._faint_mark(response)
 
     def template(self, off: Array) -> Array:
         """The mark with its centre off the middle pixel's, freed of what is coarse."""
@@ -212,67 +145,121 @@ class _Field:
         shown = picture(self.mark, pixel_from_mark, size, size, self.blur_px / self.step)
         return np.asarray(shown - cv2.GaussianBlur(shown, (0, 0), self.coarse_px), dtype=float)
 
-    def faint_mark(self, response: _Response, center: Array) -> FaintMark | None:
+    def _faint_mark(self, response: "_Response") -> FaintMark | None:
         """What the response at the mark's place is worth, against what the texture about it answers."""
-        (row, col), patch = response.pixel(center), response.patch(center)
-        height = float(response.value[row, col])
-        amplitude = height / float(response.norm[row, col])
+        pixel, patch, center = response.pixel, response.patch, response.center
+        height = float(response.value[pixel])
+        amplitude = height / float(response.norm[pixel])
         own = np.zeros_like(self.detail)
         own[patch] = amplitude * self.room[patch] ** 2 * response.template
-        signal = _correlated(own, response.template) / response.norm
-        texture = self._texture(response, signal, (row, col))
-        bend = response.bend(own, center)[1]
+        texture = self._texture(response, _correlated(own, response.template) / response.norm)
+        bend = response.bend(own)[1]
         if texture.sum() < _LEAST_PLACES or not np.all(np.linalg.eigvalsh(bend) < 0):
             return None
         slopes = np.asarray(np.cov(response.slopes()[:, texture]), dtype=float)
         scatter = float(np.sqrt(np.mean(response.value[texture] ** 2)))
         inverse, place = np.linalg.inv(bend) * self.step, center * self.step + self.origin
         covariance = Covariance.from_noise(inverse @ slopes @ inverse)
-        distance_px = float(np.hypot(*(center - self.predicted)))
         lines = np.abs(response.template)
         lit = lines * self.room[patch]
-        contrast_dn = self.polarity * amplitude * float(np.average(self.room_dn[patch], weights=lit))
+        shown, drawn = lit > _LINE * lit.max(), lines > _LINE * lines.max()
+        room_dn, ground_dn, texture_dn = (
+            float(np.average(image[patch], weights=lit)) for image in (self.room_dn, self.ground_dn, self.texture_dn)
+        )
+        pairs = texture[:, 1:] & texture[:, :-1]
+        contrast_dn = self.polarity * amplitude * room_dn
         fit = MarkFit(
             converged=True,
             reason=NO_REASON,
             center_px=place,
-            place_covariance=covariance.plus(Cause.OWN_TURN, self._leaning_px2(response, center)),
+            place_covariance=covariance.plus(Cause.OWN_TURN, self._leaning_px2(response)),
             pixel_from_mark=np.column_stack([self.linear * self.step, place]),
             contrast_dn=contrast_dn,
-            stored_contrast_dn=self.coding.stored_contrast_dn(
-                float(np.average(self.ground_dn[patch], weights=lit)), contrast_dn
-            ),
-            noise_dn=float(np.average(self.texture_dn[patch], weights=lit)),
+            stored_contrast_dn=self.coding.stored_contrast_dn(ground_dn, contrast_dn),
+            noise_dn=texture_dn,
             blur_px=self.blur_px,
-            damaged_fraction=max(1 - float((lit > _LINE * lit.max()).sum() / (lines > _LINE * lines.max()).sum()), 0.0),
-            lost_fraction=0.0,
+            damaged_fraction=max(1 - float(shown.sum() / drawn.sum()), 0.0),
             redundancy=int((lit > 0).sum()) - 3,
-            neighbour_correlation=_neighbour_correlation(self.detail, texture),
-            covariance_is_white=False,
+            neighbour_correlation=float(np.corrcoef(self.detail[:, 1:][pairs], self.detail[:, :-1][pairs])[0, 1]),
             likeness=min(height / float(np.linalg.norm(self.detail[patch][lit > _LINE / 5 * lit.max()])), 1.0),
             significance=height / scatter,
         )
-        return FaintMark(
-            fit, _false_alarms(height / scatter, slopes / scatter**2, max(distance_px, _LEAST_DISTANCE_PX))
-        )
+        distance_px = max(float(np.hypot(*(center - self.predicted))), _LEAST_DISTANCE_PX)
+        return FaintMark(fit, _false_alarms(height / scatter, slopes / scatter**2, distance_px))
 
-    def _leaning_px2(self, response: _Response, center: Array) -> Array:
+    def _leaning_px2(self, response: "_Response") -> Array:
         """What the place of a mark whose lines lie to one side of its point takes from a turn and a size that are not
         quite the frame's, as if its lines were all in their middle."""
-        lit = np.abs(response.template) * self.room[response.patch(center)] ** 2
-        lit /= lit.sum()
+        lit = np.abs(response.template) * self.room[response.patch] ** 2
         rows, cols = np.indices(lit.shape) - self.half
-        middle_px = self.step * (np.array([(lit * cols).sum(), (lit * rows).sum()]) - response.fraction)
+        middle_px = self.step * (np.array([(lit * cols).sum(), (lit * rows).sum()]) / lit.sum() - response.fraction)
         return np.asarray(_OWN_LINEAR**2 * (middle_px @ middle_px) * np.eye(2))
 
-    def _texture(self, response: _Response, signal: Array, place: tuple[int, int]) -> Mask:
+    def _texture(self, response: "_Response", signal: Array) -> Mask:
         """Where about the mark responses are the texture's alone: on ground where the mark could show."""
-        rows, cols = np.indices(signal.shape)
-        near = np.hypot(rows - place[0], cols - place[1]) <= _RING
+        (row, col), (rows, cols) = response.pixel, np.indices(signal.shape)
+        near = np.hypot(rows - row, cols - col) <= _RING
         whole = np.zeros(signal.shape, dtype=bool)
         whole[self.half : -self.half, self.half : -self.half] = True
-        alone = np.abs(signal) < _SELF * signal[place]
-        return np.asarray(near & whole & alone & (response.norm > _SHOWN * response.norm[place]))
+        alone = np.abs(signal) < _SELF * signal[row, col]
+        return np.asarray(near & whole & alone & (response.norm > _SHOWN * response.norm[row, col]))
+
+
+class _Response:
+    """What a field answers to a mark whose centre is off the pixels by as much as a centre is."""
+
+    def __init__(self, field: _Field, center: Array) -> None:
+        self.field, self.center = field, center
+        self.fraction = center - np.rint(center)
+        col, row = np.rint(center).astype(int).tolist()
+        self.pixel, half = (row, col), field.half
+        self.patch = slice(row - half, row + half + 1), slice(col - half, col + half + 1)
+
+    @cached_property
+    def templates(self) -> Array:
+        """(3, 3, rows, columns): the mark with its centre _STEP_PX less, not, and as much more off in row and column: a
+        line may be finer than the pixels are far apart, and how its picture changes between them no picture of whole
+        pixels tells."""
+        off = (-_STEP_PX, 0.0, _STEP_PX)
+        return np.array([[self.field.template(self.fraction + np.array([col, row])) for col in off] for row in off])
+
+    @cached_property
+    def template(self) -> Array:
+        """The mark as it looks so."""
+        return self.field.template(self.fraction)
+
+    @cached_property
+    def norm(self) -> Array:
+        """Of the weighted template at every pixel."""
+        return np.sqrt(np.maximum(_correlated(self.field.room**2, self.template**2), 0.0) + _LEAST_NORM)
+
+    @cached_property
+    def value(self) -> Array:
+        """The weighted correlation at every pixel."""
+        return _correlated(self.field.weighted, self.template) / self.norm
+
+    def top(self) -> Array:
+        """Of the paraboloid through the responses about the centre, as near as it tells."""
+        gradient, hessian = self.bend(self.field.weighted)
+        if not np.all(np.linalg.eigvalsh(hessian) < 0):
+            return self.center
+        return np.asarray(self.center + np.clip(-np.linalg.solve(hessian, gradient), -_STEP_PX, _STEP_PX))
+
+    def bend(self, weighted: Array) -> tuple[Array, Array]:
+        """Gradient (2,) by (col, row) and Hessian (2, 2) of what a weighted picture answers to a mark at a centre that
+        moves: of the paraboloid through nine answers, by least squares."""
+        norm = np.sqrt(((self.field.room[self.patch] * self.template) ** 2).sum() + _LEAST_NORM)
+        nine = np.einsum("rcij,ij->rc", self.templates, weighted[self.patch]) / norm
+        by_col, by_row = nine.mean(axis=0), nine.mean(axis=1)
+        gradient = np.array([by_col[2] - by_col[0], by_row[2] - by_row[0]]) / (2 * _STEP_PX)
+        mixed = (nine[2, 2] + nine[0, 0] - nine[0, 2] - nine[2, 0]) / 4
+        bends = [side[2] - 2 * side[1] + side[0] for side in (by_col, by_row)]
+        return gradient, np.array([[bends[0], mixed], [mixed, bends[1]]]) / _STEP_PX**2
+
+    def slopes(self) -> Array:
+        """(2, rows, cols) by column and row, of the values."""
+        by_col, by_row = (self.templates[1, 2] - self.templates[1, 0], self.templates[2, 1] - self.templates[0, 1])
+        return np.stack([_correlated(self.field.weighted, by) / (2 * _STEP_PX) / self.norm for by in (by_col, by_row)])
 
 
 def _reduced(picture: NDArray[np.floating], step: int) -> NDArray[np.floating]:
@@ -286,19 +273,5 @@ def _false_alarms(strength: float, slopes: Array, radius_px: float) -> float:
     return float(np.pi * radius_px**2 * density)
 
 
-def _neighbour_correlation(detail: Array, texture: Mask) -> float:
-    pairs = texture[:, 1:] & texture[:, :-1]
-    return float(np.corrcoef(detail[:, 1:][pairs], detail[:, :-1][pairs])[0, 1])
-
-
 def _correlated(image: NDArray[np.floating], template: NDArray[np.floating]) -> Array:
     return np.asarray(cv2.filter2D(np.asarray(image, np.float32), cv2.CV_32F, np.asarray(template, np.float32)), float)
-
-
-def _paraboloid(three: Array) -> tuple[Array, Array]:
-    """Gradient (2,) by (col, row) and Hessian (2, 2) of the paraboloid through 3 x 3 values, by least squares."""
-    by_col, by_row = three.mean(axis=0), three.mean(axis=1)
-    gradient = np.array([by_col[2] - by_col[0], by_row[2] - by_row[0]]) / 2
-    mixed = (three[2, 2] + three[0, 0] - three[0, 2] - three[2, 0]) / 4
-    bends = [side[2] - 2 * side[1] + side[0] for side in (by_col, by_row)]
-    return gradient, np.array([[bends[0], mixed], [mixed, bends[1]]])

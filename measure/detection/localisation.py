@@ -11,7 +11,7 @@ from scipy import fft
 from scipy.special import ndtr
 
 from measure.array_types import Array, Single
-from measure.detection.correlation import WIDE, Surroundings, correlation, variation
+from measure.detection.correlation import WIDE, Surroundings, correlation
 from measure.detection.mark_views import detail_px
 from measure.detection.peaks import highest_about
 from measure.flags import NOISE_LIKE_A_MARK
@@ -86,35 +86,34 @@ class _PeakSearch:
     def __init__(self, scan: Scan, expected: MarkPrediction, blur_px: float) -> None:
         mark, surroundings = expected.mark, expected.surroundings
         reduction = 2 if detail_px(mark, expected.linear) >= _HALVED_PX else 1
-        shift_px = (reduction - 1) / 2
-        reduced = np.column_stack([expected.linear, expected.center_px - shift_px]) / reduction
+        reduced = np.column_stack([expected.linear, expected.center_px - (reduction - 1) / 2]) / reduction
         search_px, blur_px = expected.search_px / reduction, blur_px / reduction
         spare = int(np.ceil(2 * blur_px))
-        col0, row0, width, tall = mark_window(mark, reduced, search_px + spare + 2)
         centred = np.column_stack([reduced[:, :2], np.zeros(2)])
-        least, greatest = extent_px(mark, centred)
-        low, high = np.floor(least).astype(int) - spare, np.ceil(greatest).astype(int) + spare
+        low, high = (
+            way(each).astype(int) for way, each in zip((np.floor, np.ceil), extent_px(mark, centred), strict=True)
+        )
+        low, high = low - spare, high + spare
         centred[:, 2] = -low
-        size = high - low + 1
         finest_px = max(detail_px(mark, reduced[:, :2]), blur_px)
-        template = known_picture(mark, centred, int(size[0]), int(size[1]), blur_px)
+        template_cols, template_rows = (high - low + 1).tolist()
+        template = known_picture(mark, centred, template_cols, template_rows, blur_px)
         # A median at the window's end would see half of what lies about it: beside the frame's edge only the border.
         rim = surroundings.ground_reach_px(finest_px)
-        wide = (col0 - rim, row0 - rim, width + 2 * rim, tall + 2 * rim)
+        wide = mark_window(mark, reduced, search_px + spare + 2 + rim)
         window = scan.reduced_window(reduction, *wide, expected.weights)
         flattened = surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
         self._flat = expected.polarity * flattened[rim:-rim, rim:-rim]
         self._pattern, self._counts = surroundings.pattern(template, finest_px, self._flat)
-        varied = variation(self._flat, self._counts)
-        response = correlation(self._flat, self._pattern, self._counts, varied)
-        place = np.stack(np.meshgrid(*(np.arange(count, dtype=float) for count in response.shape[::-1])), axis=-1)
-        place += np.array([col0, row0]) - low
-        near = np.hypot(*np.moveaxis(place - reduced[:, 2], -1, 0)) <= search_px
+        response = correlation(self._flat, self._pattern, self._counts)
+        first = np.array(wide[:2]) + rim - low  # the place of the first response
+        rows, cols = np.indices(response.shape)
+        near = np.hypot(cols + first[0] - reduced[0, 2], rows + first[1] - reduced[1, 2]) <= search_px
         self._best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
         self._places = int(near.sum())
         # A fit that begins within a part of a pixel takes a step less.
         top = highest_about(response, np.array([self._best[::-1]]), 0.0)[0][0]
-        self.center_px: Array = (top + np.array([col0, row0]) - low) * reduction + shift_px
+        self.center_px: Array = (top + first) * reduction + (reduction - 1) / 2
         self.height = float(response[self._best])
 
     @cached_property

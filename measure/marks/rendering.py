@@ -4,6 +4,7 @@ with the derivatives that least-squares matching needs."""
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -288,11 +289,11 @@ def _kernels(sigma: float, shift: float) -> Array:
     return kernels
 
 
-def _sampled(image: Array, positions: Array, order: int) -> Array:
+def _sampled(image: Array, positions: Array, order: Literal[0, 1, 3]) -> Array:
     """An image of a chip at positions (2, height, width) of its columns and rows, by splines of an order."""
     from scipy import ndimage
 
-    return np.asarray(ndimage.map_coordinates(image, positions[::-1], order=order, mode="nearest"), dtype=float)
+    return np.asarray(ndimage.map_coordinates(image, positions[::-1], order=order, mode="nearest"))
 
 
 def _chip_positions(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int) -> Array:
