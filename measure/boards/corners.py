@@ -60,7 +60,8 @@ class Corner:
     """A corner as fitted; where reason is not empty the fit failed, and the numbers are its last.
 
     center_px (2,), covariance_px2 (2, 2): as matched; contrast_dn: the grey value between the two steps less that
-    beside them, negative where it is dark between them; blur_px: the standard deviation. junction_px (2,): where the
+    beside them, negative where it is dark between them; blur_px: the standard deviation; moved_px: from where the fit
+    began. junction_px (2,): where the
     gradients' lines meet (`junction`); None where they do not, and for a corner that is no crossing.
     """
 
@@ -70,6 +71,7 @@ class Corner:
     noise_dn: float
     blur_px: float
     damaged_fraction: float
+    moved_px: float
     reason: Reason = NO_REASON
     junction_px: Array | None = None
 
@@ -80,9 +82,7 @@ def fit_corner(window: ScanWindow, start_px: Array, steps_px: Array, reach_px: A
     steps_px (2, 2): its columns run along the two edges; reach_px (2,): how far along either of them, forth and back,
     grey values are used. surface: `crossing` or `quarter`.
     """
-    fit = _CornerFit(window, np.asarray(start_px, float), np.asarray(steps_px, float), reach_px, surface)
-    fit.run()
-    return fit.result()
+    return _CornerFit(window, np.asarray(start_px, float), np.asarray(steps_px, float), reach_px, surface).run()
 
 
 def crossing(u: Array, v: Array, correlation: float) -> tuple[Array, Array, Array, Array]:
@@ -141,20 +141,17 @@ class _CornerFit:
         outside = Reason("too little of it is inside of the scan", Code.OUTSIDE)
         self.reason = NO_REASON if self.weights.sum() > 2 * self.unknowns else outside
 
-    def run(self) -> None:
+    def run(self) -> Corner:
         """Plain, then robust, until the corner stands still; or a reason why it does not."""
         for stage, tolerance_px in enumerate(_STAGES_TOLERANCE_PX):
             if not self.reason:
                 self.scale_dn = self._residual_scale() if stage else np.inf
                 self.reason = gauss_newton(self, tolerance_px, _MAX_ITERATIONS).reason
-
-    def result(self) -> Corner:
-        """The corner in the scan, with the covariance that the residuals' own autocovariance gives."""
         design, residuals = self._linearised()
-        used = self.weights > 0.05
-        covariance, noise = np.full((2, 2), np.inf), float("nan")
-        meeting = None
+        covariance, noise, area = np.full((2, 2), np.inf), float("nan"), self._area()
+        used, junction_px = self.weights > _UNDAMAGED, None
         if used.sum() > self.unknowns and not self.reason:
+            # The covariance that the residuals' own autocovariance gives.
             model = noise_model(residuals, used, self.unknowns)
             noise = float(np.sqrt(model.variance_dn2))
             weighted = design * self.weights
@@ -163,24 +160,22 @@ class _CornerFit:
             if not 2 * abs(self.linear[0]) > 4 * noise:
                 self.reason = Reason("no edges stand out from the noise", Code.CONTRAST)
             elif self.bends:
-                meeting = self._junction(residuals)
+                # Damage is painted over with what was fitted.
+                undamaged = self.grey - np.where(self.weights < _UNDAMAGED * area, residuals, 0.0)
+                reach_px = float(self.reach.min())
+                place = junction(undamaged, self.center, reach_px)
+                junction_px = place + self.origin if np.hypot(*(place - self.center)) < reach_px / 2 else None
         return Corner(
             center_px=self.center + self.origin,
             covariance_px2=(covariance + covariance.T) / 2,
             contrast_dn=2 * float(self.linear[0]),
             noise_dn=noise,
             blur_px=float(np.sqrt(max(self.variance - PIXEL_VARIANCE_PX2, 0.0))),
-            damaged_fraction=float(1 - self.weights.sum() / max(self._area().sum(), 1e-9)),
+            damaged_fraction=float(1 - self.weights.sum() / max(area.sum(), 1e-9)),
+            moved_px=float(np.hypot(*(self.center - self.start))),
             reason=self.reason,
-            junction_px=None if meeting is None else meeting + self.origin,
+            junction_px=junction_px,
         )
-
-    def _junction(self, residuals: Array) -> Array | None:
-        """Where the gradients' lines meet. Damage is painted over with what was fitted."""
-        damaged = self.weights < _UNDAMAGED * self._area()
-        reach_px = float(self.reach.min())
-        meeting = junction(self.grey - np.where(damaged, residuals, 0.0), self.center, reach_px)
-        return meeting if np.hypot(*(meeting - self.center)) < reach_px / 2 else None
 
     def _area(self) -> Array:
         """Weights 0 to 1 of a parallelogram about the corner; its border is smooth, and it moves with the corner: a
@@ -203,7 +198,9 @@ class _CornerFit:
         u, v = ((normal[0] * dx + normal[1] * dy) / sigma for normal in normals)
         value, by_u, by_v, by_correlation = self.surface(u, v, float(normals[0] @ normals[1]))
         grey = np.stack([value, np.ones_like(dx), dx, dy, *([value**2 - 1] if self.bends else [])])
-        self.linear = self._best_linear(grey)
+        weighted = grey * self.weights
+        right = np.tensordot(weighted, self.grey, axes=2)
+        self.linear = np.asarray(np.linalg.lstsq(products(weighted, grey), right, rcond=1e-12)[0])
         turning = [
             by * (tangent[0] * dx + tangent[1] * dy) / sigma + by_correlation * (tangent @ other)
             for by, tangent, other in zip((by_u, by_v), tangents, normals[::-1], strict=True)
@@ -216,11 +213,6 @@ class _CornerFit:
         ]
         slope = self.linear[0] + (2 * self.linear[4] * value if self.bends else 0.0)
         return np.concatenate([slope * np.stack(shape), grey]), self.grey - np.tensordot(self.linear, grey, axes=1)
-
-    def _best_linear(self, grey: Array) -> Array:
-        normal = products(grey * self.weights, grey)
-        right = np.tensordot(grey * self.weights, self.grey, axes=2)
-        return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0])
 
     def solve(self) -> Array | None:
         """A Gauss-Newton step, shortened to what a linearisation can bear; None where an unknown shows nowhere."""
@@ -301,7 +293,8 @@ def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple
     tuple of tuples
         The same marks; those with a junction moved there, with its covariance, where the lens has coma.
     """
-    apart, alike = [], []
+    unmoved = tuple(tuple(marks) for marks in pictures)
+    apart, alike = [np.zeros((0, 2))], [np.zeros((0, 2))]
     for marks in pictures:
         crossings = [mark for mark in marks if _has_junction(mark)]
         if len(crossings) > _NEIGHBOURS:
@@ -310,12 +303,17 @@ def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple
             near = np.asarray(KDTree(centers).query(centers, _NEIGHBOURS + 1)[1])[:, 1:]
             apart.append(differences)
             alike.append((differences[:, None, :] * differences[near]).mean(axis=1))
-    if sum(map(len, apart)) < _FEWEST_CROSSINGS:
-        return tuple(tuple(marks) for marks in pictures)
-    variance = float((np.concatenate(apart) ** 2).mean())
-    if float(np.concatenate(alike).mean()) <= variance / 2:
-        return tuple(tuple(marks) for marks in pictures)
-    return tuple(tuple(_moved_to_junction(mark, variance / 3) for mark in marks) for marks in pictures)
+    squares_px2 = np.concatenate(apart) ** 2
+    if len(squares_px2) < _FEWEST_CROSSINGS or np.concatenate(alike).mean() <= squares_px2.mean() / 2:
+        return unmoved
+    covariance = Covariance.from_noise(squares_px2.mean() / 3 * np.eye(2))
+    return tuple(
+        tuple(
+            replace(mark, center_px=_junction_px(mark), covariance=covariance) if _has_junction(mark) else mark
+            for mark in marks
+        )
+        for marks in pictures
+    )
 
 
 def _has_junction(mark: MarkMeasurement) -> bool:
@@ -324,9 +322,3 @@ def _has_junction(mark: MarkMeasurement) -> bool:
 
 def _junction_px(mark: MarkMeasurement) -> Array:
     return np.array([mark.quality["junction_col_px"], mark.quality["junction_row_px"]])
-
-
-def _moved_to_junction(mark: MarkMeasurement, variance_px2: float) -> MarkMeasurement:
-    if not _has_junction(mark):
-        return mark
-    return replace(mark, center_px=_junction_px(mark), covariance=Covariance.from_noise(variance_px2 * np.eye(2)))

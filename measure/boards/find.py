@@ -123,10 +123,9 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
         if pattern is None:
             continue
         if pattern.grid.shape == grid.shape == (spec.rows, spec.columns, 2):
-            corners = {
-                f"r{row}c{column}": FoundCorner(grid[row, column], steps)
-                for (row, column), steps in np.ndenumerate(_grid_steps(grid))
-            }
+            steps = np.stack(np.gradient(grid, axis=(1, 0)), axis=-1)
+            places = np.ndindex(*grid.shape[:2])
+            corners = {f"r{row}c{column}": FoundCorner(grid[row, column], steps[row, column]) for row, column in places}
             return FoundBoard(corners, others_px=_other_chessboards(picture, grid, spec))
         other_size = pattern
     return FoundBoard({}, Reason(_refusal(spec, other_size), Code.NO_BOARD))
@@ -207,40 +206,31 @@ def _right_handed(grid: Array) -> Array:
     return grid if turn > 0 else grid[:, ::-1]
 
 
-def _grid_steps(grid: Array) -> NDArray[np.object_]:
-    """(rows, columns) of (2, 2) matrices: the grid's steps to the right and down at each of its points."""
-    steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1)
-    result = np.empty(grid.shape[:2], object)
-    for place in np.ndindex(*result.shape):
-        result[place] = steps[place]
-    return result
-
-
 def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec) -> FoundBoard:
     """Search a board at a size that shows it whole, then finer: small boards in large scans need it."""
-    for factor in _search_factors(scan):
+    longest = max(scan.width_px, scan.height_px)
+    factors = {max(round(longest / size), 1) for size in (_FIRST_SIZE_PX, _LAST_SIZE_PX)}
+    for factor in sorted(factors, reverse=True):
         picture, reason = _searchable(scan, factor)
         if reason:
             return FoundBoard({}, reason)
-        if isinstance(spec, ChessboardSpec):
-            found = find_chessboard(picture, spec)
-        elif isinstance(spec, CharucoSpec):
-            found = find_charuco(picture, spec)
-        elif isinstance(spec, SquareGridSpec):
-            found = find_squares(picture, spec)
-        else:
-            found = find_aruco(picture, spec)
+        found = _find_in_picture(picture, spec)
         if found.corners:
-            corners = {name: _scan_corner(corner, factor) for name, corner in found.corners.items()}
-            return replace(found, corners=corners, others_px=tuple(_scan_px(one, factor) for one in found.others_px))
+            offset = (factor - 1) / 2  # pixel (i, j) of a reduced picture has its centre at factor j + (factor - 1) / 2
+            corners = {
+                name: FoundCorner(corner.center_px * factor + offset, corner.steps_px * factor)
+                for name, corner in found.corners.items()
+            }
+            return replace(found, corners=corners, others_px=tuple(one * factor + offset for one in found.others_px))
     return found
 
 
-def _search_factors(scan: Scan) -> list[int]:
-    """Reductions of the scan to search, the coarsest first."""
-    longest = max(scan.width_px, scan.height_px)
-    coarse, fine = (max(round(longest / size), 1) for size in (_FIRST_SIZE_PX, _LAST_SIZE_PX))
-    return [coarse] if coarse == fine else [coarse, fine]
+def _find_in_picture(picture: Bytes, spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec) -> FoundBoard:
+    if isinstance(spec, ChessboardSpec):
+        return find_chessboard(picture, spec)
+    if isinstance(spec, SquareGridSpec):
+        return find_squares(picture, spec)
+    return find_charuco(picture, spec) if isinstance(spec, CharucoSpec) else find_aruco(picture, spec)
 
 
 def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
@@ -252,12 +242,3 @@ def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
         message = f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
         return np.zeros((1, 1), np.uint8), Reason(message, Code.CONTRAST)
     return np.clip((grey - low) * (255 / (high - low)), 0, 255).astype(np.uint8), NO_REASON
-
-
-def _scan_corner(corner: FoundCorner, factor: int) -> FoundCorner:
-    return FoundCorner(_scan_px(corner.center_px, factor), corner.steps_px * factor)
-
-
-def _scan_px(place_px: Array, factor: int) -> Array:
-    """Pixel (i, j) of a reduced picture has its centre at factor j + (factor - 1) / 2."""
-    return place_px * factor + (factor - 1) / 2

@@ -16,7 +16,6 @@ from measure.boards.specs import (
     CharucoSpec,
     ChessboardSpec,
     CircleGridSpec,
-    FoundBoard,
     FoundCorner,
     SquareGridSpec,
     aruco_dictionary,
@@ -130,9 +129,13 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
         fitted, notes = _named_by_colour(fitted, board.corners, spec)
     hidden = "its square was not seen" if isinstance(spec, SquareGridSpec) else "not seen: its markers were not read"
     unseen = board.reason or Reason(hidden, Code.UNNAMED)
-    why = {name: _refused(name, board, spec) or unseen for name in spec.object_points()}
-    marks = tuple(_corner_mark(name, fitted.get(name), missing) for name, missing in why.items())
-    measured = BoardMeasurement(marks, board.reason, notes, tuple(board.refused.values()))
+    marks = []
+    for name in spec.object_points():
+        refusal = board.off_corners.get(name, NO_REASON)
+        if isinstance(spec, ArucoSpec):
+            refusal = board.refused.get(int(name.split(".")[0]), NO_REASON)
+        marks.append(_corner_mark(name, fitted.get(name), refusal or unseen))
+    measured = BoardMeasurement(tuple(marks), board.reason, notes, tuple(board.refused.values()))
     what = "squares" if isinstance(spec, SquareGridSpec) else "inner corners"
     return _unless_alone(measured, f"boards of {spec.columns} x {spec.rows} {what}", board.others_px)
 
@@ -152,50 +155,33 @@ def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Arr
     return replace(measured, marks=marks, ambiguous=why)
 
 
-def _refused(name: str, board: FoundBoard, spec: BoardSpec) -> Reason:
-    """Why a corner, or the marker that it belongs to, is not used, though it was seen."""
-    if isinstance(spec, ArucoSpec):
-        return board.refused.get(int(name.split(".")[0]), NO_REASON)
-    return board.off_corners.get(name, NO_REASON)
-
-
-@dataclass(frozen=True, eq=False)
-class FittedCorner:
-    """A corner as fitted, and how far that moved it from where it was found."""
-
-    corner: Corner
-    moved_px: float
-
-
-def _fit_found(
-    scan: Scan,
-    found: FoundCorner,
-    spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec,
-    board_reach_px: float,
-) -> FittedCorner:
+def _fit_found(scan: Scan, found: FoundCorner, spec: BoardSpec, board_reach_px: float) -> Corner:
     """Least-squares matching about a corner that was found."""
     surface: Surface = quarter if isinstance(spec, ArucoSpec | SquareGridSpec) else crossing
-    if isinstance(spec, ArucoSpec):
-        reach = _marker_reach_px(found.steps_px, spec)
-    elif isinstance(spec, SquareGridSpec):
-        reach = _square_reach_px(found.steps_px, spec)
-    else:
-        reach = _reach_px(found.steps_px, board_reach_px, spec)
-    half = np.ceil(np.abs(found.steps_px / np.hypot(*found.steps_px)) @ reach).astype(int) + 2
+    steps_px = found.steps_px
+    sides_px = np.hypot(*steps_px)
+    reach = _reach_px(sides_px, spec, board_reach_px)
+    half = np.ceil(np.abs(steps_px / sides_px) @ reach).astype(int) + 2
     col0, row0 = np.round(found.center_px).astype(int) - half
     width, height = 2 * half + 1
     place_px = int(col0), int(row0), int(width), int(height)
     window = ScanWindow(scan.window(*place_px), (col0, row0), scan.inside(*place_px))
-    corner = fit_corner(window, found.center_px, found.steps_px, reach, surface)
-    return FittedCorner(corner, float(np.hypot(*(corner.center_px - found.center_px))))
+    return fit_corner(window, found.center_px, steps_px, reach, surface)
 
 
-def _reach_px(steps_px: Array, board_reach_px: float, spec: ChessboardSpec | CharucoSpec) -> Array:
-    """(2,) how far along the square's sides grey values are used: not into a marker in one of the squares."""
+def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:
+    """(2,) how far along the sides (2,) of a square or marker grey values are used."""
+    if isinstance(spec, ArucoSpec):
+        modules = aruco_dictionary(spec.dictionary).markerSize + 2
+        gap_modules = spec.gap_mm / spec.marker_mm * modules
+        return np.asarray(np.minimum(_MARKER_REACH * min(1.0, gap_modules) * sides_px / modules, _LONGEST_REACH_PX))
+    if isinstance(spec, SquareGridSpec):  # to neither its next corner nor the next square
+        free = min(_HALF_SIDE, _FREE_GAP * spec.gap_mm / spec.square_mm)
+        return np.asarray(np.minimum(free * sides_px, _LONGEST_REACH_PX))
     farthest = _FARTHEST_REACH
-    if isinstance(spec, CharucoSpec):
+    if isinstance(spec, CharucoSpec):  # not into a marker in one of the squares
         farthest = (spec.square_mm - spec.marker_mm) / (2 * spec.square_mm)
-    return np.full(2, min(board_reach_px, farthest * float(np.hypot(*steps_px).min())))
+    return np.full(2, min(board_reach_px, farthest * float(sides_px.min())))
 
 
 def _common_reach_px(corners: Iterable[FoundCorner]) -> float:
@@ -205,59 +191,33 @@ def _common_reach_px(corners: Iterable[FoundCorner]) -> float:
     return float(np.clip(_REACH * np.median(sides), _SHORTEST_REACH_PX, _LONGEST_REACH_PX))
 
 
-def _marker_reach_px(sides_px: Array, spec: ArucoSpec) -> Array:
-    """(2,) the same along a marker's sides."""
-    modules = aruco_dictionary(spec.dictionary).markerSize + 2
-    gap_modules = spec.gap_mm / spec.marker_mm * modules
-    return np.asarray(
-        np.minimum(_MARKER_REACH * min(1.0, gap_modules) * np.hypot(*sides_px) / modules, _LONGEST_REACH_PX)
-    )
-
-
-def _square_reach_px(sides_px: Array, spec: SquareGridSpec) -> Array:
-    """(2,) the same along the sides of a square that stands alone: to neither its next corner nor the next square."""
-    free = min(_HALF_SIDE, _FREE_GAP * spec.gap_mm / spec.square_mm)
-    return np.asarray(np.minimum(free * np.hypot(*sides_px), _LONGEST_REACH_PX))
-
-
 def _named_by_colour(
-    fitted: dict[str, FittedCorner], found: dict[str, FoundCorner], spec: ChessboardSpec
-) -> tuple[dict[str, FittedCorner], tuple[str, ...]]:
+    fitted: dict[str, Corner], found: dict[str, FoundCorner], spec: ChessboardSpec
+) -> tuple[dict[str, Corner], tuple[str, ...]]:
     """The corners named so that the square r0c0, r0c1, r1c1, r1c0 is dark; a board that looks the same after a half
     turn is taken as upright. Boards of as many columns as rows are turned by quarters."""
-    quarters = range(4) if spec.columns == spec.rows else (0, 2)
     names = np.array([[f"r{row}c{column}" for column in range(spec.columns)] for row in range(spec.rows)])
-    turned = [np.rot90(names, quarter_turns) for quarter_turns in quarters]
-    # Turned by a quarter, the square between a corner's steps is its neighbour of the other colour.
-    darkness = np.array(
-        [-((-1) ** turns) * _first_square_contrast(fitted, now) for turns, now in zip(quarters, turned, strict=True)]
-    )
-    upright = np.array([_steps_right(found, names_now) for names_now in turned])
-    best = max(range(len(turned)), key=lambda index: (darkness[index] > 0, upright[index]))
-    notes: tuple[str, ...] = ()
-    if np.sum(darkness > 0) > 1:
-        notes = ("the board looks the same after a half turn: it was taken as upright in the scan",)
-    return {str(new): fitted[str(old)] for new, old in zip(names.ravel(), turned[best].ravel(), strict=True)}, notes
+    contrasts = np.array([[fitted[name].contrast_dn for name in line] for line in names])
+    columns_px = np.array([[found[name].center_px[0] for name in line] for line in names])
+
+    def fits(quarter_turns: int) -> tuple[bool, float]:
+        """Whether the first square is dark, over the whole board; and how far to the right the first row runs."""
+        contrast, (first, *_, last) = np.rot90(contrasts, quarter_turns), np.rot90(columns_px, quarter_turns)[0]
+        lighter = np.where(np.indices(contrast.shape).sum(axis=0) % 2 == 0, contrast, -contrast)
+        # Turned by a quarter, the square between a corner's steps is its neighbour of the other colour.
+        return bool((-1) ** quarter_turns * np.nanmedian(lighter) < 0), float(last - first)
+
+    ranks = {turns: fits(turns) for turns in (range(4) if spec.columns == spec.rows else (0, 2))}
+    old_names = np.rot90(names, max(ranks, key=ranks.__getitem__))
+    is_unsure = sum(is_dark for is_dark, _ in ranks.values()) > 1
+    notes = ("the board looks the same after a half turn: it was taken as upright in the scan",) if is_unsure else ()
+    return {str(new): fitted[str(old)] for new, old in zip(names.ravel(), old_names.ravel(), strict=True)}, notes
 
 
-def _first_square_contrast(fitted: dict[str, FittedCorner], names: NDArray[np.str_]) -> float:
-    """How much lighter than its neighbours the square at the first corner is, over the whole board."""
-    sign = np.where(np.indices(names.shape).sum(axis=0) % 2 == 0, 1, -1)
-    contrast = np.array([[fitted[str(name)].corner.contrast_dn for name in row] for row in names])
-    return float(np.nanmedian(sign * contrast))
-
-
-def _steps_right(found: dict[str, FoundCorner], names: NDArray[np.str_]) -> float:
-    """How far to the right in the scan the first row runs."""
-    first, last = found[str(names[0, 0])].center_px, found[str(names[0, -1])].center_px
-    return float(last[0] - first[0])
-
-
-def _corner_mark(name: str, fitted: FittedCorner | None, missing: Reason) -> MarkMeasurement:
+def _corner_mark(name: str, corner: Corner | None, missing: Reason) -> MarkMeasurement:
     """The row of a point."""
-    if fitted is None:
+    if corner is None:
         return MarkMeasurement(name, "target", None, None, Status.ABSENT, missing)
-    corner = fitted.corner
     if corner.reason:
         reason = corner.reason.reword(f"not fitted: {corner.reason}")
         return MarkMeasurement(name, "target", corner.center_px, None, Status.PREDICTED, reason)
@@ -267,7 +227,7 @@ def _corner_mark(name: str, fitted: FittedCorner | None, missing: Reason) -> Mar
         "noise_dn": corner.noise_dn,
         "blur_px": corner.blur_px,
         "damaged_fraction": corner.damaged_fraction,
-        "moved_px": fitted.moved_px,
+        "moved_px": corner.moved_px,
     }
     if corner.junction_px is not None:
         quality |= {"junction_col_px": corner.junction_px[0], "junction_row_px": corner.junction_px[1]}

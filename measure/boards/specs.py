@@ -6,6 +6,8 @@ units are those of the specification.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import product
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -17,31 +19,36 @@ Point3 = tuple[float, float, float]
 Array = NDArray[np.float64]
 
 
+class _Spec:
+    """A board of columns and rows; its lengths are positive."""
+
+    fewest: ClassVar[int] = 3  # columns, and rows
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name in ("columns", "rows") and value < self.fewest:
+                raise ValueError(f"{name} is {value}; {self.fewest} or more is right")
+            if name.endswith("_mm") and value is not None and not (value > 0 and np.isfinite(value)):
+                raise ValueError(f"{name} is {value}; a positive number is right")
+
+
 @dataclass(frozen=True)
-class ChessboardSpec:
+class ChessboardSpec(_Spec):
     """A chessboard of columns x rows INNER corners; a point's id is r{row}c{column}, row 0 the upper one."""
 
     columns: int
     rows: int
     square_mm: float
 
-    def __post_init__(self) -> None:
-        _check_count(self, "columns", 3)
-        _check_count(self, "rows", 3)
-        _check_length(self, "square_mm")
-
     def object_points(self) -> dict[str, Point3]:
         """Id to (X, Y, 0) in mm."""
-        top = (self.rows - 1) * self.square_mm
-        return {
-            f"r{row}c{column}": (column * self.square_mm, top - row * self.square_mm, 0.0)
-            for row in range(self.rows)
-            for column in range(self.columns)
-        }
+        step, last = self.square_mm, self.rows - 1
+        places = product(range(self.rows), range(self.columns))
+        return {f"r{row}c{column}": (column * step, (last - row) * step, 0.0) for row, column in places}
 
 
 @dataclass(frozen=True)
-class CircleGridSpec:
+class CircleGridSpec(_Spec):
     """A grid of columns x rows dots; a point's id is r{row}c{column}.
 
     spacing_mm: between neighbouring columns and rows. Asymmetric: only the places where row + column is even hold a dot
@@ -57,12 +64,7 @@ class CircleGridSpec:
     row_spacing_mm: float | None = None
 
     def __post_init__(self) -> None:
-        _check_count(self, "columns", 3)
-        _check_count(self, "rows", 3)
-        _check_length(self, "spacing_mm")
-        _check_length(self, "diameter_mm")
-        if self.row_spacing_mm is not None:
-            _check_length(self, "row_spacing_mm")
+        super().__post_init__()
         if self.diameter_mm >= self.shortest_distance_mm:
             raise ValueError(
                 f"diameter_mm is {self.diameter_mm}; dots less than {self.shortest_distance_mm} wide are right"
@@ -70,12 +72,8 @@ class CircleGridSpec:
 
     def places(self) -> list[tuple[int, int]]:
         """(row, column) of every dot."""
-        return [
-            (row, column)
-            for row in range(self.rows)
-            for column in range(self.columns)
-            if not self.asymmetric or (row + column) % 2 == 0
-        ]
+        places = product(range(self.rows), range(self.columns))
+        return [(row, column) for row, column in places if not self.asymmetric or (row + column) % 2 == 0]
 
     @property
     def shortest_distance_mm(self) -> float:
@@ -96,7 +94,7 @@ class CircleGridSpec:
 
 
 @dataclass(frozen=True)
-class ArucoSpec:
+class ArucoSpec(_Spec):
     """A board of columns x rows ArUco markers, the first in the upper left corner, then row by row.
 
     dictionary: OpenCV's name, "4X4_50" say. A point's id is {marker}.{corner}, the corner 0 being the marker's upper
@@ -109,25 +107,21 @@ class ArucoSpec:
     marker_mm: float
     gap_mm: float
     first_marker: int = 0
+    fewest = 1
 
     def __post_init__(self) -> None:
-        _check_count(self, "columns", 1)
-        _check_count(self, "rows", 1)
-        _check_length(self, "marker_mm")
-        _check_length(self, "gap_mm")
+        super().__post_init__()
         _check_markers(self.dictionary, self.first_marker, self.columns * self.rows)
 
     def object_points(self) -> dict[str, Point3]:
         """Id to (X, Y, 0) in mm."""
         corners = _corners(self.columns, self.rows, self.marker_mm, self.gap_mm)
-        return {
-            f"{self.first_marker + row * self.columns + column}.{corner}": point
-            for (row, column, corner), point in corners.items()
-        }
+        first, across = self.first_marker, self.columns
+        return {f"{first + row * across + column}.{k}": point for (row, column, k), point in corners.items()}
 
 
 @dataclass(frozen=True)
-class SquareGridSpec:
+class SquareGridSpec(_Spec):
     """A grid of columns x rows separate dark squares, as Zhang's pattern.
 
     A point's id is r{row}c{column}.{corner}, row 0 the upper one, the corner 0 being the square's upper left one, then
@@ -139,15 +133,9 @@ class SquareGridSpec:
     square_mm: float
     gap_mm: float
 
-    def __post_init__(self) -> None:
-        _check_count(self, "columns", 3)
-        _check_count(self, "rows", 3)
-        _check_length(self, "square_mm")
-        _check_length(self, "gap_mm")
-
     def places(self) -> list[tuple[int, int]]:
         """(row, column) of every square."""
-        return [(row, column) for row in range(self.rows) for column in range(self.columns)]
+        return list(product(range(self.rows), range(self.columns)))
 
     @staticmethod
     def square_name(place: tuple[int, int]) -> str:
@@ -161,7 +149,7 @@ class SquareGridSpec:
 
 
 @dataclass(frozen=True)
-class CharucoSpec:
+class CharucoSpec(_Spec):
     """A chessboard of columns x rows SQUARES with ArUco markers in its white ones, as OpenCV prints it.
 
     A point's id is c{number} of the inner corner, row by row from the upper left one. legacy: whether the board has the
@@ -176,24 +164,19 @@ class CharucoSpec:
     marker_mm: float
     legacy: bool | None = None
     first_id: int = 0
+    fewest = 2
 
     def __post_init__(self) -> None:
-        _check_count(self, "columns", 2)
-        _check_count(self, "rows", 2)
-        _check_length(self, "square_mm")
-        _check_length(self, "marker_mm")
+        super().__post_init__()
         if self.marker_mm >= self.square_mm:
             raise ValueError(f"marker_mm is {self.marker_mm}; less than the square's {self.square_mm} is right")
         _check_markers(self.dictionary, self.first_id, self.columns * self.rows // 2)
 
     def object_points(self) -> dict[str, Point3]:
         """Id to (X, Y, 0) in mm."""
-        across, down = self.columns - 1, self.rows - 1
-        return {
-            f"c{row * across + column}": (column * self.square_mm, (down - 1 - row) * self.square_mm, 0.0)
-            for row in range(down)
-            for column in range(across)
-        }
+        step, last, across = self.square_mm, self.rows - 2, self.columns - 1
+        places = product(range(self.rows - 1), range(across))
+        return {f"c{row * across + column}": (column * step, (last - row) * step, 0.0) for row, column in places}
 
 
 BoardSpec = ChessboardSpec | CircleGridSpec | ArucoSpec | CharucoSpec | SquareGridSpec
@@ -206,9 +189,7 @@ def _corners(columns: int, rows: int, side_mm: float, gap_mm: float) -> dict[tup
     corners = ((0.0, 0.0), (side_mm, 0.0), (side_mm, side_mm), (0.0, side_mm))
     return {
         (row, column, corner): (column * step + right, top - row * step - down, 0.0)
-        for row in range(rows)
-        for column in range(columns)
-        for corner, (right, down) in enumerate(corners)
+        for row, column, (corner, (right, down)) in product(range(rows), range(columns), enumerate(corners))
     }
 
 
@@ -227,18 +208,6 @@ def _check_markers(name: str, first: int, count: int) -> None:
         raise ValueError(
             f"the board needs markers {first} to {first + count - 1}; dictionary {name} has 0 to {size - 1}"
         )
-
-
-def _check_count(spec: object, name: str, least: int) -> None:
-    value = getattr(spec, name)
-    if value < least:
-        raise ValueError(f"{name} is {value}; {least} or more is right")
-
-
-def _check_length(spec: object, name: str) -> None:
-    value = getattr(spec, name)
-    if not (value > 0 and np.isfinite(value)):
-        raise ValueError(f"{name} is {value}; a positive number is right")
 
 
 @dataclass(frozen=True)
