@@ -123,7 +123,7 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
         if pattern is None:
             continue
         if pattern.grid.shape == grid.shape == (spec.rows, spec.columns, 2):
-            steps = np.stack(np.gradient(grid, axis=(1, 0)), axis=-1)
+            steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1)
             places = np.ndindex(*grid.shape[:2])
             corners = {f"r{row}c{column}": FoundCorner(grid[row, column], steps[row, column]) for row, column in places}
             return FoundBoard(corners, others_px=_other_chessboards(picture, grid, spec))

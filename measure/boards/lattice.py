@@ -43,15 +43,10 @@ def grid_places(points_px: Array, appearances: Array, places: list[Place]) -> li
     best: list[dict[Place, int]] = []
     for lattice in _lattices(points_px, appearances):
         found = _outlines(lattice, places)
-        if found and (not best or _rank(found) > _rank(best)):
-            best = found
-        if best and _rank(best) > (True, 0.98 * len(places)):
+        best = max(best, found, key=lambda ways: (is_whole(ways), len(ways[0]) if ways else 0))
+        if is_whole(best) and len(best[0]) > 0.98 * len(places):
             break
     return best
-
-
-def _rank(assignments: list[dict[Place, int]]) -> tuple[bool, int]:
-    return is_whole(assignments), len(assignments[0])
 
 
 def is_whole(assignments: list[dict[Place, int]]) -> bool:
@@ -59,38 +54,13 @@ def is_whole(assignments: list[dict[Place, int]]) -> bool:
     return len({frozenset(assignment.values()) for assignment in assignments}) == 1
 
 
-def other_grids(
-    centers: Array, appearances: Array, assignment: dict[Place, int], places: list[Place]
-) -> tuple[Array, ...]:
-    """The middles of the grids that the points make beside the one that was found."""
-    others: list[Array] = []
-    left = np.arange(len(centers))
-    found = list(assignment.values())
-    while True:
-        left = np.delete(left, found)
-        further = grid_places(centers[left], appearances[left], places)
-        if not is_whole(further):
-            return tuple(others)
-        found = list(further[0].values())
-        others.append(centers[left[found]].mean(axis=0))
-
-
-def upright(assignment: dict[Place, int], centers: Array) -> float:
-    """How far to the right in the scan the grid's columns follow one another."""
-    columns = np.array([column for _, column in assignment], float)
-    right = np.array([centers[index][0] for index in assignment.values()])
-    return float(np.cov(columns, right)[0, 1])
-
-
 def _lattices(points_px: Array, appearances: Array) -> list[dict[Place, int]]:
     """Lattices that the points form, {(i, j): index}, the largest first; i to j turns as column to row of a scan."""
     if len(points_px) < 4:
         return []
     tree = cKDTree(points_px)
-    found = [
-        _grown(points_px, appearances, tree, int(seed))
-        for seed in np.linspace(0, len(points_px) - 1, _SEEDS).astype(int)
-    ]
+    seeds = np.linspace(0, len(points_px) - 1, _SEEDS).astype(int).tolist()
+    found = [_grown(points_px, appearances, tree, seed) for seed in seeds]
     return [lattice for lattice in sorted(found, key=len, reverse=True)[:3] if lattice]
 
 
@@ -209,10 +179,22 @@ def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | Squar
         if assignments:
             message = f"a grid of more than {size} is seen, or one with a line of it hidden"
         return FoundGrid({}, reason=Reason(message, Code.NO_BOARD))
-    assignment = max(assignments, key=lambda found: upright(found, points_px))
+
+    def uprightness(assignment: dict[Place, int]) -> float:
+        """How far to the right in the scan the grid's columns follow one another."""
+        columns = [column for _, column in assignment]
+        return float(np.cov(columns, points_px[list(assignment.values()), 0])[0, 1])
+
+    assignment = max(assignments, key=uprightness)
     notes = ("the grid looks the same when turned: it was taken as upright in the scan",)
-    others = other_grids(points_px, appearances, assignment, places)
-    return FoundGrid(assignment, others, notes[: len(assignments) - 1])
+    others, left, found = list[Array](), np.arange(len(points_px)), list(assignment.values())
+    while True:
+        left = np.delete(left, found)
+        further = grid_places(points_px[left], appearances[left], places)
+        if not is_whole(further):
+            return FoundGrid(assignment, tuple(others), notes[: len(assignments) - 1])
+        found = list(further[0].values())
+        others.append(points_px[left[found]].mean(axis=0))
 
 
 def find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:

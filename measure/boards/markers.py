@@ -1,8 +1,8 @@
 """The markers of a board read in a picture, each at one place: where one is read at several, its board says which."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -16,8 +16,11 @@ from measure.targets.sheets import SheetView, robust_view
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Markers = Mapping[int, Array]  # the corners (4, 2) of each on its board, by number
-Key = TypeVar("Key")
+Changes = dict[str, Any]
+Layout = TypeVar("Layout", ArucoSpec, CharucoSpec)
 _OFF_SQUARES = 0.25  # of a square, that a corner lies off where the markers beside it put it
+_NO_LEGACY: tuple[Changes, ...] = ({},)
+_LEGACIES: tuple[Changes, ...] = ({"legacy": False}, {"legacy": True})  # OpenCV's two layouts of ChArUco boards
 _FEWEST_CORNERS = 4  # that a homography takes
 
 
@@ -45,7 +48,9 @@ def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary) -> MarkerRead
     """Read all markers of a dictionary, of whatever board."""
     outlines, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
     readings: dict[int, list[Array]] = {}
-    for outline, number in zip(outlines, _integers(numbers), strict=True):
+    for outline, number in zip(
+        outlines, [] if numbers is None else np.asarray(numbers, int).ravel().tolist(), strict=True
+    ):
         readings.setdefault(number, []).append(np.asarray(outline, float).reshape(4, 2))
     return MarkerReadings(readings, (picture.shape[1], picture.shape[0]), 1 / (dictionary.markerSize + 2))
 
@@ -81,31 +86,12 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
     return ReadMarkers(corners, refused, agreeing)
 
 
-def better_layout(
-    read: MarkerReadings, given: ReadMarkers, others: Iterable[tuple[Key, Markers]]
-) -> tuple[Key, ReadMarkers] | None:
-    """The layout under which more of the markers that were read lie where their board has them than under the given
-    one; None where none is better."""
-    best: tuple[Key, ReadMarkers] | None = None
-    most = given.agreeing
-    for key, board in others if given.agreeing < len(read.outlines_px) else ():
-        placed = placed_markers(read, board)
-        if placed.agreeing > most:
-            best, most = (key, placed), placed.agreeing
-    return best
-
-
 def other_first_numbers(read: MarkerReadings, first: int, count: int) -> list[int]:
     """The numbers that a board of so many markers may begin at to have all that were read, where it has not."""
     numbers = sorted(read.outlines_px)
     if not numbers or (first <= numbers[0] and numbers[-1] < first + count):
         return []
     return list(range(max(numbers[-1] - count + 1, 0), numbers[0] + 1))
-
-
-def _integers(numbers: object) -> list[int]:
-    """OpenCV's column of numbers, None where there are none."""
-    return [] if numbers is None else [int(number) for number in np.ravel(np.asarray(numbers))]
 
 
 def _view(
@@ -145,37 +131,24 @@ def _side_px(image_px: Array) -> float:
     return float(np.hypot(*(np.roll(image_px, 1, axis=0) - image_px).T).max())
 
 
-# The corners of boards with markers in a picture, to a pixel: ArUco grids and ChArUco boards.
-#
-# Markers that lie as on a board of another layout are refused, with the layout that fits: read as they are said to be,
-# all points would have their neighbours' names.
-
-
 def find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
     """The corners of the board's markers that are read; steps are the marker's sides that leave the corner."""
-    readings = read_markers(picture, aruco_dictionary(spec.dictionary))
-    read = placed_markers(readings, _aruco_markers(spec))
-    better = better_layout(readings, read, ((other, _aruco_markers(other)) for other in _other_arucos(spec, readings)))
-    if better:
-        return _other_layout_board(spec, better[0])
+    read, layout = _read_board(picture, spec)
+    if layout != spec:
+        return _other_layout_board(spec, layout)
     found: dict[str, FoundCorner] = {}
     for number, corners in read.corners_px.items():
         found |= corners_of_square(f"{number}", corners)
-    reason = NO_REASON if found else _too_few(spec, read)
-    return FoundBoard(found, reason, read.refused)
+    return FoundBoard(found, NO_REASON if found else _too_few(spec, read), read.refused)
 
 
 def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     """The inner corners whose neighbouring markers are read. Where the specification does not say which of OpenCV's two
     layouts the board has, its markers do."""
-    readings = read_markers(picture, aruco_dictionary(spec.dictionary))
-    read = placed_markers(readings, _charuco_markers(spec))
-    others = ((other, _charuco_markers(other)) for other in _other_charucos(spec, readings))
-    better = better_layout(readings, read, others)
-    if better and (spec.legacy is not None or better[0] != replace(spec, legacy=True)):
-        return _other_layout_board(spec, better[0])
-    if better:
-        spec, read = better
+    read, layout = _read_board(picture, spec)
+    if layout not in (spec, replace(spec, legacy=True) if spec.legacy is None else spec):
+        return _other_layout_board(spec, layout)
+    spec = layout
     outlines = [outline[None].astype(np.float32) for outline in read.corners_px.values()]
     numbers_read = np.array(list(read.corners_px), np.int32)[:, None]
     corners, numbers, _, _ = cv2.aruco.CharucoDetector(charuco_board(spec)).detectBoard(
@@ -184,29 +157,39 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     if corners is None or len(corners) < _FEWEST_CORNERS:
         return FoundBoard({}, _too_few(spec, read), read.refused)
     places, ids = np.asarray(corners, float).reshape(-1, 2), np.asarray(numbers, int).ravel()
-    steps = _charuco_steps(ids, places, spec)
-    found = {f"c{id}": FoundCorner(*corner) for id, *corner in zip(ids, places, steps, strict=True)}
+    # The squares' sides at each corner, from a homography of the board: neighbours may be missing.
+    across = spec.columns - 1
+    board = np.stack([ids % across, ids // across], axis=-1).astype(float)
+    homography = np.asarray(cv2.findHomography(board, places)[0], float)
+    found = {
+        f"c{number}": FoundCorner(place, homography_steps(homography, on_board))
+        for number, place, on_board in zip(ids, places, board, strict=True)
+    }
     off = off_corners(found, spec, read)
     kept = {name: corner for name, corner in found.items() if name not in off}
     return FoundBoard(kept, refused=read.refused, off_corners=off)
 
 
-def _other_arucos(spec: ArucoSpec, read: MarkerReadings) -> Iterator[ArucoSpec]:
-    """What a board may be that is taken for the one that is described."""
-    if spec.columns != spec.rows:
-        yield replace(spec, columns=spec.rows, rows=spec.columns)
-    for first in other_first_numbers(read, spec.first_marker, spec.columns * spec.rows):
-        yield replace(spec, first_marker=first)
+def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
+    """A board's markers; and the layout, the one that is described or a better one, under which most of those that were
+    read lie where their board has them."""
+    readings = read_markers(picture, aruco_dictionary(spec.dictionary))
+    best, layout = placed_markers(readings, _markers(spec)), spec
+    for other in _other_layouts(spec, readings) if best.agreeing < len(readings.outlines_px) else ():
+        placed = placed_markers(readings, _markers(other))
+        if placed.agreeing > best.agreeing:
+            best, layout = placed, other
+    return best, layout
 
 
-def _other_charucos(spec: CharucoSpec, read: MarkerReadings) -> Iterator[CharucoSpec]:
+def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
     """What a board may be that is taken for the one that is described."""
-    firsts = other_first_numbers(read, spec.first_id, spec.columns * spec.rows // 2)
-    turned = replace(spec, columns=spec.rows, rows=spec.columns)
-    for board in (spec, turned, *(replace(spec, first_id=first) for first in firsts)):
-        for legacy in (False, True):
-            if replace(board, legacy=legacy) != replace(spec, legacy=bool(spec.legacy)):
-                yield replace(board, legacy=legacy)
+    first_key, legacies = ("first_marker", _NO_LEGACY) if isinstance(spec, ArucoSpec) else ("first_id", _LEGACIES)
+    firsts = other_first_numbers(read, getattr(spec, first_key), len(_markers(spec)))
+    changes: list[Changes] = [{}, {"columns": spec.rows, "rows": spec.columns}, *({first_key: one} for one in firsts)]
+    given: Changes = {key: bool(getattr(spec, key)) for key in legacies[0]}
+    others = (replace(spec, **change, **legacy) for change in changes for legacy in legacies)
+    yield from (other for other in others if other != replace(spec, **given))
 
 
 def _other_layout_board(spec: ArucoSpec | CharucoSpec, other: ArucoSpec | CharucoSpec) -> FoundBoard:
@@ -232,7 +215,11 @@ def _too_few(spec: ArucoSpec | CharucoSpec, read: ReadMarkers) -> Reason:
     return Reason(message, Code.NO_BOARD)
 
 
-def _aruco_markers(spec: ArucoSpec) -> Markers:
+def _markers(spec: ArucoSpec | CharucoSpec) -> Markers:
+    """The markers of a board; of a ChArUco board as OpenCV has it: y down, its origin at the upper left square."""
+    if isinstance(spec, CharucoSpec):
+        board = charuco_board(spec)
+        return dict(zip(np.ravel(board.getIds()).tolist(), np.array(board.getObjPoints())[..., :2], strict=True))
     points = spec.object_points()
     numbers = range(spec.first_marker, spec.first_marker + spec.columns * spec.rows)
     return {number: np.array([points[f"{number}.{index}"][:2] for index in range(4)]) for number in numbers}
@@ -247,23 +234,9 @@ def charuco_board(spec: CharucoSpec) -> cv2.aruco.CharucoBoard:
     return board
 
 
-def _charuco_markers(spec: CharucoSpec) -> Markers:
-    """OpenCV's board: y down, its origin at the upper left square's corner."""
-    board = charuco_board(spec)
-    return dict(zip(np.ravel(board.getIds()).tolist(), np.array(board.getObjPoints())[..., :2], strict=True))
-
-
-def _charuco_steps(ids: NDArray[np.int64], places: Array, spec: CharucoSpec) -> list[Array]:
-    """The squares' sides at each corner, from a homography of the board: neighbours may be missing."""
-    across = spec.columns - 1
-    board = np.stack([ids % across, ids // across], axis=-1).astype(float)
-    homography, _ = cv2.findHomography(board, places)
-    return [homography_steps(np.asarray(homography, float), place) for place in board]
-
-
 def off_corners(found: Mapping[str, FoundCorner], spec: CharucoSpec, read: ReadMarkers) -> dict[str, Reason]:
     """The corners that do not lie where the markers that touch them put them, and why."""
-    on_board = _charuco_markers(spec)
+    on_board = _markers(spec)
     middles = {number: on_board[number].mean(axis=0) / spec.square_mm for number in read.corners_px}
     off = {}
     for name, corner in found.items():
