@@ -184,8 +184,10 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
 
 def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
     """What a board may be that is taken for the one that is described."""
-    first_key, legacies = ("first_marker", _NO_LEGACY) if isinstance(spec, ArucoSpec) else ("first_id", _LEGACIES)
-    firsts = other_first_numbers(read, getattr(spec, first_key), len(_markers(spec)))
+    is_aruco = isinstance(spec, ArucoSpec)
+    first_key: str = "first_marker" if is_aruco else "first_id"
+    legacies = _NO_LEGACY if is_aruco else _LEGACIES
+    firsts: list[int] = other_first_numbers(read, getattr(spec, first_key), len(_markers(spec)))
     changes: list[Changes] = [{}, {"columns": spec.rows, "rows": spec.columns}, *({first_key: one} for one in firsts)]
     given: Changes = {key: bool(getattr(spec, key)) for key in legacies[0]}
     others = (replace(spec, **change, **legacy) for change in changes for legacy in legacies)
