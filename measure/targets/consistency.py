@@ -184,15 +184,6 @@ def _chances(fit: _Fit, targets: TargetPlaces) -> Array:
     return chance
 
 
-# Points that several images show, and that are not quite where their coordinates say: what the other images tell of
-# each.
-#
-# A dot that was printed off its place, or lies on a buckle of its sheet, is seen off in all images; a false reading,
-# dirt or glare in one alone. So the targets of each image are compared (`shared_offsets`) with the points as all other
-# images show them: of each point, how far it is off in space, by least squares over its images, in which wrong readings
-# count little, and a prior whose spread all points tell (variance components, expectation and maximisation).
-
-
 @dataclass(frozen=True, eq=False)
 class ImagePoints:
     """What an image shows: index (n,), of the points; targets: where it should show them by their coordinates; by_point
@@ -221,61 +212,42 @@ def compared_together(images: Sequence[ImagePoints], xyz: Array) -> list[Compari
     Parameters
     ----------
     xyz : (m, 3) the points, along a plane and above it if they lie on one: each coordinate has a spread of its own.
+
+    Notes
+    -----
+    A dot that was printed off its place, or lies on a buckle of its sheet, is off in all images; a false reading, dirt
+    or glare in one alone. So each image is compared with the points as all other images show them: of each point, how
+    far it is off in space, by least squares over its images, in which wrong readings count little, and a prior whose
+    spread all points tell (variance components, expectation and maximisation).
     """
-    known = _Known.start(len(images), xyz)
+    extent = float(np.ptp(xyz, axis=0).max())
+    spread = np.full(3, _SPREAD * extent)  # standard deviation of the points about their coordinates
+    offs = np.zeros((len(images), *xyz.shape))  # of the points by all images but one
+    covariances = np.zeros((*offs.shape, 3))
+    comparisons = _compare_all(images, offs, covariances)
     for _ in range(_POINT_ROUNDS - 1):
-        known = _gathered(_Readings.read(images, known), known)
-    return _comparisons(images, known)
+        readings = _Readings.read(images, comparisons, offs)
+        is_shared = (readings.squares > 0.0).sum(axis=0) > 1
+        if not is_shared.any():
+            break
+        for _ in range(_SPREADS):
+            weights, of_prior = readings.weights(spread)
+            off, covariance = readings.solved(weights, of_prior, spread)
+            moments = of_prior[:, None] * (off**2 + np.einsum("nii->ni", covariance))
+            spread = np.maximum(np.sqrt(moments[is_shared].mean(axis=0)), _LEAST * extent)
+        others = [
+            readings.leave_out(i).solved(np.delete(weights, i, axis=0), of_prior, spread) for i in range(len(weights))
+        ]
+        offs, covariances = (np.stack(parts) for parts in zip(*others, strict=True))
+        comparisons = _compare_all(images, offs, covariances)
+    return comparisons
 
 
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """For each of i images, what the others say of m points: off (i, m, 3) their coordinates, covariance (i, m, 3, 3);
-    spread (3,): standard deviation of the points about their coordinates; extent of the field."""
-
-    off: Array
-    covariance: Array
-    spread: Array
-    extent: float
-
-    @classmethod
-    def start(cls, images: int, xyz: Array) -> "_Known":
-        extent = float(np.ptp(xyz, axis=0).max())
-        none = np.zeros((images, *xyz.shape))
-        return cls(none, np.zeros((*none.shape, 3)), np.full(3, _SPREAD * extent), extent)
-
-
-def _comparisons(images: Sequence[ImagePoints], known: _Known) -> list[Comparison]:
+def _compare_all(images: Sequence[ImagePoints], offs: Array, covariances: Array) -> list[Comparison]:
     return [
         image.compared(off[image.index], covariance[image.index])
-        for image, off, covariance in zip(images, known.off, known.covariance, strict=True)
+        for image, off, covariance in zip(images, offs, covariances, strict=True)
     ]
-
-
-def _gathered(readings: "_Readings", known: _Known) -> _Known:
-    """What the images say of the points, each by its others; nothing new where they share none."""
-    is_shared = (readings.squares > 0.0).sum(axis=0) > 1
-    if not is_shared.any():
-        return known
-    spread = known.spread
-    for _ in range(_SPREADS):
-        weights, of_prior = readings.weights(spread)
-        off, covariance = readings.solved(weights, of_prior, spread)
-        moments = of_prior[:, None] * (off**2 + np.einsum("nii->ni", covariance))
-        spread = np.maximum(np.sqrt(moments[is_shared].mean(axis=0)), _LEAST * known.extent)
-    others = [
-        readings.leave_out(i).solved(np.delete(weights, i, axis=0), of_prior, spread) for i in range(len(weights))
-    ]  # fmt: skip
-    offs, covariances = (np.stack(parts) for parts in zip(*others, strict=True))
-    return replace(known, off=offs, covariance=covariances, spread=spread)
-
-
-def _noises(comparisons: Sequence[Comparison]) -> list[Array]:
-    """(n, 2, 2) px² of each image's readings: as those of most images at least, for an image that the points were moved
-    to would seem to be without any."""
-    levels = np.array([np.median(np.einsum("nii->n", one.covariance_px2)) for one in comparisons])
-    factors = np.maximum(np.median(levels) / levels, 1.0)
-    return [factor * one.covariance_px2 for factor, one in zip(factors, comparisons, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,14 +260,18 @@ class _Readings:
     squares: Array
 
     @classmethod
-    def read(cls, images: Sequence[ImagePoints], known: _Known) -> "_Readings":
-        """What each image shows of the points, compared with what is known of them."""
-        count = known.off.shape[:2]
-        normal, right, squares = np.zeros((*count, 3, 3)), np.zeros((*count, 3)), np.zeros(count)
-        comparisons = _comparisons(images, known)
-        for i, (image, one, noise) in enumerate(zip(images, comparisons, _noises(comparisons), strict=True)):
-            offsets = one.off_px + np.einsum("nij,nj->ni", image.by_point, known.off[i, image.index])
-            weighted = np.linalg.solve(noise, np.dstack([image.by_point, offsets]))
+    def read(cls, images: Sequence[ImagePoints], comparisons: Sequence[Comparison], offs: Array) -> "_Readings":
+        """What each image shows of the points that lie so far off (i, m, 3) by the others.
+
+        Its readings are as uncertain as those of most images at least, for an image that the points were moved to would
+        seem to be without any noise.
+        """
+        normal, right, squares = np.zeros((*offs.shape, 3)), np.zeros(offs.shape), np.zeros(offs.shape[:2])
+        levels = np.array([np.median(np.einsum("nii->n", one.covariance_px2)) for one in comparisons])
+        factors = np.maximum(np.median(levels) / levels, 1.0)
+        for i, (image, one) in enumerate(zip(images, comparisons, strict=True)):
+            offsets = one.off_px + np.einsum("nij,nj->ni", image.by_point, offs[i, image.index])
+            weighted = np.linalg.solve(factors[i] * one.covariance_px2, np.dstack([image.by_point, offsets]))
             normal[i, image.index] = image.by_point.swapaxes(1, 2) @ weighted[..., :3]
             right[i, image.index] = np.einsum("nij,ni->nj", image.by_point, weighted[..., 3])
             squares[i, image.index] = np.einsum("ni,ni->n", offsets, weighted[..., 3])
@@ -364,7 +340,12 @@ def is_flat(along: Array) -> bool:
 def sheet_points(pictures: Sequence[SheetImage], sheet: Array) -> list[ImagePoints | None]:
     """Where one camera's pictures should show the points of a sheet, (m, 3) along its plane and above it; None for
     those that show too few, or that no camera sees so."""
-    views = [_view(picture, sheet) for picture in pictures]
+    views = [
+        robust_view(sheet[picture.index, :2], picture.observed_px, picture.size_px)
+        if len(picture.index) >= _LEAST_POINTS
+        else None
+        for picture in pictures
+    ]
     focal = focal_length([view for view in views if view is not None])
     return [
         None if view is None else _image_points(picture, view, focal, sheet)
@@ -372,27 +353,18 @@ def sheet_points(pictures: Sequence[SheetImage], sheet: Array) -> list[ImagePoin
     ]
 
 
-def _view(picture: SheetImage, sheet: Array) -> SheetView | None:
-    if len(picture.index) < _LEAST_POINTS:
-        return None
-    return robust_view(sheet[picture.index, :2], picture.observed_px, picture.size_px)
-
-
 def _image_points(picture: SheetImage, view: SheetView, focal: float, sheet: Array) -> ImagePoints | None:
     """Where the view folds or the sheet lies behind the camera, nothing is said of a point."""
-    places = view.places_px(sheet[picture.index, :2])
-    known = np.isfinite(places).all(axis=1)
+    known = np.isfinite(view.places_px(sheet[picture.index, :2])).all(axis=1)
     if known.sum() < _LEAST_POINTS:
         return None
-    index, places = picture.index[known], places[known]
-    by_point = view.pixel_from_space(sheet[index, :2], focal, _STEP * float(np.ptp(sheet[:, :2])))
-    places = places + by_point[..., 2] * sheet[index, 2:]
-    targets = TargetPlaces(
-        places, _view_derivatives(places, picture.size_px), np.zeros((len(index), 2, 2)), np.zeros(len(index), bool)
-    )
-    return ImagePoints(
-        index, targets, by_point, picture.observed_px[known], picture.covariance_px2[known], picture.size_px
-    )  # fmt: skip
+    points, count = sheet[picture.index[known]], int(known.sum())
+    by_point = view.pixel_from_space(points[:, :2], focal, _STEP * float(np.ptp(sheet[:, :2])))
+    places = view.places_px(points[:, :2]) + by_point[..., 2] * points[:, 2:]
+    derivatives = _view_derivatives(places, picture.size_px)
+    targets = TargetPlaces(places, derivatives, np.zeros((count, 2, 2)), np.zeros(count, bool))
+    observed = picture.observed_px[known], picture.covariance_px2[known]
+    return ImagePoints(picture.index[known], targets, by_point, *observed, picture.size_px)
 
 
 def _view_derivatives(places: Array, size_px: tuple[int, int]) -> Array:

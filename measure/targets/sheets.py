@@ -71,10 +71,8 @@ class SheetView:
 
     def pixel_from_disks(self, sheet: Array, radius: float) -> Array:
         """(n, 2, 2) the images of two radius vectors of disks about points of the sheet, px."""
-        columns = [
-            (self.places_px(sheet + step) - self.places_px(sheet - step)) / 2.0 for step in radius * np.eye(2)
-        ]  # fmt: skip
-        return np.stack(columns, axis=-1)
+        steps = radius * np.eye(2)
+        return np.stack([self.places_px(sheet + step) - self.places_px(sheet - step) for step in steps], axis=-1) / 2.0
 
     def pixel_from_space(self, sheet: Array, focal: float, step: float) -> Array:
         """(n, 2, 3) how far a unit along the sheet, both ways, and one above it move its points, px; focal: the lens's
@@ -82,9 +80,8 @@ class SheetView:
         along = self.pixel_from_disks(sheet, step) / step
         to_camera = np.diag([1.0, 1.0, focal])
         column, row = (to_camera @ self.homography[:, :2]).T
-        above = np.linalg.solve(to_camera, np.cross(column, row)) / np.sqrt(
-            np.linalg.norm(column) * np.linalg.norm(row)
-        )
+        length = np.sqrt(np.linalg.norm(column) * np.linalg.norm(row))
+        above = np.linalg.solve(to_camera, np.cross(column, row)) / length
         mapped = np.column_stack([sheet, np.ones(len(sheet))]) @ self.homography.T
         # Of the homography, but for the depth by which all three are divided.
         ideal = np.column_stack([self.homography[:, :2], above])
