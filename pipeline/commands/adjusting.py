@@ -104,11 +104,12 @@ def design(
 ) -> int:
     """Expected precision of planned photographs."""
     from pipeline.design.run import run_design
+    from pipeline.design.summary import print_design
     from pipeline.progress import Reporter
 
     planned = run_design(scene, out_dir, Reporter())
-    show(as_json, lambda: planned.content, planned.print)
-    return LOOK if planned.needs_a_look else DONE
+    show(as_json, planned.content, lambda console: print_design(planned, console))
+    return LOOK if planned.needs_look else DONE
 
 
 def _numbers(text: str) -> list[float]:

@@ -82,7 +82,7 @@ Exterior = tuple[float, float, float, float, float, float]
 
 def _photos(setup: Setup) -> Iterator[Iterable[Change]]:
     """One more photograph: each that the settings name; one as there is, but turned or carried round the field."""
-    for photo in setup.settings.photos:
+    for photo in setup.settings.photo:
         omega, phi, kappa = (math.radians(angle) for angle in photo.angles_deg)
         image = SceneImage(photo.name, (*photo.position, omega, phi, kappa))
         yield [(f"one more photo: {photo.name}", _with(setup, image))]

@@ -1,9 +1,10 @@
 """design.json: what is expected, what would help, and how it follows the quantities that were varied."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 
@@ -13,176 +14,164 @@ from adjust.problem.network import EXTERIOR_NAMES, Image
 from adjust.problem.parameter import Parameter
 from pipeline.design.alternatives import Alternative
 from pipeline.design.expected import Expected, error_unit, rms
-from pipeline.design.sweeps import Layouts, Swept, Variations
+from pipeline.design.sweeps import Layouts, Swept
 from pipeline.results.adjustment_content import ANGLES, DEG_PER_RAD
-from pipeline.text.text_file import without_nan
 
-Json = dict[str, Any]
-
-
-def design_json(
-    scene: Variations,
-    expected: Expected,
-    alone: Mapping[Parameter, float],
-    layouts: Layouts,
-    helpful: tuple[Alternative, ...],
-    swept: tuple[tuple[Swept, str], ...],
-) -> Json:
-    """The contents of design.json; a standard deviation of null: the observations do not determine the quantity.
-
-    alone: the standard deviations without given fiducials and interior orientation.
-    swept: every sweep with the name of its picture.
-    """
-    adjustment = expected.plan.adjustment
-    observations = expected.network.observations
-    content = {
-        "reseau": version("reseau"),
-        "scene": str(scene.path),
-        "sigma0": expected.plan.sigma0,
-        "images_planned": len(expected.network.images),
-        "points_planned": len(expected.network.points),
-        "marks": {kind: observations.kind.count(kind) for kind in ("target", "fiducial")},
-        "observations": adjustment.conditions,
-        "unknowns": adjustment.unknowns,
-        "redundancy": adjustment.redundancy,
-        "singular": [
-            {"parameters": [each.text for each in null.parameters], "cause": null.cause, "remedy": null.remedy}
-            for null in expected.plan.singular
-        ],
-        "warnings": list(adjustment.warnings),
-        "cameras": {expected.camera: _camera(expected)},
-        "scanners": {
-            scanner.name: {term: _quantity(expected, Parameter.scanner(scanner.name, term)) for term in scanner.terms}
-            for scanner in expected.network.scanners
-        },
-        "photographs_alone": {parameter.text: sigma for parameter, sigma in alone.items()},
-        "images": {image.name: _image(expected, image) for image in expected.network.images},
-        "points": _points(expected),
-        "point_summary": _point_summary(expected),
-        "distances": [
-            {
-                "name": each.name,
-                "sigma": expected.plan.sigma0 * each.sigma,
-                "redundancy": each.redundancy,
-                "detectable": expected.plan.sigma0 * each.detectable,
-            }
-            for each in adjustment.further
-            if each.group == "distance"
-        ],
-        "reliability": _reliability(expected),
-        "layouts": _layouts(layouts),
-        "what_would_help": [
-            {"change": one.change, "gain_percent": dict(one.gain_percent), "sigmas": dict(one.expected.camera_sigmas)}
-            for one in helpful
-        ],
-        "sweeps": [_sweep(one, picture) for one, picture in swept],
-    }
-    return dict(without_nan(content))
+Content = dict[str, object]
 
 
-def _camera(expected: Expected) -> Json:
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A plan that was carried out. alone: the standard deviations without given fiducials and interior orientation;
+    files: what was written, by a word for it: design.json first, then the picture of every sweep."""
+
+    scene: Path
+    expected: Expected
+    alone: Mapping[Parameter, float]
+    layouts: Layouts
+    helpful: tuple[Alternative, ...]
+    swept: tuple[Swept, ...]
+    files: Mapping[str, Path]
+
+    @property
+    def needs_look(self) -> bool:
+        """Whether something is not determined, or hardly."""
+        return bool(self.expected.plan.singular or self.expected.plan.adjustment.warnings)
+
+    def content(self) -> Content:
+        """That of design.json; a standard deviation of null: the observations do not determine the quantity."""
+        expected, plan = self.expected, self.expected.plan
+        network, adjustment = expected.network, plan.adjustment
+        kinds, pictures = network.observations.kind, list(self.files.values())[1:]
+        return {
+            "reseau": version("reseau"),
+            "scene": str(self.scene),
+            "sigma0": plan.sigma0,
+            "images_planned": len(network.images),
+            "points_planned": len(network.points),
+            "marks": {kind: kinds.count(kind) for kind in ("target", "fiducial")},
+            "observations": adjustment.conditions,
+            "unknowns": adjustment.unknowns,
+            "redundancy": adjustment.redundancy,
+            "singular": [
+                {"parameters": [each.text for each in null.parameters], "cause": null.cause, "remedy": null.remedy}
+                for null in plan.singular
+            ],
+            "warnings": adjustment.warnings,
+            "cameras": {expected.camera: _camera(expected)},
+            "scanners": {
+                each.name: {term: _quantity(expected, Parameter.scanner(each.name, term)) for term in each.terms}
+                for each in network.scanners
+            },
+            "photographs_alone": {parameter.text: sigma for parameter, sigma in self.alone.items()},
+            "images": {image.name: _image(expected, image) for image in network.images},
+            "points": dict(_points(expected)),
+            "point_summary": dict(zip("XYZ", map(_axis_summary, expected.point_sigmas.T), strict=True)),
+            "distances": [
+                {
+                    "name": each.name,
+                    "sigma": plan.sigma0 * each.sigma,
+                    "redundancy": each.redundancy,
+                    "detectable": plan.sigma0 * each.detectable,
+                }
+                for each in adjustment.further
+                if each.group == "distance"
+            ],
+            "reliability": _reliability(expected),
+            "layouts": {"count": self.layouts.count, "sigmas": _means_and_spreads(self.layouts)},
+            "what_would_help": [
+                {"change": one.change, "gain_percent": one.gain_percent, "sigmas": one.expected.camera_sigmas}
+                for one in self.helpful
+            ],
+            "sweeps": [_sweep(swept, path.name) for swept, path in zip(self.swept, pictures, strict=True)],
+        }
+
+
+def _camera(expected: Expected) -> Content:
     camera = expected.network.cameras[0]
-    distortion: Json = {"family": camera.distortion.family, "r0_mm": camera.distortion.r0_mm}
-    for parameter in parameter_names(camera.distortion.family):
-        distortion[parameter] = _quantity(expected, Parameter.interior(camera.name, parameter))
+    name, family = camera.name, camera.distortion.family
+    parameters = {each: _quantity(expected, Parameter.interior(name, each)) for each in parameter_names(family)}
     return {
-        "principal_distance_mm": _quantity(expected, Parameter.interior(camera.name, "c")),
-        "principal_point_mm": {axis: _quantity(expected, Parameter.interior(camera.name, f"{axis}0")) for axis in "xy"},
-        "distortion": distortion,
+        "principal_distance_mm": _quantity(expected, Parameter.interior(name, "c")),
+        "principal_point_mm": {axis: _quantity(expected, Parameter.interior(name, f"{axis}0")) for axis in "xy"},
+        "distortion": {"family": family, "r0_mm": camera.distortion.r0_mm, **parameters},
         "fiducials": {
-            id: {f"{axis}_mm": _quantity(expected, Parameter.fiducial(camera.name, id, axis)) for axis in "xy"}
+            id: {f"{axis}_mm": _quantity(expected, Parameter.fiducial(name, id, axis)) for axis in "xy"}
             for id in camera.fiducials
         },
-        "precision_at_radii": [
-            {
-                "radius_mm": at.radius_mm,
-                "radial_um": at.radial_um,
-                "tangential_um": at.tangential_um,
-                "ray_um": at.ray_um,
-            }
-            for at in expected.curve
-        ],
-        "sigmas": dict(expected.camera_sigmas),
+        "precision_at_radii": expected.curve,
+        "sigmas": expected.camera_sigmas,
     }
 
 
-def _image(expected: Expected, image: Image) -> Json:
+def _image(expected: Expected, image: Image) -> Content:
     observations = expected.network.observations
     kinds = [kind for name, kind in zip(observations.image, observations.kind, strict=True) if name == image.name]
-    transformation: Json = {"kind": image.transformation}
-    for parameter in film_parameter_names(image.transformation):
-        key, scale = (f"{parameter}_deg", DEG_PER_RAD) if parameter in ANGLES else (parameter, 1.0)
-        transformation[key] = _quantity(expected, Parameter.film(image.name, parameter), scale)
-    exterior = {}
-    for element in EXTERIOR_NAMES:
-        key, scale = (f"{element}_deg", DEG_PER_RAD) if element in ANGLES else (element, 1.0)
-        exterior[key] = _quantity(expected, Parameter.exterior(image.name, element), scale)
+    film = {name: Parameter.film(image.name, name) for name in film_parameter_names(image.transformation)}
+    exterior = {name: Parameter.exterior(image.name, name) for name in EXTERIOR_NAMES}
     return {
         "targets": kinds.count("target"),
         "fiducials": kinds.count("fiducial"),
-        "transformation": transformation,
-        "exterior": exterior,
+        "transformation": {"kind": image.transformation, **_in_degrees(expected, film)},
+        "exterior": _in_degrees(expected, exterior),
     }
 
 
-def _points(expected: Expected) -> Json:
-    observed = [
-        point
-        for point, kind in zip(expected.network.observations.point, expected.network.observations.kind, strict=True)
-        if kind == "target"
-    ]
+def _in_degrees(expected: Expected, parameters: Mapping[str, Parameter]) -> Content:
+    """Angles in degrees, by names that say so."""
     return {
-        point.id: {axis: _quantity(expected, Parameter.point(point.id, axis)) for axis in "XYZ"}
-        | {"images": observed.count(point.id)}
-        for point in expected.network.points
+        f"{name}_deg" if name in ANGLES else name: _quantity(expected, each, DEG_PER_RAD if name in ANGLES else 1.0)
+        for name, each in parameters.items()
     }
 
 
-def _point_summary(expected: Expected) -> Json:
+def _points(expected: Expected) -> Iterator[tuple[str, Content]]:
+    observations = expected.network.observations
+    pairs = zip(observations.point, observations.kind, strict=True)
+    observed = [point for point, kind in pairs if kind == "target"]
+    for point in expected.network.points:
+        axes = {axis: _quantity(expected, Parameter.point(point.id, axis)) for axis in "XYZ"}
+        yield point.id, {**axes, "images": observed.count(point.id)}
+
+
+def _axis_summary(sigmas: np.ndarray) -> Content:
     """Over the points whose coordinate is not fixed and is determined; how many are not determined."""
-    summary: Json = {}
-    for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
-        estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
-        summary[axis] = {
-            "rms": rms(estimated),
-            "largest": float(estimated.max(initial=0.0)),
-            "estimated": len(estimated),
-            "undetermined": int(np.isinf(sigmas).sum()),
-        }
-    return summary
-
-
-def _reliability(expected: Expected) -> Json:
-    """null for a smallest error: nothing checks any of the group."""
+    estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
     return {
-        "groups": {
-            one.group: {
-                "coordinates": one.coordinates,
-                "redundancy": one.redundancy,
-                "smallest_error": {"median": one.median, "largest": one.largest, "unit": error_unit(one.group)},
-                "unchecked": one.unchecked,
-            }
-            for one in expected.reliability.groups
-        },
-        "camera": [
-            {"parameter": one.parameter.text, "effect_in_sigmas": one.in_sigmas, "error_in": one.cause}
-            for one in expected.reliability.camera
-        ],
+        "rms": rms(estimated),
+        "largest": float(estimated.max(initial=0.0)),
+        "estimated": len(estimated),
+        "undetermined": int(np.isinf(sigmas).sum()),
     }
 
 
-def _quantity(expected: Expected, parameter: Parameter, scale: float = 1.0) -> Json:
+def _reliability(expected: Expected) -> Content:
+    """null for a smallest error: nothing checks any of the group."""
+    groups = {
+        one.group: {
+            "coordinates": one.coordinates,
+            "redundancy": one.redundancy,
+            "smallest_error": {"median": one.median, "largest": one.largest, "unit": error_unit(one.group)},
+            "unchecked": one.unchecked,
+        }
+        for one in expected.reliability.groups
+    }
+    camera = [
+        {"parameter": one.parameter.text, "effect_in_sigmas": one.in_sigmas, "error_in": one.cause}
+        for one in expected.reliability.camera
+    ]
+    return {"groups": groups, "camera": camera}
+
+
+def _quantity(expected: Expected, parameter: Parameter, scale: float = 1.0) -> Content:
     return {"value": scale * expected.plan.adjustment.value(parameter), "sigma": scale * expected.plan.sigma(parameter)}
 
 
-def _layouts(layouts: Layouts) -> Json:
-    return {
-        "count": layouts.count,
-        "sigmas": {name: {"mean": layouts.mean[name], "spread": layouts.spread[name]} for name in layouts.mean},
-    }
+def _means_and_spreads(layouts: Layouts) -> Content:
+    return {name: {"mean": layouts.mean[name], "spread": layouts.spread[name]} for name in layouts.mean}
 
 
-def _sweep(swept: Swept, picture: str) -> Json:
+def _sweep(swept: Swept, picture: str) -> Content:
     slopes = {name: swept.slope(name) for name in swept.names}
     return {
         "quantity": swept.quantity,
@@ -194,8 +183,8 @@ def _sweep(swept: Swept, picture: str) -> Json:
                 "points": step.points,
                 "redundancy": step.redundancy,
                 "null_directions": step.singular,
-                "sigmas": dict(step.sigmas.mean),
-                "spread": dict(step.sigmas.spread),
+                "sigmas": step.sigmas.mean,
+                "spread": step.sigmas.spread,
             }
             for step in swept.steps
         ],

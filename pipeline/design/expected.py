@@ -13,6 +13,7 @@ from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.images import adjusted_lens
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
+from adjust.quality.reliability import OuterEffect
 from adjust.solution.adjustment import Options
 from adjust.solution.planning import Plan, plan
 from pipeline.design.setup import Setup, planned_network
@@ -45,20 +46,11 @@ class GroupReliability:
 
 
 @dataclass(frozen=True)
-class CameraEffect:
-    """What the worst error that is not found does to a camera parameter: in sigmas of it; cause: where the error is."""
-
-    parameter: Parameter
-    in_sigmas: float
-    cause: str
-
-
-@dataclass(frozen=True)
 class PlannedReliability:
     """Inner reliability by groups, outer reliability by camera parameters (Baarda)."""
 
     groups: tuple[GroupReliability, ...]
-    camera: tuple[CameraEffect, ...]
+    camera: tuple[OuterEffect, ...]
 
 
 def planned_reliability(plan: Plan) -> PlannedReliability:
@@ -73,8 +65,7 @@ def planned_reliability(plan: Plan) -> PlannedReliability:
         rows += [(float(redundancy[i]), scale * float(smallest[i])) for i in range(len(unit.coordinates))]
     for each in plan.adjustment.further:
         groups.setdefault(each.group, []).append((each.redundancy, plan.sigma0 * each.detectable))
-    camera = tuple(CameraEffect(one.parameter, one.in_sigmas, one.cause) for one in found.outer)
-    return PlannedReliability(tuple(_group(name, rows) for name, rows in groups.items()), camera)
+    return PlannedReliability(tuple(_group(name, rows) for name, rows in groups.items()), tuple(found.outer))
 
 
 def error_unit(group: str) -> str:
@@ -126,8 +117,9 @@ class Expected:
     @property
     def family_parameters(self) -> tuple[str, ...]:
         """The distortion parameters that are not fixed."""
-        given = self.network.cameras[0].distortion.parameters
-        return tuple(name for name in self._parameters if name in given and given[name].sigma > 0.0)
+        distortion = self.network.cameras[0].distortion
+        given, names = distortion.parameters, parameter_names(distortion.family)
+        return tuple(name for name in names if name in given and given[name].sigma > 0.0)
 
     @property
     def fiducials(self) -> tuple[str, ...]:
@@ -140,11 +132,11 @@ class Expected:
         c, x0, y0, fiducials (rms of all coordinates) and scanner (rms of the terms of its bend) in um, distortion
         parameters in their own units, `ray`: where a ray is imaged at the largest radius, um.
         """
-        names = list(self._unknowns)
-        by_name = dict(zip(names, self.plan.sigmas(self._full_names, np.eye(len(names))), strict=True))
-        sigmas = {name: UM_PER_MM * float(by_name[name]) for name in INTERIOR}
-        sigmas |= {name: float(by_name[name]) for name in self.family_parameters}
-        marks = [float(by_name[name]) for name in names[len(INTERIOR) + len(self._parameters) :]]
+        found = self.plan.sigmas(self._interior, np.eye(len(self._interior))).tolist()
+        by_name = dict(zip((each.quantity for each in self._interior), found, strict=True))
+        sigmas = {name: UM_PER_MM * by_name[name] for name in INTERIOR}
+        sigmas |= {name: by_name[name] for name in self.family_parameters}
+        marks = [self.plan.sigma(each) for each in _fiducial_unknowns(self.network.cameras[0])]
         sigmas |= {"fiducials": UM_PER_MM * rms(marks), "ray": self.curve[-1].ray_um}
         sigmas |= {"scanner": UM_PER_MM * rms(list(self.scanner_sigmas.values()))}
         return {name: sigma for name, sigma in sigmas.items() if sigma > 0.0}
@@ -164,14 +156,11 @@ class Expected:
             corner = float(np.hypot(*self.setup.lens.frame_mm)) / 2
             radii = tuple(corner * quarter / QUARTERS for quarter in range(1, QUARTERS + 1))
         functions = [self._functions(radius) for radius in radii]
-        sigmas = self.plan.sigmas(self._full_names, np.concatenate(functions))
+        sigmas = self.plan.sigmas(self._interior, np.concatenate(functions))
         sigmas = np.where(sigmas > ROUNDING_UM, sigmas, 0.0)
-        parts = np.split(sigmas, len(radii))
         return tuple(
-            AtRadius(
-                radius, rms(part[:DIRECTIONS]), rms(part[DIRECTIONS : 2 * DIRECTIONS]), rms(part[2 * DIRECTIONS :])
-            )
-            for radius, part in zip(radii, parts, strict=True)
+            AtRadius(radius, rms(part[0]), rms(part[1]), rms(part[2:].ravel()))
+            for radius, part in zip(radii, sigmas.reshape(len(radii), 4, DIRECTIONS), strict=True)
         )
 
     @cached_property
@@ -185,40 +174,23 @@ class Expected:
         return np.array([self.plan.sigma(each) for each in coordinates]).reshape(-1, 3)
 
     @property
-    def _parameters(self) -> tuple[str, ...]:
-        return parameter_names(self.network.cameras[0].distortion.family)
-
-    @property
-    def _unknowns(self) -> tuple[str, ...]:
-        """All quantities of the camera, the interior orientation first, then the distortion, then the fiducials."""
-        marks = (f"{id}.{axis}" for id in self.fiducials for axis in "xy")
-        return (*INTERIOR, *self._parameters, *marks)
-
-    @property
-    def _full_names(self) -> list[str]:
-        within = len(INTERIOR) + len(self._parameters)
-        owners = ["IO"] * within + ["FID"] * (2 * len(self.fiducials))
-        return [f"{owner}.{self.camera}.{name}" for owner, name in zip(owners, self._unknowns, strict=True)]
+    def _interior(self) -> list[Parameter]:
+        """The interior orientation and all parameters of the distortion."""
+        names = (*INTERIOR, *parameter_names(self.network.cameras[0].distortion.family))
+        return [Parameter.interior(self.camera, name) for name in names]
 
     def _functions(self, radius_mm: float) -> Array:
         """Rows (4 DIRECTIONS, k) in um: the radial and the tangential distortion at a radius, the image of a ray."""
         angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
         outward = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         across = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
-        adjustment = self.plan.adjustment
-        lens = adjusted_lens(adjustment, self.camera)
+        lens = adjusted_lens(self.plan.adjustment, self.camera)
         by_c_and_parameters = lens.displacement(radius_mm * outward).by_unknowns_um
         by_c_and_parameters[np.abs(by_c_and_parameters) < ROUNDING_UM] = 0.0  # most families do not depend on c
-        radial = np.einsum("di,dik->dk", outward, by_c_and_parameters)
-        tangential = np.einsum("di,dik->dk", across, by_c_and_parameters)
-        ray = _ray_by_unknowns(lens, radius_mm * outward)
-        functions = np.zeros((4 * DIRECTIONS, len(self._unknowns)))
-        count = len(lens.quantities)
-        columns = [0, *range(len(INTERIOR), count)]
-        functions[:DIRECTIONS, columns] = radial
-        functions[DIRECTIONS : 2 * DIRECTIONS, columns] = tangential
-        functions[2 * DIRECTIONS :, :count] = UM_PER_MM * ray.reshape(-1, count)
-        return functions
+        distortion = [np.einsum("di,dik->dk", along, by_c_and_parameters) for along in (outward, across)]
+        by_interior = np.insert(np.concatenate(distortion), [1, 1], 0.0, axis=1)
+        ray = UM_PER_MM * _ray_by_unknowns(lens, radius_mm * outward)
+        return np.concatenate([by_interior, ray.reshape(-1, ray.shape[2])])
 
 
 def _ray_by_unknowns(lens: Lens, from_principal_point_mm: Array) -> Array:
@@ -259,22 +231,23 @@ def alone(expected: Expected) -> Mapping[Parameter, float]:
     options = Options(expected.setup.settings.datum)
     free = plan(without, planned_network(expected.setup)[1], options, expected.plan.sigma0)
     interior = [Parameter.interior(camera.name, name) for name in (*INTERIOR, *expected.family_parameters)]
-    marks = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
+    marks = _fiducial_unknowns(camera)
     moved = free.null[[free.adjustment.index(each) for each in (*interior, *marks)]]
     functions = np.eye(len(interior) + len(marks))
     functions[:, len(interior) :] -= moved @ np.linalg.pinv(moved[len(interior) :], rcond=ROUNDING)
     return dict(zip((*interior, *marks), free.sigmas((*interior, *marks), functions).tolist(), strict=True))
 
 
+def _fiducial_unknowns(camera: Camera) -> list[Parameter]:
+    return [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
+
+
 def _without_priors(camera: Camera) -> Camera:
     """What is not fixed is free."""
     fiducials = {id: Fiducial(_freed(mark.x_mm), _freed(mark.y_mm)) for id, mark in camera.fiducials.items()}
-    c, x0, y0 = (_freed_if_given(prior) for prior in (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm))
+    interior = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
+    c, x0, y0 = (prior and _freed(prior) for prior in interior)
     return replace(camera, principal_distance_mm=c, x0_mm=x0, y0_mm=y0, fiducials=fiducials)
-
-
-def _freed_if_given(prior: Prior | None) -> Prior | None:
-    return None if prior is None else _freed(prior)
 
 
 def _freed(prior: Prior) -> Prior:

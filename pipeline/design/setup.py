@@ -115,14 +115,14 @@ def _frames(images: Sequence[SceneImage]) -> tuple[SceneImage, ...]:
 def _check_named(scene_file: SceneFile, targets: set[str], images: set[str]) -> None:
     """Raises InputError where [design] names an end of a distance, or an image, that the scene does not have."""
     known = targets | images
-    for distance in scene_file.design.distances:
+    for distance in scene_file.design.distance:
         for end in (distance.start, distance.end):
             if end not in known:
                 raise InputError(
                     f"{scene_file.path}: [[design.distance]]: {end!r} is neither a target nor an image."
                     f"{did_you_mean(end, known)}"
                 )
-    for orientation in scene_file.design.orientations:
+    for orientation in scene_file.design.orientation:
         if orientation.image and orientation.image not in images:
             raise InputError(
                 f"{scene_file.path}: [[design.orientation]]: there is no image {orientation.image!r}."
@@ -164,7 +164,7 @@ def _image(setup: Setup, camera: str, image: SceneImage) -> network.Image:
     observed = setup.settings.orientation_of(image.name)
     exterior = None
     if observed is not None:
-        sigmas = np.array([*observed.position, *np.radians(observed.angles_deg)])
+        sigmas = np.array([*observed.position_sigma, *np.radians(observed.angles_sigma_deg)])
         exterior = network.Exterior(np.array(image.exterior), sigmas)
     scanner = DEFAULT_SCANNER if setup.bends else ""
     return network.Image(image.name, camera, setup.transformation, exterior, scanner)
@@ -175,7 +175,7 @@ def _distances(setup: Setup, points: Mapping[str, Array]) -> tuple[Distance, ...
     places = {image.name: np.array(image.exterior[:3]) for image in setup.images} | dict(points)
     return tuple(
         Distance(each.start, each.end, float(np.linalg.norm(places[each.end] - places[each.start])), each.sigma)
-        for each in setup.settings.distances
+        for each in setup.settings.distance
         if each.start in places and each.end in places
     )
 

@@ -1,7 +1,7 @@
 """What reseau design prints and draws: the expected precision, what would help, the sweeps."""
 
 import math
-from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from pathlib import Path
 
 from markupsafe import Markup
@@ -10,9 +10,10 @@ from rich.table import Table
 from rich.text import Text
 
 from adjust.problem.parameter import Parameter, description
-from pipeline.design.alternatives import FOUND, Alternative
+from pipeline.design.alternatives import FOUND
+from pipeline.design.design_file import Design
 from pipeline.design.expected import Expected, error_unit, rms
-from pipeline.design.sweeps import Layouts, Swept
+from pipeline.design.sweeps import Swept
 from pipeline.drawing import svg
 from pipeline.report.numbers import NONE, fixed, significant, value_and_sigma
 
@@ -31,8 +32,8 @@ KINDS = {
     "exterior": "given exterior",
 }
 UNIT_WORDS = {"um": " µm", "object unit": ""}
-LABELS = {"c": "c", "x0": "x0'", "y0": "y0'", "fiducials": "fiducials", "ray": "ray", "scanner": "scanner"}
-UNITS = {"c": "µm", "x0": "µm", "y0": "µm", "fiducials": "µm", "ray": "µm", "scanner": "µm"}
+LABELS = {"x0": "x0'", "y0": "y0'"}
+IN_UM = ("c", "x0", "y0", "fiducials", "ray", "scanner")
 
 
 def plot_sweep(swept: Swept, path: Path) -> None:
@@ -76,13 +77,13 @@ def _axes(swept: Swept, places: list[float], shares: dict[str, list[float]]) -> 
 
 def _curve(axes: svg.Axes, number: int, places: list[float], shares: list[float]) -> Markup:
     """A line through the values that there are, interrupted where there is none, and a dot at each."""
-    pixels = [(float(axes.x(place)), float(axes.y(share))) for place, share in zip(places, shares, strict=True)]
-    there = [math.isfinite(share) for share in shares]
-    pairs = zip(pixels, pixels[1:], there, there[1:], strict=False)
-    path = "".join(f"M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" for (x0, y0), (x1, y1), a, b in pairs if a and b)
-    dots = [
-        svg.tag("circle", cx=x, cy=y, r=2.5, fill=_color(number)) for (x, y), a in zip(pixels, there, strict=True) if a
+    pixels = [
+        (float(axes.x(place)), float(axes.y(share))) if math.isfinite(share) else None
+        for place, share in zip(places, shares, strict=True)
     ]
+    path = "".join(f"M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}" for a, b in pairwise(pixels) if a and b)
+    color = COLORS[number % len(COLORS)]
+    dots = [svg.tag("circle", cx=pixel[0], cy=pixel[1], r=2.5, fill=color) for pixel in pixels if pixel]
     return _stroke(number, path) + Markup("").join(dots)
 
 
@@ -92,12 +93,8 @@ def _key(axes: svg.Axes, number: int, name: str) -> Markup:
 
 
 def _stroke(number: int, path: str) -> Markup:
-    dash = DASHES[number // len(COLORS) % len(DASHES)]
-    return svg.tag("path", d=path, fill="none", stroke=_color(number), stroke_width=1.6, stroke_dasharray=dash)
-
-
-def _color(number: int) -> str:
-    return COLORS[number % len(COLORS)]
+    dash, color = DASHES[number // len(COLORS) % len(DASHES)], COLORS[number % len(COLORS)]
+    return svg.tag("path", d=path, fill="none", stroke=color, stroke_width=1.6, stroke_dasharray=dash)
 
 
 def _relative(sigmas: list[float]) -> list[float]:
@@ -106,17 +103,9 @@ def _relative(sigmas: list[float]) -> list[float]:
     return [sigma / first if math.isfinite(sigma) else math.nan for sigma in sigmas]
 
 
-def print_design(
-    expected: Expected,
-    alone: Mapping[Parameter, float],
-    layouts: Layouts,
-    helpful: tuple[Alternative, ...],
-    swept: Iterable[Swept],
-    files: Mapping[str, Path],
-    console: Console,
-) -> None:
+def print_design(design: Design, console: Console) -> None:
     """For a person; file paths are never folded."""
-    adjustment = expected.plan.adjustment
+    expected, adjustment = design.expected, design.expected.plan.adjustment
     console.print(
         f"{len(expected.network.images)} photographs, {len(expected.network.points)} points, redundancy "
         f"{adjustment.redundancy}, sigma0 {expected.plan.sigma0:g} (given)",
@@ -127,78 +116,67 @@ def print_design(
         console.print(Text(f"  {null.remedy}", style="dim"))
     for warning in adjustment.warnings:
         console.print(Text(f"- {warning}"))
-    console.print(_camera_table(expected, alone, layouts))
-    console.print(_curve_table(expected))
-    if expected.fiducials:
-        console.print(_fiducial_table(expected, alone))
-    if expected.network.scanners:
-        console.print(_scanner_table(expected))
-    console.print(_point_table(expected))
-    if expected.reliability.groups:
-        console.print(_reliability_table(expected))
-        console.print(_outer_table(expected))
-    if helpful:
-        console.print(_help_table(expected, helpful, layouts))
-    for one in swept:
-        console.print(_sweep_table(one))
-    for word, path in files.items():
+    tables = [_camera_table(design), _curve_table(expected), _fiducial_table(design), _scanner_table(expected)]
+    tables += [_point_table(expected), _reliability_table(expected), _outer_table(expected), _help_table(design)]
+    for table in (*tables, *map(_sweep_table, design.swept)):
+        if table.row_count:
+            console.print(table)
+    for word, path in design.files.items():
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _camera_table(expected: Expected, alone: Mapping[Parameter, float], layouts: Layouts) -> Table:
-    """With fiducials beside it: what the photographs alone tell, in the frame that the fiducials make."""
+def _table(title: str, *columns: str) -> Table:
+    return Table(*columns, title=title, title_justify="left")
+
+
+def _camera_table(design: Design) -> Table:
+    """With fiducials also what the photographs alone tell, in the frame that the fiducials make."""
+    expected, layouts = design.expected, design.layouts
     several = layouts.count > 1
-    title = f"Expected precision of camera {expected.camera}"
-    table = Table("quantity", "value", "sigma", title=title, title_justify="left")
-    if expected.fiducials:
-        table.add_column("photographs alone")
-    if several:
-        table.add_column(f"mean of {layouts.count} layouts")
-        table.add_column("spread")
-    plan = expected.plan
+    columns = ["quantity", "value", "sigma", *(["photographs alone"] if expected.fiducials else [])]
+    columns += [f"mean of {layouts.count} layouts", "spread"] if several else []
+    table = _table(f"Expected precision of camera {expected.camera}", *columns)
     rows = {"c": "principal distance, mm", "x0": "principal point x', mm", "y0": "principal point y', mm"}
-    rows |= {name: name for name in expected.family_parameters}
-    for name, label in rows.items():
+    for name, label in {**rows, **{name: name for name in expected.family_parameters}}.items():
         parameter = Parameter.interior(expected.camera, name)
-        sigma = plan.sigma(parameter)
-        cells = [label, *_told(plan.adjustment.value(parameter), sigma)]
+        value, sigma = expected.plan.adjustment.value(parameter), expected.plan.sigma(parameter)
+        known = (significant(value, 6), UNDETERMINED) if math.isinf(sigma) else value_and_sigma(value, sigma)
+        cells = [label, *known]
         if expected.fiducials:
-            cells.append(_sigma(alone[parameter]) if sigma > 0.0 else "")
+            cells.append(_sigma(design.alone[parameter]) if sigma > 0.0 else "")
         if several and name in layouts.mean:
-            scale = UM_PER_MM if name in UNITS else 1.0
+            scale = UM_PER_MM if name in IN_UM else 1.0
             cells += [_sigma(layouts.mean[name] / scale), _sigma(layouts.spread[name] / scale)]
         table.add_row(*cells)
     return table
 
 
 def _curve_table(expected: Expected) -> Table:
-    table = Table(
-        "radius, mm", "radial", "tangential", "image of a ray", title="Distortion, sigma in µm", title_justify="left"
-    )
+    table = _table("Distortion, sigma in µm", "radius, mm", "radial", "tangential", "image of a ray")
     for at in expected.curve:
         table.add_row(f"{at.radius_mm:.1f}", _sigma(at.radial_um), _sigma(at.tangential_um), _sigma(at.ray_um))
     return table
 
 
-def _fiducial_table(expected: Expected, alone: Mapping[Parameter, float]) -> Table:
+def _fiducial_table(design: Design) -> Table:
     heads = ("x', µm", "y', µm", "photographs alone: x', µm", "y', µm")
-    table = Table("fiducial", *heads, title="Fiducial marks, sigma", title_justify="left")
-    for id in expected.fiducials:
-        place = [Parameter.fiducial(expected.camera, id, axis) for axis in "xy"]
-        sigmas = (*(expected.plan.sigma(each) for each in place), *(alone[each] for each in place))
+    table = _table("Fiducial marks, sigma", "fiducial", *heads)
+    for id in design.expected.fiducials:
+        place = [Parameter.fiducial(design.expected.camera, id, axis) for axis in "xy"]
+        sigmas = (*(design.expected.plan.sigma(each) for each in place), *(design.alone[each] for each in place))
         table.add_row(Text(id), *(_sigma(UM_PER_MM * sigma) for sigma in sigmas))
     return table
 
 
 def _scanner_table(expected: Expected) -> Table:
-    table = Table("term", "sigma, µm", title="Bend of the scanner", title_justify="left")
+    table = _table("Bend of the scanner", "term", "sigma, µm")
     for parameter, sigma in expected.scanner_sigmas.items():
         table.add_row(parameter.quantity, _sigma(UM_PER_MM * sigma))
     return table
 
 
 def _point_table(expected: Expected) -> Table:
-    table = Table("coordinate", "rms", "largest", title="Object points, sigma", title_justify="left")
+    table = _table("Object points, sigma", "coordinate", "rms", "largest")
     for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
         free = [float(sigma) for sigma in sigmas if sigma > 0.0]
         table.add_row(axis, _sigma(rms(free)) if free else "fixed", _sigma(max(free)) if free else "fixed")
@@ -206,24 +184,20 @@ def _point_table(expected: Expected) -> Table:
 
 
 def _reliability_table(expected: Expected) -> Table:
-    title = "Smallest gross errors that are found"
-    table = Table(
-        "kind", "coordinates", "redundancy", "median", "largest", "unchecked", title=title, title_justify="left"
-    )
+    heads = ("kind", "coordinates", "redundancy", "median", "largest", "unchecked")
+    table = _table("Smallest gross errors that are found", *heads)
     for one in expected.reliability.groups:
         unit = error_unit(one.group)
         sizes = () if unit == "mixed" else (one.median, one.largest)
         errors = [_sigma(size) + UNIT_WORDS[unit] if math.isfinite(size) else NONE for size in sizes] or [NONE, NONE]
-        table.add_row(
-            KINDS.get(one.group, one.group), str(one.coordinates), fixed(one.redundancy), *errors, str(one.unchecked)
-        )
+        kind = KINDS.get(one.group, one.group)
+        table.add_row(kind, str(one.coordinates), fixed(one.redundancy), *errors, str(one.unchecked))
     return table
 
 
 def _outer_table(expected: Expected) -> Table:
     """Of the fiducials the worst alone."""
-    title = "What errors that are not found may do to the camera"
-    table = Table("parameter", "in its sigmas", "error in", title=title, title_justify="left")
+    table = _table("What errors that are not found may do to the camera", "parameter", "in its sigmas", "error in")
     effects = expected.reliability.camera
     marks = [one for one in effects if one.parameter.kind == "fiducial"]
     shown = [one for one in effects if one not in marks] + sorted(marks, key=lambda one: -one.in_sigmas)[:1]
@@ -232,23 +206,22 @@ def _outer_table(expected: Expected) -> Table:
     return table
 
 
-def _help_table(expected: Expected, helpful: tuple[Alternative, ...], layouts: Layouts) -> Table:
-    names = list(expected.camera_sigmas)
+def _help_table(design: Design) -> Table:
+    names = list(design.expected.camera_sigmas)
     title = "What would help: by how many percent the sigmas shrink"
-    if layouts.count > 1:
-        title += ", of the first layout"
-    table = Table("change", *(LABELS.get(name, name) for name in names), title=title, title_justify="left")
-    for one in helpful:
+    title += ", of the first layout" if design.layouts.count > 1 else ""
+    table = _table(title, "change", *(LABELS.get(name, name) for name in names))
+    for one in design.helpful:
         table.add_row(Text(one.change), *(_gain(one.gain_percent[name]) for name in names))
     return table
 
 
 def _sweep_table(swept: Swept) -> Table:
     names = swept.names
-    heads = (f"{LABELS.get(name, name)}, {UNITS[name]}" if name in UNITS else name for name in names)
+    heads = (f"{LABELS.get(name, name)}, µm" if name in IN_UM else name for name in names)
     layouts = swept.steps[0].sigmas.count
     title = f"Sigmas over {swept.quantity}" + (f", mean of {layouts} layouts" if layouts > 1 else "")
-    table = Table(swept.quantity, "points", *heads, title=title, title_justify="left")
+    table = _table(title, swept.quantity, "points", *heads)
     for step in swept.steps:
         value = step.value if isinstance(step.value, str) else f"{step.value:g}"
         sigmas = (_sigma(step.sigmas.mean[name]) if name in step.sigmas.mean else "fixed" for name in names)
@@ -258,12 +231,6 @@ def _sweep_table(swept: Swept) -> Table:
         table.add_section()
         table.add_row("slope", "", *("" if math.isnan(slope) else f"{slope:+.2f}" for slope in slopes))
     return table
-
-
-def _told(value: float, sigma: float) -> tuple[str, str]:
-    if math.isinf(sigma):
-        return significant(value, 6), UNDETERMINED
-    return value_and_sigma(value, sigma)
 
 
 def _sigma(sigma: float) -> str:
