@@ -52,7 +52,7 @@ def of_file(path: Path) -> str:
     return of_content(read_bytes(path))
 
 
-def of_scan(path: Path) -> str:
+def scan_fingerprint(path: Path) -> str:
     """Its size, and SHA-256 of pieces of its file. "" where it cannot be read."""
     try:
         size = path.stat().st_size
@@ -170,7 +170,7 @@ def parts_hash(path: Path, max_pixels: int | None = None) -> str:
         if isinstance(path, Address) and path.etag:
             return hashlib.sha256(f"{path.etag} {path.stat().st_size}".encode()).hexdigest()
         part = str(path).removeprefix(whole_file(str(path)))  # two parts of one file are two scans
-        digest = hashlib.sha256(f"{of_scan(path)}{part}".encode())
+        digest = hashlib.sha256(f"{scan_fingerprint(path)}{part}".encode())
         with path.open("rb") as file:
             digest.update(file.read(_HEAD_BYTES))
     except (OSError, MissingError, UnreachableError):
@@ -230,6 +230,6 @@ def options_hash(options_json: str) -> str:
     return hashlib.sha256(options_json.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def shard_of(name: str, shards: int) -> int:
+def shard_number(name: str, shards: int) -> int:
     """Which of so many shards, 1 to N, an image is of: by its name, the same on every machine and in every run."""
     return int.from_bytes(hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()[:8]) % shards + 1

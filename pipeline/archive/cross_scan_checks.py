@@ -19,7 +19,7 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.camera_identification import with_plates
 from pipeline.measuring.roll import CheckedScan, checked, roll_of, with_same_frames
 from pipeline.measuring.scan_task import ScanTask
-from pipeline.provenance import content_hash, fingerprint, shard_of
+from pipeline.provenance import content_hash, fingerprint, shard_number
 from pipeline.results.measured_record import MeasuredScan
 
 _TOGETHER = 2000  # frames of a camera that are checked beside one another: more would only take memory
@@ -131,7 +131,7 @@ def _beside(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
             lots *= 2
         some = defaultdict[int, list[ScanTask]](list)
         for task in own:
-            some[shard_of(project.part_of(task.name) or task.name, lots)].append(task)
+            some[shard_number(project.part_of(task.name) or task.name, lots)].append(task)
         found += [(camera, some[lot]) for lot in sorted(some)]
     return found
 

@@ -25,7 +25,7 @@ from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.measuring.tie_stage import check_tie_names, tied
 from pipeline.measuring.tone_stage import said_of_tones
 from pipeline.progress import Reporter
-from pipeline.provenance import FileStates, Identity, content_hash, parts_hash, shard_of
+from pipeline.provenance import FileStates, Identity, content_hash, parts_hash, shard_number
 from pipeline.text.wording import counted, gathered
 from pipeline.workers import WorkOptions, worker_pool
 
@@ -140,7 +140,7 @@ def measure_archive(
         store.set_project({work.state(task).uri: task.name for task in tasks})
         if options.shard is not None:
             part, parts = options.shard
-            work.complete([task for task in tasks if shard_of(task.name, parts) == part], reporter)
+            work.complete([task for task in tasks if shard_number(task.name, parts) == part], reporter)
             return ""
         work.complete(tasks, reporter)
         if options.moved:

@@ -19,7 +19,7 @@ from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 from pipeline.provenance import FileState, FileStates, Identity, options_hash, parts_hash, result_key
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.text.wording import counted, listed, without_file
+from pipeline.text.wording import counted, drop_file_name, listed
 from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, results_of
 
 _HOUR_S, _MINUTE_S = 3600.0, 60.0
@@ -191,7 +191,7 @@ class Work:
                 self.results[task.name] = row
                 expected.is_done(task.name, kept.scan.seconds, kept.bytes_read)
                 if kept.scan.failure:
-                    same = without_file(kept.scan.failure.sentence, task.shown_scan)
+                    same = drop_file_name(kept.scan.failure.sentence, task.shown_scan)
                     if same not in failed:  # that of many others would be the same
                         reporter.say(f"failed: {task.name}: {same}")
                     failed[same].append(task.name)

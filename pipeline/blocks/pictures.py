@@ -74,7 +74,7 @@ class BlockPicture:
         return max(places, key=lambda place: place[0].depths_px(place[1][None])[0], default=None)
 
 
-def lattice_of(camera: CameraFile, pitch_mm: float) -> Lattice:
+def camera_lattice(camera: CameraFile, pitch_mm: float) -> Lattice:
     """The exposed frame at whole multiples of the pitch. Raises InputError where its size is not known."""
     if camera.frame_mm is None or not camera.fiducials:
         raise InputError(
@@ -91,7 +91,7 @@ def write_pictures(
     made = []
     for task in tasks:
         camera = cameras[task.camera]
-        lattice = lattice_of(camera, task.pitch_mm)
+        lattice = camera_lattice(camera, task.pitch_mm)
         picture, mask = _cut(task.target, lattice)
         mask = mask & _usable(camera, lattice)
         name = f"{file_word(task.camera)}/{task.image.replace('/', '_')}.png"

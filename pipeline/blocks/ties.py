@@ -48,10 +48,10 @@ def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[Compara
     for number in chosen_tracks(mapped, by_image, precision):
         for sight in mapped.tracks[number]:
             picture = by_image[sight.image]
-            seen = picture.scan_place(picture.lattice.camera_mm(np.array([sight.col, sight.row])))
-            if seen is None:
+            shown = picture.scan_place(picture.lattice.camera_mm(np.array([sight.col, sight.row])))
+            if shown is None:
                 continue
-            scan, place_px = seen
+            scan, place_px = shown
             place = comparator_from_pixel(place_px, scan.chain.pitch_um)
             sigma = np.full(2, precision.sigma_px(sight.size_px) * picture.lattice.pitch_mm)
             marks.append(ComparatorPoint(scan.image, f"tie-{number}", "tie", place, sigma, 0.0, Status.MEASURED, ""))
@@ -135,19 +135,19 @@ def oriented_by_control(
     camera_rays: by image the principal distance and point (3,) by which COLMAP saw it, mm. Raises InputError where
     fewer than three control points are seen by two oriented images each.
     """
-    seen: dict[str, dict[str, Array]] = defaultdict(dict)
+    places: dict[str, dict[str, Array]] = defaultdict(dict)
     scans = {scan.image: (picture.image, scan) for picture in pictures for scan in picture.scans}
     for mark in marks:
         if mark.kind == "target" and mark.status.is_observation and mark.point in points and mark.image in scans:
             frame, scan = scans[mark.image]
             if frame in mapped.poses:
-                seen[mark.point].setdefault(frame, _camera_mm(mark, scan))
+                places[mark.point].setdefault(frame, _camera_mm(mark, scan))
     theirs, ours = [], []
-    for point, places in sorted(seen.items()):
+    for point, own in sorted(places.items()):
         given = points[point]
-        if len(places) < 2 or given.X is None or given.Y is None or given.Z is None:
+        if len(own) < 2 or given.X is None or given.Y is None or given.Z is None:
             continue
-        theirs.append(_intersection(mapped, places, camera_rays))
+        theirs.append(_intersection(mapped, own, camera_rays))
         ours.append([given.X.value, given.Y.value, given.Z.value])
     if len(ours) < FEWEST_CONTROL:
         raise InputError(

@@ -17,9 +17,9 @@ from pipeline.commands.shared import (
     finish,
     pitch_option,
     read,
+    run_stage,
     say,
     show,
-    with_project,
 )
 from pipeline.errors import InputError
 
@@ -28,14 +28,14 @@ def adjust(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels 
     """Adjust: orientations, camera, film and fiducials at once."""
     from pipeline.stages import run_adjust
 
-    return with_project(project, run_adjust, as_json, max_pixels)
+    return run_stage(project, run_adjust, as_json, max_pixels)
 
 
 def check(project: ProjectFile, as_json: AsJson = False) -> int:
     """Compare the adjustment with OpenCV's calibration."""
     from pipeline.stages import run_check
 
-    return with_project(project, run_check, as_json)
+    return run_stage(project, run_check, as_json)
 
 
 def choose(project: ProjectFile, as_json: AsJson = False) -> int:
@@ -109,7 +109,7 @@ def design(
 
     planned = run_design(scene, out_dir, Reporter())
     show(as_json, planned.content, lambda console: print_design(planned, console))
-    return LOOK if planned.needs_look else DONE
+    return LOOK if planned.has_findings else DONE
 
 
 def _numbers(text: str) -> list[float]:

@@ -15,7 +15,7 @@ from pipeline.commands.shared import (
     OutDir,
     ProjectFile,
     SceneFile,
-    one_of,
+    choices_help,
     pitch_option,
     read,
     say,
@@ -53,7 +53,7 @@ def resample(
 
 def export(
     project: ProjectFile,
-    format: Annotated[str, typer.Argument(metavar="FORMAT", help=one_of(FORMATS), show_default=False)],
+    format: Annotated[str, typer.Argument(metavar="FORMAT", help=choices_help(FORMATS), show_default=False)],
     out_dir: OutDir,
     pitch_um: Annotated[float | None, pitch_option("As given to `reseau resample`.")] = None,
     lens: Annotated[bool, typer.Option("--lens", help="For frames of `reseau resample --lens`.")] = False,
@@ -77,7 +77,7 @@ def export(
 
 
 def import_(
-    format: Annotated[str, typer.Argument(metavar="FORMAT", help=one_of(IMPORTED), show_default=False)],
+    format: Annotated[str, typer.Argument(metavar="FORMAT", help=choices_help(IMPORTED), show_default=False)],
     paths: Annotated[list[Path], typer.Argument(metavar="FILE... OUT_DIR", show_default=False)],
     pitch_um: Annotated[float | None, pitch_option("A pixel of the pictures.")] = None,
     sigma_px: Annotated[
@@ -137,7 +137,7 @@ def render(scene: SceneFile, out_dir: OutDir) -> int:
 
 
 def template(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help=one_of(TEMPLATES), show_default=False)],
+    kind: Annotated[str, typer.Argument(metavar="KIND", help=choices_help(TEMPLATES), show_default=False)],
 ) -> int:
     """Print a commented file to start from, or all keys."""
     if kind not in TEMPLATES:

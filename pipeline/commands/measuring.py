@@ -18,9 +18,9 @@ from pipeline.commands.shared import (
     finish,
     pitch_option,
     read,
+    run_stage,
     say,
     show,
-    with_project,
 )
 from pipeline.errors import InputError, missing_extra
 from pipeline.terminal import PlainConsole, plain
@@ -92,7 +92,7 @@ def measuring(stage: str, help_text: str) -> Callable[..., int]:
         from pipeline.workers import WorkOptions
 
         work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
-        return with_project(project, partial(getattr(stages, stage), work=work), as_json, max_pixels)
+        return run_stage(project, partial(getattr(stages, stage), work=work), as_json, max_pixels)
 
     command.__doc__ = help_text
     return command
@@ -162,7 +162,7 @@ def report(
     if not frames:
         if names:
             raise InputError("images are named after --frames: reseau report PROJECT.toml --frames NAME...")
-        return with_project(project, run_report, as_json, max_pixels)
+        return run_stage(project, run_report, as_json, max_pixels)
     pages = run_frame_pages(read(project, max_pixels), list(dict.fromkeys([*frames, *(names or ())])), Reporter())
     help_text = {image: str(path) for image, path in pages.items()}
     show(

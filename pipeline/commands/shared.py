@@ -46,7 +46,7 @@ def read(path: Path, max_pixels: int | None = None) -> "Project":
     return replace(read_project(path), max_pixels=max_pixels)
 
 
-def with_project(
+def run_stage(
     path: Path, stage: "Callable[[Project, Reporter], Summary]", as_json: bool, max_pixels: int | None = None
 ) -> int:
     """Run a stage on a project and tell its summary; the exit code."""
@@ -80,6 +80,6 @@ def say(*lines: str) -> None:
         typer.echo(plain(line))
 
 
-def one_of(words: Mapping[str, Any] | tuple[str, ...]) -> str:
+def choices_help(words: Mapping[str, Any] | tuple[str, ...]) -> str:
     """The help of an argument that is one of several words."""
     return f"One of {', '.join(words)}."

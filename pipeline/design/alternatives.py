@@ -85,26 +85,26 @@ def _photos(setup: Setup) -> Iterator[Iterable[Change]]:
     for photo in setup.settings.photo:
         omega, phi, kappa = (math.radians(angle) for angle in photo.angles_deg)
         image = SceneImage(photo.name, (*photo.position, omega, phi, kappa))
-        yield [(f"one more photo: {photo.name}", _with(setup, image))]
+        yield [(f"one more photo: {photo.name}", _add_image(setup, image))]
     center, axis = _field_axis(setup.points)
     yield _more(setup, "turned by 90 degrees", _rolled)
     for turn, words in ((QUARTER, "a quarter"), (2 * QUARTER, "half")):
-        rotation = _about(axis, turn)
+        rotation = _rotation(axis, turn)
         yield _more(setup, f"carried {words} round the field", partial(_carried, center=center, rotation=rotation))
 
 
 def _more(setup: Setup, words: str, moved: Callable[[Exterior], Exterior]) -> Iterator[Change]:
     for image in setup.images:
         new = SceneImage(f"{image.name} again", moved(image.exterior))
-        if len(setup.seen_by(new)) >= FEWEST_TARGETS:
-            yield f"one more photo: as {image.name}, {words}", _with(setup, new)
+        if len(setup.visible_points(new)) >= FEWEST_TARGETS:
+            yield f"one more photo: as {image.name}, {words}", _add_image(setup, new)
 
 
 def _turned(setup: Setup) -> Iterator[Change]:
     """Another kappa of one photograph."""
     for i, image in enumerate(setup.images):
         new = replace(image, exterior=_rolled(image.exterior))
-        if len(setup.seen_by(new)) >= FEWEST_TARGETS:
+        if len(setup.visible_points(new)) >= FEWEST_TARGETS:
             images = (*setup.images[:i], new, *setup.images[i + 1 :])
             yield f"another kappa: {image.name} turned by 90 degrees", replace(setup, images=images)
 
@@ -134,7 +134,7 @@ def _double(point: PlannedPoint) -> PlannedPoint:
     return replace(point, id=f"{point.id} again")
 
 
-def _with(setup: Setup, image: SceneImage) -> Setup:
+def _add_image(setup: Setup, image: SceneImage) -> Setup:
     return replace(setup, images=(*setup.images, image))
 
 
@@ -151,7 +151,7 @@ def _field_axis(points: Iterable[PlannedPoint]) -> tuple[Array, Array]:
     return center, axis / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
 
 
-def _about(axis: Array, turn_rad: float) -> Array:
+def _rotation(axis: Array, turn_rad: float) -> Array:
     """The rotation matrix (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -34,7 +34,7 @@ class Design:
     files: Mapping[str, Path]
 
     @property
-    def needs_look(self) -> bool:
+    def has_findings(self) -> bool:
         """Whether something is not determined, or hardly."""
         return bool(self.expected.plan.singular or self.expected.plan.adjustment.warnings)
 
@@ -112,12 +112,12 @@ def _image(expected: Expected, image: Image) -> Content:
     return {
         "targets": kinds.count("target"),
         "fiducials": kinds.count("fiducial"),
-        "transformation": {"kind": image.transformation, **_in_degrees(expected, film)},
-        "exterior": _in_degrees(expected, exterior),
+        "transformation": {"kind": image.transformation, **_degree_quantities(expected, film)},
+        "exterior": _degree_quantities(expected, exterior),
     }
 
 
-def _in_degrees(expected: Expected, parameters: Mapping[str, Parameter]) -> Content:
+def _degree_quantities(expected: Expected, parameters: Mapping[str, Parameter]) -> Content:
     """Angles in degrees, by names that say so."""
     return {
         f"{name}_deg" if name in ANGLES else name: _quantity(expected, each, DEG_PER_RAD if name in ANGLES else 1.0)

@@ -227,7 +227,7 @@ def alone(expected: Expected) -> Mapping[Parameter, float]:
     """
     network = expected.network
     camera = network.cameras[0]
-    without = replace(network, cameras=(_without_priors(camera),))
+    without = replace(network, cameras=(_freed_camera(camera),))
     options = Options(expected.setup.settings.datum)
     free = plan(without, planned_network(expected.setup)[1], options, expected.plan.sigma0)
     interior = [Parameter.interior(camera.name, name) for name in (*INTERIOR, *expected.family_parameters)]
@@ -242,7 +242,7 @@ def _fiducial_unknowns(camera: Camera) -> list[Parameter]:
     return [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
 
 
-def _without_priors(camera: Camera) -> Camera:
+def _freed_camera(camera: Camera) -> Camera:
     """What is not fixed is free."""
     fiducials = {id: Fiducial(_freed(mark.x_mm), _freed(mark.y_mm)) for id, mark in camera.fiducials.items()}
     interior = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)

@@ -60,7 +60,7 @@ class Setup:
         """Whether the bend of the scanner is to be found."""
         return self.settings.scanner != "none" and self.transformation != "none"
 
-    def seen_by(self, image: SceneImage) -> list[int]:
+    def visible_points(self, image: SceneImage) -> list[int]:
         """The points that lie within an image's frame and face its camera; that one hides another is not looked for."""
         xyz = np.array([point.xyz for point in self.points])
         normals = np.array([point.normal for point in self.points])
@@ -71,7 +71,7 @@ class Setup:
         return [int(i) for i in np.flatnonzero(inside & faces)]
 
 
-def setup_of(scene_file: SceneFile) -> Setup:
+def scene_setup(scene_file: SceneFile) -> Setup:
     """The plan of a scene. Raises InputError where it names control points that the field does not have, or has no
     targets at all."""
     settings = scene_file.design
@@ -137,7 +137,7 @@ def planned_network(setup: Setup) -> tuple[Network, Approximations]:
     visible mark is measured. A point of which nothing is known and
     that fewer than two images show has no part in it. Raises InputError where an image shows too few targets.
     """
-    visible = {image.name: setup.seen_by(image) for image in setup.images}
+    visible = {image.name: setup.visible_points(image) for image in setup.images}
     for name, rows in visible.items():
         if len(rows) < FEWEST_TARGETS:
             raise InputError(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.design.expected import Expected, expect
-from pipeline.design.setup import Setup, setup_of
+from pipeline.design.setup import Setup, scene_setup
 from pipeline.errors import InputError
 from pipeline.rendered.design_table import Sweep
 from pipeline.rendered.scene_file import parse_scene
@@ -54,12 +54,12 @@ class Variations:
     def setup(self, layout: int = 0) -> Setup:
         """The setup, with the random layout of its field of that number."""
         values = self.values | {"seed": self.values.get("seed", 1) + layout} if layout else self.values
-        return setup_of(parse_scene(Table(values, self.path, "")))
+        return scene_setup(parse_scene(Table(values, self.path, "")))
 
     def varied(self, number: int, sweep: Sweep, value: float | str) -> "Variations":
         """The scene with the quantity of a sweep at a value. Raises InputError for a quantity that there is not."""
         try:
-            values = self._with(sweep.quantity, value)
+            values = self._changed_values(sweep.quantity, value)
             varied = Variations(self.path, values)
             varied.setup()
         except InputError as error:
@@ -68,13 +68,13 @@ class Variations:
             ) from None
         return varied
 
-    def _with(self, quantity: str, value: float | str) -> Values:
+    def _changed_values(self, quantity: str, value: float | str) -> Values:
         values = copy.deepcopy(self.values)
         parts = quantity.split(".")
         if parts[0] == "camera" and isinstance(values.get("camera"), str):
             values["camera"] = _camera_values(self.path.parent / values["camera"])
         if parts[0] == "exterior":
-            element = _one_of(parts[-1], EXTERIOR, "an exterior orientation has no element")
+            element = _known_word(parts[-1], EXTERIOR, "an exterior orientation has no element")
             image = _member(values.get("image", []), ".".join(parts[1:-1]), "image")
             key, index = EXTERIOR[element]
             image[key] = [*image[key][:index], value, *image[key][index + 1 :]]
@@ -85,7 +85,7 @@ class Variations:
         elif quantity == "camera.fiducials":
             values["camera"]["fiducial"] = values["camera"].get("fiducial", [])[: _count(quantity, value)]
         else:
-            _set(values, parts, value)
+            _assign(values, parts, value)
         return values
 
 
@@ -126,7 +126,7 @@ def _spread(field: Values, points: int) -> None:
         first += part["points"] if "points" in part else part["columns"] * part["rows"]
 
 
-def _set(values: Values, parts: list[str], value: float | str) -> None:
+def _assign(values: Values, parts: list[str], value: float | str) -> None:
     node: Any = values
     for i, part in enumerate(parts[:-1]):
         if isinstance(node, list):
@@ -153,7 +153,7 @@ def _member(entries: list[Any], name: str, what: str) -> Any:
     raise InputError(f"there is no {what} {name!r}.{did_you_mean(name, known)} There are {', '.join(known) or 'none'}.")
 
 
-def _one_of(word: str, known: Mapping[str, object], sentence: str) -> str:
+def _known_word(word: str, known: Mapping[str, object], sentence: str) -> str:
     if word not in known:
         raise InputError(f"{sentence} {word!r}.{did_you_mean(word, known)} It has {', '.join(known)}.")
     return word
@@ -210,19 +210,19 @@ class Swept:
         return float(np.polyfit(x, y, 1)[0])
 
 
-def sweep(scene: Variations, number: int, asked: Sweep, progress: Progress | None = None) -> Swept:
+def sweep(scene: Variations, number: int, planned: Sweep, progress: Progress | None = None) -> Swept:
     """Carry out a sweep, the one of that number in the scene. Raises InputError for a quantity that there is not."""
-    varied = [scene.varied(number, asked, value) for value in asked.values]
+    varied = [scene.varied(number, planned, value) for value in planned.values]
     steps = []
     for i, variation in enumerate(varied):
-        value: float | str = asked.values[i]
+        value: float | str = planned.values[i]
         if progress is not None:
-            progress(f"{asked.quantity} = {value}", i, len(varied))
+            progress(f"{planned.quantity} = {value}", i, len(varied))
         first = expect(variation.setup())
         adjustment = first.plan.adjustment
         sigmas = over_layouts(variation, first)
         steps.append(Step(value, len(first.network.points), adjustment.redundancy, len(first.plan.singular), sigmas))
-    return Swept(asked.quantity, tuple(steps))
+    return Swept(planned.quantity, tuple(steps))
 
 
 def over_layouts(scene: Variations, first: Expected) -> Layouts:

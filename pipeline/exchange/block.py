@@ -122,13 +122,13 @@ class WholeFrame:
 
     def camera_mm(self, marks: tuple[ComparatorPoint, ...]) -> Array:
         """Observed places (n, 2) of its marks in the camera's frame."""
-        return self._by_scan(marks, OutFrame.camera_mm)
+        return self._collect(marks, OutFrame.camera_mm)
 
     def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
         """The same in the resampled frame, whose lens may have been taken out."""
-        return self._by_scan(marks, lambda scan, own: scan.frame_mm(own, with_lens))
+        return self._collect(marks, lambda scan, own: scan.frame_mm(own, with_lens))
 
-    def _by_scan(
+    def _collect(
         self, marks: tuple[ComparatorPoint, ...], places: Callable[[OutFrame, tuple[ComparatorPoint, ...]], Array]
     ) -> Array:
         images, found = np.array([mark.image for mark in marks]), np.zeros((len(marks), 2))

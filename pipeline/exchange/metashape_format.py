@@ -9,9 +9,9 @@ from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.fitted_lens import BROWN, FittedLens, sheared_lens
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ImportOptions, Incoming, opencv_camera
-from pipeline.exchange.micmac_format import box_of
+from pipeline.exchange.micmac_format import film_box
 from pipeline.exchange.pinhole import checked_misfits
-from pipeline.exchange.xml_tree import numbers_of, read_xml, xml_text
+from pipeline.exchange.xml_tree import child_numbers, read_xml, xml_text
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.canvas import Canvas
 from pipeline.text.names import file_word
@@ -38,7 +38,7 @@ def write(block: Block, options: ExportOptions) -> Written:
     notes = []
     for camera in dict.fromkeys(frame.camera for frame in frames if frame.is_oriented):
         own = [frame for frame in frames if frame.camera == camera and frame.is_oriented]
-        lens, box = sheared_lens(block, own[0], at_ideal=False), box_of(block, own[0], options)
+        lens, box = sheared_lens(block, own[0], at_ideal=False), film_box(block, own[0], options)
         misfit_px = checked_misfits(block, own, lens, box, options, "metashape")
         files[f"{file_word(camera)}.xml"] = _calibration(lens, box)
         notes.append(f"{camera}: the lens was fitted over the frame: off by {misfit_px:.2g} px at most.")
@@ -132,7 +132,7 @@ def _read_camera(path: Path, options: ImportOptions) -> CameraFile:
     if projection != "frame":
         raise InputError(f"{path}: is of a {projection} camera; only frame cameras are read.")
     names = ("width", "height", "f", *NAMES[1:])
-    given = {name: numbers_of(root, name, 1, path)[0] for name in names if root.find(name) is not None}
+    given = {name: child_numbers(root, name, 1, path)[0] for name in names if root.find(name) is not None}
     missing = [name for name in ("width", "height", "f") if not given.get(name, 0.0) > 0.0]
     if missing:
         raise InputError(f"{path}: has no positive {missing[0]}. Export the calibration again.")

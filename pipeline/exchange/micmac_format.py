@@ -13,7 +13,7 @@ from pipeline.exchange.fitted_lens import BROWN, FittedLens, frame_corners_mm, s
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming, fiducial_camera
 from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD, checked_misfits
-from pipeline.exchange.xml_tree import Content, Element, numbers_of, read_xml, text_of, xml_text
+from pipeline.exchange.xml_tree import Content, Element, child_numbers, child_text, read_xml, xml_text
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.names import file_word, image_name
@@ -72,11 +72,11 @@ def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
     oriented = [frame for frame in frames if frame.is_oriented]
     if not oriented:
         has_frame = bool(fiducials and frames) and block.camera_file(camera).frame_mm is not None
-        command = (_resampling(camera, box_of(block, frames[0], options)),) if has_frame else ()
+        command = (_resampling(camera, film_box(block, frames[0], options)),) if has_frame else ()
         without = f"{camera}: no image is oriented, so there are marks only: camera and poses come by object points."
         return Written(files, notes=(*command, without), left_out=left_out)
     lens = sheared_lens(block, oriented[0], at_ideal=True)
-    box = box_of(block, oriented[0], options) if fiducials else _picture_box(block, oriented[0])
+    box = film_box(block, oriented[0], options) if fiducials else _picture_box(block, oriented[0])
     reech = _REECH if fiducials else ""
     misfit_px = checked_misfits(block, oriented, lens, box, options, "micmac")
     calibration = f"Ori-Reseau/AutoCal_{file_word(camera)}.xml"
@@ -91,7 +91,7 @@ def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
     return Written(files, notes=tuple(notes), left_out=left_out)
 
 
-def box_of(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
+def film_box(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
     """The frame that ReSampFid is to make: the exposed frame, at whole multiples of the pitch, never the marks' box."""
     pitch = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
     corners = frame_corners_mm(block, frame) / (pitch / 1000.0)
@@ -234,7 +234,7 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
             continue
         kind: Literal["fiducial", "target"] = "fiducial" if alone or options.fiducials else "target"
         for image in images:
-            name = image_name(text_of(image, "NameIm", path))
+            name = image_name(child_text(image, "NameIm", path))
             for point, place, sigma_px in _points(image, path):
                 covariance = None if sigma_px is None else sigma_px**2 * np.eye(2)
                 marks.append(ForeignMark(name, point, kind, place - CONVENTION.first_pixel_px, covariance))
@@ -244,5 +244,5 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
 def _points(image: Element, path: Path) -> Iterator[tuple[str, Array, float | None]]:
     """Name, place and standard deviation, if there is one, of an image's marks."""
     for mark in image.findall("OneMesureAF1I"):
-        sigma_px = numbers_of(mark, "PrecPointe", 1, path)[0] if mark.find("PrecPointe") is not None else None
-        yield text_of(mark, "NamePt", path), np.array(numbers_of(mark, "PtIm", 2, path)), sigma_px
+        sigma_px = child_numbers(mark, "PrecPointe", 1, path)[0] if mark.find("PrecPointe") is not None else None
+        yield child_text(mark, "NamePt", path), np.array(child_numbers(mark, "PtIm", 2, path)), sigma_px

@@ -9,7 +9,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming
-from pipeline.exchange.xml_tree import Content, numbers_of, read_xml, text_of, xml_text
+from pipeline.exchange.xml_tree import Content, child_numbers, child_text, read_xml, xml_text
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.names import image_name
 
@@ -63,13 +63,13 @@ def _marks(path: Path, options: ImportOptions) -> Iterator[ForeignMark]:
     measures = read_xml(path).find("Data/SetMesIm")
     if measures is None:
         raise InputError(f"{path}: has no <SetMesIm>. Files MesIm-*.xml are read.")
-    image = image_name(_unquoted(text_of(measures, "NameIm", path)))
+    image = image_name(_unquoted(child_text(measures, "NameIm", path)))
     for element in measures.iterfind("Measures/el"):
-        place = np.array(numbers_of(element, "Pt", 2, path)) - CONVENTION.first_pixel_px
-        xx, xy, yy = numbers_of(element, "Sigma2", 3, path)
+        place = np.array(child_numbers(element, "Pt", 2, path)) - CONVENTION.first_pixel_px
+        xx, xy, yy = child_numbers(element, "Sigma2", 3, path)
         known = xx > 0.0 and yy > 0.0 and xx * yy > xy * xy
         covariance = np.array([[xx, xy], [xy, yy]]) if known else None
-        name = _unquoted(text_of(element, "Name", path))
+        name = _unquoted(child_text(element, "Name", path))
         yield ForeignMark(image, name, "fiducial" if is_fiducial else "target", place, covariance)
 
 

@@ -12,7 +12,7 @@ from pipeline.exchange.block import Block, Frame, WholeFrame
 from pipeline.exchange.fitted_lens import FittedLens, fisheye_lens, nearest_lens
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.opencv_check.opencv_model import INTERIOR
-from pipeline.resampling.canvas import Canvas, canvas_of
+from pipeline.resampling.canvas import Canvas, outline_canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.types import Array
 
@@ -123,7 +123,7 @@ def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportO
     """Raises MeasurementError where the lens folds within the scan."""
     pitch_um = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
     scans = [(scan.chain(options.with_lens), *block.size_px(scan)) for scan in frame.scans]
-    canvas = canvas_of(scans, pitch_um / 1000.0)
+    canvas = outline_canvas(scans, pitch_um / 1000.0)
     misfit_mm = lens.largest_mm + sight_misfit_mm(block, frame)
     return PinholeFrame(frame, canvas, lens, misfit_mm / canvas.pitch_mm, options.with_lens)
 

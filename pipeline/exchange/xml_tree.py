@@ -57,7 +57,7 @@ def read_xml(path: Path) -> Element:
     return builder.close()
 
 
-def text_of(element: Element, name: str, path: Path) -> str:
+def child_text(element: Element, name: str, path: Path) -> str:
     """The text of a child element. Raises InputError where there is none."""
     found = element.find(name)
     if found is None or found.text is None:
@@ -65,9 +65,9 @@ def text_of(element: Element, name: str, path: Path) -> str:
     return found.text.strip()
 
 
-def numbers_of(element: Element, name: str, count: int, path: Path) -> list[float]:
+def child_numbers(element: Element, name: str, count: int, path: Path) -> list[float]:
     """So many numbers in the text of a child element. Raises InputError where there are others."""
-    text = text_of(element, name, path)
+    text = child_text(element, name, path)
     try:
         values = [float(part) for part in text.split()]
     except ValueError:

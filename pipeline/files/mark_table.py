@@ -142,7 +142,7 @@ def read_template(table: Table) -> MarkTemplate:
     """Raises InputError naming the key that is wrong."""
     image = _image(table, "image")
     if np.ptp(image) == 0.0:
-        path = table.path_of("image")
+        path = table.path_value("image")
         raise table.error("image", f"{path} shows nothing: all its pixels are alike. Cut out the mark with its ground.")
     template = MarkTemplate(
         image,
@@ -187,7 +187,7 @@ def _image(table: Table, key: str) -> Array:
     from measure.scans.opening import open_scan
 
     try:
-        with open_scan(table.path_of(key)) as chip:
+        with open_scan(table.path_value(key)) as chip:
             return chip.window(0, 0, chip.width_px, chip.height_px).astype(np.float64)
     except MeasurementError as error:
         raise table.error(key, str(error)) from error

@@ -146,8 +146,8 @@ def _chips(
     frames = {scan.frame.image: scan.frame for scan in measure(tasks)}
     named = [(task, frames[task.name]) for task in tasks if _is_named(frames[task.name], start)]
     chips = dict[str, list[Chip]]()
-    for of_scan in map_items(workers, partial(_chips_of, learned), named):
-        for id, chip in of_scan.items():
+    for scan_fingerprint in map_items(workers, partial(_chips_of, learned), named):
+        for id, chip in scan_fingerprint.items():
             chips.setdefault(id, []).append(chip)
     return chips, {rival for frame in frames.values() if frame.pose for rival in frame.pose.rivals}
 

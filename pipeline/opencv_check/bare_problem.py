@@ -99,7 +99,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
     )
 
 
-def in_opencv_model(problem: BareProblem, parameters: Array) -> BareProblem:
+def opencv_problem(problem: BareProblem, parameters: Array) -> BareProblem:
     """The same problem with OpenCV's own distortion, from parameters (18,) in the order of `opencv_model.NAMES`."""
     values = dict(zip(NAMES, parameters.tolist(), strict=True))
     values |= {"b1": values["fx"] / values["fy"] - 1, "b2": 0.0}

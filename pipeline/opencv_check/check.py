@@ -26,7 +26,7 @@ from pipeline.opencv_check.bare_problem import (
     bare_problem,
     converted,
     free_parameters,
-    in_opencv_model,
+    opencv_problem,
 )
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate, calibrate_fisheye
 from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners
@@ -229,7 +229,7 @@ def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: Open
     """Whether the adjustment with OpenCV's own model comes to OpenCV's solution."""
     if problem.network.cameras[0].distortion.family in ("opencv", FISHEYE):
         return False
-    same = in_opencv_model(problem, conversion.parameters)
+    same = opencv_problem(problem, conversion.parameters)
     solved = adjust(same.network, same.approximations)
     if not solved.converged:
         return False

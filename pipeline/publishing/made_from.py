@@ -57,8 +57,8 @@ def measured_from(project: Project) -> MadeFrom:
     ]
 
     def scan_hash(image: str, path: Path) -> str:
-        told = f"{_parts(path, project, known, files)} {project.camera_of(image).name}"
-        return of_content(told.encode("utf-8", "surrogateescape"))
+        text = f"{_parts(path, project, known, files)} {project.camera_of(image).name}"
+        return of_content(text.encode("utf-8", "surrogateescape"))
 
     return {
         SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
@@ -104,13 +104,13 @@ def _numbers(mark: ComparatorPoint) -> tuple[Any, ...]:
     return (*mark.xy_mm.tolist(), *(() if mark.sigma_mm is None else mark.sigma_mm.tolist()), mark.rho)
 
 
-def _settings(project: Project) -> dict[str, Any]:
+def _settings(project: Project) -> dict[str, object]:
     return {name: value for name, value in _field_values(project).items() if name not in _FILES | _NO_MATTER}
 
 
-def _sought(camera: CameraFile) -> dict[str, Any]:
+def _sought(camera: CameraFile) -> dict[str, object]:
     return {name: value for name, value in _field_values(camera).items() if name not in _LENS | _ORIGIN}
 
 
-def _field_values(value: Any) -> dict[str, Any]:
+def _field_values(value: Any) -> dict[str, object]:
     return {field.name: getattr(value, field.name) for field in fields(value)}

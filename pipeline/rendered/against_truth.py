@@ -93,7 +93,7 @@ def _frame(scan: MeasuredScan, truth: Json) -> FrameComparison:
             continue
         observed[mark.kind] += 1
         place = places[mark.kind].get(mark.point)
-        error = np.full(2, np.inf) if place is None else mark.center_px - _seen(place)
+        error = np.full(2, np.inf) if place is None else mark.center_px - _visible_place(place)
         if np.linalg.norm(error) > WRONG_PX:
             wrong.append(mark.point)
         else:
@@ -112,7 +112,7 @@ def _frame(scan: MeasuredScan, truth: Json) -> FrameComparison:
     )
 
 
-def _seen(place: Json) -> Array:
+def _visible_place(place: Json) -> Array:
     """Where the centre of the figure lies that is seen: for a disk that of its ellipse."""
     return np.array([place.get("ellipse_col_px", place["col_px"]), place.get("ellipse_row_px", place["row_px"])])
 

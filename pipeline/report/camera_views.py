@@ -129,9 +129,9 @@ def _lens_view(
     curves = lens.curves(known, largest)
     lens_map = None
     if rows:
-        on = vectors.plane(vectors.VectorField.of_residuals(rows).places_mm, frame_mm, PLOT_PX)
+        on = vectors.plane(vectors.VectorField.from_residuals(rows).places_mm, frame_mm, PLOT_PX)
         if reach is not None and reach.frame_mm is not None:
-            on = vectors.plane_about(np.array(reach.frame_mm), PLOT_PX)
+            on = vectors.padded_plane(np.array(reach.frame_mm), PLOT_PX)
         lens_map = lens.lens_map(known, on, radius_mm)
     return LensView(
         curves,
@@ -143,6 +143,6 @@ def _lens_view(
 
 
 def _vectors(rows: list[ResidualRecord], frame_mm: tuple[float, float] | None) -> Markup:
-    scale = vectors.VectorField.of_residuals(rows).scale(LONGEST_VECTOR_PX)
-    residuals = vectors.VectorField.of_residuals(rows[:: -(-len(rows) // MOST_VECTORS)])  # evenly over the frames
+    scale = vectors.VectorField.from_residuals(rows).scale(LONGEST_VECTOR_PX)
+    residuals = vectors.VectorField.from_residuals(rows[:: -(-len(rows) // MOST_VECTORS)])  # evenly over the frames
     return vectors.all_images_plot(residuals, vectors.plane(residuals.places_mm, frame_mm, PLOT_PX), scale)

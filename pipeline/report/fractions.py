@@ -175,5 +175,5 @@ def _histograms(what: str, by_axis: Mapping[str, Array]) -> Iterator[tuple[str, 
     for axis, values in by_axis.items():
         if len(values):
             rms, largest = np.sqrt(np.mean(values**2)), np.abs(values).max()
-            told = f"{counted(len(values), 'mark')}, rms {rms:.2f} µm, at most {largest:.2f} µm"
-            yield told, histogram(f"{what} in {axis} (µm)", values)
+            caption = f"{counted(len(values), 'mark')}, rms {rms:.2f} µm, at most {largest:.2f} µm"
+            yield caption, histogram(f"{what} in {axis} (µm)", values)

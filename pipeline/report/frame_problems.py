@@ -8,7 +8,7 @@ from pipeline.report.data import Problem
 from pipeline.report.fractions import fraction_test
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
-from pipeline.text.wording import LISTED, counted, listed, without_file
+from pipeline.text.wording import LISTED, counted, drop_file_name, listed
 from pipeline.types import Array
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
@@ -21,7 +21,7 @@ _ONE_ANSWER = (
 Sentence = TypeVar("Sentence", Problem, str)
 
 
-def problems_of(frame: Frame, with_pose: bool) -> Iterator[Problem]:
+def single_frame_problems(frame: Frame, with_pose: bool) -> Iterator[Problem]:
     """What one frame has to say. with_pose: also of a pose that nothing decides."""
     yield from _assumed_pose(frame) if with_pose else ()
     yield from _measurement_problems(frame)
@@ -77,7 +77,7 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
     evidence = pose.evidence if pose and not pose.decided else ()
     for problem in measured.problems if measured else ():
         if problem not in evidence:
-            yield Problem(without_file(problem, frame.scan.scan) if frame.scan else problem)
+            yield Problem(drop_file_name(problem, frame.scan.scan) if frame.scan else problem)
     lost = [mark for mark in frame.marks if mark.is_fiducial and mark.is_open]
     found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
     if lost and (found or pose):  # a frame that was not found at all has said so

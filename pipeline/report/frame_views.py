@@ -144,7 +144,7 @@ def _plots(
     stored = data.adjustment
     if stored is None or not by_image:
         return {}
-    scale = vectors.VectorField.of_residuals(stored.residuals).scale(LONGEST_VECTOR_PX)
+    scale = vectors.VectorField.from_residuals(stored.residuals).scale(LONGEST_VECTOR_PX)
     frame_mm = {image: data.frame_mm.get(stored.camera_of(image)) for image in images}
     return {
         image: vectors.image_plot(image, by_image[image], frame_mm[image], PLOT_PX, scale, suspects) for image in images

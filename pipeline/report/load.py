@@ -45,8 +45,8 @@ def measured(
 ) -> ReportData:
     """The marks, and what measurement.db says of them where it is theirs. at: where each result stands now.
 
-    most_frames: of more than these the scans are not read; `scans_of` gives them one by one. rows: some of the marks,
-    where not all are to be read; then no scans are.
+    most_frames: of more than these the scans are not read; `unread_scans` gives them one by one. rows: some of the
+    marks, where not all are to be read; then no scans are.
     """
     comparator = at(project.comparator)
     data = ReportData(
@@ -65,8 +65,8 @@ def measured(
         return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
     if made is None:
         what = f"{path.name} is of other marks than {project.comparator.name}: it is not shown."
-        return _with_problems(data, Problem(what, "Run `reseau measure`."))
-    many = rows is not None or (most_frames is not None and frames_of(data) > most_frames)
+        return _add_problems(data, Problem(what, "Run `reseau measure`."))
+    many = rows is not None or (most_frames is not None and frame_count(data) > most_frames)
     scans = {} if many else {scan.frame.image: scan for scan in measured_scans(path, digest)}
     data = replace(data, measurement=scans, made_from={**data.made_from, path.name: digest})
     unlike: list[Problem] = []
@@ -84,15 +84,15 @@ def measured(
     with Store(path) as store:
         lines = inapplicable(store, digest)
     idle = [Problem(f"{project.decisions_path.name}, {line}", "It does not count.") for line in lines]
-    return _with_problems(data, *damaged, *idle, *unlike)
+    return _add_problems(data, *damaged, *idle, *unlike)
 
 
-def frames_of(data: ReportData) -> int:
+def frame_count(data: ReportData) -> int:
     """How many images have marks."""
     return len({row.image for row in data.comparator})
 
 
-def scans_of(data: ReportData, project: Project, images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
+def unread_scans(data: ReportData, project: Project, images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
     """The scans of data that have not been read, or those of some images, one after the other; none where the store is
     of other marks."""
     digest = data.made_from.get(project.measurement_path.name)
@@ -104,12 +104,12 @@ def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> Rep
     camera_of = partial(_camera_name, project)
     stored = _stored(project, at)
     if stored is not None and len(stored.names) > most_frames:
-        look = stored.names - {frame.image for frame in stored.plain}
-        return reduced(measured(project, at, rows=stored.rows(look)), stored.scans(look), camera_of, stored)
+        needed = stored.names - {frame.image for frame in stored.plain}
+        return reduced(measured(project, at, rows=stored.rows(needed)), stored.scans(needed), camera_of, stored)
     data = adjusted(project, at, most_frames)
-    if frames_of(data) <= most_frames:
+    if frame_count(data) <= most_frames:
         return data
-    return reduced(data, scans_of(data, project), camera_of)
+    return reduced(data, unread_scans(data, project), camera_of)
 
 
 def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
@@ -120,7 +120,7 @@ def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
     for image in images:
         if image not in known:
             raise InputError(f"{project.comparator}: has no image {image!r}.{did_you_mean(image, known)}")
-    scans = {scan.frame.image: scan for scan in scans_of(data, project, images)}
+    scans = {scan.frame.image: scan for scan in unread_scans(data, project, images)}
     return replace(data, comparator=[row for row in data.comparator if row.image in images], measurement=scans)
 
 
@@ -148,7 +148,7 @@ def adjusted(project: Project, at: At, most_frames: int | None = None) -> Report
     elif covariance.adjustment != fingerprint:
         not_shown = f"adjustment.npz belongs to another {path.name}: both are not shown."
     if not_shown:
-        return _with_problems(data, Problem(not_shown, "Run `reseau adjust`."))
+        return _add_problems(data, Problem(not_shown, "Run `reseau adjust`."))
     made_from = {**data.made_from, path.name: fingerprint}
     data = replace(data, adjustment=adjustment, covariance=covariance, made_from=made_from)
     check_path = at(project.check_path)
@@ -158,7 +158,7 @@ def adjusted(project: Project, at: At, most_frames: int | None = None) -> Report
         return data
     if check.made_from != {path.name: fingerprint}:
         what = f"{check_path.name} is of another adjustment: it is not shown."
-        return _with_problems(data, Problem(what, "Run `reseau check`."))
+        return _add_problems(data, Problem(what, "Run `reseau check`."))
     return replace(data, check=check, made_from={**data.made_from, check_path.name: of_file(check_path)})
 
 
@@ -188,5 +188,5 @@ def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem
         )
 
 
-def _with_problems(data: ReportData, *problems: Problem) -> ReportData:
+def _add_problems(data: ReportData, *problems: Problem) -> ReportData:
     return replace(data, problems=(*data.problems, *problems))

@@ -14,7 +14,7 @@ from pipeline.archive.measurement import MarkColumns, StoredFrame, StoredMarks
 from pipeline.archive.verdicts import Verdict, frame_verdict
 from pipeline.report.data import FrameTotals, Problem, ReportData
 from pipeline.report.fractions import centers_px, places_apart
-from pipeline.report.frame_problems import masked_text, problems_of
+from pipeline.report.frame_problems import masked_text, single_frame_problems
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.marks import Frame, frames
 from pipeline.report.verdict import is_film_alone, suspect_rows
@@ -104,7 +104,7 @@ def reduced(
         nonlocal needs_look
         for one in _one_by_one(data, scans):
             (frame,) = frames(one)
-            verdict, problems = _verdict(frame, with_pose), list(problems_of(frame, with_pose))
+            verdict, problems = _verdict(frame, with_pose), list(single_frame_problems(frame, with_pose))
             kind = camera_of(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
             totals.add(frame, kind, verdict, problems)
             if problems or verdict.needs_look or frame.image in suspect:

@@ -9,7 +9,7 @@ from adjust.problem.parameter import Parameter
 from pipeline.drawing import svg
 from pipeline.report.data import ReportData
 from pipeline.report.parameters import ParameterRow, term_rows
-from pipeline.report.vectors import grid_mm, longest_vector, plane_about, strokes_and_dots
+from pipeline.report.vectors import grid_mm, longest_vector, padded_plane, strokes_and_dots
 from pipeline.results.adjustment_record import AdjustmentRecord, ScannerRecord
 from pipeline.results.covariance_file import Covariance
 from pipeline.types import Array
@@ -49,7 +49,7 @@ def _view(stored: AdjustmentRecord, covariance: Covariance | None, name: str, sc
     counts = np.maximum(np.rint(GRID * half / half.max()), 2.0).astype(int)
     xy_mm = grid_mm(np.linspace(c - h, c + h, count) for c, h, count in zip(center, half, counts, strict=True))
     value_um, covariance_um2 = bend_field(name, scanner, covariance, xy_mm)
-    on = plane_about(np.stack([center - half, center + half]), PLOT_PX, ROOM)
+    on = padded_plane(np.stack([center - half, center + half]), PLOT_PX, ROOM)
     radii_um, angles = svg.ellipse_axes(covariance_um2)
     reach_um = float((np.hypot(*value_um.T) + radii_um.max(axis=1)).max())
     mesh_px = on.px_per_mm * float(np.ptp(xy_mm, axis=0).max()) / (GRID - 1)

@@ -60,14 +60,14 @@ class VectorField:
     is_fiducial: Mask
 
     @classmethod
-    def of_residuals(cls, rows: Sequence[ResidualRecord]) -> "VectorField":
+    def from_residuals(cls, rows: Sequence[ResidualRecord]) -> "VectorField":
         """The residuals along the camera's axes."""
         numbers = [(row.camera_x_mm, row.camera_y_mm, row.camera_vx_um, row.camera_vy_um) for row in rows]
         places, vectors = np.hsplit(np.array(numbers, dtype=float).reshape(-1, 4), 2)
         return cls(places, vectors, np.array([row.kind == "fiducial" for row in rows], dtype=bool))
 
     @classmethod
-    def of_joins(cls, rows: Sequence[JoinRecord]) -> "VectorField":
+    def from_joins(cls, rows: Sequence[JoinRecord]) -> "VectorField":
         """How far two scans of a frame differ."""
         places, vectors = np.hsplit(np.array([(row.x_mm, row.y_mm, row.dx_um, row.dy_um) for row in rows]), 2)
         return cls(places, vectors, np.zeros(len(rows), dtype=bool))
@@ -89,10 +89,10 @@ def plane(places_mm: Array, frame_mm: tuple[float, float] | None, width_px: floa
     half = 0.5 * np.array(frame_mm) if frame_mm is not None else np.zeros(2)
     if np.all(np.abs([low, high]) <= half):
         low, high = -half, half
-    return plane_about(np.stack([low, high]), width_px)
+    return padded_plane(np.stack([low, high]), width_px)
 
 
-def plane_about(corners_mm: Array, width_px: float, share: float = 0.02) -> Plane:
+def padded_plane(corners_mm: Array, width_px: float, share: float = 0.02) -> Plane:
     """The rectangle between two corners (2, 2), with a little room about it: a share of its longer side."""
     # A single point, or points in a row, still need a plane to stand in.
     room = share * max(float(np.ptp(corners_mm, axis=0).max()), 1.0)
@@ -121,7 +121,7 @@ def image_plot(
     suspects: Collection[ResidualRecord],
 ) -> Markup:
     """The residuals of one image, each with its name and numbers to point at."""
-    residuals = VectorField.of_residuals(rows)
+    residuals = VectorField.from_residuals(rows)
     on = plane(residuals.places_mm, frame_mm, width_px)
     marks = []
     for start, end, row in zip(*residuals.ends(on, px_per_um), rows, strict=True):
@@ -161,7 +161,7 @@ def joined_view(frame: JoinedFrameRecord) -> JoinedView:
     """The joins of a frame."""
     if not frame.joins:
         return JoinedView(frame, (None, None), "–", None)
-    apart = VectorField.of_joins(frame.joins)
+    apart = VectorField.from_joins(frame.joins)
     lengths_um = np.hypot(*apart.vectors_um.T)
     x_um, y_um = np.sqrt(np.mean(apart.vectors_um**2, axis=0)).tolist()
     largest = f"{frame.joins[int(lengths_um.argmax())].point}: {fixed(float(lengths_um.max()), 1)} µm"

@@ -105,7 +105,7 @@ class Canvas:
         return np.stack([x, y], axis=-1)
 
 
-def canvas_of(scans: Sequence[tuple[FrameChain, int, int]], pitch_mm: float) -> Canvas:
+def outline_canvas(scans: Sequence[tuple[FrameChain, int, int]], pitch_mm: float) -> Canvas:
     """The canvas that holds the whole outlines of scans, each with its width and height, its pixels at whole multiples
     of the pitch.
 

@@ -66,9 +66,9 @@ def read_description(path: Path) -> dict[str, Any] | None:
 
 
 def write_frame(
-    path: Path, described: Description, channels: int, dtype: type, tile_at: Callable[[int, int], Tile]
+    path: Path, described: Description, channels: int, dtype: type, make_tile: Callable[[int, int], Tile]
 ) -> int:
-    """Write the frame, tile by tile as `tile_at(col0, row0)` gives them; how many samples were clamped.
+    """Write the frame, tile by tile as `make_tile(col0, row0)` gives them; how many samples were clamped.
 
     Memory holds a tile, the first reduced page, and the mask of tiles at the scan's edge. Raises InputError where the
     file cannot be written.
@@ -82,7 +82,7 @@ def write_frame(
         nonlocal clamped
         for row0 in range(0, canvas.height_px, TILE_PX):
             for col0 in range(0, canvas.width_px, TILE_PX):
-                tile = tile_at(col0, row0)
+                tile = make_tile(col0, row0)
                 clamped += tile.clamped
                 reduced.take(tile.samples, col0, row0)
                 inside = bool(tile.is_inside.flat[0])

@@ -78,7 +78,7 @@ def _inside_mask(source: _ByWindows, col0: int, row0: int, width: int, height: i
 
 
 @contextmanager
-def source_of(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Source]:
+def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Source]:
     """The scan, of which a row of tiles needs `rows_at_a_time` rows. scratch: a folder for what is decoded."""
     wide = scan.segment_px[1] >= scan.width_px
     if not wide or rows_at_a_time <= scan.rows_kept:

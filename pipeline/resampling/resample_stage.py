@@ -19,9 +19,9 @@ from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.provenance import file_state
-from pipeline.resampling.canvas import FrameChain, adjusted_chain, canvas_of, measured_chain
+from pipeline.resampling.canvas import FrameChain, adjusted_chain, measured_chain, outline_canvas
 from pipeline.resampling.frame_file import TILE_PX, Description, read_description, write_frame
-from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile, source_of
+from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile, open_source
 from pipeline.resampling.seam import Part, find_inner_edges, joined_tile, seams_mm
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.adjustment_record import AdjustmentRecord
@@ -177,7 +177,7 @@ def _resampled(task: ResampleTask) -> Resampled:
     given = [(task.scan, task.chain), *((other.scan, other.chain) for other in task.others)]
     with ExitStack() as opened:
         scans = [(opened.enter_context(open_scan(path, task.max_pixels)), chain) for path, chain in given]
-        canvas = canvas_of([(chain, scan.width_px, scan.height_px) for scan, chain in scans], task.pitch_mm)
+        canvas = outline_canvas([(chain, scan.width_px, scan.height_px) for scan, chain in scans], task.pitch_mm)
         done = Resampled(task.image, task.target, canvas.width_px, canvas.height_px)
         fingerprint = task.fingerprint
         if before is not None and before.get("fingerprint") == fingerprint:
@@ -186,18 +186,18 @@ def _resampled(task: ResampleTask) -> Resampled:
         parts = []
         for scan, chain in scans:
             rows = _rows_at_a_time(chain, task.pitch_mm, canvas.width_px)
-            parts.append(Part(opened.enter_context(source_of(scan, rows, task.target.parent)), chain))
+            parts.append(Part(opened.enter_context(open_source(scan, rows, task.target.parent)), chain))
         parts = find_inner_edges(parts)
         names = (task.part, *(other.image for other in task.others)) if task.part else ()
         has_lens = task.chain.lens is not None
         seams = seams_mm(parts, canvas) if task.others else ()
         described = Description(task.image, task.camera, canvas, task.pose, has_lens, fingerprint, names, seams)
 
-        def tile_at(col0: int, row0: int) -> Tile:
+        def make_tile(col0: int, row0: int) -> Tile:
             return joined_tile(parts, canvas, col0, row0, TILE_PX, task.degree)
 
         source = parts[0].source
-        clamped = write_frame(task.target, described, source.channels, source.dtype, tile_at)
+        clamped = write_frame(task.target, described, source.channels, source.dtype, make_tile)
     return replace(done, clamped=clamped)
 
 

@@ -37,7 +37,7 @@ def _parse(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
     except IsADirectoryError:
-        raise InputError(f"{path}: is a folder; a TOML file is needed here. {_toml_files_in(path)}") from None
+        raise InputError(f"{path}: is a folder; a TOML file is needed here. {_toml_files_sentence(path)}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not text in UTF-8; a TOML file, saved as such, is needed here.") from None
     except RecursionError:
@@ -59,7 +59,7 @@ def _mending(text: str, error: str) -> str:
     return "Mend that line."
 
 
-def _toml_files_in(folder: Path) -> str:
+def _toml_files_sentence(folder: Path) -> str:
     files = sorted(folder.glob("*.toml"))
     if not files:
         return "It holds none; `reseau template` prints one to start from."
@@ -84,7 +84,7 @@ class Table:
 
     def error(self, key: str, message: str) -> InputError:
         """An InputError that names the file, the line (of the table where the key is missing) and the key."""
-        line = self._line_of(key)
+        line = self._line_number(key)
         at = f"{self.file}, line {line}" if line else f"{self.file}"
         table = f"[{self.place}] " if self.place else ""
         return InputError(f"{at}: {table}{key}: {message}")
@@ -99,7 +99,7 @@ class Table:
             )
         return value
 
-    def path_of(self, key: str, default: str | None = None) -> Path:
+    def path_value(self, key: str, default: str | None = None) -> Path:
         """A file's or folder's name, relative to the folder of this file."""
         return self.file.parent / self.path_text(key, default)
 
@@ -276,7 +276,7 @@ class Table:
     def _inside(self, key: str) -> str:
         return f"{self.place}.{key}" if self.place else key
 
-    def _line_of(self, key: str) -> int | None:
+    def _line_number(self, key: str) -> int | None:
         """The line where the key, or the table of that name, stands inside this table; this table's own if nowhere."""
         try:
             lines = self.file.read_text(encoding="utf-8-sig").splitlines()

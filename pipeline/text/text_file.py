@@ -1,9 +1,7 @@
 """Files that are read whole, regular ones of a stated size at most; numbers as JSON knows them."""
 
 import json
-import math
 import stat
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -78,19 +76,3 @@ def shown(value: object) -> str:
     except (ValueError, RecursionError):
         return "a number of thousands of digits" if isinstance(value, int) else "this"
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
-
-
-def without_nan(value: Any) -> Any:
-    """The same with null for every number that is not finite: JSON knows no others.
-
-    What holds none is handed back as it is: a copy of a large result would take as much memory again.
-    """
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        cleaned = {key: without_nan(item) for key, item in value.items()}
-        return cleaned if any(cleaned[key] is not item for key, item in value.items()) else value
-    if isinstance(value, list | tuple):
-        items = [without_nan(item) for item in value]
-        return items if any(new is not old for new, old in zip(items, value, strict=True)) else value
-    return value

@@ -32,7 +32,7 @@ def counted(number: int, one: str, many: str = "") -> str:
     return f"{number} {one if number == 1 else many or one + 's'}"
 
 
-def without_file(sentence: str, file: str) -> str:
+def drop_file_name(sentence: str, file: str) -> str:
     """The sentence without the name of the file that it begins with."""
     name = f"{PurePosixPath(file.replace(chr(92), '/')).name}: "
     head, found, rest = sentence.partition(name)
@@ -43,7 +43,7 @@ def gathered(told: Iterable[tuple[str, str, str]]) -> list[str]:
     """What images have to say, each with its name and file: once where many say the same, with their number."""
     alike: dict[str, list[tuple[str, str]]] = {}
     for image, file, sentence in told:
-        alike.setdefault(without_file(sentence, file), []).append((image, sentence))
+        alike.setdefault(drop_file_name(sentence, file), []).append((image, sentence))
     return [
         f"{len(own)} scans ({listed([image for image, _ in own])}): {same}" if len(own) > 1 else own[0][1]
         for same, own in alike.items()

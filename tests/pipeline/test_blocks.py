@@ -17,7 +17,7 @@ from adjust.problem.network import ObjectPoint
 from measure.flags import Status
 from pipeline.blocks.block_stage import written_block
 from pipeline.blocks.mapping import Mapped, Sight, camera_params
-from pipeline.blocks.pictures import BlockPicture, BlockScan, lattice_of, write_pictures
+from pipeline.blocks.pictures import BlockPicture, BlockScan, camera_lattice, write_pictures
 from pipeline.blocks.ties import A_CELL, CELLS, feature_precision, oriented_by_control, similarity, tie_marks
 from pipeline.errors import InputError
 from pipeline.exchange.incoming import fiducial_camera
@@ -37,7 +37,7 @@ CAMERA: CameraFile = replace(
     principal_point_mm=(TRUTH.x0, TRUTH.y0),
     distortion=Distortion(),
 )
-LATTICE = lattice_of(CAMERA, PITCH_MM)
+LATTICE = camera_lattice(CAMERA, PITCH_MM)
 PITCH_UM = (1000.0 * PITCH_MM, 1000.0 * PITCH_MM)
 
 

@@ -12,7 +12,7 @@ import pytest
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.design.alternatives import alternatives, gains
 from pipeline.design.expected import alone, expect, rms
-from pipeline.design.setup import planned_network, setup_of
+from pipeline.design.setup import planned_network, scene_setup
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.errors import InputError
 from pipeline.rendered.design_table import Sweep
@@ -228,7 +228,7 @@ def test_the_network_is_what_the_frames_show(tmp_path: Path) -> None:
     assert network.point_by_id["1"].Z.sigma == 0.001
     np.testing.assert_allclose(values.transformation["one"], [0, 1, 0, 0, 0, 1], atol=1e-12)
     near = small(tmp_path, ("[0.0, 0.0, 5.0]", "[0.0, 0.0, 2.1]"))
-    assert len(Variations.read(near).setup().seen_by(Variations.read(near).setup().images[0])) == 4
+    assert len(Variations.read(near).setup().visible_points(Variations.read(near).setup().images[0])) == 4
     below = small(tmp_path, ("[0.0, 0.0, 5.0]", "[0.0, 0.0, -5.0]"), ("angles_deg = [0.0", "angles_deg = [180.0"))
     with pytest.raises(InputError, match="'one' would show 0 targets and needs 3"):
         planned_network(Variations.read(below).setup())
@@ -334,7 +334,7 @@ def test_fiducials_of_photographs_alone_are_the_mean_of_as_many(tmp_path: Path) 
 
 def test_a_field_of_natural_points_cannot_be_planned() -> None:
     with pytest.raises(InputError, match="has no targets"):
-        setup_of(read_scene(SCENES / "juhl_natural.toml"))
+        scene_setup(read_scene(SCENES / "juhl_natural.toml"))
 
 
 def with_table(folder: Path, table: str) -> Path:

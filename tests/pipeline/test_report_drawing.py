@@ -138,7 +138,7 @@ def test_the_longest_arrow_fits() -> None:
 def test_vectors_over_the_camera_are_to_scale() -> None:
     """A point at (50, 20) mm of a frame of 200 x 100 mm, moved by (10, -5) µm."""
     row = replace(RESIDUAL, camera_x_mm=50.0, camera_y_mm=20.0, camera_vx_um=10.0, camera_vy_um=-5.0)
-    field = VectorField.of_residuals([row])
+    field = VectorField.from_residuals([row])
     on = plane(field.places_mm, (200.0, 100.0), 560.0)
     assert on.height_px < on.width_px
     (x, y), (right, top) = on.page(np.array([(50.0, 20.0), (60.0, 30.0)]))

@@ -19,8 +19,8 @@ from adjust.functional_model.transformation import Film
 from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from pipeline.cli import run
-from pipeline.resampling.canvas import FrameChain, canvas_of, scan_places
-from pipeline.resampling.interpolation import source_of
+from pipeline.resampling.canvas import FrameChain, outline_canvas, scan_places
+from pipeline.resampling.interpolation import open_source
 from pipeline.resampling.resample_stage import BEST, FAST, OtherScan, ResampleTask, resampled
 
 Array = NDArray[np.float64]
@@ -231,7 +231,7 @@ def test_a_fisheyes_ideal_picture_ends_where_it_would_be_stretched_without_end()
     c, k = 5.0, np.array([0.02, -0.005, 0.0, 0.0])
     lens = Lens(Distortion("opencv_fisheye"), np.array([c, 8.0, -8.0]), np.array([*k, 0.0, 0.0]))
     chain = FrameChain((10.0, 10.0), Film("none", np.empty(0), np.zeros(2)), lens=lens)
-    canvas = canvas_of([(chain, 1600, 1600)], 0.01)
+    canvas = outline_canvas([(chain, 1600, 1600)], 0.01)
     assert (canvas.width_px, canvas.height_px) == (2001, 2001)
     assert (canvas.x_mm, canvas.y_mm) == pytest.approx((8.0 - 2 * c, -8.0 + 2 * c))
     columns, rows = scan_places(chain, canvas, 1000, 1000, 64)
@@ -259,7 +259,7 @@ def test_what_is_resampled_is_not_measured(scan: Path, tmp_path: Path) -> None:
 
 
 def test_a_scan_in_strips_that_lies_across_is_decoded_once(scan: Path, tmp_path: Path) -> None:
-    with open_scan(scan) as opened, source_of(opened, 10**9, tmp_path) as decoded:
+    with open_scan(scan) as opened, open_source(opened, 10**9, tmp_path) as decoded:
         for place in ((-20, -30, 100, 90), (WIDTH - 50, 100, 90, 60), (100, HEIGHT - 5, 40, 30), (300, 200, 50, 40)):
             assert (decoded.window(*place) == opened.samples(*place)).all()
     assert not list(tmp_path.iterdir())

@@ -25,7 +25,7 @@ from pipeline.adjusting import second_visit
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
-from pipeline.provenance import fingerprint, of_scan
+from pipeline.provenance import fingerprint, scan_fingerprint
 from pipeline.publishing.made_from import measured_from
 from pipeline.report.load import adjusted
 from pipeline.results.comparator_file import mark_rows, read_comparator, write_comparator
@@ -429,12 +429,12 @@ def test_a_scan_counts_as_another_wherever_a_piece_of_it_changes(tmp_path: Path)
         file = tmp_path / "scan.tif"
         data = bytearray(np.random.default_rng(size).bytes(size))
         file.write_bytes(data)
-        seen = {of_scan(file)}
+        seen = {scan_fingerprint(file)}
         places = range(0, size, max(size // 7, 1)) if size <= 200_000 else (0, 30_000, 2_130_000, size - 1)
         for at in list(places)[:8]:
             changed = data.copy()
             changed[at] ^= 1
             file.write_bytes(changed)
-            seen.add(of_scan(file))
+            seen.add(scan_fingerprint(file))
         assert len(seen) == 1 + len(list(places)[:8]), size
-    assert of_scan(tmp_path / "none.tif") == ""
+    assert scan_fingerprint(tmp_path / "none.tif") == ""

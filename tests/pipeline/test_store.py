@@ -34,7 +34,7 @@ from pipeline.archive.results_database import Store
 from pipeline.archive.schema import MIGRATIONS, VERSION, opened
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, scan_verdict
 from pipeline.errors import InputError
-from pipeline.provenance import content_hash, file_state, options_hash, parts_hash, result_key, shard_of
+from pipeline.provenance import content_hash, file_state, options_hash, parts_hash, result_key, shard_number
 from pipeline.results.comparator_file import mark_rows
 from pipeline.results.measured_record import MeasuredScan
 
@@ -297,7 +297,7 @@ def test_failed_scans_are_tried_again_only_when_asked(path: Path) -> None:
 def test_stores_of_shards_become_one(tmp_path: Path) -> None:
     whole, joined, shards = tmp_path / "whole.db", tmp_path / "joined.db", [tmp_path / f"{k}.db" for k in (1, 2)]
     for seed in range(20):
-        for place in (whole, shards[shard_of(str(seed), 2) - 1]):
+        for place in (whole, shards[shard_number(str(seed), 2) - 1]):
             with Store(place) as store:
                 store.keep(kept(seed, options=f"[{seed % 3}]"), str(seed))
     with Store(joined) as store:
@@ -318,8 +318,8 @@ def test_merging_names_what_is_no_store(tmp_path: Path) -> None:
 
 def test_shards_are_the_same_everywhere() -> None:
     """By SHA-256 of the name: another Python, or another start of it, gives the same."""
-    assert [shard_of(name, 8) for name in ("0001", "box1/0001", "Übersicht")] == [4, 7, 2]  # sha256sum's 8th byte
-    counts = [sum(shard_of(str(n), 4) == k for n in range(4000)) for k in (1, 2, 3, 4)]
+    assert [shard_number(name, 8) for name in ("0001", "box1/0001", "Übersicht")] == [4, 7, 2]  # sha256sum's 8th byte
+    counts = [sum(shard_number(str(n), 4) == k for n in range(4000)) for k in (1, 2, 3, 4)]
     assert min(counts) > 900
 
 
