@@ -23,7 +23,7 @@ from pipeline.files.library import read_library
 SCENE = Path(__file__).with_suffix(".toml")
 ROOT = SCENE.parents[1]
 PACKAGES = ("measure", "adjust", "pipeline", "synthetic_images")
-POOLS = ("archive.measure_archive", "archive.sampling", "resampling.resample_stage")
+POOLS = ("archive.measure_archive", "archive.new_project", "resampling.resample_stage")
 CERTIFICATE = (
     "calibrated_principal_distance_mm = 153.0\nangle_deg = [7.5, 15.0, 22.7, 30.0]\nradial_um = [1, 2, 1, -3]\n"
 )
@@ -112,7 +112,7 @@ def main(folder: Path) -> None:
         for module in POOLS:
             stack.enter_context(patch(f"pipeline.{module}.worker_pool", lambda *_: ThreadPoolExecutor(1)))
         stack.enter_context(patch("pipeline.demo.SCENE", (str(first_frame),)))
-        for module in ("files.library", "archive.sampling"):
+        for module in ("files.library", "archive.new_project"):
             stack.enter_context(patch(f"pipeline.{module}.read_library", lambda: cameras))
         called = [{"extra": extra, **call(arguments)} for extra, arguments in calls(folder)]
     json.dump({"calls": called, "modules": modules_not_imported()}, sys.stdout)

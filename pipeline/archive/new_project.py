@@ -4,9 +4,8 @@ import glob
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -14,18 +13,16 @@ from rich.console import Console
 from measure.errors import MeasurementError
 from measure.scans.opening import ScanHead
 from measure.scans.remote import Address, is_address, scan_path
-from pipeline.archive.catalogue import Catalogue, Group, catalogue
-from pipeline.archive.sampling import library, name_cameras
+from pipeline.archive.catalogue import Catalogue, catalogue
+from pipeline.archive.scan_groups import GroupedScans, ScanGroup, name_cameras, trial_of_cameras
 from pipeline.errors import InputError
-from pipeline.files.library import PREFIX
-from pipeline.measuring.scan_kinds import ScanKind
+from pipeline.files.library import PREFIX, read_library
 from pipeline.progress import Reporter
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
 from pipeline.text.names import image_name, names_below
 from pipeline.text.wording import counted, quoted
-
-Json = dict[str, Any]
+from pipeline.workers import worker_pool
 
 OUTPUT = "out"
 _LIST = ".txt"
@@ -39,29 +36,23 @@ _FORMATS = ("JPEG", "PNG", "TIFF")  # the later the better, of one name and size
 
 @dataclass(frozen=True, eq=False)
 class NewProject:
-    """A project to be written at `folder`. given: where scans were looked for; kinds: of each of `found.groups` what
-    its samples say; left_out: by reason the files that are not measured."""
+    """A project to be written at `folder`. given: where scans were looked for; left_out: by reason the files that are
+    not measured."""
 
     folder: Path
     given: tuple[Path, ...]
     found: Catalogue
-    kinds: tuple[ScanKind, ...]
     left_out: Mapping[str, Sequence[Path]]
 
     @property
-    def named(self) -> list[tuple[Group, ScanKind]]:
-        return [(group, kind) for group, kind in zip(self.found.groups, self.kinds, strict=True) if chosen(kind)]
-
-    @property
-    def unknown(self) -> list[tuple[Group, ScanKind]]:
-        return [(group, kind) for group, kind in zip(self.found.groups, self.kinds, strict=True) if not chosen(kind)]
+    def named(self) -> list[ScanGroup]:
+        return [group for group in self.found.groups if group.camera]
 
     @property
     def cameras(self) -> dict[Path, str]:
         """The camera of each scan that is to be measured; "" where none is told of any."""
         out = {path for paths in self.left_out.values() for path in paths}
-        groups = zip(self.found.groups, self.kinds, strict=True)
-        return {path: chosen(kind) for group, kind in groups for path in group.paths if path not in out}
+        return {path: group.camera for group in self.found.groups for path in group.paths if path not in out}
 
     def remarks(self) -> Iterator[tuple[str, list[str]]]:
         """What needs a look, and the single cases of it."""
@@ -69,19 +60,23 @@ class NewProject:
         yield (
             "are of no camera that could be told"
             + ("" if self.named else ": draw it in camera.toml (`reseau template camera`), or have its marks learned"),
-            [f"{_told(group.folder, group.head, len(group.paths))}: {_why_not(kind)}" for group, kind in self.unknown],
+            [
+                f"{group.folder}, {len(group.paths)} scans, {_form(group.head)}: {group.why_not()}"
+                for group in self.found.groups
+                if not group.camera
+            ],
         )
         yield (
             "have marks that several cameras have: that of most calibration reports is taken, images.csv sets another",
             [
-                f"{group.folder}: {chosen(kind)} of {', '.join(kind.cameras)}"
-                for group, kind in self.named
-                if kind.cameras[1:]
+                f"{group.folder}: {group.camera} of {', '.join(group.cameras)}"
+                for group in self.named
+                if group.cameras[1:]
             ],
         )
         numbers = defaultdict[str, set[str]](set)
-        for _, kind in self.named:
-            numbers[chosen(kind)].update(kind.numbers)
+        for group in self.named:
+            numbers[group.camera].update(group.numbers)
         yield (
             "are of several cameras of one type, by their plates: give each a camera file with its number",
             [f"{name}: Nr {', '.join(sorted(own))}" for name, own in numbers.items() if len(own) > 1],
@@ -93,32 +88,32 @@ class NewProject:
         for reason in (_COPIES, _NAMESAKES):
             if paths := self.left_out[reason]:
                 yield f"{len(paths)} left out: {reason} ({', '.join(map(str, paths[:3]))}{'...' * (len(paths) > 3)})."
-        mute = [(group, kind) for group, kind in self.named if group.head.pitch.um is None]
+        mute = [group for group in self.named if group.head.pitch.um is None]
         if mute:
-            scans = sum(len(group.paths) for group, _ in mute)
-            pixels = [um for _, kind in mute if (um := _pixel_um(kind))]
+            scans = sum(len(group.paths) for group in mute)
+            pixels = [um for group in mute if (um := group.pixel_um)]
             spacing_text = f", {np.median(pixels):.1f} um in the samples" if pixels else ""
             are_all = len(mute) == len(self.named)
             sets = "sets it" if are_all else "is that of all scans: to set it, give these a project of their own"
             yield (
-                f"{scans} scans do not say their resolution ({mute[0][0].head.pitch.note}): the marks' separations "
+                f"{scans} scans do not say their resolution ({mute[0].head.pitch.note}): the marks' separations "
                 f"tell it{spacing_text}; pitch_um in the project {sets}."
             )
-        plates = sorted({number for _, kind in self.named for number in kind.numbers})
+        plates = sorted({number for group in self.named for number in group.numbers})
         if plates:
             yield f"Cameras' numbers on plates in the samples: {', '.join(plates)}."
         if self.found.endings:
             others = sorted(self.found.endings.items(), key=lambda item: -item[1])[:_SHOWN]
             yield f"Not looked at: {', '.join(f'{count} files {_ending(ending)}' for ending, count in others)}."
 
-    def as_json(self) -> Json:
+    def as_json(self) -> Mapping[str, object]:
         return {
             "project": str(self.folder / "project.toml"),
             "images": str(self.folder / "images.csv"),
             "scans": len(self.cameras),
             "kinds": [
-                {"folder": str(group.folder), **_head_json(group.head), "camera": chosen(kind), **kind.as_json()}
-                for group, kind in zip(self.found.groups, self.kinds, strict=True)
+                {"folder": str(group.folder), **_head_json(group.head), **group.as_json()}
+                for group in self.found.groups
             ],
             "left_out": {reason: [str(path) for path in paths] for reason, paths in self.left_out.items()},
             "broken": {str(path): reason for path, reason in self.found.broken.items()},
@@ -128,8 +123,8 @@ class NewProject:
         }
 
     def _contradicted_pitches(self) -> Iterator[str]:
-        for group, kind in self.named:
-            contradiction = next((against for sample in kind.samples if (against := sample.against_pitch())), "")
+        for group in self.named:
+            contradiction = next((against for sample in group.samples if (against := sample.against_pitch())), "")
             if contradiction:
                 yield f"{group.folder}: {contradiction}"
 
@@ -140,7 +135,7 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
     for path in (folder / "project.toml", folder / "images.csv"):
         if path.exists():
             raise InputError(f"{path} is there already, and init writes over nothing. Give another folder by --out.")
-    given = [path for one in given for path in _named(one)]
+    given = [path for one in given for path in _given_paths(one)]
     for path in given:
         if not isinstance(path, Address) and not path.exists():
             raise InputError(f"there is no {path} (looked for {path.absolute()}). Give folders with scans, or scans.")
@@ -149,15 +144,14 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
             found = catalogue(given, count, max_pixels)
         except MeasurementError as error:
             raise InputError(str(error)) from error
-    kinds, unread = name_cameras(found.groups, reporter, max_pixels)
-    found = Catalogue(found.groups, {**found.broken, **unread}, found.copies, found.endings)
-    new = NewProject(folder, tuple(given), found, tuple(kinds), _left_out(found, kinds))
+    found = _with_cameras(found, reporter, max_pixels)
+    new = NewProject(folder, tuple(given), found, _left_out(found))
     write_atomically(folder / "project.toml", project_text(new))
     write_atomically(folder / "images.csv", images_text(new))
     return new
 
 
-def _named(given: Path) -> list[Path]:
+def _given_paths(given: Path) -> list[Path]:
     """Itself, or all that a list of paths and addresses names, a line each."""
     if isinstance(given, Address) or given.suffix.lower() != _LIST or not given.is_file():
         return [given]
@@ -166,20 +160,12 @@ def _named(given: Path) -> list[Path]:
     return [scan_path(line) if is_address(line) else given.parent / line for line in named]
 
 
-def chosen(kind: ScanKind) -> str:
-    """Of cameras with the same marks the one that rests on most calibration reports; "" without any, and where they
-    are told by the form of marks alone: then they may be of a camera that is not in the library."""
-    return "" if kind.much_alike else max(kind.cameras, key=_reports, default="")
-
-
-def _why_not(kind: ScanKind) -> str:
-    if not kind.cameras:
-        return kind.why_not()
-    found, drawn = np.sum([(trial.found, trial.drawn) for sample in kind.samples for trial in sample.best[:1]], axis=0)
-    return (
-        f"perhaps {' or '.join(kind.cameras)}, {found} of {drawn} marks seen, but that rests on the form of its marks "
-        f"alone, and {' or '.join(kind.much_alike)} has marks much like them: compare the drawings with a scan"
-    )
+def _with_cameras(found: Catalogue, reporter: Reporter, max_pixels: int | None) -> Catalogue:
+    """The groups with the cameras of the library that their samples show, tried in processes side by side."""
+    with worker_pool(sum(len(group.to_try) for group in found.groups)) as workers:
+        grouped = GroupedScans(found.groups, found.broken)
+        named = name_cameras(grouped, trial_of_cameras(read_library(), None, max_pixels), reporter, workers)
+    return replace(found, groups=named.groups, broken=named.unread)
 
 
 def project_text(new: NewProject) -> str:
@@ -237,12 +223,11 @@ def print_new_project(new: NewProject, console: Console) -> None:
     say(f"Next: look at them, then `reseau measure {project}`.")
 
 
-def _left_out(found: Catalogue, kinds: Sequence[ScanKind]) -> dict[str, list[Path]]:
+def _left_out(found: Catalogue) -> dict[str, list[Path]]:
     """By reason. Where no camera is told at all, the project's own file has to say it, and is of all scans."""
-    groups = list(zip(found.groups, kinds, strict=True))
-    is_named = any(chosen(kind) for kind in kinds)
+    is_named = any(group.camera for group in found.groups)
     broken = [path for path in found.broken if isinstance(path, Address) or path.exists() or path.is_symlink()]
-    unknown = [path for group, kind in groups if is_named and not chosen(kind) for path in group.paths]
+    unknown = [path for group in found.groups if is_named and not group.camera for path in group.paths]
     taken = set(broken) | set(unknown)
     whole = [(path, group.head) for group in found.groups for path in group.paths if path not in taken]
     return {_BROKEN: broken, _COPIES: list(found.copies), _NAMESAKES: _namesakes(whole), _UNKNOWN: unknown}
@@ -270,7 +255,7 @@ def _patterns(new: NewProject) -> list[str]:
         if isinstance(given, Address):
             patterns |= dict.fromkeys(_address_patterns(new, given))
             continue
-        shown = _seen_from(new.folder, given)
+        shown = _relative_name(new.folder, given)
         if not given.is_dir():
             patterns[shown] = None
             continue
@@ -301,30 +286,22 @@ def _exclude_lines(new: NewProject) -> list[str]:
         endings = {scan.suffix for scan in new.cameras}
         found = [path for path in paths if path.suffix in endings and _has_patterns(path)]
         excluded += [f"    # {reason}"] if found else []
-        excluded += [f"    {quoted(_seen_from(new.folder, path))}," for path in found]
+        excluded += [f"    {quoted(_relative_name(new.folder, path))}," for path in found]
     return ["exclude = [", *excluded, "]"] if excluded else []
 
 
-def _seen_from(folder: Path, path: Path) -> str:
+def _relative_name(folder: Path, path: Path) -> str:
     return path.location if isinstance(path, Address) else Path(os.path.relpath(path, folder)).as_posix()
 
 
 def _totals(new: NewProject) -> dict[tuple[str, str], tuple[int, int]]:
     """Scans and folders by camera and form."""
     scans, folders = defaultdict[tuple[str, str], int](int), defaultdict[tuple[str, str], set[Path]](set)
-    for group, kind in zip(new.found.groups, new.kinds, strict=True):
-        key = (chosen(kind), _form(group.head))
+    for group in new.found.groups:
+        key = (group.camera, _form(group.head))
         scans[key] += len(group.paths)
         folders[key].add(group.folder)
     return {key: (count, len(folders[key])) for key, count in scans.items()}
-
-
-def _alike(kind: ScanKind) -> bool:
-    return len(kind.cameras) > 1
-
-
-def _told(folder: Path, head: ScanHead, scans: int) -> str:
-    return f"{folder}, {scans} scans, {_form(head)}"
 
 
 def _form(head: ScanHead) -> str:
@@ -337,20 +314,9 @@ def _form(head: ScanHead) -> str:
     return f"{head.file_format} {head.bits} bit {colours}, about {head.width_px} x {head.height_px} px, {pitch}"
 
 
-def _head_json(head: ScanHead) -> Json:
+def _head_json(head: ScanHead) -> Mapping[str, object]:
     return {"format": head.file_format, "bits": head.bits, "channels": head.channels, "pitch_um": head.pitch.um}
-
-
-def _pixel_um(kind: ScanKind) -> float | None:
-    """What the marks say of a pixel, the median of the samples."""
-    pixels = [trial.pixel_um for sample in kind.samples for trial in sample.best[:1] if trial.pixel_um]
-    return float(np.median(pixels)) if pixels else None
 
 
 def _ending(ending: str) -> str:
     return f"that end in {ending}" if ending else "without an ending"
-
-
-def _reports(name: str) -> int:
-    source = library()[name].source
-    return source.reports if source else 0

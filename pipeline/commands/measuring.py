@@ -228,10 +228,11 @@ def _name_cameras(
     given: Sequence[Path], project: "Project | None", pitch_um: float | None, max_pixels: int | None, as_json: bool
 ) -> int:
     """One scan with all that was tried on it; of many some of each kind."""
+    from pipeline.archive.catalogue import find_scan_files
+    from pipeline.archive.scan_groups import group_scans, name_cameras, print_groups, trial_of_cameras
     from pipeline.files.library import PREFIX, read_library
     from pipeline.measuring.camera_identification import print_identification
     from pipeline.measuring.camera_trials import identify
-    from pipeline.measuring.scan_kinds import identify_kinds, print_kinds, scan_files
     from pipeline.progress import Reporter
 
     own = {name: camera for name, camera in project.cameras.items() if PREFIX not in name} if project else {}
@@ -240,9 +241,13 @@ def _name_cameras(
         identification = identify(given[0], tried, pitch_um, reporter, max_pixels)
         show(as_json, identification.as_json, lambda console: print_identification(identification, console))
         return DONE if identification.best else LOOK
-    many = identify_kinds(scan_files(given), lambda path: identify(path, tried, pitch_um, reporter, max_pixels))
-    show(as_json, many.as_json, lambda console: print_kinds(many, console))
-    return DONE if many.all_named else LOOK
+    with reporter.stage("looked at") as count:
+        found = group_scans(find_scan_files(given)[0], count, max_pixels, by_folder=False)
+    grouped = name_cameras(found, trial_of_cameras(tried, pitch_um, max_pixels), reporter, None)
+    if not grouped.groups:
+        raise InputError("\n".join(grouped.unread.values()))
+    show(as_json, grouped.as_json, lambda console: print_groups(grouped, console))
+    return DONE if grouped.all_named else LOOK
 
 
 def _shard(text: str | None) -> tuple[int, int] | None:

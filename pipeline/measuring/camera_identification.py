@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +26,6 @@ _NEAR_MM = 6.0  # marks of two cameras that are taken for each other
 _ALIKE = (
     0.75  # correlation from which on it takes a look to tell them apart: forms of the K-17's wings have 0.8 to 0.93
 )
-Json = dict[str, Any]
 
 _OUTSTANDING = 2.0  # times what chance finds
 CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
@@ -106,7 +104,7 @@ def _told(
 
 def drawn_alike(layouts: Mapping[tuple[str, ...], FiducialLayout]) -> dict[str, tuple[str, ...]]:
     """By name, of cameras of solid marks alone, the others whose marks look much like theirs at about their places."""
-    solid = {names: layout for names, layout in layouts.items() if all(_is_solid(mark) for mark in layout.marks)}
+    solid = {names: layout for names, layout in layouts.items() if all(is_solid(mark) for mark in layout.marks)}
     pictures = {names: [_picture(mark) for mark in layout.marks] for names, layout in solid.items()}
 
     def alike(names: tuple[str, ...], other: tuple[str, ...]) -> bool:
@@ -121,7 +119,8 @@ def drawn_alike(layouts: Mapping[tuple[str, ...], FiducialLayout]) -> dict[str, 
     return {name: tuple(own) for names, own in others.items() if own for name in names}
 
 
-def _is_solid(mark: LayoutMark) -> bool:
+def is_solid(mark: LayoutMark) -> bool:
+    """Whether a mark is made of areas alone, as wings, notches and arrows are."""
     return isinstance(mark.mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.mark.parts)
 
 
@@ -181,7 +180,7 @@ class Identification:
     """The trials, best first, and what follows from them. unreported: by name, what cameras without any calibration
     report rest on. pitch_um: of the scan in x and y, as given or as its file has it. plate: what the camera's own plate
     says, by field; contradicted: by name, how it says that it is of no such camera. alike: by name, other cameras whose
-    marks are drawn much like its own."""
+    marks are drawn much like its own; reports: on how many calibration reports it rests."""
 
     scan: Path
     trials: tuple[Trial, ...]
@@ -190,6 +189,7 @@ class Identification:
     plate: Mapping[str, str] = field(default_factory=dict)
     contradicted: Mapping[str, Sequence[str]] = field(default_factory=dict)
     alike: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    reports: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def best(self) -> tuple[Trial, ...]:
@@ -258,7 +258,7 @@ class Identification:
             f"{pitch_um:.1f}: if the scan is of this camera, the pitch that --pitch or its file gives is wrong."
         )
 
-    def as_json(self) -> Json:
+    def as_json(self) -> Mapping[str, object]:
         trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
         best = [name for trial in self.best for name in trial.cameras]
         head = {"scan": str(self.scan), "best": best, "sentence": self.sentence(), "trials": trials}

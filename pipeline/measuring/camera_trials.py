@@ -19,7 +19,7 @@ from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.flags import CAMERA_BY_CHANCE
 from measure.marks.frame_border import limit_to_frame
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon, thinnest_mm
+from measure.marks.shapes import FiducialLayout, LayoutMark, thinnest_mm
 from measure.scans.opening import open_scan, thumbnail
 from measure.scans.scan import Scan
 from pipeline.files.camera_file import CameraFile
@@ -29,6 +29,7 @@ from pipeline.measuring.camera_identification import (
     Trial,
     contradictions,
     drawn_alike,
+    is_solid,
     is_whole_plate,
     plate_of,
 )
@@ -96,7 +97,7 @@ class LayoutSearch:
     ) -> Tried:
         """By hypotheses that follow from a given pitch."""
         bold = _boldest(layout)
-        picture = self._solid if all(_is_solid(mark) for mark in bold.marks) else self._fine
+        picture = self._solid if all(is_solid(mark) for mark in bold.marks) else self._fine
         times = self._scan.width_px / picture.width_px
         options = FiducialOptions(pitch_is_right=True)
         ((given,), *_) = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
@@ -105,7 +106,7 @@ class LayoutSearch:
     def at_any_pitch(self, layout: FiducialLayout) -> Tried:
         """Where the frame may fill the scan, its pixels being square."""
         bold = _boldest(layout)
-        picture = self._coarse_solid if all(_is_solid(mark) for mark in bold.marks) else self._coarse
+        picture = self._coarse_solid if all(is_solid(mark) for mark in bold.marks) else self._coarse
         return self._tried(_some(layout), bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions())[0])
 
     def refined(self, coarse: Tried) -> Tried:
@@ -150,7 +151,7 @@ def _boldest(layout: FiducialLayout) -> FiducialLayout:
     """The marks that are the plainest to see, where they are enough: solid ones, or else those of the widest lines."""
     groups: dict[float, list[LayoutMark]] = {}
     for mark in layout.marks:
-        groups.setdefault(np.inf if _is_solid(mark) else thinnest_mm(mark.mark), []).append(mark)
+        groups.setdefault(np.inf if is_solid(mark) else thinnest_mm(mark.mark), []).append(mark)
     enough = [width for width, marks in groups.items() if len(marks) >= _BOLD]
     return replace(layout, marks=tuple(groups[max(enough)])) if enough else layout
 
@@ -158,10 +159,6 @@ def _boldest(layout: FiducialLayout) -> FiducialLayout:
 def _some(layout: FiducialLayout) -> FiducialLayout:
     """As many marks as tell whether they are there."""
     return replace(layout, marks=layout.marks[:: 1 if len(layout.marks) <= _ENOUGH else 2])
-
-
-def _is_solid(mark: LayoutMark) -> bool:
-    return isinstance(mark.mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.mark.parts)
 
 
 def _stretched(layout: FiducialLayout) -> FiducialLayout:
@@ -190,12 +187,13 @@ def identify(
     del search  # and the correlations that it holds
     sources = {name: camera.source for name, camera in cameras.items()}
     unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
+    reports = {name: source.reports for name, source in sources.items() if source}
     trials = [replace(trial, pixel_um=trial.pixel_um and trial.pixel_um / times) for trial in trials]
     ranked = tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected)))
     plate = _plate(picture) if any(trial.stands_out for trial in trials) else {}
     against_plate = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in against_plate.items() if against}
-    return Identification(path, ranked, unreported, given, plate, contradicted, drawn_alike(layouts))
+    return Identification(path, ranked, unreported, given, plate, contradicted, drawn_alike(layouts), reports)
 
 
 def _picture(path: Path, max_pixels: int | None) -> tuple[Scan, float, tuple[float, float] | None]:

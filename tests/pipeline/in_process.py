@@ -12,7 +12,7 @@ from pipeline.workers import WorkerKilled
 
 _POOLS = (
     "pipeline.archive.measure_archive.worker_pool",
-    "pipeline.archive.sampling.worker_pool",
+    "pipeline.archive.new_project.worker_pool",
     "pipeline.resampling.resample_stage.worker_pool",
 )
 

@@ -3,7 +3,6 @@
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,19 +11,18 @@ import pytest
 import tifffile
 from range_server import range_server
 
-from pipeline.archive import new_project, sampling
-from pipeline.archive.catalogue import Group, catalogue
-from pipeline.archive.new_project import chosen
-from pipeline.archive.sampling import name_cameras
+from pipeline.archive import new_project
+from pipeline.archive.catalogue import catalogue
+from pipeline.archive.scan_groups import GroupedScans, ScanGroup, group_scans, name_cameras
 from pipeline.cli import run
 from pipeline.files.library import read_library
 from pipeline.files.project_file import read_project
 from pipeline.measuring.camera_identification import Identification, Trial
-from pipeline.measuring.scan_kinds import ScanKind
 from pipeline.progress import Reporter
 
 SAID = pytest.CaptureFixture[str]
 RNG = np.random.default_rng(9)
+REPORTS = {name: camera.source.reports for name, camera in read_library().items() if camera.source}
 
 
 def scan(path: Path, height: int = 60, width: int = 90, **tags: object) -> Path:
@@ -87,11 +85,11 @@ def of_camera(
     trial = Trial(names, 4, 4, 0.9, 9.0, 0.9, None, None, None, "", 1.0, 1e-9, 20.0)
     contradicted = {name: ["another"] for name in against}
     alike = {name: [beside] for name in names if beside}
-    return Identification(path, (trial,) if names else (), {}, (20.0, 20.0), plate or {}, contradicted, alike)
+    return Identification(path, (trial,) if names else (), {}, (20.0, 20.0), plate or {}, contradicted, alike, REPORTS)
 
 
-def kind(group: Group, *samples: Identification) -> ScanKind:
-    return ScanKind(group.paths, group.head.width_px, group.head.height_px, samples)
+def kind(group: ScanGroup, *samples: Identification) -> ScanGroup:
+    return replace(group, samples=samples)
 
 
 def test_a_camera_is_told_by_most_samples_and_by_what_its_plate_does_not_contradict(box: Path) -> None:
@@ -114,24 +112,25 @@ def test_a_camera_is_told_by_most_samples_and_by_what_its_plate_does_not_contrad
         assert told.cameras == ()
         assert why in told.why_not()
     form = of_camera(path, "zeiss-rmk-a-153", beside="arrow-153")
-    assert chosen(kind(group, form)) == ""
+    assert kind(group, form).camera == ""
+    assert "compare the drawings" in kind(group, form).sentence()
     plate = {"camera_type": "Zeiss"}
-    assert chosen(kind(group, replace(form, plate=plate))) == "zeiss-rmk-a-153"
+    assert kind(group, replace(form, plate=plate)).camera == "zeiss-rmk-a-153"
     both = kind(group, of_camera(path, "wild-rc30-153", "wild-rc10-153"))
-    assert chosen(both) == "wild-rc10-153"  # by far the more reports
+    assert both.camera == "wild-rc10-153"  # by far the more reports
 
 
 @pytest.fixture
 def told(monkeypatch: pytest.MonkeyPatch) -> None:
     """What samples say, by where they stand: those of 1952 are of one camera, all others of none that is known."""
 
-    def samples(groups: Sequence[Group], _: Reporter, __: int | None) -> tuple[list[ScanKind], dict[Path, str]]:
-        names = [("wild-rc10-153",) if group.folder.name in ("1952", "sub") else () for group in groups]
-        plates = [{"camera_number": str(group.head.height_px)} for group in groups]
-        return [
-            kind(group, of_camera(group.paths[0], *own, plate=plate, beside="arrow-153" * (group.folder.name == "sub")))
-            for group, own, plate in zip(groups, names, plates, strict=True)
-        ], {}
+    def samples(grouped: GroupedScans, *_: object) -> GroupedScans:
+        groups = []
+        for group in grouped.groups:
+            names = ("wild-rc10-153",) if group.folder.name in ("1952", "sub") else ()
+            plate, beside = {"camera_number": str(group.head.height_px)}, "arrow-153" * (group.folder.name == "sub")
+            groups.append(kind(group, of_camera(group.paths[0], *names, plate=plate, beside=beside)))
+        return replace(grouped, groups=tuple(groups))
 
     monkeypatch.setattr(new_project, "name_cameras", samples)
 
@@ -178,36 +177,28 @@ def test_where_no_camera_is_told_all_scans_are_of_the_one_that_the_user_draws(
     assert (box / "1958/images.csv").read_text(encoding="utf-8") == "image,camera\n0001,\n"
 
 
-def test_of_each_kind_in_each_folder_three_are_tried(box: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Here:
-        def submit(self, function: object, *given: object) -> object:
-            from concurrent.futures import Future
-
-            future: Future[object] = Future()
-            future.set_result(function(*given))  # type: ignore[operator]
-            return future
-
-    def identified(path: Path, _: int | None) -> Identification | str:
+def test_of_each_group_in_each_folder_three_are_tried(box: Path) -> None:
+    def identified(path: Path) -> Identification | str:
         return "cannot be decoded" if path.name == "0004.tif" else of_camera(path, "wild-rc5-153")
 
     for number in range(5, 9):
         scan(box / "1952" / f"000{number}.tif")
-    monkeypatch.setattr(sampling, "worker_pool", lambda _: nullcontext(Here()))
-    monkeypatch.setattr(sampling, "_identified", identified)
-    groups = catalogue([box], no_count).groups
-    kinds, unread = name_cameras(groups, Reporter(), None)
-    tried = {
-        (group.folder.name, group.head.height_px): len(each.samples) for group, each in zip(groups, kinds, strict=True)
-    }
+    found = catalogue([box], no_count)
+    named = name_cameras(GroupedScans(found.groups, {}), identified, Reporter(), None)
+    tried = {(group.folder.name, group.head.height_px): len(group.samples) for group in named.groups}
     assert tried == {("1952", 60): 3, ("1952", 120): 0, ("sub", 60): 1, ("1958", 60): 1, ("1958", 30): 1}
-    assert [
-        sample.scan.name for sample in kinds[groups.index(next(g for g in groups if len(g.paths) > 3))].samples
-    ] == [
-        "0001.tif",
-        "0005.tif",
-        "0008.tif",
-    ]
-    assert unread == {box / "1952/0004.tif": "cannot be decoded"}
+    samples = next(group.samples for group in named.groups if len(group.paths) > 3)
+    assert [sample.scan.name for sample in samples] == ["0001.tif", "0005.tif", "0008.tif"]
+    assert named.unread == {box / "1952/0004.tif": "cannot be decoded"}
+
+
+def test_init_and_cameras_group_scans_alike(box: Path) -> None:
+    """`cameras --scan` has one group where `init` has one in each folder."""
+    (whole,) = [group for group in catalogue([box / "1952"], no_count).groups if len(group.paths) == 3]
+    files = [path for path in sorted(box.rglob("*.tif")) if path.name[0] == "0" and " " not in path.name]
+    first = group_scans(files, no_count, by_folder=False).groups[0]
+    assert set(whole.paths) <= set(first.paths)
+    assert {path.parent.name for path in first.paths} == {"1952", "sub"}
 
 
 @pytest.mark.usefixtures("told")

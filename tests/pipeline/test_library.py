@@ -230,7 +230,7 @@ def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras
 
 def test_a_folder_without_scans_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["cameras", "--scan", str(tmp_path)]) == 2
-    assert "the folder holds no scan" in capsys.readouterr().err
+    assert "no scan there, nor below" in capsys.readouterr().err
 
 
 @pytest.mark.study

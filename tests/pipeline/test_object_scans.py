@@ -1,7 +1,7 @@
 """A project of scans in an object store or on a server gives the rows of the same scans on the disk."""
 
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,10 @@ from moto.server import ThreadedMotoServer
 from range_server import range_server
 
 from measure.scans import remote
-from pipeline.archive.catalogue import Group
+from pipeline.archive.scan_groups import GroupedScans
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
-from pipeline.measuring.scan_kinds import ScanKind
 from pipeline.provenance import file_state, parts_hash
 
 
@@ -107,10 +106,10 @@ def test_init_makes_a_project_of_a_bucket(
     store.put_object(Bucket="boxes", Key="1952/broken.tif", Body=b"no scan")
     store.put_object(Bucket="boxes", Key="1952/notes.txt", Body=b"by hand")
 
-    def untold(groups: Sequence[Group], *_: Any) -> tuple[list[ScanKind], dict[Path, str]]:
-        return [ScanKind(each.paths, each.head.width_px, each.head.height_px, ()) for each in groups], {}
+    def unnamed(grouped: GroupedScans, *_: Any) -> GroupedScans:
+        return grouped
 
-    monkeypatch.setattr("pipeline.archive.new_project.name_cameras", untold)
+    monkeypatch.setattr("pipeline.archive.new_project.name_cameras", unnamed)
     assert run(["init", "s3://boxes/1952/", "--out", str(tmp_path)]) == 1
     text = (tmp_path / "project.toml").read_text(encoding="utf-8")
     assert 'scans = ["s3://boxes/1952/**/*.tif"]' in text
