@@ -161,12 +161,15 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
     target = _centred(known, given)
     starts = Rotation.from_quat(np.random.default_rng(0).normal(size=(STARTS, 4))).as_matrix()  # even over all turns
     costs = np.array([(_misfit(start, model, target, given) ** 2).sum() for start in starts])
-    found = []
+    found: list[tuple[float, bool, Array]] = []
+
+    def misfit(turn: Array, start: Array) -> Array:
+        return _misfit(rotation_from_vector(turn) @ start, model, target, given)
+
     for start in starts[np.argsort(costs, kind="stable")[:REFINED]]:
-        near = least_squares(
-            lambda turn, start=start: _misfit(rotation_from_vector(turn) @ start, model, target, given), np.zeros(3)
-        )
-        is_determined = np.linalg.svd(near.jac, compute_uv=False)[2] > SINGULAR * np.linalg.norm(target)
+        near = least_squares(misfit, np.zeros(3), args=(start,))
+        strength = np.linalg.svd(np.asarray(near.jac), compute_uv=False)
+        is_determined = bool(strength[2] > SINGULAR * np.linalg.norm(target))
         found.append((2.0 * float(near.cost), is_determined, rotation_from_vector(near.x) @ start))
     most = min(cost for cost, _, _ in found) + AS_GOOD * (target**2).sum()
     candidates = [

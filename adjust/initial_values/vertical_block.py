@@ -88,7 +88,7 @@ class _Rays:
     def relief(self) -> Array:
         """(n,) the points' heights above the mean, 0 where unknown."""
         heights = self.known[self.point, 2]
-        return np.nan_to_num(heights - np.nanmean(heights), nan=0.0)
+        return np.asarray(np.nan_to_num(heights - np.nanmean(heights), nan=0.0))
 
     def scale_of_relief(self, plane: Complex) -> float:
         """Object units a unit of the plane at which the relief displacements leave least."""

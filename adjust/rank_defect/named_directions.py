@@ -1,13 +1,14 @@
 """The directions in which a network's unknowns are known to move together: a table with the words for each."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from adjust.array_types import Array, Indices
 from adjust.functional_model.families import family
+from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.functional_model.transformation import follows_tilts
 from adjust.problem.parameter import Kind, Parameter, enumeration
 from adjust.problem.problem import Problem, State
@@ -31,20 +32,24 @@ class Reason(NamedTuple):
 class NamedDirection:
     """What a null direction is called after: a functional (n,) of the unknowns that it changes, and the words for it.
 
-    rank: of several that would do, that of the lowest rank gives the name. motion: what moves. reason: of what moves
-    along. partner: another unknown (its key, and in words) whose prior would end it, where it moves too.
+    rank: of several that would do, that of the lowest rank gives the name. motion: what moves. reason: why, and
+    by_companion, where a lens or fiducial marks move along ("lens", "marks"). partner: another unknown (its key, and in
+    words) whose prior would end it, where it moves too.
     """
 
     rank: int
     functional: Array
     motion: str
-    reason: Callable[[set[Parameter]], Reason]
+    reason: Reason
     partner: tuple[Parameter, str] | None = None
+    by_companion: Mapping[str, Reason] = field(default_factory=dict)
 
     def sentence(self, moved: Iterable[Parameter]) -> tuple[str, str]:
         """Cause and remedy of a direction that moves some unknowns."""
         moved = set(moved)
-        because, given, otherwise = self.reason(moved)
+        lens = any(each.kind == "interior" and each.quantity not in INTERIOR_NAMES for each in moved)
+        companion = "lens" if lens else "marks" if any(each.kind == "fiducial" for each in moved) else ""
+        because, given, otherwise = self.by_companion.get(companion, self.reason)
         if self.partner and self.partner[0] in moved:
             given = f"{given}, or to {self.partner[1]}"
         cause = f"{self.motion}{followers(moved, self.motion)}{because and f': {because}'}."
@@ -121,85 +126,67 @@ def camera_directions(problem: Problem, state: State) -> list[NamedDirection]:
     fiducials, 2 interior orientation, 3 distortion; -2 of a scanner's bend, which moves still more (see
     `scanner_directions`).
     """
-    directions = []
+    directions: list[NamedDirection] = []
     for name, positions in problem.unknowns.camera.items():
-        marks = _film_places(problem, name)
-        if marks is not None:
-            directions += _fiducial_directions(problem, state, name, marks)
-            directions += _tilt_directions(problem, state, name, marks)
-        directions += _interior_directions(problem, name, positions, field_geometry(problem, state, name))
+        directions += _fiducial_directions(problem, state, name)
+        geometry = field_geometry(problem, state, name)
+        for_point = geometry.remedy
+        if geometry.known != "points" and not geometry.flat:
+            for_point = "add images turned by 180 degrees about their axes"
+        for number, motion, given, otherwise in (
+            (1, f"The principal point's x0' of camera {name} can shift", "x0' (F7)", for_point),
+            (2, f"The principal point's y0' of camera {name} can shift", "y0' (F8)", for_point),
+            (0, f"The principal distance of camera {name} can change", "it (F9)", geometry.remedy),
+        ):
+            functional = changed(problem, positions[number], 1.0)
+            directions.append(NamedDirection(2, functional, motion, Reason(geometry.because, given, otherwise)))
         directions += _distortion_directions(problem, name, positions[3:])
     return directions
 
 
-def _film_places(problem: Problem, camera: str) -> Indices | None:
-    """Positions (m, 2) of all fiducials of a camera, and of what joins the scans of its frames, which moves with
-    them; None of a camera without fiducials."""
-    frames = {image.frame for image in problem.network.images if image.camera == camera}
-    unknowns = problem.unknowns
-    marks = [positions for (owner, _), positions in unknowns.fiducial.items() if owner == camera]
-    joins = [positions for (frame, _), positions in unknowns.join.items() if frame in frames]
-    return np.array(marks + joins) if marks else None
+def changed(problem: Problem, positions: Indices | int, values: Array | float) -> Array:
+    """The functional (n,) of some unknowns' changes."""
+    functional = np.zeros(len(problem.unknowns))
+    functional[positions] = values
+    return functional
 
 
-def _fiducial_directions(problem: Problem, state: State, camera: str, marks: Indices) -> list[NamedDirection]:
-    """Shift, rotation, scale, affinity and shear of all fiducials of a camera."""
-    centred = state.values[marks] - state.values[marks].mean(axis=0)
-    basis = np.column_stack([np.ones(len(centred)), centred])
-    directions = []
-    for rank, dx, dy, motion, given, partner, otherwise in FIDUCIAL_MOTIONS:
-        functional = _functional(problem, marks, basis @ np.array([dx, dy]).T)
-        words = motion.format(f"all fiducial marks of camera {camera} can")
-        with_partner = partner and (Parameter.interior(camera, partner[0]), partner[1])
-        directions.append(NamedDirection(rank, functional, words, _fixed_reason("", given, otherwise), with_partner))
-    return directions
+def _fiducial_directions(problem: Problem, state: State, camera: str) -> Iterator[NamedDirection]:
+    """Shift, rotation, scale, affinity and shear of all fiducials of a camera and of what joins the scans of its
+    frames, which moves with them; and a tilt of all cameras about x' or y', where every film transformation of the
+    camera can undo it.
 
-
-def _tilt_directions(problem: Problem, state: State, camera: str, marks: Indices) -> list[NamedDirection]:
-    """A tilt of all cameras about x' or y', where every film transformation of a camera can undo it.
-
-    It moves the fiducials by t (x'², x'y'), of which the functional takes what no affinity of theirs can be.
+    A tilt moves the fiducials by t (x'², x'y'), of which the functional takes what no affinity of theirs can be.
     """
-    kinds = [image.transformation for image in problem.network.images if image.camera == camera]
-    if not all(follows_tilts(kind) for kind in kinds):
-        return []
+    images = [image for image in problem.network.images if image.camera == camera]
+    places = [positions for (owner, _), positions in problem.unknowns.fiducial.items() if owner == camera]
+    if not places:
+        return
+    frames = {image.frame for image in images}
+    marks = np.array(places + [at for (frame, _), at in problem.unknowns.join.items() if frame in frames])
     centred = state.values[marks] - state.values[marks].mean(axis=0)
     affine = np.column_stack([np.ones(len(centred)), centred])
-    directions = []
-    for axis, other in ((0, 1), (1, 0)):
-        bend = centred[:, [axis]] * centred
+    for rank, dx, dy, motion, given, partner, otherwise in FIDUCIAL_MOTIONS:
+        functional = changed(problem, marks, affine @ np.array([dx, dy]).T)
+        words = motion.format(f"all fiducial marks of camera {camera} can")
+        with_partner = partner and (Parameter.interior(camera, partner[0]), partner[1])
+        yield NamedDirection(rank, functional, words, Reason("", given, otherwise), with_partner)
+    if not all(follows_tilts(image.transformation) for image in images):
+        return
+    given = "x' and y' of four fiducial marks (F5, F6), or to the attitude of an image"
+    for axis, other in ("xy", "yx"):
+        bend = centred[:, ["xy".index(axis)]] * centred
         bend -= affine @ np.linalg.lstsq(affine, bend)[0]
-        if np.abs(bend).max() < LEAST_BEND * np.abs(centred).max() ** 2:
-            continue
-        motion = (
-            f"Tilt {'xy'[axis]}: all fiducial marks of camera {camera} can move by {'xy'[axis]}' times x' and y', as "
-            f"with one tilt of all cameras about {'xy'[other]}'"
-        )
-        given = "x' and y' of four fiducial marks (F5, F6), or to the attitude of an image"
-        reason = _fixed_reason("", given, "choose an affine transformation")
-        directions.append(NamedDirection(-1, _functional(problem, marks, bend), motion, reason))
-    return directions
+        if np.abs(bend).max() >= LEAST_BEND * np.abs(centred).max() ** 2:
+            motion = (
+                f"Tilt {axis}: all fiducial marks of camera {camera} can move by {axis}' times x' and y', as with one "
+                f"tilt of all cameras about {other}'"
+            )
+            reason = Reason("", given, "choose an affine transformation")
+            yield NamedDirection(-1, changed(problem, marks, bend), motion, reason)
 
 
-def _interior_directions(
-    problem: Problem, camera: str, positions: Indices, field: "FieldGeometry"
-) -> list[NamedDirection]:
-    """x0', y0' and c of a camera."""
-    for_point = field.remedy
-    if field.known != "points" and not field.flat:
-        for_point = "add images turned by 180 degrees about their axes"
-    table = (
-        (1, f"The principal point's x0' of camera {camera} can shift", "x0' (F7)", for_point),
-        (2, f"The principal point's y0' of camera {camera} can shift", "y0' (F8)", for_point),
-        (0, f"The principal distance of camera {camera} can change", "it (F9)", field.remedy),
-    )
-    return [
-        unit_direction(problem, 2, positions[number], motion, _fixed_reason(field.because, given, otherwise))
-        for number, motion, given, otherwise in table
-    ]
-
-
-def _distortion_directions(problem: Problem, camera: str, positions: Indices) -> list[NamedDirection]:
+def _distortion_directions(problem: Problem, camera: str, positions: Indices) -> Iterator[NamedDirection]:
     """The distortion parameters of a camera."""
     own_family = family(problem.network.camera_by_name[camera].distortion.family)
     named = dict(zip(own_family.parameters, positions, strict=True))
@@ -208,34 +195,10 @@ def _distortion_directions(problem: Problem, camera: str, positions: Indices) ->
     if free:
         because = f"with {', '.join(free)} free the radial numerator and denominator do the same over this image"
         remedy = f"fix some of {', '.join(free)} at 0"
-    return [
-        unit_direction(
-            problem,
-            3,
-            position,
-            f"The distortion parameter {name} of camera {camera} can change",
-            _fixed_reason(because, name, f"fix it, or {remedy}"),
-        )
-        for name, position in named.items()
-    ]
-
-
-def unit_direction(
-    problem: Problem, rank: int, position: int, motion: str, reason: Callable[[set[Parameter]], Reason]
-) -> NamedDirection:
-    """The direction that is called after one unknown."""
-    return NamedDirection(rank, _functional(problem, position, 1.0), motion, reason)
-
-
-def _fixed_reason(because: str, given: str, otherwise: str) -> Callable[[set[Parameter]], Reason]:
-    """A reason that does not depend on what moves along."""
-    return lambda _: Reason(because, given, otherwise)
-
-
-def _functional(problem: Problem, positions: Indices | int, values: Array | float) -> Array:
-    functional = np.zeros(len(problem.unknowns))
-    functional[positions] = values
-    return functional
+    for name, position in named.items():
+        motion = f"The distortion parameter {name} of camera {camera} can change"
+        reason = Reason(because, name, f"fix it, or {remedy}")
+        yield NamedDirection(3, changed(problem, position, 1.0), motion, reason)
 
 
 @dataclass(frozen=True)

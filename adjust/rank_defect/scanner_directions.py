@@ -1,17 +1,15 @@
 """Bends of a scanner that the observations do not tell from what the films and the fiducial marks do, in words."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 
 from adjust.array_types import Array, Indices
-from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.functional_model.scanner import is_left, term_degree
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import Cofactor
-from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
-from adjust.rank_defect.named_directions import NamedDirection, Reason, unit_direction
+from adjust.rank_defect.named_directions import NamedDirection, Reason, changed
 
 Pose = tuple[int, bool]  # how a frame is turned in its scan, degrees, and whether it is mirrored
 
@@ -29,25 +27,15 @@ def scanner_directions(problem: Problem, state: State) -> list[NamedDirection]:
         for position in positions:
             term = problem.unknowns.parameters[position].quantity
             film = next((kind for kind in kinds if not is_left(kind, term)), "")
+            reason = term_reason(term, poses, "")
+            by_companion = {each: term_reason(term, poses, each) for each in ("lens", "marks")}
+            if film:
+                because = f"the {film} transformation of its films does the same"
+                reason, by_companion = Reason(because, "the term itself", "leave it out"), {}
             motion = f"The term {term} of the bend of scanner {name} can change"
-            reason = _reason_by_motion(term, poses, film)
-            directions.append(unit_direction(problem, SCANNER_RANK, int(position), motion, reason))
+            functional = changed(problem, int(position), 1.0)
+            directions.append(NamedDirection(SCANNER_RANK, functional, motion, reason, by_companion=by_companion))
     return directions
-
-
-def _reason_by_motion(term: str, poses: Sequence[Pose], film: str) -> Callable[[set[Parameter]], Reason]:
-    """By what moves along: a film transformation that does the same (empty where none does), the lens, the fiducial
-    marks, or nothing that could."""
-
-    def reason(moved: set[Parameter]) -> Reason:
-        if film:
-            because = f"the {film} transformation of its films does the same"
-            return Reason(because, "the term itself", "leave it out")
-        by_lens = any(each.kind == "interior" and each.quantity not in INTERIOR_NAMES for each in moved)
-        by_marks = any(each.kind == "fiducial" for each in moved)
-        return term_reason(term, poses, "lens" if by_lens else "marks" if by_marks else "")
-
-    return reason
 
 
 def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
