@@ -16,7 +16,7 @@ from adjust.functional_model.families import family
 from adjust.functional_model.rotation import rotation_from_angles, vector_by_angles
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates
-from adjust.problem.network import EXTERIOR_NAMES, Network
+from adjust.problem.network import EXTERIOR_NAMES
 from adjust.problem.parameter import MANY, Parameter
 
 HIGH = 0.95
@@ -24,14 +24,43 @@ IMAGES_AT_ONCE = 16
 SHARE = 0.3  # of an element of the exterior orientation in a direction, from which on it is named
 SHOWN = 3  # images that are named one by one
 FIELD = 4  # known points from which the field is known
-ALONG, TURN = 2, 5  # directions of an exterior orientation: across in x', in y', along, tilts about x', y', turn
-DIRECTIONS = (
-    "the station's place across its axis in x'",
-    "the station's place across its axis in y'",
-    "the station's distance along its axis",
-    "the tilt about x'",
-    "the tilt about y'",
-    "the turn about the axis",
+DIRECTIONS = (  # of an exterior orientation: its kind, and it in words
+    ("across", "the station's place across its axis in x'"),
+    ("across", "the station's place across its axis in y'"),
+    ("along", "the station's distance along its axis"),
+    ("tilt", "the tilt about x'"),
+    ("tilt", "the tilt about y'"),
+    ("turn", "the turn about the axis"),
+)
+WIDER = "Targets out to the corners of the frame would tell them apart, in a wider field of view."
+OUTWARD = "Targets from the centre to the corners of the frame would tell them apart."
+APART, TILTED = "apart", "tilted"  # remedies that depend on whether the field is known
+CAUSES = {  # of correlations between two kinds of parameters, and what would tell these apart
+    frozenset(("c", "along")): ("flying height and principal distance trade off", TILTED),
+    frozenset(("point", "across")): ("the principal point and a shift of the camera trade off", APART),
+    frozenset(("point", "tilt")): (
+        "the principal point and a tilt of the camera trade off in a narrow field of view",
+        WIDER,
+    ),
+    frozenset(("point", "decentering")): (
+        "decentering distortion with a tilt looks like a shift of the principal point",
+        f"{WIDER} Else use the two together, or fix the decentering where it is not significant.",
+    ),
+    frozenset(("decentering", "tilt")): ("decentering distortion looks like a tilt with a shift of the camera", WIDER),
+    frozenset(("radial",)): (
+        "neighbouring powers of the radius are alike within the frame",
+        "Compare the curve and not its coefficients; leave out the highest one that is not significant.",
+    ),
+    frozenset(("c", "radial")): ("a change of scale and radial distortion are alike where the targets lie", OUTWARD),
+    frozenset(("radial", "along")): (
+        "a change of distance and radial distortion are alike where the targets lie",
+        OUTWARD,
+    ),
+}
+OTHERS = (
+    "these targets and images hardly tell them apart",
+    "Spread the targets over the whole frame, add images tilted in different directions, or fix what is not "
+    "significant.",
 )
 
 
@@ -56,51 +85,45 @@ def correlations(estimates: Estimates, above: float = HIGH) -> tuple[Correlation
     return tuple(sorted(found, key=lambda each: -abs(each.rho)))
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """A parameter of a camera: its name there, and what it is: c, point, a group of the distortion family, other."""
-
-    name: str
-    group: str
-
-    def __str__(self) -> str:
-        return self.name + "'" * (self.group == "point")
-
-
 def _camera_correlations(estimates: Estimates, camera: Camera, above: float) -> Iterator[Correlation]:
-    kinds = [kind for kind in _kinds(camera) if _is_free(estimates, Parameter.interior(camera.name, kind.name))]
-    if not kinds:
+    own, kinds, words = [], [], []
+    for name, kind in _parameter_kinds(camera).items():
+        if _is_free(estimates, Parameter.interior(camera.name, name)):
+            own.append(Parameter.interior(camera.name, name))
+            kinds.append(kind)
+            words.append(name + "'" * (kind == "point"))
+    if not own:
         return
-    own = [Parameter.interior(camera.name, kind.name) for kind in kinds]
+    known = len(estimates.network.known_places) >= FIELD
     marks = _free_marks(estimates, camera)
     own_rho = _correlation(_hold_figure(estimates.cofactor_of([*own, *marks]), len(own), _figure(estimates, marks)))
-    known = _field_is_known(estimates.network)
     for i, j in combinations(range(len(own)), 2):
         if abs(own_rho[i, j]) > above:
-            yield _pair_correlation(camera.name, kinds[i], kinds[j], float(own_rho[i, j]), known)
-    frames = (image.frame for image in estimates.network.images if image.camera == camera.name)
-    images = list(dict.fromkeys(frames))
-    rho = np.concatenate(
-        [
-            _exterior_correlations(estimates, own, marks, images[i : i + IMAGES_AT_ONCE])
-            for i in range(0, len(images), IMAGES_AT_ONCE)
-        ]
-    )
-    for (i, kind), direction in ((pair, d) for pair in enumerate(kinds) for d in range(6)):
-        rows = np.flatnonzero(np.abs(rho[:, i, direction]) > above)
-        if len(rows):
-            of = [images[row] for row in rows]
-            value = float(rho[rows, i, direction][np.argmax(np.abs(rho[rows, i, direction]))])
-            yield _image_correlation(estimates, camera.name, kind, direction, of, len(images), value, known)
+            rho = float(own_rho[i, j])
+            why, remedy = _cause(kinds[i], kinds[j], known)
+            cause = f"{words[i]} and {words[j]} of camera {camera.name} are correlated by {rho:.3f}: {why}."
+            yield Correlation((own[i], own[j]), rho, cause, remedy)
+    frames = list(dict.fromkeys(image.frame for image in estimates.network.images if image.camera == camera.name))
+    parts = [frames[i : i + IMAGES_AT_ONCE] for i in range(0, len(frames), IMAGES_AT_ONCE)]
+    all_rho = np.concatenate([_exterior_correlations(estimates, own, marks, part) for part in parts])
+    for i, direction in np.ndindex(len(own), len(DIRECTIONS)):
+        high = [row for row in range(len(frames)) if abs(all_rho[row, i, direction]) > above]
+        if high:
+            rho = float(max(all_rho[high, i, direction], key=abs))
+            elements, what, owner = _exterior_words(estimates, frames, high, direction)
+            why, remedy = _cause(kinds[i], DIRECTIONS[direction][0], known)
+            cause = f"{words[i]} of camera {camera.name} and {what} are correlated by {rho:.3f}: {why}."
+            exterior = (Parameter.exterior(owner, element) for element in elements)
+            yield Correlation((own[i], *exterior), rho, cause, remedy)
 
 
-def _kinds(camera: Camera) -> list[_Kind]:
-    groups: dict[str, str] = {}
-    of = family(camera.distortion.family)
-    for group, names in of.groups:
-        groups |= {name: group for name in names if name not in groups}
-    interior = [_Kind("c", "c"), _Kind("x0", "point"), _Kind("y0", "point")]
-    return interior + [_Kind(name, groups.get(name, "other")) for name in of.parameters]
+def _parameter_kinds(camera: Camera) -> dict[str, str]:
+    """A camera's parameters by name, and what each is: c, point, a group of the distortion family, other."""
+    lens = family(camera.distortion.family)
+    kinds = {"c": "c", "x0": "point", "y0": "point"} | dict.fromkeys(lens.parameters, "other")
+    for group, names in reversed(lens.groups):
+        kinds |= dict.fromkeys(names, group)
+    return kinds
 
 
 def _is_free(estimates: Estimates, parameter: Parameter) -> bool:
@@ -166,93 +189,27 @@ def _camera_axes(estimates: Estimates, image: str) -> Array:
     return turn
 
 
-def _field_is_known(network: Network) -> bool:
-    return len(network.known_places) >= FIELD
-
-
-def _pair_correlation(camera: str, first: _Kind, second: _Kind, rho: float, known: bool) -> Correlation:
-    why, remedy = _why(first.group, second.group, known)
-    cause = f"{first} and {second} of camera {camera} are correlated by {rho:.3f}: {why}."
-    pair = Parameter.interior(camera, first.name), Parameter.interior(camera, second.name)
-    return Correlation(pair, rho, cause, remedy)
-
-
-def _image_correlation(
-    estimates: Estimates,
-    camera: str,
-    kind: _Kind,
-    direction: int,
-    images: list[str],
-    count: int,
-    rho: float,
-    known: bool,
-) -> Correlation:
-    elements = _elements(estimates, images, direction)
-    if len(images) == count:
-        of = "all images" if count > 1 else f"image {images[0]}"
-    else:
-        more = len(images) - SHOWN
-        of = f"image{'s' * (len(images) > 1)} {', '.join(images[:SHOWN])}" + (f" and {more} more" if more > 0 else "")
-    what = elements[0] if len(elements) == 1 else DIRECTIONS[direction]
-    other = (
-        "along" if direction == ALONG else "turn" if direction == TURN else "across" if direction < ALONG else "tilt"
-    )
-    why, remedy = _why(kind.group, other, known)
-    cause = f"{kind} of camera {camera} and {what} of {of} are correlated by {rho:.3f}: {why}."
-    owner = MANY if len(images) > 1 else images[0]
-    exterior = (Parameter.exterior(owner, element) for element in elements)
-    return Correlation((Parameter.interior(camera, kind.name), *exterior), rho, cause, remedy)
-
-
-def _elements(estimates: Estimates, images: list[str], direction: int) -> list[str]:
-    """The elements of exterior orientations that have a share in a direction."""
+def _exterior_words(
+    estimates: Estimates, frames: list[str], high: list[int], direction: int
+) -> tuple[list[str], str, str]:
+    """The elements of some exterior orientations that have a share in a direction, these in words, and their owner."""
+    images = [frames[row] for row in high]
     shares = np.array([np.abs(_camera_axes(estimates, image)[direction]) for image in images]).max(axis=0)
-    return [name for name, share in zip(EXTERIOR_NAMES, shares, strict=True) if share > SHARE]
+    elements = [name for name, share in zip(EXTERIOR_NAMES, shares, strict=True) if share > SHARE]
+    what = elements[0] if len(elements) == 1 else DIRECTIONS[direction][1]
+    owner = MANY if len(images) > 1 else images[0]
+    if len(images) == len(frames) > 1:
+        return elements, f"{what} of all images", owner
+    more = f" and {len(images) - SHOWN} more" if len(images) > SHOWN else ""
+    return elements, f"{what} of image{'s' * (len(images) > 1)} {', '.join(images[:SHOWN])}{more}", owner
 
 
-def _why(first: str, second: str, known: bool) -> tuple[str, str]:
-    """What makes two kinds of parameters alike, and what would tell them apart."""
-    pair = frozenset((first, second))
-    relief = "a field with more relief" if known else "known points at different heights"
-    tilted = f"Images tilted in different directions, or {relief}, would tell them apart."
-    wider = "Targets out to the corners of the frame would tell them apart, in a wider field of view."
-    apart = tilted
-    if not known:
-        apart = "Images turned by 90 and 180 degrees about their axes, and tilted ones, would tell them apart."
-    for members, why, remedy in (
-        (
-            {"c", "along"},
-            "flying height and principal distance trade off",
-            tilted,
-        ),
-        ({"point", "across"}, "the principal point and a shift of the camera trade off", None),
-        ({"point", "tilt"}, "the principal point and a tilt of the camera trade off in a narrow field of view", wider),
-        (
-            {"point", "decentering"},
-            "decentering distortion with a tilt looks like a shift of the principal point",
-            f"{wider} Else use the two together, or fix the decentering where it is not significant.",
-        ),
-        ({"decentering", "tilt"}, "decentering distortion looks like a tilt with a shift of the camera", wider),
-        (
-            {"radial"},
-            "neighbouring powers of the radius are alike within the frame",
-            "Compare the curve and not its coefficients; leave out the highest one that is not significant.",
-        ),
-        (
-            {"c", "radial"},
-            "a change of scale and radial distortion are alike where the targets lie",
-            "Targets from the centre to the corners of the frame would tell them apart.",
-        ),
-        (
-            {"radial", "along"},
-            "a change of distance and radial distortion are alike where the targets lie",
-            "Targets from the centre to the corners of the frame would tell them apart.",
-        ),
-    ):
-        if pair == members:
-            return why, remedy or apart
-    return (
-        "these targets and images hardly tell them apart",
-        "Spread the targets over the whole frame, add images tilted in different directions, or fix what is not "
-        "significant.",
-    )
+def _cause(first: str, second: str, known: bool) -> tuple[str, str]:
+    """What makes two kinds of parameters alike, and what would tell them apart; known: whether the field is."""
+    why, remedy = CAUSES.get(frozenset((first, second)), OTHERS)
+    if remedy == APART and not known:
+        return why, "Images turned by 90 and 180 degrees about their axes, and tilted ones, would tell them apart."
+    if remedy in (APART, TILTED):
+        relief = "a field with more relief" if known else "known points at different heights"
+        return why, f"Images tilted in different directions, or {relief}, would tell them apart."
+    return why, remedy

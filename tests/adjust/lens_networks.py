@@ -2,12 +2,12 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from simulated import digital_network
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.camera import Camera
-from adjust.problem.network import Image, Network, ObjectPoint
-from adjust.problem.observations import ObservationKind, Observations
+from adjust.problem.network import Network
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import Distortion as SceneDistortion
 from synthetic_images.scene import SceneCamera
@@ -41,21 +41,9 @@ def network_of(name: str, rng: np.random.Generator | None = None) -> Network:
         back = rotation_from_angles(np.array(angles)).T @ np.array([0.0, 0.0, 1.3])
         seen = camera_from_object(camera, (*back, *angles), field)
         rows += [(f"i{i}", f"t{k}", seen[k]) for k in np.flatnonzero((np.abs(seen) < half).all(axis=1))]
-    places = np.array([row[2] for row in rows])
     if rng is not None:
-        places = places + rng.normal(0.0, SIGMA_MM, places.shape)
-    kinds: list[ObservationKind] = ["target"] * len(rows)
-    free = dict.fromkeys(values, Prior(0.0, np.inf))
-    unknown = Prior(0.0, np.inf)
-    return Network(
-        (Camera("L", Prior(c * 1.03, np.inf), unknown, unknown, Distortion(name, free, r0_mm=R0_MM)),),
-        tuple(Image(f"i{i}", "L", "none") for i in range(len(POSES))),
-        tuple(ObjectPoint(f"t{k}", *(Prior(float(v)) for v in xyz)) for k, xyz in enumerate(field)),
-        Observations(
-            tuple(row[0] for row in rows),
-            tuple(row[1] for row in rows),
-            tuple(kinds),
-            places,
-            np.tile(SIGMA_MM**2 * np.eye(2), (len(rows), 1, 1)),
-        ),
-    )
+        noise = rng.normal(0.0, SIGMA_MM, (len(rows), 2))
+        rows = [(*row[:2], row[2] + error) for row, error in zip(rows, noise, strict=True)]
+    free, unknown = dict.fromkeys(values, Prior(0.0, np.inf)), Prior(0.0, np.inf)
+    lens = Camera("L", Prior(c * 1.03, np.inf), unknown, unknown, Distortion(name, free, r0_mm=R0_MM))
+    return digital_network(lens, rows, {f"t{k}": xyz for k, xyz in enumerate(field)}, SIGMA_MM)

@@ -5,17 +5,17 @@ test but the scale of the effect: v'Pv of a network without noise grows with its
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from simulated import digital_network
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.problem.camera import Camera
-from adjust.problem.network import Exterior, Image, Network, ObjectPoint
-from adjust.problem.observations import ObservationKind, Observations
+from adjust.problem.network import Exterior, Network
 from adjust.problem.probabilities import Probabilities
 from adjust.solution.adjustment import adjust
 
@@ -101,14 +101,11 @@ def scene(seed: int, flat: bool) -> Scene:
 
 def network(made: Scene, effects: Effects, kind: Kind, rng: np.random.Generator | None) -> Network:
     """The network as it is given: square pixels, one c, one size, the lens of `kind.free`; rng None: no noise."""
-    images: list[str] = []
-    points: list[str] = []
-    places = []
+    names, places = [], []
     for i, (rotation, station) in enumerate(zip(made.rotations, made.stations, strict=True)):
         seen = _projected(made, effects, kind, i, rotation, station)
         inside = np.flatnonzero((np.abs(seen - MIDDLE_MM) < HALF_MM).all(axis=1))
-        images += [f"im{i:02d}"] * len(inside)
-        points += [f"p{k}" for k in inside]
+        names += [(f"im{i:02d}", f"p{k}") for k in inside]
         places.append(seen[inside])
     xy_mm = np.concatenate(places)
     if rng is not None:
@@ -120,22 +117,11 @@ def network(made: Scene, effects: Effects, kind: Kind, rng: np.random.Generator 
     frame = (float(2.0 * HALF_MM[0]), float(2.0 * HALF_MM[1])) if kind.frame_given else (0.0, 0.0)
     camera = Camera("cam", c, None, None, Distortion("opencv", given), {}, (float(middle[0]), float(middle[1])), frame)
     exterior = _exteriors(made) if kind.stations_given else {}
-    target: ObservationKind = "target"
-    return Network(
-        (camera,),
-        tuple(Image(name, "cam", "none", exterior.get(name)) for name in dict.fromkeys(images)),
-        tuple(
-            ObjectPoint(f"p{k}", *(Prior(float(value)) for value in effects.object_unit * xyz))
-            for k, xyz in enumerate(made.points)
-        ),
-        Observations(
-            tuple(images),
-            tuple(points),
-            (target,) * len(images),
-            xy_mm,
-            np.tile((effects.pitch * SIGMA_MM) ** 2 * np.eye(2), (len(images), 1, 1)),
-        ),
-    )
+    rows = [(*name, xy) for name, xy in zip(names, xy_mm, strict=True)]
+    points = {f"p{k}": effects.object_unit * xyz for k, xyz in enumerate(made.points)}
+    given_network = digital_network(camera, rows, points, effects.pitch * SIGMA_MM)
+    images = tuple(replace(image, exterior=exterior.get(image.name)) for image in given_network.images)
+    return replace(given_network, images=images)
 
 
 def _exteriors(made: Scene) -> dict[str, Exterior]:

@@ -1,6 +1,7 @@
 """Networks simulated with formulas of their own, term by term: nothing of them comes from the code under test."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -151,6 +152,51 @@ def simulated(
     )
     images = tuple(Image(f"f{i}", "K", kind) for i in range(len(truth.stations)))
     return Network((camera,), images, object_points, observations), start_of(truth, kind, points)
+
+
+def row_of(network: Network, kind: str, image: str, point: str) -> int:
+    """Where an observation stands."""
+    rows = network.observations
+    return list(zip(rows.kind, rows.image, rows.point, strict=True)).index((kind, image, point))
+
+
+def with_errors(network: Network, errors: dict[int, Array]) -> Network:
+    """With errors in mm in the observations of some rows."""
+    xy_mm = network.observations.xy_mm.copy()
+    for row, error in errors.items():
+        xy_mm[row] += error
+    return replace(network, observations=replace(network.observations, xy_mm=xy_mm))
+
+
+def with_covariance(network: Network, covariance_mm2: Array) -> Network:
+    return replace(network, observations=replace(network.observations, covariance_mm2=covariance_mm2))
+
+
+def without_rows(network: Network, rows: list[int]) -> Network:
+    kept = np.setdiff1d(np.arange(len(network.observations)), rows)
+    return replace(network, observations=network.observations.only(kept))
+
+
+def digital_network(
+    camera: Camera, rows: Sequence[tuple[str, str, Array]], xyz: dict[str, Array], sigma: float
+) -> Network:
+    """Known points in images of a digital camera; rows: image, point and comparator coordinates of its marks."""
+    images, points, xy_mm = zip(*rows, strict=True)
+    return Network(
+        (camera,),
+        tuple(Image(name, camera.name, "none") for name in dict.fromkeys(images)),
+        tuple(ObjectPoint(id_, *(Prior(float(value)) for value in place)) for id_, place in xyz.items()),
+        Observations(
+            images, points, ("target",) * len(rows), np.array(xy_mm), np.tile(sigma**2 * np.eye(2), (len(rows), 1, 1))
+        ),
+    )
+
+
+def joined(*parts: Observations) -> Observations:
+    """Observations behind one another."""
+    texts = (sum((getattr(each, name) for each in parts), ()) for name in ("image", "point", "kind"))
+    arrays = (np.concatenate([getattr(each, name) for each in parts]) for name in ("xy_mm", "covariance_mm2"))
+    return Observations(*texts, *arrays)
 
 
 def start_of(truth: Truth, kind: Transformation, points: Array) -> Approximations:

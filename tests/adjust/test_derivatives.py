@@ -13,7 +13,12 @@ from studies import parametrize_with_studies
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Decentering, Distortion, Lens, Prior
 from adjust.functional_model.projection import rays
-from adjust.functional_model.rotation import rotation_from_angles, rotation_from_vector, vector_by_angles
+from adjust.functional_model.rotation import (
+    angles_from_rotation,
+    rotation_from_angles,
+    rotation_from_vector,
+    vector_by_angles,
+)
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.network import Transformation
 from adjust.problem.problem import Problem, number
@@ -85,6 +90,13 @@ def test_rotation_vector_by_angles() -> None:
 def test_a_rotation_vector_is_the_rotation_of_other_programs(length: float) -> None:
     vector = length * np.array([2.0, -3.0, 6.0]) / 7.0
     np.testing.assert_allclose(rotation_from_vector(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
+
+
+def test_angles_of_any_rotation() -> None:
+    for matrix in Rotation.random(50, rng=np.random.default_rng(8)).as_matrix():
+        np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(matrix)), matrix, atol=1e-12)
+    locked = rotation_from_angles(np.array([0.4, np.pi / 2, 0.3]))
+    np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(locked)), locked, atol=1e-12)
 
 
 def test_rays_accept_complex_steps() -> None:

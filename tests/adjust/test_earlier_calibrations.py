@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from simulated import field_points, simulated
+from simulated import field_points, joined, simulated
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Fiducial
 from adjust.problem.network import Approximations, Network, Transformation
-from adjust.problem.observations import Calibration, Observations
+from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
 from adjust.quality.contradiction import CalibrationTest
 from adjust.solution.adjustment import adjust
@@ -42,19 +42,14 @@ def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, App
         )
         networks.append((network, replace(start, exterior=exterior, transformation=films, points=known)))
     (a, start_a), (b, start_b) = networks
-    rows_a, rows_b = a.observations, b.observations
-    rows = Observations(
-        rows_a.image + rows_b.image,
-        rows_a.point + rows_b.point,
-        rows_a.kind + rows_b.kind,
-        np.vstack([rows_a.xy_mm, rows_b.xy_mm]),
-        np.vstack([rows_a.covariance_mm2, rows_b.covariance_mm2]),
-    )
+    rows = joined(a.observations, b.observations)
     joint = replace(a, images=a.images + b.images, points=a.points + b.points, observations=rows)
-    exterior = {**start_a.exterior, **start_b.exterior}
-    films = {**start_a.transformation, **start_b.transformation}
-    known = {**start_a.points, **start_b.points}
-    start_joint = replace(start_a, exterior=exterior, transformation=films, points=known)
+    start_joint = replace(
+        start_a,
+        exterior={**start_a.exterior, **start_b.exterior},
+        transformation={**start_a.transformation, **start_b.transformation},
+        points={**start_a.points, **start_b.points},
+    )
     return (a, start_a), (b, start_b), (joint, start_joint)
 
 

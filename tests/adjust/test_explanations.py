@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from misfits import KINDS, NOTHING, Effects, Kind, drawn, network, outcome, said, scene
+from simulated import with_errors
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
@@ -45,9 +46,7 @@ def test_figures_are_those_that_were_planted() -> None:
 @pytest.mark.study
 def test_gross_errors_of_single_marks_are_no_fault_of_the_model() -> None:
     given = network(scene(6, flat=True), Effects(), SOUND, np.random.default_rng(1))
-    xy_mm = given.observations.xy_mm.copy()
-    xy_mm[[3, 40, 90]] += [0.05, -0.04]
-    result = adjust(replace(given, observations=replace(given.observations, xy_mm=xy_mm)))
+    result = adjust(with_errors(given, dict.fromkeys((3, 40, 90), np.array([0.05, -0.04]))))
     assert result.explanations == ()
     assert len(result.suspects) == 3
 

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from simulated import digital_network
 from studies import parametrize_with_studies
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Camera
-from adjust.problem.network import Image, Network, ObjectPoint
-from adjust.problem.observations import Observations
+from adjust.problem.network import Network
 from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
@@ -45,24 +45,13 @@ def network_of(
 ) -> Network:
     """points: of some images, the corners that they show; all 54 of the others."""
     rows = [
-        (name, k, xy[k] + rng.normal(0.0, SIGMA_MM, 2))
+        (name, f"c{k}", xy[k] + rng.normal(0.0, SIGMA_MM, 2))
         for name, xy in images.items()
         for k in (points or {}).get(name, range(len(BOARD)))
     ]
     free = {name: Prior(0.0, np.inf) for name in ("k1", "k2", "p1", "p2")}
     camera = Camera("cam", Prior(1.03 * C, np.inf), Prior(0.0, np.inf), Prior(0.0, np.inf), Distortion("opencv", free))
-    return Network(
-        (camera,),
-        tuple(Image(name, "cam", "none") for name in images),
-        tuple(ObjectPoint(f"c{k}", *(Prior(float(each)) for each in xyz)) for k, xyz in enumerate(BOARD)),
-        Observations(
-            tuple(name for name, _, _ in rows),
-            tuple(f"c{k}" for _, k, _ in rows),
-            tuple("target" for _ in rows),
-            np.array([xy for _, _, xy in rows]),
-            np.tile(SIGMA_MM**2 * np.eye(2), (len(rows), 1, 1)),
-        ),
-    )
+    return digital_network(camera, rows, {f"c{k}": xyz for k, xyz in enumerate(BOARD)}, SIGMA_MM)
 
 
 @parametrize_with_studies("robust", [False, True], quick=(1,))

@@ -6,7 +6,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from simulated import Truth, simulated
+from simulated import Truth, simulated, with_errors
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
@@ -29,18 +29,10 @@ def without(network: Network, image: str, kind: str, left: int) -> Network:
     return rows(network, [i for i in range(len(observations)) if i not in places[left:]])
 
 
-def without_point(network: Network) -> Network:
-    return replace(network, points=network.points[1:])
-
-
 def without_fiducial(network: Network) -> Network:
     camera = network.cameras[0]
     marks = {id_: mark for id_, mark in camera.fiducials.items() if id_ != "3"}
     return replace(network, cameras=(replace(camera, fiducials=marks),))
-
-
-def other_camera(network: Network) -> Network:
-    return replace(network, images=(replace(network.images[0], camera="RMK"), *network.images[1:]))
 
 
 def strange_parameter(network: Network) -> Network:
@@ -54,46 +46,39 @@ def bad_covariance(network: Network) -> Network:
     return replace(network, observations=replace(network.observations, covariance_mm2=covariance))
 
 
-def nan_coordinate(network: Network) -> Network:
-    xy = network.observations.xy_mm.copy()
-    xy[9, 1] = np.nan
-    return replace(network, observations=replace(network.observations, xy_mm=xy))
-
-
-def unknown_image(network: Network) -> Network:
-    return replace(network, images=network.images[1:])
-
-
-def bent(network: Network) -> Network:
-    return replace(network, images=tuple(replace(image, transformation="projective") for image in network.images))
-
-
-def lopsided(network: Network) -> Network:
-    return replace(network, observations=replace(network.observations, point=network.observations.point[:-1]))
-
-
 GALLERY: dict[str, tuple[Change, list[str]]] = {
     "no images": (lambda n: replace(n, images=()), ["nothing to adjust", "no image"]),
     "no observations": (lambda n: rows(n, []), ["nothing to adjust", "statuses"]),
     "camera twice": (lambda n: replace(n, cameras=n.cameras * 2), ["camera K", "more than once"]),
     "image twice": (lambda n: replace(n, images=(*n.images, n.images[2])), ["image f2", "more than once"]),
     "point twice": (lambda n: replace(n, points=(*n.points, n.points[4])), ["object point 4", "more than once"]),
-    "unknown camera": (other_camera, ["image f0", "camera RMK", "given: K"]),
-    "unknown image": (unknown_image, ["image f0", "Add the image"]),
-    "unknown point": (without_point, ["target 0", "image f0", "Add it to the points"]),
+    "unknown camera": (
+        lambda n: replace(n, images=(replace(n.images[0], camera="RMK"), *n.images[1:])),
+        ["image f0", "camera RMK", "given: K"],
+    ),
+    "unknown image": (lambda n: replace(n, images=n.images[1:]), ["image f0", "Add the image"]),
+    "unknown point": (lambda n: replace(n, points=n.points[1:]), ["target 0", "image f0", "Add it to the points"]),
     "unknown fiducial": (without_fiducial, ["fiducial 3", "image f0", "camera K"]),
     "observed twice": (lambda n: rows(n, [*range(len(n.observations)), 7]), ["point 2", "2 times", "image f0"]),
     "covariance": (bad_covariance, ["target 3", "image f0", "not positive definite"]),
-    "nan": (nan_coordinate, ["target 4", "image f0", "not a finite number"]),
+    "nan": (lambda n: with_errors(n, {9: np.array([0.0, np.nan])}), ["target 4", "image f0", "not a finite number"]),
     "two targets": (lambda n: without(n, "f1", "target", 2), ["image f1", "2 object points", "needs 3"]),
     "two fiducials": (lambda n: without(n, "f3", "fiducial", 2), ["image f3", "2 fiducial", "affine", "needs 3"]),
     "two of four": (
-        lambda n: without(bent(n), "f3", "fiducial", 2),
+        lambda n: without(
+            replace(n, images=tuple(replace(each, transformation="projective") for each in n.images)),
+            "f3",
+            "fiducial",
+            2,
+        ),
         ["image f3", "2 fiducial", "projective transformation needs 3", "4 where its targets tell nothing of it"],
     ),
     "no fiducials": (lambda n: without(n, "f3", "fiducial", 0), ["image f3", "0 fiducial", "needs 3"]),
     "parameter": (strange_parameter, ["camera K", "torlegard", "k9", "k3, k5"]),
-    "rows do not go together": (lopsided, ["do not go together"]),
+    "rows do not go together": (
+        lambda n: replace(n, observations=replace(n.observations, point=n.observations.point[:-1])),
+        ["do not go together"],
+    ),
 }
 
 

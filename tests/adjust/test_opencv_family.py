@@ -7,19 +7,18 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-from simulated import Truth, camera_point, field_points, simulated
+from simulated import Truth, camera_point, digital_network, field_points, simulated
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.projection import ImageModel
-from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
+from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
 from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Camera
 from adjust.problem.images import adjusted_image
-from adjust.problem.network import Approximations, Image, Network, ObjectPoint
+from adjust.problem.network import Approximations, Image, Network
 from adjust.problem.observations import Observations
 from adjust.solution.adjustment import adjust
 
@@ -61,6 +60,10 @@ def camera(free: bool) -> Camera:
     }
     c, x0, y0 = FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM
     return Camera("D", Prior(c, sigma), Prior(x0, sigma), Prior(y0, sigma), Distortion("opencv", parameters))
+
+
+def numbered(xyz: Array) -> dict[str, Array]:
+    return {str(j): each for j, each in enumerate(xyz)}
 
 
 def board() -> Array:
@@ -130,25 +133,13 @@ def test_corrected_points_are_opencvs_undistorted_points() -> None:
 def test_adjustment_recovers_opencvs_parameters() -> None:
     """Exact images by OpenCV, its parameters and fx/fy free: estimated as they went in."""
     rng = np.random.default_rng(6)
-    plane = board()
-    relief = plane + np.stack([0 * plane[:, 0], 0 * plane[:, 0], 150 * np.sin(plane[:, 0] / 70)], axis=1)
+    relief = board()
+    relief[:, 2] = 150 * np.sin(relief[:, 0] / 70)
     tilts = [(0.0, 0.0, 0.0), (0.4, 0.1, 1.5), (-0.4, 0.2, 3.0), (0.1, 0.45, -1.5), (-0.1, -0.4, 0.7)]
     poses = [(np.array(tilt), np.array([1200 * tilt[1], -1200 * tilt[0], 1150.0])) for tilt in tilts]
     rows = [
         (f"i{i}", str(j), xy) for i, pose in enumerate(poses) for j, xy in enumerate(mm(opencv_pixels(*pose, relief)))
     ]
-    network = Network(
-        (camera(True),),
-        tuple(Image(f"i{i}", "D", "none") for i in range(len(poses))),
-        tuple(ObjectPoint(str(j), *map(Prior, map(float, xyz))) for j, xyz in enumerate(relief)),
-        Observations(
-            tuple(row[0] for row in rows),
-            tuple(row[1] for row in rows),
-            tuple("target" for _ in rows),
-            np.array([row[2] for row in rows]),
-            np.broadcast_to(0.0005**2 * np.eye(2), (len(rows), 2, 2)),
-        ),
-    )
     c, x0, y0 = FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM
     start = Approximations(
         {"D": np.array([c * 1.01, x0 + 0.1, y0 - 0.1])},
@@ -156,7 +147,7 @@ def test_adjustment_recovers_opencvs_parameters() -> None:
          for i, (a, s) in enumerate(poses)},
         {}, {},
     )  # fmt: skip
-    result = adjust(network, start)
+    result = adjust(digital_network(camera(True), rows, numbered(relief), 0.0005), start)
     assert result.converged
     assert result.vpv < 1e-12
     expected = dict(zip(NAMES, DISTORTION, strict=True)) | {"c": c, "x0": x0, "y0": y0, "b1": FX / FY - 1}
@@ -212,13 +203,6 @@ def test_what_has_no_image_is_told() -> None:
     assert list(visible) == [True, False, False]
 
 
-def test_angles_of_any_rotation() -> None:
-    for matrix in Rotation.random(50, rng=np.random.default_rng(8)).as_matrix():
-        np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(matrix)), matrix, atol=1e-12)
-    locked = rotation_from_angles(np.array([0.4, np.pi / 2, 0.3]))
-    np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(locked)), locked, atol=1e-12)
-
-
 def test_adjusted_image_predicts_its_observations() -> None:
     xyz = field_points(np.random.default_rng(1), 12)
     network, start = simulated(np.random.default_rng(9), points=xyz, noise=False)
@@ -252,27 +236,12 @@ def wide_network(seed: int, lens: Array = WIDE) -> Network:
         pixels = pixels.reshape(-1, 2)
         shown = np.flatnonzero(((pixels > 0.0) & (pixels < SIZE_PX)).all(axis=1))
         rows += [(f"i{i}", str(j), mm(pixels[j]) + rng.normal(0.0, noise_mm, 2)) for j in shown]
-    observations = Observations(
-        tuple(row[0] for row in rows),
-        tuple(row[1] for row in rows),
-        tuple("target" for _ in rows),
-        np.array([row[2] for row in rows]),
-        np.array([noise_mm**2 * np.eye(2)] * len(rows)),
-    )
     c, x0, y0 = (Prior(value * PIXEL_MM, np.inf) for value in (WIDE_FX, CX, -CY))
-    wide = Camera(
-        "D",
-        c,
-        x0,
-        y0,
-        Distortion("opencv", {name: Prior(0.0, np.inf) for name in RATIONAL}),
-    )
+    wide = Camera("D", c, x0, y0, Distortion("opencv", {name: Prior(0.0, np.inf) for name in RATIONAL}))
     seen = {row[1] for row in rows}
-    points = tuple(ObjectPoint(str(j), *map(Prior, each.tolist())) for j, each in enumerate(xyz) if str(j) in seen)
-    return Network((wide,), tuple(Image(f"i{i}", "D", "none") for i in range(5)), points, observations)
+    return digital_network(wide, rows, {k: v for k, v in numbered(xyz).items() if k in seen}, noise_mm)
 
 
-@pytest.mark.study
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_rational_distortion_begins_at_zero(seed: int) -> None:
     """Where its numerator and its denominator do the same: the solution is regular, and it is found."""

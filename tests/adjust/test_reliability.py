@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import special
-from simulated import Truth, field_points, simulated
+from simulated import Truth, field_points, row_of, simulated, with_errors
 
 from adjust.functional_model.lens import Prior
-from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Exterior, Network
-from adjust.problem.observations import Calibration, ObservationKind
+from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
 from adjust.problem.probabilities import Probabilities
 from adjust.quality.reliability import Reliability
@@ -31,7 +30,7 @@ def exact_network() -> tuple[Network, Approximations]:
         np.random.default_rng(3), truth, point_sigma=0.02, noise=False, fiducial_sigma=0.005, free={"k3": np.inf}
     )
     covariance = network.observations.covariance_mm2.copy()
-    covariance[unit_of(network, "target", "f1", "4")] = 0.004**2 * np.array([[1.0, 0.6], [0.6, 2.0]])
+    covariance[row_of(network, "target", "f1", "4")] = 0.004**2 * np.array([[1.0, 0.6], [0.6, 2.0]])
     values = np.array([*truth.stations[2], *truth.attitudes[2]])
     sigmas = np.array([0.1, 0.1, np.inf, np.inf, np.inf, np.inf])
     images = tuple(
@@ -41,20 +40,9 @@ def exact_network() -> tuple[Network, Approximations]:
     return replace(network, images=images, observations=observations), start
 
 
-def unit_of(network: Network, kind: ObservationKind, image: str, point: str) -> int:
-    rows = network.observations
-    return list(zip(rows.kind, rows.image, rows.point, strict=True)).index((kind, image, point))
-
-
 def reliability_of(result: Adjustment) -> Reliability:
     assert result.reliability is not None
     return result.reliability
-
-
-def with_observation(network: Network, row: int, error: Array) -> Network:
-    xy = network.observations.xy_mm.copy()
-    xy[row] += error
-    return replace(network, observations=replace(network.observations, xy_mm=xy))
 
 
 def with_control(network: Network, error: float) -> Network:
@@ -65,17 +53,11 @@ def with_control(network: Network, error: float) -> Network:
     return replace(network, points=points)
 
 
-def with_camera(network: Network, change: Callable[[Camera], Camera]) -> Network:
-    return replace(network, cameras=(change(network.cameras[0]),))
-
-
 def with_fiducial(network: Network, error: float) -> Network:
-    def changed(camera: Camera) -> Camera:
-        mark = camera.fiducials["3"]
-        wrong = replace(mark, y_mm=Prior(mark.y_mm.value + error, mark.y_mm.sigma))
-        return replace(camera, fiducials=dict(camera.fiducials) | {"3": wrong})
-
-    return with_camera(network, changed)
+    camera = network.cameras[0]
+    mark = camera.fiducials["3"]
+    wrong = replace(mark, y_mm=Prior(mark.y_mm.value + error, mark.y_mm.sigma))
+    return replace(network, cameras=(replace(camera, fiducials=dict(camera.fiducials) | {"3": wrong}),))
 
 
 def with_station(network: Network, error: float) -> Network:
@@ -88,11 +70,11 @@ def with_station(network: Network, error: float) -> Network:
 
 X, Y = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 CASES: dict[str, tuple[str, int, Callable[[Network, float], Network]]] = {
-    "target": ("target 4 in image f1", 1, lambda n, e: with_observation(n, unit_of(n, "target", "f1", "4"), e * Y)),
+    "target": ("target 4 in image f1", 1, lambda n, e: with_errors(n, {row_of(n, "target", "f1", "4"): e * Y})),
     "fiducial": (
         "fiducial 2 in image f3",
         0,
-        lambda n, e: with_observation(n, unit_of(n, "fiducial", "f3", "2"), e * X),
+        lambda n, e: with_errors(n, {row_of(n, "fiducial", "f3", "2"): e * X}),
     ),
     "control": ("control point 5 Z", 0, with_control),
     "datum": ("given fiducial 3 (camera K)", 1, with_fiducial),
@@ -135,7 +117,7 @@ def test_the_cause_that_is_named_moves_the_parameter_by_what_is_told() -> None:
         unit, axis = named[outer.cause]
         if unit < len(network.observations):
             error = tests.smallest[unit, axis] * np.eye(2)[axis]
-            dirty = adjust(with_observation(network, unit, error), start)
+            dirty = adjust(with_errors(network, {unit: error}), start)
             shift = dirty.value(outer.parameter) - clean.value(outer.parameter)
             assert shift == pytest.approx(outer.effect, rel=5e-3)
             checked += 1
@@ -146,11 +128,11 @@ def test_the_cause_that_is_named_moves_the_parameter_by_what_is_told() -> None:
 def test_an_error_in_the_least_favourable_direction_shifts_the_test_of_the_point() -> None:
     network, start = exact_network()
     tests = reliability_of(adjust(network, start))
-    unit = unit_of(network, "target", "f1", "4")
+    unit = row_of(network, "target", "f1", "4")
     size = tests.smallest_together[unit]
     turns = np.linspace(0.0, np.pi, 7)[:-1]
     errors = size * np.column_stack([np.cos(turns), np.sin(turns)])
-    spoilt = [adjust(with_observation(network, unit, error), start) for error in errors]
+    spoilt = [adjust(with_errors(network, {unit: error}), start) for error in errors]
     statistics = [reliability_of(result).statistic[unit] for result in spoilt]
     # As a function of the direction it is a constant and a sine of twice the angle: its minimum follows from these.
     mean = np.mean(statistics)
@@ -191,8 +173,8 @@ def test_the_redundancies_of_everything_add_up() -> None:
 def test_w_of_an_observation_does_not_depend_on_the_weight_that_it_was_left() -> None:
     """Nearly without weight it is predicted by the others; the test is that of the observation as it was given."""
     network, start = simulated(np.random.default_rng(5), fiducial_sigma=0.01)
-    unit = unit_of(network, "target", "f1", "4")
-    spoilt = with_observation(network, unit, np.array([0.03, 0.08]))
+    unit = row_of(network, "target", "f1", "4")
+    spoilt = with_errors(network, {unit: np.array([0.03, 0.08])})
     plain, robust = adjust(spoilt, start), adjust(spoilt, start, Options(robust="igg3"))
     assert robust.weights[unit] < 1e-6
     others = np.delete(robust.weights, unit)
@@ -204,24 +186,16 @@ def test_what_nothing_checks_is_told() -> None:
     """Three fiducials for an affine transformation: no reading of theirs is checked, and none has an MDB."""
     network, start = simulated(np.random.default_rng(10))
     rows = network.observations
-    keep = [
-        i
-        for i, (image, kind, point) in enumerate(zip(rows.image, rows.kind, rows.point, strict=True))
-        if image != "f0" or (kind == "fiducial" and point in "123")
+    kept = [
+        image != "f0" or (kind == "fiducial" and point in "123")
+        for image, kind, point in zip(rows.image, rows.kind, rows.point, strict=True)
     ]
-    few = replace(
-        rows,
-        image=tuple(rows.image[i] for i in keep),
-        point=tuple(rows.point[i] for i in keep),
-        kind=tuple(rows.kind[i] for i in keep),
-        xy_mm=rows.xy_mm[keep],
-        covariance_mm2=rows.covariance_mm2[keep],
-    )
+    few = rows.only(np.flatnonzero(kept))
     exterior = Exterior(np.array([*Truth().stations[0], *Truth().attitudes[0]]), np.zeros(6))
     images = tuple(replace(i, exterior=exterior) if i.name == "f0" else i for i in network.images)
     result = adjust(replace(network, observations=few, images=images), start)
     tests = reliability_of(result)
-    unit = unit_of(replace(network, observations=few), "fiducial", "f0", "1")
+    unit = row_of(replace(network, observations=few), "fiducial", "f0", "1")
     assert np.isinf(tests.smallest[unit]).all()
     assert (tests.w[unit] == 0.0).all()
     assert {"fiducial 1 x in image f0", "fiducial 3 y in image f0"} <= set(tests.unchecked)
@@ -250,15 +224,15 @@ def test_the_smallest_detectable_error_is_detected_as_often_as_told() -> None:
     points = field_points(np.random.default_rng(0), 12)
     exact, start = simulated(np.random.default_rng(0), points=points, noise=False)
     reliability = reliability_of(adjust(exact, start))
-    unit, runs = unit_of(exact, "target", "f1", "4"), 400
+    unit, runs = row_of(exact, "target", "f1", "4"), 400
     limit = -special.ndtri(0.0005)
     _, directions = np.linalg.eigh(weight_of_point(exact, start, unit))
     found = np.zeros(2)
     for seed in range(runs):
         noisy, _ = simulated(np.random.default_rng(1000 + seed), points=points)
-        coordinate = reliability_of(adjust(with_observation(noisy, unit, reliability.smallest[unit, 0] * X), start))
+        coordinate = reliability_of(adjust(with_errors(noisy, {unit: reliability.smallest[unit, 0] * X}), start))
         worst = reliability.smallest_together[unit] * directions[:, 0]
-        point = reliability_of(adjust(with_observation(noisy, unit, worst), start))
+        point = reliability_of(adjust(with_errors(noisy, {unit: worst}), start))
         found += abs(coordinate.w[unit, 0]) > limit, point.statistic[unit] > special.chdtri(2, 0.001)
     assert found / runs == pytest.approx([0.8, 0.8], abs=0.06)
 
@@ -267,6 +241,6 @@ def weight_of_point(exact: Network, start: Approximations, unit: int) -> Array:
     """P Q_v P (2, 2) of a point, from what its statistic becomes with small errors."""
     size = 1e-4
     e = [X, Y, X + Y]
-    s = [reliability_of(adjust(with_observation(exact, unit, size * each), start)).statistic[unit] for each in e]
+    s = [reliability_of(adjust(with_errors(exact, {unit: size * each}), start)).statistic[unit] for each in e]
     mixed = 0.5 * (s[2] - s[0] - s[1])
     return np.array([[s[0], mixed], [mixed, s[1]]]) / size**2

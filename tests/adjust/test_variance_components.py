@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from simulated import field_points, simulated
+from simulated import field_points, simulated, with_errors
 from studies import parametrize_with_studies
 
 from adjust.functional_model.rotation import rotation_from_angles
@@ -84,9 +84,7 @@ def test_a_group_without_redundancy_keeps_its_variance() -> None:
 @pytest.mark.study
 def test_a_gross_error_that_is_left_out_does_not_spoil_the_factors() -> None:
     network, start = checkable(5, 15)
-    xy = network.observations.xy_mm.copy()
-    xy[9] += [0.3, 0.1]
-    spoilt = replace(network, observations=replace(network.observations, xy_mm=xy))
+    spoilt = with_errors(network, {9: np.array([0.3, 0.1])})
     clean = adjust(network, start, Options(variance_components=True))
     result = adjust(spoilt, start, Options(variance_components=True, snooping=True))
     assert len(result.suspects) == 1

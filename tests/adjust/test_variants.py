@@ -7,14 +7,13 @@ from functools import partial
 import numpy as np
 import pytest
 from dense_adjustment import solve_densely
-from simulated import Truth, field_points, simulated
+from simulated import Truth, field_points, joined, simulated
 from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint, Transformation
-from adjust.problem.observations import Observations
 from adjust.solution.adjustment import adjust
 
 Case = tuple[Network, Approximations]
@@ -100,15 +99,10 @@ def two_cameras() -> Case:
     lens = Distortion("brown", {"k1": Prior(3e-7, np.inf), "b1": Prior(0.0, 1e-3), "b2": Prior(0.0, np.inf)})
     camera = Camera("D", Prior(80.5, np.inf), Prior(0.0, 1.0), Prior(0.0, 1.0), lens)
     names = {image.name: f"d{image.name}" for image in other.images}
-    rows = [film.observations, other.observations]
-    turned = np.array([[1.0, 0.6], [0.6, 1.5]]) * 0.004**2
-    observations = Observations(
-        rows[0].image + tuple(names[name] for name in rows[1].image),
-        rows[0].point + rows[1].point,
-        rows[0].kind + rows[1].kind,
-        np.concatenate([rows[0].xy_mm, rows[1].xy_mm]),
-        np.concatenate([rows[0].covariance_mm2, np.tile(turned, (len(rows[1]), 1, 1))]),
-    )
+    rows, turned = other.observations, np.array([[1.0, 0.6], [0.6, 1.5]]) * 0.004**2
+    renamed = tuple(names[name] for name in rows.image)
+    rows = replace(rows, image=renamed, covariance_mm2=np.tile(turned, (len(rows), 1, 1)))
+    observations = joined(film.observations, rows)
     images = (*film.images, *(Image(name, "D", "none") for name in names.values()))
     both = Network((*film.cameras, camera), images, film.points, observations)
     return both, Approximations(

@@ -5,11 +5,10 @@ from dataclasses import replace
 from itertools import chain
 
 import numpy as np
-from simulated import Truth, field_points, simulated
+from simulated import Truth, field_points, joined, simulated
 
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Network
-from adjust.problem.observations import Observations
 
 Name = Callable[[str], str]
 
@@ -27,18 +26,11 @@ def two_cameras(
         )
     ]
     networks, starts = zip(*both, strict=True)
-    rows = [each.observations for each in networks]
     network = Network(
         tuple(each.cameras[0] for each in networks),
         tuple(chain.from_iterable(each.images for each in networks)),
         networks[0].points,
-        Observations(
-            tuple(chain.from_iterable(each.image for each in rows)),
-            tuple(chain.from_iterable(each.point for each in rows)),
-            tuple(chain.from_iterable(each.kind for each in rows)),
-            np.concatenate([each.xy_mm for each in rows]),
-            np.concatenate([each.covariance_mm2 for each in rows]),
-        ),
+        joined(*(each.observations for each in networks)),
     )
     start = replace(
         starts[0],
