@@ -20,11 +20,11 @@ from adjust.array_types import Array
 from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Prior
-from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates, GivenGroup
 from adjust.problem.parameter import Kind, Parameter
 
 LEVEL = 0.01  # probability of calling a superfluous parameter significant
+FIXED = Prior(0.0)
 UNCHECKED = 1e-6  # redundancy of a prior below which the data say nothing against it
 
 
@@ -64,44 +64,42 @@ def significance_tests(estimates: Estimates) -> dict[tuple[str, str], tuple[Sign
     """
     if not estimates.converged:
         return {}
-    network = estimates.network
-    cameras = (camera for camera in network.cameras if camera.name not in network.idle_cameras)
-    tests = {("interior", camera.name): _camera_tests(estimates, camera) for camera in cameras}
-    tests |= {
-        ("scanner", each.name): _term_tests(estimates, "scanner", each.name, each.terms) for each in network.scanners
-    }
+    network, tests = estimates.network, dict[tuple[str, str], tuple[SignificanceTest, ...]]()
+    for camera in network.cameras:
+        if camera.name not in network.idle_cameras:
+            interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
+            given = (_against_given(estimates, camera.name, name, prior) for name, prior in interior.items())
+            lens = family(camera.distortion.family)
+            priors = {name: camera.distortion.parameters.get(name, FIXED) for name in lens.parameters}
+            own = _against_zero(estimates, "interior", camera.name, priors, dict(lens.groups))
+            tests["interior", camera.name] = (*filter(None, given), *own)
+    for scanner in network.scanners:
+        tests["scanner", scanner.name] = _against_zero(estimates, "scanner", scanner.name, scanner.terms)
     for board in network.boards:
         bends = dict(zip(BOARD_NAMES, board.bends, strict=True))
-        tests["board", board.name] = _term_tests(estimates, "board", board.name, bends)
+        tests["board", board.name] = _against_zero(estimates, "board", board.name, bends)
     return tests
 
 
-def _camera_tests(estimates: Estimates, camera: Camera) -> tuple[SignificanceTest, ...]:
-    interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
-    given = (_against_given(estimates, camera.name, name, prior) for name, prior in interior.items())
-    estimated = _estimated(camera)
-    groups = dict(family(camera.distortion.family).groups) | {"all": estimated}
-    present = {name: tuple(each for each in members if each in estimated) for name, members in groups.items()}
-    several = {name: members for name, members in present.items() if len(members) > 1}
-    if len(several) == 2 and len(set(several.values())) == 1:
-        del several["all"]
-    tested = [(name, (name,)) for name in estimated] + list(several.items())
-    own = (_against_zero(estimates, "interior", camera.name, *each) for each in tested)
-    return (*filter(None, given), *own)
-
-
-def _term_tests(
-    estimates: Estimates, kind: Kind, owner: str, terms: Mapping[str, Prior]
+def _against_zero(
+    estimates: Estimates,
+    kind: Kind,
+    owner: str,
+    priors: Mapping[str, Prior],
+    groups: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[SignificanceTest, ...]:
-    estimated = tuple(name for name, prior in terms.items() if prior.sigma > 0.0)
-    tested = [(name, (name,)) for name in estimated] + ([("all", estimated)] if len(estimated) > 1 else [])
-    return tuple(_against_zero(estimates, kind, owner, *each) for each in tested)
-
-
-def _estimated(camera: Camera) -> tuple[str, ...]:
-    given = camera.distortion.parameters
-    names = family(camera.distortion.family).parameters
-    return tuple(name for name in names if name in given and given[name].sigma > 0.0)
+    """Tests of what is not fixed of some quantities, one by one, in groups, and all together if no group is all."""
+    estimated = tuple(name for name, prior in priors.items() if prior.sigma > 0.0)
+    several = {name: tuple(each for each in members if each in estimated) for name, members in (groups or {}).items()}
+    several = {name: members for name, members in several.items() if len(members) > 1}
+    if len(estimated) > 1 and list(several.values()) != [estimated]:
+        several["all"] = estimated
+    tests = []
+    for name, quantities in [*((name, (name,)) for name in estimated), *several.items()]:
+        tested = [Parameter(kind, owner, "", each) for each in quantities]
+        values, cofactor = estimates.values_of(tested), estimates.cofactor_of(tested)
+        tests.append(_significance_test(estimates, name, quantities, values, cofactor))
+    return tuple(tests)
 
 
 def _against_given(estimates: Estimates, camera: str, name: str, prior: Prior | None) -> SignificanceTest | None:
@@ -117,29 +115,20 @@ def _against_given(estimates: Estimates, camera: str, name: str, prior: Prior | 
         if redundancy < UNCHECKED:
             return None
         cofactor = given * redundancy
-    return _tested(estimates, name, (name,), np.array([estimates.value(full) - prior.value]), np.array([[cofactor]]))
+    difference = np.array([estimates.value(full) - prior.value])
+    return _significance_test(estimates, name, (name,), difference, np.array([[cofactor]]))
 
 
-def _against_zero(
-    estimates: Estimates, kind: Kind, owner: str, name: str, quantities: Sequence[str]
-) -> SignificanceTest:
-    tested = [Parameter(kind, owner, "", each) for each in quantities]
-    return _tested(estimates, name, tuple(quantities), estimates.values_of(tested), estimates.cofactor_of(tested))
-
-
-def _tested(
+def _significance_test(
     estimates: Estimates, name: str, parameters: tuple[str, ...], difference: Array, cofactor: Array
 ) -> SignificanceTest:
-    scale = np.sqrt(np.diag(cofactor))
-    normalised = difference / scale
-    variance = estimates.sigma0**2
-    r = estimates.variance.redundancy
-    if len(parameters) == 1:
-        t = float(normalised[0]) / float(np.sqrt(variance))
+    scale, count = np.sqrt(np.diag(cofactor)), len(parameters)
+    normalised, r = difference / scale, estimates.variance.redundancy
+    if count == 1:
+        t = float(normalised[0]) / estimates.sigma0
         one_sided = stdtr(r, -abs(t)) if r > 0 else ndtr(-abs(t))
         return SignificanceTest(name, parameters, t, 2.0 * float(one_sided))
-    count = len(parameters)
     square = float(normalised @ np.linalg.solve(cofactor / np.outer(scale, scale), normalised))
-    statistic = square / (count * variance)
+    statistic = square / (count * estimates.sigma0**2)
     p = fdtrc(count, r, statistic) if r > 0 else chdtrc(count, square)
     return SignificanceTest(name, parameters, statistic, float(p))

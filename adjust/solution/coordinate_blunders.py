@@ -1,7 +1,7 @@
 """Blunders in the given coordinates of points: too large for an adjustment that takes them for observations."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -61,11 +61,17 @@ def far_points(problem: Problem, family: float) -> list[FarPoint]:
     if not gaps:
         return []
     far, others, limit = falling[: gaps[-1]], miss[falling[gaps[-1]]], limits[gaps[-1]]
-    places = _places({name: rays[name] for name in far})
+    rows = [(number, ray) for number, name in enumerate(far) for ray in rays[name]]
+    places, _ = intersect(
+        np.array([ray.center for _, ray in rows]),
+        np.array([ray.direction for _, ray in rows]),
+        np.array([number for number, _ in rows], dtype=np.intp),
+        np.full((len(far), 3), np.nan),
+    )
     return [
-        FarPoint(name, len(rays[name]), places[name], miss[name], others)
-        for name in far
-        if max(ray.missed_by_mm(places[name]) for ray in rays[name]) < limit
+        FarPoint(name, len(rays[name]), place, miss[name], others)
+        for name, place in zip(far, places, strict=True)
+        if max(ray.missed_by_mm(place) for ray in rays[name]) < limit
     ]
 
 
@@ -90,19 +96,18 @@ class _Ray:
 def _rays_of_given(problem: Problem, sights: Mapping[str, Sight]) -> dict[str, list[_Ray]]:
     """The rays of every point that is given in X, Y and Z and seen in some images."""
     unknowns, start = problem.unknowns, problem.start()
-    given = {id: unknowns.given[at] for id, at in unknowns.point.items() if np.isfinite(unknowns.sigma[at]).all()}
+    given = {id_: unknowns.given[at] for id_, at in unknowns.point.items() if np.isfinite(unknowns.sigma[at]).all()}
     rays = defaultdict(list)
     for image, rotation in zip(problem.network.images, start.rotations, strict=True):
-        if image.name not in sights:
+        sight = sights.get(image.name)
+        if sight is None:
             continue
-        sight, center = sights[image.name], start.values[unknowns.exterior[image.name][:3]]
-        rows = [row for row, name in enumerate(sight.points) if name in given]
-        xyz = np.array([given[sight.points[row]] for row in rows]).reshape(-1, 3)
-        pose = Pose(rotation, center)
-        distances = image_distances(pose, xyz, sight.xy_mm[rows], sight.principal_distance_mm)
-        for row, distance in zip(rows, distances, strict=True):
-            ray = _Ray(center, sight.rays[row] @ rotation, sight.principal_distance_mm, float(distance))
-            rays[sight.points[row]].append(ray)
+        center, c = start.values[unknowns.exterior[image.name][:3]], sight.principal_distance_mm
+        known = [row for row, name in enumerate(sight.points) if name in given]
+        xyz = np.array([given[sight.points[row]] for row in known]).reshape(-1, 3)
+        distances = image_distances(Pose(rotation, center), xyz, sight.xy_mm[known], c)
+        for row, distance in zip(known, distances, strict=True):
+            rays[sight.points[row]].append(_Ray(center, sight.rays[row] @ rotation, c, float(distance)))
     return {name: own for name, own in sorted(rays.items()) if len(own) >= FEWEST_IMAGES}
 
 
@@ -110,24 +115,11 @@ def _sights(problem: Problem) -> dict[str, Sight]:
     """By image name, of those that show object points: freed of the distortion as far as it is known beforehand."""
     network, unknowns = problem.network, problem.unknowns
     transformation = {name: unknowns.start[at] for name, at in unknowns.transformation.items()}
-    frames = camera_frames(network, transformation, problem.mirrored)
-    sights = {}
+    frames, sights = camera_frames(network, transformation, problem.mirrored), dict[str, Sight]()
     for name, at in unknowns.camera.items():
         interior, known = np.split(unknowns.start[at], [3])
-        sights.update(frames.sights(name, Lens(network.camera_by_name[name].distortion, interior, known)))
+        sights |= frames.sights(name, Lens(network.camera_by_name[name].distortion, interior, known))
     return sights
-
-
-def _places(rays: Mapping[str, list[_Ray]]) -> dict[str, Array]:
-    """Where the rays of each point meet (3,), nan where they do not."""
-    rows = [(number, ray) for number, own in enumerate(rays.values()) for ray in own]
-    points, _ = intersect(
-        np.array([ray.center for _, ray in rows]),
-        np.array([ray.direction for _, ray in rows]),
-        np.array([number for number, _ in rows], dtype=np.intp),
-        np.full((len(rays), 3), np.nan),
-    )
-    return dict(zip(rays, points, strict=True))
 
 
 @dataclass(frozen=True)
@@ -163,12 +155,12 @@ class Slip:
 def free_points(network: Network, start: Approximations, far: Sequence[FarPoint]) -> tuple[Network, Approximations]:
     """The network with nothing known of the far points' coordinates, and its start with them where their rays meet."""
     places = {each.name: each.place for each in far}
-    points = tuple(_unknown(point) if point.id in places else point for point in network.points)
+
+    def freed(point: ObjectPoint) -> ObjectPoint:
+        return ObjectPoint(point.id, *(Prior(each.value, np.inf) for each in (point.X, point.Y, point.Z) if each))
+
+    points = tuple(freed(point) if point.id in places else point for point in network.points)
     return replace(network, points=points), replace(start, points={**start.points, **places})
-
-
-def _unknown(point: ObjectPoint) -> ObjectPoint:
-    return ObjectPoint(point.id, *(Prior(each.value, np.inf) for each in (point.X, point.Y, point.Z) if each))
 
 
 def coordinate_slips(network: Network, far: Sequence[FarPoint], without: Adjustment, options: Options) -> list[Slip]:
@@ -180,18 +172,21 @@ def coordinate_slips(network: Network, far: Sequence[FarPoint], without: Adjustm
     """
     if not without.converged:
         return []
-    given = network.known_places
-    critical = float(options.probabilities.critical(np.array([3]), len(given))[0]) * max(without.sigma0, 1.0) ** 2
+    given, scale = network.known_places, max(without.sigma0, 1.0)
+    critical = float(options.probabilities.critical(np.array([3]), len(given))[0]) * scale**2
     found = []
     for each in far:
-        coordinates = [Parameter.point(each.name, axis) for axis in "XYZ"]
+        coordinates, point = [Parameter.point(each.name, axis) for axis in "XYZ"], network.point_by_id[each.name]
         place, cofactor = without.values_of(coordinates), without.cofactor_of(coordinates)
-        covariance = cofactor + _given_covariance(network.point_by_id[each.name])
-        test = _Test(place, np.asarray(np.linalg.inv(covariance), dtype=np.float64), critical)
-        if not test.passes(given[each.name]):
-            off = given[each.name] - place
-            sigma = max(without.sigma0, 1.0) * float(np.sqrt(np.diag(cofactor).max()))
-            found.append(Slip(each, place, sigma, off, _explanation(each.name, given, test)))
+        variances = [prior.sigma**2 for prior in (point.X, point.Y, point.Z) if prior]
+        weight: Array = np.asarray(np.linalg.inv(cofactor + np.diag(variances)), dtype=np.float64)
+
+        def passes(xyz: Array, place: Array = place, weight: Array = weight) -> bool:
+            return bool((xyz - place) @ weight @ (xyz - place) <= critical)
+
+        if not passes(given[each.name]):
+            sigma = scale * float(np.sqrt(np.diag(cofactor).max()))
+            found.append(Slip(each, place, sigma, given[each.name] - place, _explanation(each.name, given, passes)))
     return found
 
 
@@ -206,35 +201,14 @@ def few_points(network: Network) -> list[str]:
     ]
 
 
-def _given_covariance(point: ObjectPoint) -> Array:
-    return np.diag([each.sigma**2 for each in (point.X, point.Y, point.Z) if each])
-
-
-@dataclass(frozen=True)
-class _Test:
-    """Whether coordinates (3,) can be those of an adjusted place."""
-
-    place: Array
-    weight: Array
-    critical: float
-
-    def passes(self, xyz: Array) -> bool:
-        return bool((xyz - self.place) @ self.weight @ (xyz - self.place) <= self.critical)
-
-
-def _explanation(name: str, given: Mapping[str, Array], test: _Test) -> str:
+def _explanation(name: str, given: Mapping[str, Array], passes: Callable[[Array], bool]) -> str:
     """The slip of the pen after which the coordinates would be the given ones, where there is one such."""
     own = given[name]
-    causes = []
-    for i, j in combinations(range(3), 2):
-        other = own.copy()
-        other[[i, j]] = own[[j, i]]
-        if test.passes(other):
-            causes.append(f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")
-    for i in range(3):
-        other = own.copy()
-        other[i] = -own[i]
-        if test.passes(other):
-            causes.append(f"The sign of {'XYZ'[i]} looks wrong.")
-    causes += [f"It lies where point {id} is given." for id, xyz in given.items() if id != name and test.passes(xyz)]
+    readings = [
+        (own[[j if k == i else i if k == j else k for k in range(3)]], f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")
+        for i, j in combinations(range(3), 2)
+    ]
+    readings += [(own * (1.0 - 2.0 * np.eye(3)[i]), f"The sign of {'XYZ'[i]} looks wrong.") for i in range(3)]
+    readings += [(xyz, f"It lies where point {id_} is given.") for id_, xyz in given.items() if id_ != name]
+    causes = [cause for xyz, cause in readings if passes(xyz)]
     return causes[0] if len(causes) == 1 else ""

@@ -37,7 +37,12 @@ def two_groups(run: Run, camera: str) -> ImageGroups | None:
     along = np.vstack([np.eye(3), interior / np.linalg.norm(interior)])
     single = (right @ along.T) / np.maximum(np.einsum("di,mij,dj->md", along, normal, along), 1e-300)
     starts = [_threshold(normal, right, shift) for shift in np.hstack([_solved(normal, right), single]).T]
-    mask = max((_two_means(normal, right, start) for start in starts), key=lambda each: _gain(normal, right, each))
+
+    def gain(mask: Mask) -> float:
+        """By how much v'Pv falls with shifts of two groups."""
+        return float(sum(_quadratic(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)))
+
+    mask = max((_two_means(normal, right, start) for start in starts), key=gain)
     smaller = mask if 2 * mask.sum() <= len(names) else ~mask
     images = tuple(name for name, is_in in zip(names, smaller, strict=True) if is_in)
     choices = (len(names) - 1) * float(np.log(2.0)) + float(np.log(DIRECTIONS))
@@ -83,28 +88,20 @@ def _threshold(normal: Array, right: Array, shift: Array) -> Mask:
     order = np.argsort(shift, kind="stable")
     below = np.cumsum(normal[order], axis=0)[:-1], np.cumsum(right[order], axis=0)[:-1]
     above = normal.sum(axis=0) - below[0], right.sum(axis=0) - below[1]
-    best = int(np.argmax(_quadratic(*below) + _quadratic(*above)))
     mask = np.ones(len(order), dtype=bool)
-    mask[order[: best + 1]] = False
+    mask[order[: np.argmax(_quadratic(*below) + _quadratic(*above)) + 1]] = False
     return mask
 
 
 def _two_means(normal: Array, right: Array, mask: Mask) -> Mask:
     for _ in range(MOST_TURNS):
-        gains = []
-        for members in (mask, ~mask):
-            shift = _solved(normal[members].sum(axis=0), right[members].sum(axis=0))
-            gains.append(right @ shift - 0.5 * ((normal @ shift) @ shift))
-        moved = gains[0] > gains[1]
+        shifts = [_solved(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)]
+        own, other = (right @ shift - 0.5 * ((normal @ shift) @ shift) for shift in shifts)
+        moved = own > other
         if (moved == mask).all() or moved.all() or not moved.any():
             return mask
         mask = moved
     return mask
-
-
-def _gain(normal: Array, right: Array, mask: Mask) -> float:
-    """By how much v'Pv falls with shifts of two groups."""
-    return float(sum(_quadratic(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)))
 
 
 def _quadratic(normal: Array, right: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.lens import Decentering, Distortion, Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.network import Approximations, Image, Network, ObjectPoint, Transformation
-from adjust.problem.observations import Observations
+from adjust.problem.observations import ObservationKind, Observations
 
 Array = NDArray[np.float64]
 
@@ -154,7 +155,7 @@ def simulated(
     return Network((camera,), images, object_points, observations), start_of(truth, kind, points)
 
 
-def row_of(network: Network, kind: str, image: str, point: str) -> int:
+def row_of(network: Network, kind: ObservationKind, image: str, point: str) -> int:
     """Where an observation stands."""
     rows = network.observations
     return list(zip(rows.kind, rows.image, rows.point, strict=True)).index((kind, image, point))
@@ -182,21 +183,24 @@ def digital_network(
 ) -> Network:
     """Known points in images of a digital camera; rows: image, point and comparator coordinates of its marks."""
     images, points, xy_mm = zip(*rows, strict=True)
+    kinds: tuple[ObservationKind, ...] = tuple("target" for _ in rows)
     return Network(
         (camera,),
         tuple(Image(name, camera.name, "none") for name in dict.fromkeys(images)),
         tuple(ObjectPoint(id_, *(Prior(float(value)) for value in place)) for id_, place in xyz.items()),
-        Observations(
-            images, points, ("target",) * len(rows), np.array(xy_mm), np.tile(sigma**2 * np.eye(2), (len(rows), 1, 1))
-        ),
+        Observations(images, points, kinds, np.array(xy_mm), np.tile(sigma**2 * np.eye(2), (len(rows), 1, 1))),
     )
 
 
 def joined(*parts: Observations) -> Observations:
     """Observations behind one another."""
-    texts = (sum((getattr(each, name) for each in parts), ()) for name in ("image", "point", "kind"))
-    arrays = (np.concatenate([getattr(each, name) for each in parts]) for name in ("xy_mm", "covariance_mm2"))
-    return Observations(*texts, *arrays)
+    return Observations(
+        tuple(chain.from_iterable(each.image for each in parts)),
+        tuple(chain.from_iterable(each.point for each in parts)),
+        tuple(chain.from_iterable(each.kind for each in parts)),
+        np.concatenate([each.xy_mm for each in parts]),
+        np.concatenate([each.covariance_mm2 for each in parts]),
+    )
 
 
 def start_of(truth: Truth, kind: Transformation, points: Array) -> Approximations:
