@@ -18,8 +18,7 @@ from adjust.functional_model.transformation import Film
 from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Camera
 from adjust.problem.images import adjusted_image
-from adjust.problem.network import Approximations, Image, Network
-from adjust.problem.observations import Observations
+from adjust.problem.network import Approximations, Network
 from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
