@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.detection.localisation import highest_peak
 from measure.fiducials.frame import Frame
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
 from measure.matching.match import mark_window
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
-
-Array = NDArray[np.float64]
 
 _MARGIN_PX = 4.0  # of ground about a mark, from which its offset and slopes are told
 _BLUR_PX = 0.8  # of a mark's picture: what a match begins with

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.measure_frame import measure_frame
@@ -15,8 +15,6 @@ from measure.geometry import POSES, linear_scale, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
-
-Array = NDArray[np.float64]
 
 LEAST_CLICKS = 3  # two do not tell a mirrored frame from one that is not
 _TOLD = ("the marks that were pointed at say so.",)

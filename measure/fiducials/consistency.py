@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtrc, logsumexp
 
+from measure.array_types import Array
 from measure.fiducials.film_model import film_terms, interleaved
 from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_DEGREES, SCATTER_MM
 from measure.flags import FALSE_DOUBT
-
-Array = NDArray[np.float64]
 
 NAMED = float(np.log(100.0))  # log-odds from which one cause rather than another is taken for what is off
 _SUSPECT = -float(np.log(10.0))  # log-odds from which a mark may be the wrong one

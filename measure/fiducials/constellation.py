@@ -5,18 +5,16 @@ Places are complex numbers here, x + iy in mm of the scan's own axes (right, up)
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from measure.array_types import Array
 from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.responses import LEAST_TOLERANCE_PX, ResponseMap, Responses, narrow_tolerance_px
 from measure.geometry import linear_scale, up_from_camera
 from measure.marks.shapes import LayoutMark, Mark
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 NARROW = 0.25  # of the tolerance: marks on film that is hardly deformed agree as well
@@ -24,9 +22,6 @@ _LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
 _PAIRS = 60  # of marks that hypotheses are made from
 _FAR = 0.4  # of the largest distance of two marks: nearer ones tell turn and scale badly
 _KEPT = 12  # placements of a pose that are refined
-_STEPPED = 3  # of them, in a lattice, that are moved by its steps
-_NEIGHBOURS = 4  # of a mark of a lattice
-_ALIKE = 0.5  # of the marks that a step takes to others: they are a lattice
 _SAME_PX = 10  # of the reduced scan: placements no farther apart put a mark on itself, which is some 14 px large there
 _SAME_SIZE = 0.01  # the same at the frame's edge, a thousand of these pixels off the middle
 _SAME = 0.1  # of the tolerance: orientations whose marks lie so near to one another's have the same placements
@@ -187,18 +182,6 @@ class PlacementSearch:
         sign = mark_sign(self.marks[index].mark, placement.polarity)
         return self.responses.by_key[self.kinds[placement.pose][index], sign]
 
-    @cached_property
-    def steps_mm(self) -> Array:
-        """(n, 2) the steps from the middle mark to the nearest ones that take most marks to others."""
-        places = self.camera_mm
-        tree = cKDTree(places)
-        order = np.argsort(np.hypot(*(places - places.mean(axis=0)).T), kind="stable")
-        middle = places[order[0]]
-        _, near = tree.query(middle, k=min(len(places), _NEIGHBOURS + 1))
-        steps = places[np.ravel(near)[1:]] - middle
-        onto = [np.mean(tree.query(places + step)[0] < self.bounds.misfit_mm) for step in steps]
-        return np.asarray(steps[np.array(onto) > _ALIKE])
-
     def find_placements(self, pose: str, kinds: Sequence[int]) -> list[Placement]:
         """The best placements of an orientation that differ from one another, best first; none where no two marks
         respond. kinds: of each mark's template in this orientation."""
@@ -227,9 +210,7 @@ class _Constellation:
             return []
         scores, _ = self._scores(self.search.tolerance_px, scale, offset)
         kept = np.argsort(-scores, kind="stable")[:_KEPT]
-        stepped = self._step_along_lattice(scale[kept[:_STEPPED]], offset[kept[:_STEPPED]])
-        starts = (np.concatenate(each) for each in zip((scale[kept], offset[kept]), stepped, strict=True))
-        scale, offset = self._refined(*starts)
+        scale, offset = self._refined(scale[kept], offset[kept])
         scores, supported = self._scores(narrow_tolerance_px(self.search.tolerance_px), scale, offset)
         return [
             Placement(
@@ -246,21 +227,6 @@ class _Constellation:
                 scale.tolist(), offset.tolist(), scores.tolist(), supported.tolist(), strict=True
             )
         ]
-
-    def _step_along_lattice(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
-        """Of a lattice too large for all its marks to be candidates the best hypothesis may be many steps off: these,
-        moved step by step as long as more marks answer. None where the marks are no lattice."""
-        turned = self.search.steps_mm @ up_from_camera(self.pose).T
-        steps = np.concatenate([[0.0], turned @ [1.0, 1.0j]])
-        moving = len(steps) > 1
-        while moving:
-            tried = offset[:, None] + scale[:, None] * steps
-            scores = self._scores(self.search.tolerance_px, np.repeat(scale, len(steps)), tried.ravel())[0]
-            scores = scores.reshape(tried.shape)
-            best = scores.argmax(axis=1)
-            moving = bool(best.any())
-            offset = tried[np.arange(len(best)), best]
-        return (scale, offset) if len(steps) > 1 else (scale[:0], offset[:0])
 
     def _complex(self, scan_px: Array) -> Complex:
         scaled = scan_px * self.pitch

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.detection.faint_marks import FaintMark, detect_faint
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.frame import Frame
@@ -15,8 +15,6 @@ from measure.marks.rendering import extent_px
 from measure.marks.shapes import FrameCorner, Mark
 from measure.results import MarkFit
 from measure.scans.scan import Scan
-
-Array = NDArray[np.float64]
 
 _FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
 _FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured

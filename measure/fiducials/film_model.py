@@ -1,9 +1,8 @@
 """Film deformation models: what each adds to an affine transformation, as columns of linear equations."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from measure.array_types import Array
 
 
 def interleaved(*columns: tuple[Array, Array]) -> Array:

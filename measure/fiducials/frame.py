@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from measure.array_types import Array, Mask
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.fiducials.constellation import NARROW, Placement, mark_sign
@@ -21,9 +21,6 @@ from measure.results import MarkFit
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR
 from measure.tone.estimate import FrameTone
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MANY = 6  # marks that agree and tell where a faint one must be
 CLEAR_LIKENESS = 0.5  # below it a mark's picture has more in it that is not the mark

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from measure.fiducials.options import AFFINITY_SIGMA
@@ -12,8 +11,6 @@ from measure.flags import RIGHT_PITCH_REFUSED, Code, Reason, Status
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.scan import Scan
-
-Array = NDArray[np.float64]
 
 _LEAST_MARKS = 3  # with two, a false one makes a pitch of its own
 _REACH_PX = 20.0  # about a mark whose size is not told: that of a disk or crossing of a field, with its ground

@@ -4,12 +4,10 @@ what the film model of the project adds."""
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.fiducials.film_model import film_terms
 from measure.fiducials.options import AFFINITY_SIGMA
-
-Array = NDArray[np.float64]
 
 _LINEAR = [0, 1, 4, 5]  # of the unknowns: all but the shift
 _FREE = 0.03  # standard deviation of stretch, shear and film terms that are free, as shares of the frame's radius

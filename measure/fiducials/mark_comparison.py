@@ -11,14 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from measure.array_types import Array
 from measure.flags import MARK_UNLIKE_THE_OTHERS
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.results import MarkFit
 
-Array = NDArray[np.float64]
 # The standard deviation of a figure from mark to mark, by the variance that so many marks show exceedance their own.
 _Spread = Callable[[float, int], float]
 

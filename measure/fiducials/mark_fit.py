@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.detection.localisation import MarkPrediction, localise
 from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.marks.rendering import extent_px
@@ -17,8 +17,6 @@ from measure.results import MarkFit
 from measure.scans.compression import covariance_of_compression, tone_variance
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR
-
-Array = NDArray[np.float64]
 
 _DRIFT_PX = 2.0  # of a fit, from the pixel where it begins: what goes farther has found something else, dust say
 _MOST_CONTRAST = (
@@ -125,20 +123,7 @@ def _localise_and_fit(
     if peak is None:
         return None, 1.0
     center_px, false_alarms = peak
-    fit = _fit_from(scan, expected, center_px, options, frame_sigma)
-    # Along its edges a slim wedge looks like itself: a fit that runs away along them begins anew from where it came to.
-    if is_held_by_frame(mark) and _ran_away(fit, center_px, options) and _is_near(fit, expected):
-        fit = _fit_from(scan, expected, fit.center_px, options, frame_sigma)
-    return fit, false_alarms
-
-
-def _ran_away(fit: MarkFit, start_px: Array, options: MatchOptions) -> bool:
-    return not fit.converged and bool(np.hypot(*(fit.center_px - start_px)) > options.max_shift_px)
-
-
-def _is_near(fit: MarkFit, expected: MarkPrediction) -> bool:
-    """Whether it is still where the mark may be."""
-    return bool(np.hypot(*(fit.center_px - expected.center_px)) <= expected.search_px)
+    return _fit_from(scan, expected, center_px, options, frame_sigma), false_alarms
 
 
 def _fit_from(

@@ -82,17 +82,8 @@ def _detect(frame: Frame, indices: Iterable[int], search_px: float) -> Frame:
     """Detect marks anew, within search_px of where they are predicted now."""
     # From below upwards: the search of windows ended there, and what it read last is still decoded.
     upwards = sorted(indices, key=lambda index: -frame.predicted_px[index, 1])
-    detections = map_in_threads(lambda index: _detect_near(frame, index, search_px), upwards)
+    detections = map_in_threads(lambda index: _detection(frame, frame.prediction(index, search_px)), upwards)
     return frame.replace_detections(dict(zip(upwards, detections, strict=True)))
-
-
-def _detect_near(frame: Frame, index: int, search_px: float) -> Detection:
-    """At a closer look what is not found is searched nearer by, too: noise feigns fewer marks there."""
-    detection = _detection(frame, frame.prediction(index, search_px))
-    if detection.fit is None and frame.placement.surroundings.robust and frame.near_px < search_px:
-        near = _detection(frame, frame.prediction(index, frame.near_px))
-        return near if near.fit is not None else detection
-    return detection
 
 
 def _detection(frame: Frame, expected: MarkPrediction) -> Detection:

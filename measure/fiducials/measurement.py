@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.annotations.detect_text import networks
 from measure.annotations.fields import KnownLine, Line
 from measure.annotations.read import read_writing
+from measure.array_types import Array
 from measure.fiducials.clicked_frame import clicked_frame, contradicted_pose, is_shown, place_clicked_marks
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
@@ -27,8 +27,6 @@ from measure.results import FrameMeasurement, Pose
 from measure.scans.opening import crop_scan
 from measure.scans.remote import Window
 from measure.scans.scan import Scan
-
-Array = NDArray[np.float64]
 
 _SET = ("set in the project.",)
 _UNSURE = Reason("none of the marks is measured without blemish: the frame may lie elsewhere.", Code.CHANCE)

@@ -7,9 +7,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from measure.array_types import Array, Mask
 from measure.detection.mark_views import detail_px
 from measure.geometry import linear_scale, turn_by_quarters
 from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
@@ -17,9 +17,6 @@ from measure.marks.shapes import Mark, MarkTemplate
 from measure.noise.robust_estimation import TukeyFit, robust_scale, tukey_fit
 from measure.results import MarkFit
 from measure.scans.scan import Scan, means
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _ALIKE = 0.05  # of the contrast: pictures that differ nowhere by more are one
 _FINEST_PX = 3.0  # of the finest line on the grid

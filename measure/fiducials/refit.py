@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.fiducials.frame import CLEAR_LIKENESS, WRONG_PX, Frame, orient_frame
 from measure.fiducials.mark_comparison import (
     SharedBlur,
@@ -30,8 +30,6 @@ from measure.results import MarkFit
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import FrameTone, MarkTone
-
-Array = NDArray[np.float64]
 
 _NEAR_MM = 3.0  # from the frame's edge: a mark nearer has it beside itself, in what is read of the scan anyway
 _BESIDE_MM, _LONGEST_MM = 0.5, 6.0  # from a mark, to where an edge begins and ends

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.annotations.fields import Line
 from measure.annotations.orientation_from_text import line_score, main_pose, writing_likelihoods
+from measure.array_types import Array
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame, first_search_px
 from measure.fiducials.interior_orientation import FrameFit, fit_frame
@@ -24,8 +24,6 @@ from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMar
 from measure.results import MarkFit, Pose
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan
-
-Array = NDArray[np.float64]
 
 DECIDED = 7.0  # log-odds: a thousand to one
 TOLD = 1.0  # log-odds: less than e to one is no evidence worth a sentence

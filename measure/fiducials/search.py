@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import comb
 
+from measure.array_types import Array
 from measure.detection.correlation import WIDE, Map, Surroundings
 from measure.detection.mark_views import MarkView
 from measure.detection.responses import (
@@ -26,7 +26,6 @@ from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 _PITCH_STRETCHES = (-0.015, 0.015, -0.03, 0.03)  # an office scanner's carriage may run by per cents too fast

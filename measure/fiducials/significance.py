@@ -8,16 +8,14 @@ the marks found says what these are worth.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import bdtrc
 
+from measure.array_types import Array
 from measure.detection.localisation import highest_peak
 from measure.fiducials.frame import CLEAR_LIKENESS, Frame, first_search_px
 from measure.fiducials.search import FrameSearch
 from measure.flags import FRAME_BY_CHANCE, NO_FRAME, NO_REASON, Code, Reason
 from measure.scans.scan import Scan
-
-Array = NDArray[np.float64]
 
 _SELDOM, _HOPELESS = 1e-3, 1e6  # expected frames: fewer are no question, and of more nothing becomes a frame
 _COUNTED = 3  # marks that at least are no chance

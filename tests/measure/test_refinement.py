@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from brute_marks import brute_picture
-from drawn import scan_of
 
-from measure.detection.localisation import MarkPrediction
-from measure.fiducials.mark_fit import detect_mark, options_for, strain_error_px
+from measure.fiducials.mark_fit import options_for, strain_error_px
 from measure.marks.shapes import MarkShape, cross, polygon
 from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
@@ -27,27 +25,6 @@ def test_a_stretch_moves_what_lies_to_one_side_of_its_centre(mark: MarkShape) ->
     assert strain_error_px(mark, START[:, :2], true[:, :2], 0.0) == pytest.approx(np.hypot(*off), abs=0.025)
     assert (np.hypot(*off) > 0.05) == (mark is WING)
     assert strain_error_px(mark, 1.02 * true[:, :2], true[:, :2], 0.0) == pytest.approx(0.0, abs=1e-12)
-
-
-@pytest.mark.parametrize("along_px", [-10.0, 9.0])
-def test_a_slim_wedge_that_looks_like_itself_along_its_edges_is_followed_to_its_tip(
-    along_px: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first look is no more than where the fit begins; how far off the mark may lie the search radius says."""
-    true = np.array([[36.0, 0.0, 95.3], [0.0, -36.0, 89.6]])
-    slim = MarkShape(polygon(((0.0, 0.0), (2.2, 0.0), (2.2, 0.7))))
-    grey = 8000.0 + 20000.0 * brute_picture(slim, true, 201, 181, 1.2)
-    scan = scan_of(grey + np.random.default_rng(2).normal(0.0, 400.0, grey.shape))
-    first = true[:, 2] + (along_px, 0.0)
-    monkeypatch.setattr("measure.fiducials.mark_fit.localise", lambda *_: (first, 0.0))
-    expected = MarkPrediction(slim, true, 12.0, 1)
-    fit = detect_mark(scan, expected, MatchOptions()).fit
-    assert fit is not None
-    assert np.hypot(*(fit.center_px - true[:, 2])) < 0.3
-    far = replace(
-        expected, pixel_from_mark=np.column_stack([true[:, :2], true[:, 2] - (14.0 * np.sign(along_px), 0.0)])
-    )
-    assert detect_mark(scan, far, MatchOptions()).fit is None
 
 
 def test_the_flanks_of_a_drawing_that_is_true_in_part_lie_as_the_film_shows_them() -> None:

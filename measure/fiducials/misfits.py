@@ -1,0 +1,277 @@
+"""What explains the misfits of a camera's frames: a pattern that they share, their film and affinity, or wrong marks.
+
+Patterns are estimated from all frames, film and affinity from those that do not stand out, and each frame is tested by
+`frame_consistency` against what the others have.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import chdtrc, chdtri
+
+from measure.array_types import Array
+from measure.fiducials.consistency import (
+    LONE_AFFINITY,
+    Affinity,
+    FrameMarks,
+    Hypothesis,
+    Scatter,
+    frame_consistency,
+    frame_p_value,
+)
+from measure.fiducials.options import SCATTER_DEGREES
+from measure.flags import FALSE_DOUBT
+
+_UNKNOWN_MM = 1.0  # of a pattern of which nothing is known beforehand
+_LEAST_MM = 1e-6
+_FEWEST_ALIKE = 3  # frames: of two nobody knows which one is off
+_ROUNDS = 3  # of pattern, film and affinity in turn
+_AS_ODD = 0.5  # of the logarithm of the least p-value: frames that stand out as well are explained together
+_CLIPPED_AT = 0.25  # p-value of a frame beyond which its chi-square counts as this quantile
+_CLIPPED_EFFICIENCY = 0.6  # of a variance from these, against one from the mean of squares
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMisfit:
+    """A frame's marks, the sites (n,) of the pattern at which they lie, and what explains them. p_value: of one that
+    stands out; film_mm: of its film, None of an ordinary one; hypothesis: the best; off_mm: how far wrong marks lie
+    off, by their number; suspect_mm2 (n,): variances of marks that may be wrong."""
+
+    marks: FrameMarks
+    sites: NDArray[np.intp]
+    pose: str
+    p_value: float = 1.0
+    film_mm: float | None = None
+    hypothesis: Hypothesis = Hypothesis.SOUND
+    off_mm: Mapping[int, float] = field(default_factory=dict)
+    suspect_mm2: Array = field(default_factory=lambda: np.zeros(1))
+
+    @property
+    def places(self) -> NDArray[np.intp]:
+        """(2n,) of its marks' coordinates in the pattern."""
+        return np.asarray((2 * self.sites[:, None] + np.arange(2)).ravel())
+
+    @cached_property
+    def widened(self) -> FrameMarks:
+        """With the variances of marks that are wrong."""
+        off = np.zeros(len(self.sites))
+        off[list(self.off_mm)] = list(self.off_mm.values())
+        return self.marks.widen(off**2)
+
+
+Frames = Mapping[int, FrameMisfit]  # by their places among the camera's
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """How far off the given places marks lie in all frames alike, at m sites.
+
+    places_mm (m, 2), sigma_mm (m,): of the sites; free_mm: by how much more it may be; information (2m, 2m) and right
+    (2m,): of the normal equations by the frames, whose films scatter by given standard deviations.
+    """
+
+    places_mm: Array
+    sigma_mm: Array
+    free_mm: float
+    information: Array
+    right: Array
+
+    @classmethod
+    def from_frames(
+        cls, frames: Frames, films_mm: Mapping[int, float], places_mm: Array, sigma_mm: Array, free_mm: float
+    ) -> "Pattern":
+        information, right = np.zeros((2 * len(sigma_mm),) * 2), np.zeros(2 * len(sigma_mm))
+        for place, frame in frames.items():
+            weight = frame.widened.precision(films_mm[place])
+            information[np.ix_(frame.places, frame.places)] += weight
+            right[frame.places] += weight @ frame.marks.off_mm.ravel()
+        return cls(places_mm, sigma_mm, free_mm, information, right)
+
+    def expected_marks(self, frame: FrameMisfit, film_mm: float, is_pooled: bool = False) -> FrameMarks:
+        """The frame's marks beside the pattern that all others show. is_pooled: the pattern's own affinity, which no
+        frame shows, is counted to the mean affinity of the frames."""
+        weight, own = frame.widened.precision(film_mm), np.ix_(frame.places, frame.places)
+        information, right = self._posterior.copy(), self.right.copy()
+        information[own] -= weight
+        right[frame.places] -= weight @ frame.marks.off_mm.ravel()
+        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        if is_pooled:
+            covariance = self._beyond_affine @ covariance @ self._beyond_affine
+        return frame.widened.expecting((covariance @ right)[frame.places].reshape(-1, 2), covariance[own])
+
+    @cached_property
+    def mm(self) -> Array:
+        """(m, 2) its estimate."""
+        return np.asarray(np.linalg.solve(self._posterior, self.right)).reshape(-1, 2)
+
+    @property
+    def p_value(self) -> float:
+        """Of the pattern against nothing but its sites' standard deviations."""
+        spread = self.information + self.information @ np.diag(np.repeat(self.sigma_mm**2, 2)) @ self.information
+        chi_square = float(self.right @ np.linalg.pinv(spread, hermitian=True) @ self.right)
+        return float(chdtrc(max(int(np.linalg.matrix_rank(self.information, hermitian=True)), 1), chi_square))
+
+    @property
+    def log_density(self) -> float:
+        """Of all frames with it over that without any."""
+        shared = np.log(self._prior_information).sum() - np.linalg.slogdet(self._posterior)[1]
+        return float(shared + self.right @ self.mm.ravel()) / 2
+
+    @cached_property
+    def _beyond_affine(self) -> Array:
+        """(2m, 2m) projection on what no affine transformation makes of the sites."""
+        design = np.kron(np.column_stack([self.places_mm, np.ones(len(self.places_mm))]), np.eye(2))
+        return np.eye(len(design)) - design @ np.linalg.pinv(design)
+
+    @cached_property
+    def _prior_information(self) -> Array:
+        return np.repeat(1 / (self.sigma_mm**2 + self.free_mm**2 + _LEAST_MM**2), 2)
+
+    @cached_property
+    def _posterior(self) -> Array:
+        return self.information + np.diag(self._prior_information)
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Of all frames of a camera, with the pattern that they share. film_is_more: whether they scatter more than was
+    believed, beyond chance."""
+
+    frames: Frames
+    pattern: Pattern
+    film: Scatter
+    film_is_more: bool
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether nothing stands out."""
+        return not (self.film_is_more or any(each.film_mm or each.off_mm for each in self.frames.values()))
+
+    @property
+    def log_evidence(self) -> float:
+        """What stands out costs as much as it is rare."""
+        odd = sum((each.film_mm is not None) + len(each.off_mm) for each in self.frames.values())
+        alone = sum(each.widened.log_density(each.film_mm or self.film.sigma) for each in self.frames.values())
+        return alone + self.pattern.log_density + odd * float(np.log(FALSE_DOUBT))
+
+
+def explain_by_pattern(frames: Frames, places_mm: Array, sigma_mm: Array, believed_mm: float) -> Explanation:
+    """With a pattern beyond its sites' standard deviations, as large as it is: what is not believed beforehand speaks
+    against a hypothesis by how much room it takes."""
+    wide = explain(frames, places_mm, sigma_mm, _UNKNOWN_MM, believed_mm)
+    size_mm = float(np.sqrt(np.mean(wide.pattern.mm**2)))
+    return explain(frames, places_mm, sigma_mm, max(size_mm, believed_mm), believed_mm)
+
+
+def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, believed_mm: float) -> Explanation:
+    """Explain the frames that stand out, the worst first, each by one of its marks or by its film.
+
+    Parameters
+    ----------
+    places_mm, sigma_mm : (m, 2) and (m,), of the pattern's sites.
+    free_mm : by how much it may differ from that beforehand.
+    believed_mm : standard deviation of film, beforehand.
+    """
+    frames, sites = dict(frames), (places_mm, sigma_mm, free_mm)
+    film, is_more = Scatter(believed_mm, SCATTER_DEGREES), False
+    while True:
+        ordinary = [place for place, each in frames.items() if each.film_mm is None]
+        alike = Counter(frames[place].pose for place in ordinary)
+        films_mm = {place: each.film_mm or film.sigma for place, each in frames.items()}
+        for _ in range(_ROUNDS):  # film gives the weights of the pattern, and the pattern what is left for film
+            pattern = Pattern.from_frames(frames, films_mm, *sites)
+            expected = {
+                place: pattern.expected_marks(each, films_mm[place], alike[each.pose] >= _FEWEST_ALIKE)
+                for place, each in frames.items()
+            }
+            film, is_more = _film([expected[place] for place in ordinary], believed_mm)
+            films_mm |= {place: _own_film_mm(expected[place], film) for place in ordinary}
+        affinities = _affinities({place: (expected[place], frames[place].pose) for place in ordinary}, film.sigma)
+        tests = {place: (expected[place], film, affinities[place]) for place in ordinary}
+        p_values = {place: frame_p_value(*test) for place, test in tests.items()}
+        least = min(p_values.values(), default=1.0)
+        if least * len(frames) >= FALSE_DOUBT:
+            films_mm = {place: each.film_mm or film.sigma for place, each in frames.items()}
+            return Explanation(frames, Pattern.from_frames(frames, films_mm, *sites), film, is_more)
+        limit = min(FALSE_DOUBT / len(frames), max(least, 1e-300) ** _AS_ODD)
+        for place, p_value in p_values.items():
+            if p_value < limit or p_value == least:
+                frames[place] = _explain_alone(replace(frames[place], p_value=p_value), *tests[place])
+
+
+def _explain_alone(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinity: Affinity) -> FrameMisfit:
+    """Explain a frame that stands out by a mark, or else by its film, its pitch or a perspective. Marks that may be the
+    wrong one are known no better than they would then lie off."""
+    found = frame_consistency(marks, film, affinity)
+    off_mm, mark = np.hypot(*found.off_mm.T), found.wrong_mark
+    if mark is not None and mark not in frame.off_mm:
+        return replace(frame, off_mm={**frame.off_mm, mark: float(off_mm[mark])})
+    hypothesis = found.best_hypothesis
+    if hypothesis is Hypothesis.PITCH:
+        return replace(frame, film_mm=film.sigma, hypothesis=hypothesis)
+    film_mm = float(np.sqrt(film.sigma**2 + marks.film_variance_mm2()))
+    suspect = np.where(found.suspects, off_mm**2 / 2, 0.0)
+    return replace(frame, film_mm=film_mm, hypothesis=hypothesis, suspect_mm2=suspect)
+
+
+def _own_film_mm(marks: FrameMarks, film: Scatter) -> float:
+    """A frame's film where films scatter as Student's t: a frame that stands out has little weight in the pattern."""
+    known = SCATTER_DEGREES * film.sigma**2 + marks.redundancy * marks.film_variance_mm2()
+    return float(np.sqrt(known / (SCATTER_DEGREES + marks.redundancy)))
+
+
+def _film(frames: Sequence[FrameMarks], believed_mm: float) -> tuple[Scatter, bool]:
+    """From frames that do not stand out, beside what is believed; and whether it is more than that."""
+    frames = [each for each in frames if each.redundancy]
+    if len(frames) < 2:
+        return Scatter(believed_mm, SCATTER_DEGREES), False
+    degrees = np.array([each.redundancy for each in frames], dtype=float)
+    shown = _clipped_variance(lambda variance: np.array([each.chi_square(variance**0.5) for each in frames]), degrees)
+    known = _CLIPPED_EFFICIENCY * float(degrees.sum())
+    variance = (SCATTER_DEGREES * believed_mm**2 + known * shown) / (SCATTER_DEGREES + known)
+    is_more = bool(chdtrc(known, known * shown / believed_mm**2) < FALSE_DOUBT)
+    return Scatter(float(np.sqrt(variance)), SCATTER_DEGREES + known), is_more
+
+
+def _affinities(frames: Mapping[int, tuple[FrameMarks, str]], film_mm: float) -> dict[int, Affinity]:
+    """Of each frame, with its pose, what the others show that lie alike, about their median."""
+    result = dict.fromkeys(frames, LONE_AFFINITY)
+    for pose in {pose for _, pose in frames.values()}:
+        alike = [place for place, (_, own) in frames.items() if own == pose]
+        if len(alike) < _FEWEST_ALIKE:
+            continue
+        fitted, covariances = map(np.array, zip(*(frames[p][0].affinity(film_mm) for p in alike), strict=True))
+        apart, size = fitted - np.median(fitted, axis=0), fitted.shape[1]
+
+        def chi_squares(variance: float, apart: Array = apart, covariances: Array = covariances) -> Array:
+            spread = covariances + max(variance, 1e-18) * np.eye(apart.shape[1])
+            return np.asarray(np.einsum("fi,fi->f", apart, np.linalg.solve(spread, apart[..., None])[..., 0]))
+
+        variance = _clipped_variance(chi_squares, np.full(len(alike), float(size)))
+        others = len(alike) - 1
+        of_median = np.pi / 2 / others * (variance + float(np.trace(covariances.mean(axis=0))) / size)
+        scatter = Scatter(float(np.sqrt(variance + of_median)), _CLIPPED_EFFICIENCY * size * others)
+        for number, place in enumerate(alike):
+            result[place] = Affinity(np.median(np.delete(fitted, number, axis=0), axis=0), scatter)
+    return result
+
+
+def _clipped_variance(chi_squares: Callable[[float], Array], degrees: Array) -> float:
+    """The variance with which clipped chi-squares (n,) have their expected mean: what stands out moves it little."""
+    limit = chdtri(degrees, _CLIPPED_AT)
+    expected = degrees * (1 - chdtrc(degrees + 2, limit)) + _CLIPPED_AT * limit
+
+    def excess(variance: float) -> float:
+        return float((np.minimum(chi_squares(variance), limit) - expected).sum())
+
+    if excess(0.0) <= 0:
+        return 0.0
+    most = _UNKNOWN_MM**2
+    while excess(most) > 0:
+        most *= 10
+    return float(brentq(excess, 0.0, most))
