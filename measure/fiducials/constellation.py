@@ -5,9 +5,11 @@ Places are complex numbers here, x + iy in mm of the scan's own axes (right, up)
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from measure.array_types import Array
 from measure.detection.correlation import WIDE, Surroundings
@@ -22,6 +24,9 @@ _LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
 _PAIRS = 60  # of marks that hypotheses are made from
 _FAR = 0.4  # of the largest distance of two marks: nearer ones tell turn and scale badly
 _KEPT = 12  # placements of a pose that are refined
+_STEPPED = 3  # of them, in a lattice, that are moved by its steps
+_NEIGHBOURS = 4  # of a mark of a lattice
+_ALIKE = 0.5  # of the marks that a step takes to others: they are a lattice
 _SAME_PX = 10  # of the reduced scan: placements no farther apart put a mark on itself, which is some 14 px large there
 _SAME_SIZE = 0.01  # the same at the frame's edge, a thousand of these pixels off the middle
 _SAME = 0.1  # of the tolerance: orientations whose marks lie so near to one another's have the same placements
@@ -182,6 +187,16 @@ class PlacementSearch:
         sign = mark_sign(self.marks[index].mark, placement.polarity)
         return self.responses.by_key[self.kinds[placement.pose][index], sign]
 
+    @cached_property
+    def steps_mm(self) -> Array:
+        """(n, 2) the steps from the middle mark to the nearest ones that take most marks to others."""
+        tree, middle = cKDTree(self.camera_mm), self.camera_mm.mean(axis=0)
+        origin = self.camera_mm[np.hypot(*(self.camera_mm - middle).T).argmin()]
+        near = np.ravel(tree.query(origin, k=min(len(self.camera_mm), _NEIGHBOURS + 1))[1])[1:]
+        steps = self.camera_mm[near] - origin
+        onto = [np.mean(tree.query(self.camera_mm + step)[0] < self.bounds.misfit_mm) for step in steps]
+        return np.asarray(steps[np.array(onto) > _ALIKE])
+
     def find_placements(self, pose: str, kinds: Sequence[int]) -> list[Placement]:
         """The best placements of an orientation that differ from one another, best first; none where no two marks
         respond. kinds: of each mark's template in this orientation."""
@@ -210,7 +225,8 @@ class _Constellation:
             return []
         scores, _ = self._scores(self.search.tolerance_px, scale, offset)
         kept = np.argsort(-scores, kind="stable")[:_KEPT]
-        scale, offset = self._refined(scale[kept], offset[kept])
+        stepped = self._step_along_lattice(scale[kept[:_STEPPED]], offset[kept[:_STEPPED]])
+        scale, offset = self._refined(np.append(scale[kept], stepped[0]), np.append(offset[kept], stepped[1]))
         scores, supported = self._scores(narrow_tolerance_px(self.search.tolerance_px), scale, offset)
         return [
             Placement(
@@ -227,6 +243,19 @@ class _Constellation:
                 scale.tolist(), offset.tolist(), scores.tolist(), supported.tolist(), strict=True
             )
         ]
+
+    def _step_along_lattice(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
+        """The best hypotheses of a lattice, moved step by step as long as more marks answer: where it has too many for
+        all to be candidates these may be many steps off. None where the marks are no lattice."""
+        turned = self.search.steps_mm @ up_from_camera(self.pose).T
+        steps = np.append(0.0, turned @ [1.0, 1.0j])
+        best = np.full(len(scale) if len(steps) > 1 else 0, -1)
+        while best.any():
+            tried = offset[:, None] + scale[:, None] * steps
+            scores = self._scores(self.search.tolerance_px, np.repeat(scale, len(steps)), tried.ravel())[0]
+            best = scores.reshape(tried.shape).argmax(axis=1)
+            offset = tried[np.arange(len(best)), best]
+        return scale[: len(best)], offset[: len(best)]
 
     def _complex(self, scan_px: Array) -> Complex:
         scaled = scan_px * self.pitch

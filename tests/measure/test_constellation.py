@@ -60,6 +60,20 @@ def test_missing_marks_do_not_hinder() -> None:
     assert np.abs(predicted(found[0]) - true).max() < 2.0
 
 
+def test_a_lattice_of_more_marks_than_candidates_is_not_a_step_off() -> None:
+    """The hundred strongest answers, all in one corner, tell how it lies and not where it begins."""
+    steps = 9.0 * (np.arange(23) - 11)
+    lattice = [LayoutMark(f"{x}, {y}", (float(x), float(y)), (0.01, 0.01), DOT) for x in steps for y in steps]
+    camera = np.array([mark.xy_mm for mark in lattice])
+    true = camera @ np.array([[1.01, 0.02], [0.02, -1.01]]) / PITCH_MM + (268.0, 257.0)
+    heights = np.interp(camera.min(axis=1), [-99.0, 99.0], [0.4, 0.7])
+    answers = responses(true, heights)
+    search = PlacementSearch(lattice, answers, (PITCH_MM, PITCH_MM), BOUNDS)
+    best = search.find_placements("0", [0] * len(lattice))[0]
+    found = camera @ best.pixel_from_camera[:, :2].T + best.pixel_from_camera[:, 2]
+    assert np.abs(found - true).max() < 1.5
+
+
 def test_nothing_that_answers_gives_no_placement() -> None:
     assert placements("0", Responses({(0, 1): np.zeros((300, 300), np.float32)}, (0,), 1, ByteCache(0))) == []
 
