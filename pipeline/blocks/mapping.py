@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.blocks.pictures import BlockPicture, Lattice
+from pipeline.blocks.pictures import BlockPicture
 from pipeline.errors import InputError
 from pipeline.exchange.colmap_format import CONVENTION, import_pycolmap
 from pipeline.files.camera_file import CameraFile
+from pipeline.resampling.canvas import Canvas
 from pipeline.types import Array
 
 FEATURES = 2000  # an image: a block needs hundreds of them in common
@@ -128,13 +129,12 @@ def _extract(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[Blo
     )
 
 
-def camera_params(camera: CameraFile, lattice: Lattice) -> list[float]:
+def camera_params(camera: CameraFile, lattice: Canvas) -> list[float]:
     """fx, fy, cx, cy, k1, k2, p1, p2 of COLMAP's OPENCV: the given principal distance and point, no distortion."""
-    c, x0, y0 = given_interior(camera).tolist()
-    focal = c / lattice.pitch_mm
-    col, row = CONVENTION.first_pixel_px
-    center = ((x0 - lattice.x_mm) / lattice.pitch_mm + col, (lattice.y_mm - y0) / lattice.pitch_mm + row)
-    return [focal, focal, float(center[0]), float(center[1]), 0.0, 0.0, 0.0, 0.0]
+    interior = given_interior(camera)
+    focal = float(interior[0]) / lattice.pitch_mm
+    center = lattice.pixel_from_camera(interior[1:]) + CONVENTION.first_pixel_px
+    return [focal, focal, *center.tolist(), 0.0, 0.0, 0.0, 0.0]
 
 
 def given_interior(camera: CameraFile) -> Array:

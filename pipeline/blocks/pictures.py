@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from measure.scans.opening import open_scan
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
-from pipeline.resampling.canvas import FrameChain
+from pipeline.resampling.canvas import Canvas, FrameChain
 from pipeline.resampling.resample_stage import ResampleTask
 from pipeline.text.names import file_word, path_below
 from pipeline.types import Array, Mask
@@ -23,21 +23,6 @@ Picture = NDArray[np.uint8]
 _BORDER = 0.02  # of the frame's side: vignetting, the frame's edge
 _MARK = 0.03  # about a fiducial: it stands still in the camera, and would be matched with itself in every frame
 _DARKEST, _LIGHTEST = 0.5, 99.5  # percentiles that become black and white
-
-
-@dataclass(frozen=True)
-class Lattice:
-    """The pixels of a camera's pictures: camera coordinates of the first one's centre, and how many there are."""
-
-    x_mm: float
-    y_mm: float
-    pitch_mm: float
-    width_px: int
-    height_px: int
-
-    def camera_mm(self, pixels: Array) -> Array:
-        """(n, 2) of columns and rows (n, 2), the first pixel's centre being (0, 0)."""
-        return np.asarray((self.x_mm, self.y_mm) + pixels * (self.pitch_mm, -self.pitch_mm))
 
 
 @dataclass(frozen=True)
@@ -58,12 +43,13 @@ class BlockScan:
 
 @dataclass(frozen=True)
 class BlockPicture:
-    """One frame: its file's name, in its camera's folder; the lattice, and its scan, or several that show parts."""
+    """One frame: its file's name, in its camera's folder; lattice: the pixels of its camera's pictures; its scan, or
+    several that show parts."""
 
     image: str
     camera: str
     name: str
-    lattice: Lattice
+    lattice: Canvas
     scans: tuple[BlockScan, ...]
 
     def scan_place(self, camera_mm: Array) -> tuple[BlockScan, Array] | None:
@@ -74,14 +60,14 @@ class BlockPicture:
         return max(places, key=lambda place: place[0].depths_px(place[1][None])[0], default=None)
 
 
-def camera_lattice(camera: CameraFile, pitch_mm: float) -> Lattice:
+def camera_lattice(camera: CameraFile, pitch_mm: float) -> Canvas:
     """The exposed frame at whole multiples of the pitch. Raises InputError where its size is not known."""
     if camera.frame_mm is None or not camera.fiducials:
         raise InputError(
             f"{camera.path}: frame_mm and fiducials are needed to make pictures of one lattice. Give them."
         )
     columns, rows = (int(np.floor(side / 2.0 / pitch_mm)) for side in camera.frame_mm)
-    return Lattice(-columns * pitch_mm, rows * pitch_mm, pitch_mm, 2 * columns + 1, 2 * rows + 1)
+    return Canvas(-columns * pitch_mm, rows * pitch_mm, pitch_mm, 2 * columns + 1, 2 * rows + 1)
 
 
 def write_pictures(
@@ -114,7 +100,7 @@ def _scans(task: ResampleTask) -> tuple[BlockScan, ...]:
     return tuple(scans)
 
 
-def _cut(path: Path, lattice: Lattice) -> tuple[Array, Mask]:
+def _cut(path: Path, lattice: Canvas) -> tuple[Array, Mask]:
     """A resampled frame's part within the lattice in grey, and which of it the scan has."""
     with tifffile.TiffFile(path) as file:
         description = json.loads(file.pages.first.description)
@@ -122,10 +108,8 @@ def _cut(path: Path, lattice: Lattice) -> tuple[Array, Mask]:
     grey = pixels.mean(axis=2) if pixels.ndim == 3 else pixels.astype(np.float64)
     col = round((lattice.x_mm - description["x_mm"]) / lattice.pitch_mm)
     row = round((description["y_mm"] - lattice.y_mm) / lattice.pitch_mm)
-    picture, mask = (
-        np.zeros((lattice.height_px, lattice.width_px)),
-        np.zeros((lattice.height_px, lattice.width_px), bool),
-    )
+    shape = (lattice.height_px, lattice.width_px)
+    picture, mask = np.zeros(shape), np.zeros(shape, bool)
     rows = slice(max(row, 0), min(row + lattice.height_px, grey.shape[0]))
     cols = slice(max(col, 0), min(col + lattice.width_px, grey.shape[1]))
     there = (slice(rows.start - row, rows.stop - row), slice(cols.start - col, cols.stop - col))
@@ -133,7 +117,7 @@ def _cut(path: Path, lattice: Lattice) -> tuple[Array, Mask]:
     return picture, mask
 
 
-def _usable(camera: CameraFile, lattice: Lattice) -> Mask:
+def _usable(camera: CameraFile, lattice: Canvas) -> Mask:
     """The frame within its border, its fiducials left out."""
     assert camera.frame_mm is not None
     x = lattice.x_mm + lattice.pitch_mm * np.arange(lattice.width_px)

@@ -48,7 +48,7 @@ def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[Compara
     for number in chosen_tracks(mapped, by_image, precision):
         for sight in mapped.tracks[number]:
             picture = by_image[sight.image]
-            shown = picture.scan_place(picture.lattice.camera_mm(np.array([sight.col, sight.row])))
+            shown = picture.scan_place(picture.lattice.camera_from_pixel(np.array([sight.col, sight.row])))
             if shown is None:
                 continue
             scan, place_px = shown

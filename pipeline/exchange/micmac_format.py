@@ -135,7 +135,7 @@ def _calibration(lens: FittedLens, box: Canvas) -> str:
     fx, fy, x0, y0 = lens.values[:4]
     k1, k2, p1, p2, k3 = lens.named(BROWN)
     focal = float(fy / box.pitch_mm)
-    point = np.array([x0 - box.x_mm, box.y_mm - y0]) / box.pitch_mm + CONVENTION.first_pixel_px
+    point = box.pixel_from_camera(np.array([x0, y0])) + CONVENTION.first_pixel_px
     radial: list[tuple[str, Content]] = [("CDist", point)]
     radial += [("CoeffDist", float(k / focal ** (2 * i))) for i, k in enumerate((k1, k2, k3), 1)]
     affine = {"b1": float(fx / fy - 1.0), "b2": float(lens.shear)}
@@ -170,7 +170,7 @@ def _measures(block: Block, frames: Sequence[OutFrame], box: Canvas, reech: str)
     images = []
     for frame in frames:
         marks = frame.observed(fiducials=False)
-        pixels = (frame.camera_mm(marks) - (box.x_mm, box.y_mm)) * _Y_DOWN / box.pitch_mm + CONVENTION.first_pixel_px
+        pixels = box.pixel_from_camera(frame.camera_mm(marks)) + CONVENTION.first_pixel_px
         places = {point: pixel for point, pixel in zip(_names(marks), pixels, strict=True) if point in block.points}
         images.append(_marks(f"{reech}{frame.file_name}", places, _sigmas_px(marks, box.pitch_mm)))
     return xml_text("SetOfMesureAppuisFlottants", images)

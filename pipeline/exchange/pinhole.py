@@ -37,9 +37,9 @@ class PinholeFrame:
 
     def interior_px(self, convention: Convention) -> Array:
         """fx, fy, cx, cy (4,)."""
-        fx, fy, x0, y0 = self.lens.named(INTERIOR)
-        in_px = np.array([fx, fy, x0 - self.canvas.x_mm, self.canvas.y_mm - y0]) / self.canvas.pitch_mm
-        return np.asarray(in_px + np.array([0.0, 0.0, *convention.first_pixel_px]))
+        interior = self.lens.named(INTERIOR)
+        point = self.canvas.pixel_from_camera(interior[2:]) + convention.first_pixel_px
+        return np.concatenate([interior[:2] / self.canvas.pitch_mm, point])
 
     @property
     def rotation(self) -> Array:
@@ -59,9 +59,7 @@ class PinholeFrame:
 
     def pixels(self, marks: tuple[ComparatorPoint, ...]) -> Array:
         """Column and row (n, 2) of the marks in the resampled frame."""
-        places = self.frame.frame_mm(marks, self.with_lens)
-        first = np.array([self.canvas.x_mm, self.canvas.y_mm])
-        return np.asarray((places - first) * (1.0, -1.0) / self.canvas.pitch_mm)
+        return self.canvas.pixel_from_camera(self.frame.frame_mm(marks, self.with_lens))
 
 
 def pinhole_frames(

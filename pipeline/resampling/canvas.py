@@ -99,6 +99,14 @@ class Canvas:
     width_px: int
     height_px: int
 
+    def camera_from_pixel(self, pixels: Array) -> Array:
+        """Camera coordinates (n, 2) of columns and rows (n, 2)."""
+        return np.asarray((self.x_mm, self.y_mm) + pixels * (self.pitch_mm, -self.pitch_mm))
+
+    def pixel_from_camera(self, places_mm: Array) -> Array:
+        """Columns and rows (..., 2) of camera coordinates (..., 2)."""
+        return np.asarray((places_mm - np.array([self.x_mm, self.y_mm])) / (self.pitch_mm, -self.pitch_mm))
+
     def camera_mm(self, col: Array, row: Array) -> Array:
         """(rows, cols, 2) of columns (cols,) and rows (rows,)."""
         x, y = np.meshgrid(self.x_mm + self.pitch_mm * col, self.y_mm - self.pitch_mm * row)

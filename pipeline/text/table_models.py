@@ -12,8 +12,7 @@ from pydantic import ConfigDict, GetCoreSchemaHandler, PlainValidator, TypeAdapt
 from pydantic.fields import FieldInfo
 
 from pipeline.errors import InputError
-from pipeline.text.tables import Table, list_words
-from pipeline.text.wording import LISTED, did_you_mean, nearest
+from pipeline.text.tables import Table
 
 Model = TypeVar("Model")
 
@@ -89,20 +88,11 @@ _adapter: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
 
 
 def _input_error(table: Table, model: type, error: ValidationError) -> InputError:
-    known = sorted(one.name for one in fields(model))
-    unknown = [key for key in table.values if key not in known]
+    known = {one.name for one in fields(model)}
     for each in error.errors(include_url=False, include_context=False, include_input=False):
-        key = str(each["loc"][0])
         if each["type"] == "missing":
-            near = nearest(key, unknown)
-            return table.error(key, "is missing. Add it" + (f", or rename {near!r} to it." if near else "."))
-    messages = [
-        str(table.error(key, f"is no key of this table.{did_you_mean(key, known)} Known here: {list_words(known)}."))
-        for key in unknown[:LISTED]
-    ]
-    if len(unknown) > LISTED:
-        messages.append(f"{table.file}: {len(unknown) - LISTED} more keys are not known.")
-    return InputError("\n".join(messages))
+            return table.missing_key(str(each["loc"][0]), known)
+    return table.unknown_keys(known) or InputError(f"{table.file}: {error}")
 
 
 @dataclass(frozen=True)

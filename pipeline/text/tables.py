@@ -4,7 +4,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -152,24 +152,25 @@ class Table:
         return value
 
     def pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
-        value = self._get(key, default)
-        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
-            raise self.error(key, f"must be two numbers, [x, y], not {shown(value)}.")
-        return (self._number(key, value[0]), self._number(key, value[1]))
+        x, y = self._several(key, self._get(key, default), 2, "two numbers, [x, y]")
+        return (x, y)
 
     def number_or_pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
         """One number for both axes, or [x, y]."""
         value = self._get(key, default)
-        if isinstance(value, Sequence) and not isinstance(value, str):
+        if isinstance(value, list | tuple):
             return self.pair(key, default)
         number = self._number(key, value)
         return (number, number)
 
     def triple(self, key: str, default: tuple[float, float, float] | None = None) -> tuple[float, float, float]:
-        value = self._get(key, default)
-        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 3:
-            raise self.error(key, f"must be three numbers, [x, y, z], not {shown(value)}.")
-        return (self._number(key, value[0]), self._number(key, value[1]), self._number(key, value[2]))
+        x, y, z = self._several(key, self._get(key, default), 3, "three numbers, [x, y, z]")
+        return (x, y, z)
+
+    def _several(self, key: str, value: Any, count: int, form: str) -> list[float]:
+        if not isinstance(value, list | tuple) or len(value) != count:
+            raise self.error(key, f"must be {form}, not {shown(value)}.")
+        return [self._number(key, item) for item in value]
 
     def pairs(self, key: str) -> tuple[tuple[float, float], ...]:
         value = self._get(key, None)
@@ -224,24 +225,30 @@ class Table:
 
     def done(self) -> None:
         """Refuse every key that nothing has asked for, all of them in one message."""
-        known = sorted(self._known)
-        unknown = [key for key in self.values if key not in self._known]
+        if unknown := self.unknown_keys(self._known):
+            raise unknown
+
+    def unknown_keys(self, known: Collection[str]) -> InputError | None:
+        """What to say of keys that are not known; None where there are none."""
+        names, unknown = sorted(known), [key for key in self.values if key not in known]
         messages = [
-            str(self.error(key, f"is no key of this table.{did_you_mean(key, known)} Known here: {list_words(known)}."))
+            str(self.error(key, f"is no key of this table.{did_you_mean(key, names)} Known here: {list_words(names)}."))
             for key in unknown[:LISTED]
         ]
         if len(unknown) > LISTED:
             messages.append(f"{self.file}: {len(unknown) - LISTED} more keys are not known.")
-        if messages:
-            raise InputError("\n".join(messages))
+        return InputError("\n".join(messages)) if messages else None
+
+    def missing_key(self, key: str, known: Collection[str]) -> InputError:
+        """What to say of a key that must be given."""
+        near = nearest(key, [name for name in self.values if name not in known])
+        return self.error(key, "is missing. Add it" + (f", or rename {near!r} to it." if near else "."))
 
     def _get(self, key: str, default: Any) -> Any:
         self._known.add(key)
         value = self.values.get(key, default)
         if value is None:
-            unknown = [name for name in self.values if name not in self._known]
-            near = nearest(key, unknown)
-            raise self.error(key, "is missing. Add it" + (f", or rename {near!r} to it." if near else "."))
+            raise self.missing_key(key, self._known)
         return value
 
     def _path(self, key: str, text: str) -> str:
