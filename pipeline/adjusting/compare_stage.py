@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
 from pipeline.drawing import svg
@@ -39,8 +40,9 @@ def run_compare(
     """
     labels = _labels(paths)
     contents = [read_adjustment(path) for path in paths]
-    names = [_camera(path, content, camera) for path, content in zip(paths, contents, strict=True)]
-    calibrations = [_calibration(*each) for each in zip(paths, contents, names, labels, strict=True)]
+    chosen = [calibrated_lens(path, content, camera) for path, content in zip(paths, contents, strict=True)]
+    names, lenses = zip(*chosen, strict=True)
+    calibrations = [_calibration(*each) for each in zip(paths, contents, names, lenses, labels, strict=True)]
     halves = [_half_mm(*each) for each in zip(paths, contents, names, strict=True)]
     comparison = compare(calibrations, (min(x for x, _ in halves), min(y for _, y in halves)), times, use)
     record = comparison_record(comparison, _remarks(paths, contents, names), level)
@@ -63,25 +65,28 @@ def _labels(paths: Sequence[Path]) -> list[str]:
     return ["/".join(each[-enough:]) for each in parts]
 
 
-def _camera(path: Path, content: AdjustmentRecord, name: str | None) -> str:
-    cameras = list(content.cameras)
-    if name is None and len(cameras) == 1:
-        return cameras[0]
-    if name is None:
-        raise InputError(f"{path}: holds the cameras {listed(cameras)}. Say which one: --camera NAME.")
-    if name not in cameras:
-        raise InputError(f"{path}: holds no camera {name!r}{did_you_mean(name, cameras)}; it has {listed(cameras)}.")
-    return name
+def calibrated_lens(path: Path, content: AdjustmentRecord, name: str | None) -> tuple[str, Lens]:
+    """A camera of an adjustment.json, by its name or because it is the only one, and its lens.
 
-
-def _calibration(path: Path, content: AdjustmentRecord, name: str, label: str) -> CameraCalibration:
+    Raises InputError where there is no such camera, or none that is calibrated.
+    """
     if not content.converged:
         raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
-    camera = content.cameras[name]
-    lens = camera.lens()
+    cameras = list(content.cameras)
+    if name is None and len(cameras) > 1:
+        raise InputError(f"{path}: holds the cameras {listed(cameras)}. Say which one: --camera NAME.")
+    chosen = cameras[0] if name is None else name
+    if chosen not in cameras:
+        hint = did_you_mean(chosen, cameras)
+        raise InputError(f"{path}: holds no camera {chosen!r}{hint}; it has {listed(cameras)}.")
+    lens = content.cameras[chosen].lens()
     if not np.isfinite(lens.values).all():
-        raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
-    marks = {id: np.array(mark.xy_mm) for id, mark in camera.fiducials.items()}
+        raise InputError(f"{path}: holds no interior orientation of {chosen!r}: no image shows object points.")
+    return chosen, lens
+
+
+def _calibration(path: Path, content: AdjustmentRecord, name: str, lens: Lens, label: str) -> CameraCalibration:
+    marks = {id: np.array(mark.xy_mm) for id, mark in content.cameras[name].fiducials.items()}
     unknowns = [Parameter.interior(name, each) for each in lens.quantities]
     unknowns += [Parameter.fiducial(name, id, axis) for id in marks for axis in "xy"]
     covariance, redundancy = read_own_covariance(path).of(unknowns), content.variance_factor.redundancy
@@ -221,8 +226,7 @@ def _panel(title: str, field_um: Array, covariance_um2: Array, starts: Array, px
         *svg.ellipses(ends, px_per_um * radii_um, angles),
         svg.strokes(starts, ends, "vector target"),
         svg.strokes(starts, starts, "dot target"),
-        svg.line((left, left + um * px_per_um), (bottom + 16.0, bottom + 16.0), "bar"),
-        svg.words(left + um * px_per_um + 8.0, bottom + 20.0, f"{um:g} µm, ellipses of 95 %", "tick"),
+        svg.scale_bar(left, bottom + 16.0, um * px_per_um, f"{um:g} µm, ellipses of 95 %"),
     )
 
 

@@ -12,6 +12,7 @@ from adjust.functional_model.families import FAMILY_NAMES, family
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
 from adjust.problem.parameter import Parameter
+from pipeline.adjusting.compare_stage import calibrated_lens
 from pipeline.errors import InputError
 from pipeline.exchange.export_stage import check_folder, publish, readme
 from pipeline.files.camera_file import read_camera
@@ -135,23 +136,14 @@ def _convert(
 def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> Converted:
     """The whole adjustment.json and adjustment.npz, with one camera's lens converted."""
     content, covariance = read_adjustment(path), read_own_covariance(path)
-    if not content.converged:
-        raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
-    cameras = list(content.cameras)
-    name = options.camera or cameras[0]
-    if name not in cameras or (options.camera is None and len(cameras) > 1):
-        raise InputError(f"{path}: holds the cameras {listed(cameras)}. Say which one: --camera NAME.")
-    camera = content.cameras[name]
-    given = camera.lens()
-    if not np.isfinite(given.values).all():
-        raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
+    name, given = calibrated_lens(path, content, options.camera)
     known = np.sqrt(np.diag(covariance.of(_parameters(name, given)[3:])))
     places = observed_mm(path, content, name)
     corners_mm = np.array([places.min(axis=0), places.max(axis=0)])
     lens, sentences = _convert(given, known, corners_mm, options)
     moved = _moved_covariance(covariance, name, given, lens)
     sigmas = np.sqrt(np.diag(moved.of(_parameters(name, lens.lens))))
-    entry = _camera_entry(camera, given.distortion, lens, sigmas)
+    entry = _camera_entry(content.cameras[name], given.distortion, lens, sigmas)
     gone = {Parameter.interior(name, each).text for each in given.quantities[3:]}
     correlations = tuple(row for row in content.correlations if not gone & set(row.parameters))
     converted = replace(content, cameras={**content.cameras, name: entry}, correlations=correlations)

@@ -61,33 +61,28 @@ def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None 
     return Check.of({name: _check_camera(adjustment, name, pictures) for name in names})
 
 
+class _NotPossible(Exception):
+    """Why there is nothing to compare."""
+
+
 def _check_camera(adjustment: Adjustment, name: str, pictures: BoardPictures | None) -> CameraCheck:
-    if not adjustment.converged:
-        return CameraCheck("not possible", f"The adjustment itself has no solution: {_stop_reason(adjustment)}.")
-    camera = adjustment.network.camera_by_name[name]
-    if name in adjustment.network.idle_cameras:
-        return CameraCheck("not possible", "No image shows object points: the camera is not calibrated.")
-    if not adjustment.network.line_of_sight.is_straight:
-        return CameraCheck("not possible", "OpenCV knows neither refraction nor the curvature of the earth.")
-    hindrance = _hindrance(camera)
-    if hindrance:
-        return CameraCheck("not possible", hindrance)
-    problem = bare_problem(adjustment, name)
-    if not problem.images:
-        return CameraCheck("not possible", "No image shows enough points for OpenCV: 4 in a plane, 6 otherwise.")
-    counts = (len(problem.images), sum(len(image.xyz) for image in problem.images))
+    known: dict[str, Any] = {}  # of the check, as far as it came
     try:
-        solved = adjust(problem.network, problem.approximations)
-    except AdjustmentError as error:
-        return CameraCheck("not possible", f"Without priors this camera cannot be adjusted: {error}", *counts)
-    undetermined = _undetermined(solved, name)
-    if undetermined:
-        return CameraCheck("not possible", undetermined, *counts)
-    return _compared(adjustment, problem, solved, counts, pictures)
+        verdict, reason = _compare(adjustment, name, pictures, known)
+    except _NotPossible as hindrance:
+        verdict, reason = "not possible", str(hindrance)
+    return CameraCheck(verdict, reason, **known)
 
 
-def _hindrance(camera: Camera) -> str:
+def _hindrance(adjustment: Adjustment, name: str) -> str:
     """Why OpenCV has no model for this camera; empty where it has."""
+    network, camera = adjustment.network, adjustment.network.camera_by_name[name]
+    if not adjustment.converged:
+        return f"The adjustment itself has no solution: {_stop_reason(adjustment)}."
+    if name in network.idle_cameras:
+        return "No image shows object points: the camera is not calibrated."
+    if not network.line_of_sight.is_straight:
+        return "OpenCV knows neither refraction nor the curvature of the earth."
     if camera.distortion.family not in COUNTERPARTS:
         return f"OpenCV has no counterpart of the distortion family {camera.distortion.family}."
     free = free_parameters(camera)
@@ -96,26 +91,30 @@ def _hindrance(camera: Camera) -> str:
     stretch = [name for name in free if COUNTERPARTS[camera.distortion.family].get(name) == "fy"]
     if stretch and "c" not in free:
         return f"OpenCV holds both focal lengths or neither; here c is fixed and {stretch[0]} is not."
-    if not free:
-        return "Everything of this camera is fixed: there is nothing to compare."
-    return ""
+    return "" if free else "Everything of this camera is fixed: there is nothing to compare."
 
 
-def _undetermined(solved: Adjustment, name: str) -> str:
-    """Why the observations without priors give no camera; empty where they do."""
+def _solve_without_priors(problem: BareProblem) -> Adjustment:
+    """Raises _NotPossible where the observations without priors give no camera."""
+    try:
+        solved = adjust(problem.network, problem.approximations)
+    except AdjustmentError as error:
+        raise _NotPossible(f"Without priors this camera cannot be adjusted: {error}") from None
     if solved.singular:
         causes = " ".join(f"{description(direction.parameters)}: {direction.cause}" for direction in solved.singular)
-        return f"Priors carried the solution; the observations of the points alone do not determine it. {causes}"
+        raise _NotPossible(
+            f"Priors carried the solution; the observations of the points alone do not determine it. {causes}"
+        )
     if not solved.converged:
-        return f"Without priors the adjustment finds no solution: {_stop_reason(solved)}."
-    distance = Parameter.interior(name, "c")
+        raise _NotPossible(f"Without priors the adjustment finds no solution: {_stop_reason(solved)}.")
+    distance = Parameter.interior(problem.network.cameras[0].name, "c")
     c, sigma = solved.value(distance), solved.sigma(distance)
     if sigma > UNDETERMINED * c:
-        return (
+        raise _NotPossible(
             f"Priors carried the solution: from the observations of the points alone the principal distance has a "
             f"standard deviation of {sigma:.3g} mm, {sigma / c:.0%} of its value."
         )
-    return ""
+    return solved
 
 
 def _stop_reason(adjustment: Adjustment) -> str:
@@ -123,27 +122,30 @@ def _stop_reason(adjustment: Adjustment) -> str:
     return " ".join(causes).rstrip(".")
 
 
-def _compared(
-    adjustment: Adjustment,
-    problem: BareProblem,
-    solved: Adjustment,
-    counts: tuple[int, int],
-    pictures: BoardPictures | None,
-) -> CameraCheck:
+def _compare(
+    adjustment: Adjustment, name: str, pictures: BoardPictures | None, known: dict[str, Any]
+) -> tuple[Verdict, str]:
+    """The verdict and its reason; known: takes what was found on the way. Raises _NotPossible."""
+    if hindrance := _hindrance(adjustment, name):
+        raise _NotPossible(hindrance)
+    problem = bare_problem(adjustment, name)
+    if not problem.images:
+        raise _NotPossible("No image shows enough points for OpenCV: 4 in a plane, 6 otherwise.")
+    known |= {"images": len(problem.images), "points": sum(len(image.xyz) for image in problem.images)}
+    solved = _solve_without_priors(problem)
     rms_um, sigma_um = _rms_um(solved), 1e3 * problem.sigma_mm
-    known: dict[str, Any] = {"images": counts[0], "points": counts[1], "rms_reseau_um": rms_um}
+    known["rms_reseau_um"] = rms_um
     try:
         conversion = converted(problem, solved)
     except AdjustmentError as error:
-        return CameraCheck("not possible", f"OpenCV's model cannot take this lens: {error}", **known)
+        raise _NotPossible(f"OpenCV's model cannot take this lens: {error}") from None
     refit_um = 1e3 * conversion.residual_mm
     known["refit_residual_um"] = refit_um
     if refit_um > LARGEST_REFIT * sigma_um:
-        reason = (
+        raise _NotPossible(
             f"OpenCV's model cannot take this lens: the nearest one is off by {refit_um:.2f} um, rms over the image, "
             f"where a coordinate's standard deviation is {sigma_um:.2f} um."
         )
-        return CameraCheck("not possible", reason, **known)
     is_fisheye = problem.network.cameras[0].distortion.family == FISHEYE
     calibrated = partial(
         calibrate_fisheye if is_fisheye else calibrate, freedom=problem.freedom, start=conversion.parameters
@@ -151,7 +153,7 @@ def _compared(
     try:
         opencv = calibrated(problem.images)
     except cv2.error as error:
-        return CameraCheck("not possible", f"OpenCV refuses these observations: {error.err}.", **known)
+        raise _NotPossible(f"OpenCV refuses these observations: {error.err}.") from None
     sigmas_tell = rms_um > ROUNDINGS * opencv.rounding_um
     names = model_names(problem.network.cameras[0].distortion.family)
     rows = _rows(names, problem.freedom, conversion, solved.sigma0 if sigmas_tell else 1.0, opencv)
@@ -159,24 +161,21 @@ def _compared(
     if pictures is not None and _is_digital(adjustment, problem):
         known["corners_px"] = compare_corners(problem.images, pictures, calibrated)
     if opencv.rms_um > WORSE_RMS * rms_um + ROUNDINGS * opencv.rounding_um:
-        reason = (
+        raise _NotPossible(
             f"OpenCV ends in a worse solution, {opencv.rms_um:.2f} um a point against {rms_um:.2f} um: it begins every "
             "image by itself and did not come to the minimum."
         )
-        return CameraCheck("not possible", reason, **known)
     verdict, reason = _agreement(rows, sigmas_tell)
     if verdict == "differs" and _same_model_agrees(problem, conversion, opencv):
-        verdict, reason = (
-            "agrees",
-            (
-                "Given the very same model both programs agree. OpenCV's own model is not quite this lens: the refit "
-                f"leaves {refit_um:.3f} um, which {counts[1]} points notice. {reason}"
-            ),
+        verdict = "agrees"
+        reason = (
+            "Given the very same model both programs agree. OpenCV's own model is not quite this lens: the refit "
+            f"leaves {refit_um:.3f} um, which {known['points']} points notice. {reason}"
         )
     if verdict == "agrees" and sigmas_tell:
         verdict, reason = _judge_departure(reason, _departures(adjustment, solved, problem.network.cameras[0]))
     rms = f"The residuals are {opencv.rms_um:.2f} um rms a point in OpenCV, {rms_um:.2f} um here."
-    return CameraCheck(verdict, f"{reason} {rms} {_notes(problem, opencv, sigmas_tell)}", **known)
+    return verdict, f"{reason} {rms} {_notes(problem, opencv, sigmas_tell)}"
 
 
 def _is_digital(adjustment: Adjustment, problem: BareProblem) -> bool:

@@ -25,7 +25,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.images_file import read_images
 from pipeline.files.project_file import read_project
 from pipeline.resampling.canvas import FrameChain
-from pipeline.resampling.resample_stage import BEST, ResampleTask, resampled
+from pipeline.resampling.resample_stage import FAST, ResampleTask, resampled
 from pipeline.results.comparator_file import ComparatorPoint, points_text, read_comparator
 
 Array = NDArray[np.float64]
@@ -220,7 +220,7 @@ def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
     cols, rows = np.meshgrid(np.arange(2500.0), np.arange(2500.0))
     spot = 9000.0 * np.exp(-((cols - col) ** 2 + (rows - row) ** 2) / (2 * 2.5**2))
     tifffile.imwrite(tmp_path / "f2.tif", np.rint(4000.0 + 14.0 * cols + spot).astype(np.uint16), compression="deflate")
-    task = ResampleTask("f2", "K", tmp_path / "f2.tif", chain(2), "0m", PITCH_MM, BEST, None, tmp_path / "frame.tif")
+    task = ResampleTask("f2", "K", tmp_path / "f2.tif", chain(2), "0m", PITCH_MM, FAST, None, tmp_path / "frame.tif")
     assert resampled(task).problem == ""
     (picture,) = write_pictures([task], {"K": CAMERA}, tmp_path)
     image = np.asarray(cv2.imread(str(tmp_path / "pictures" / picture.name), cv2.IMREAD_UNCHANGED), dtype=float)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
+from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
@@ -24,7 +25,7 @@ GIVEN_MM = np.array(
     [(-106, 106), (106, 106), (106, -106), (-106, -106), (0, 112), (112, 0), (0, -112), (-112, 0)], dtype=np.float64
 )
 IDS = tuple("12345678")
-SIGMA_MM, FRAMES, RUNS = 0.004, 10, 40
+SIGMA_MM, FRAMES, RUNS = 0.004, 10, 20
 TRUE_MM = GIVEN_MM + np.random.default_rng(0).normal(0.0, 0.006, GIVEN_MM.shape)
 
 
@@ -85,7 +86,7 @@ def form(kind: str, seed: int) -> Figure:
 
 
 @pytest.mark.study
-@pytest.mark.parametrize(("kind", "taken_up"), [("similarity", 4), ("affine", 6), ("projective", 8)])
+@parametrize_with_studies(("kind", "taken_up"), [("similarity", 4), ("affine", 6), ("projective", 8)], quick=(1,))
 def test_the_sigmas_of_the_form_hold_against_realisations(kind: str, taken_up: int) -> None:
     found = [form(kind, seed) for seed in range(RUNS)]
     changes = np.array([each.change_um.ravel() for each in found])
