@@ -20,7 +20,9 @@ def intersect(centers: Array, directions: Array, point: Indices, known: Array) -
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     sought: Mask = np.isnan(known)
-    determination = _smallest_eigenvalue(across, point, sought)
+    normal = np.where(sought[:, :, None] & sought[:, None, :], _sums(across, point, len(known)), 0.0)
+    normal += np.where(sought, 0.0, 1e6)[:, :, None] * np.eye(3)  # a given coordinate is no unknown
+    determination = np.linalg.eigvalsh(normal)[:, 0]
     usable: Mask = determination > WEAKEST
     weights = np.ones(len(point))
     for iteration in range(ITERATIONS):
@@ -39,24 +41,21 @@ def intersect(centers: Array, directions: Array, point: Indices, known: Array) -
     return np.where(good[:, None], points, np.nan), np.where(good, determination, 0.0)
 
 
-def _smallest_eigenvalue(across: Array, point: Indices, sought: Mask) -> Array:
-    normal = np.zeros((len(sought), 3, 3))
-    np.add.at(normal, point, across)
-    normal = np.where(sought[:, :, None] & sought[:, None, :], normal, 0.0)
-    normal += np.where(sought, 0.0, 1e6)[:, :, None] * np.eye(3)  # a given coordinate is no unknown
-    return np.asarray(np.linalg.eigvalsh(normal)[:, 0], dtype=np.float64)
+def _sums(values: Array, point: Indices, count: int) -> Array:
+    """The sums (p, ...) of values (m, ...) of every point."""
+    sums = np.zeros((count, *values.shape[1:]))
+    np.add.at(sums, point, values)
+    return sums
 
 
 def _nearest(across: Array, centers: Array, point: Indices, known: Array, usable: Mask) -> Array:
     """Weighted least-squares points (p, 3), given coordinates kept; nan where not usable."""
-    normal, right = np.zeros((len(known), 3, 3)), np.zeros((len(known), 3))
-    np.add.at(normal, point, across)
-    np.add.at(right, point, np.einsum("mij,mj->mi", across, centers))
+    normal = _sums(across, point, len(known))
+    right = _sums(np.einsum("mij,mj->mi", across, centers), point, len(known))
     given = ~np.isnan(known)
     values = np.where(given, known, 0.0)
     right = np.where(given, values, right - np.einsum("pij,pj->pi", normal, values))
-    either = given[:, :, None] | given[:, None, :]
-    normal = np.where(either, np.eye(3), normal)
+    normal = np.where(given[:, :, None] | given[:, None, :], np.eye(3), normal)
     points = np.full(known.shape, np.nan)
     solvable = usable & (np.linalg.det(normal) != 0.0)  # of rays that all lost their weight nothing is left
     if solvable.any():

@@ -166,26 +166,21 @@ class Problem:
     @cached_property
     def films(self) -> list[Films]:
         """The film transformations of all images, those of one kind together."""
+        network, found = self.network, []
         members: dict[tuple[Transformation, bool], list[int]] = {}
-        for i, image in enumerate(self.network.images):
+        for i, image in enumerate(network.images):
             members.setdefault((image.transformation, image.name in self.mirrored), []).append(i)
-        return [self._films(film_kind(*key), np.array(images)) for key, images in members.items()]
-
-    def _films(self, kind: FilmKind, images: Indices) -> Films:
-        names = [self.network.images[i].name for i in images]
-        extents = [self.network.extent_by_image[name] for name in names]
-        place = np.full(len(self.network.images), ABSENT, dtype=np.intp)
-        place[images] = np.arange(len(images))
-        rows = np.flatnonzero(place[self.image_numbers] != ABSENT)
-        return Films(
-            kind,
-            images,
-            np.array([self.unknowns.transformation[name] for name in names], dtype=np.intp),
-            np.array([extent.center_mm for extent in extents]),
-            np.array([extent.half_mm for extent in extents]),
-            rows,
-            place[self.image_numbers[rows]],
-        )
+        for key, images in members.items():
+            names = [network.images[i].name for i in images]
+            place = np.full(len(network.images), ABSENT, dtype=np.intp)
+            place[images] = np.arange(len(images))
+            rows = np.flatnonzero(place[self.image_numbers] != ABSENT)
+            positions = np.array([self.unknowns.transformation[name] for name in names], dtype=np.intp)
+            center_mm = np.array([network.extent_by_image[name].center_mm for name in names])
+            half_mm = np.array([network.extent_by_image[name].half_mm for name in names])
+            of = place[self.image_numbers[rows]]
+            found.append(Films(film_kind(*key), np.array(images), positions, center_mm, half_mm, rows, of))
+        return found
 
     @cached_property
     def scans(self) -> list[Scans]:

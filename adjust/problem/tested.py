@@ -1,6 +1,5 @@
 """What is tested as one: an image point, a given fiducial, any other given coordinate."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -96,16 +95,12 @@ class TestedUnits:
         observations = self.problem.network.observations
         rows = zip(observations.kind, observations.image, observations.point, strict=True)
         observed = [Tested(kind, image, point, ("x", "y")) for kind, image, point in rows]
-        return (*observed, *self._named_priors())
-
-    def _named_priors(self) -> Sequence[Tested]:
-        parameters = self.problem.unknowns.parameters
-        named = []
+        parameters, given = self.problem.unknowns.parameters, []
         for pair in self.positions:
-            first, *others = (parameters[i] for i in pair if i != ABSENT)
-            coordinates = tuple(each.quantity for each in (first, *others))
-            named.append(Tested(_group(first), first.owner, first.id, coordinates))
-        return named
+            keys = [parameters[i] for i in pair if i != ABSENT]
+            coordinates = tuple(each.quantity for each in keys)
+            given.append(Tested(_group(keys[0]), keys[0].owner, keys[0].id, coordinates))
+        return (*observed, *given)
 
 
 def _group(parameter: Parameter) -> str:
