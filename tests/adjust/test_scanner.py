@@ -14,6 +14,8 @@ from adjust.functional_model.scanner import Bend, carriage_terms, smooth_terms
 from adjust.initial_values.approximations import approximate
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import Network, Scanner, Transformation
+from adjust.problem.parameter import Parameter
+from adjust.rank_defect.named_directions import NamedDirection, Reason
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 
@@ -257,3 +259,16 @@ def test_a_bend_that_the_films_make_too_is_laid_to_the_films() -> None:
     (direction,) = solved(network).singular
     assert "the polynomial(2) transformation of its films does the same" in direction.cause
     assert direction.remedy.endswith("or leave it out.")
+
+
+def test_a_direction_is_explained_by_what_moves_along() -> None:
+    reasons = {each: Reason(f"{each} do the same", "it", "") for each in ("lens", "marks")}
+    bend = NamedDirection(-2, np.zeros(1), "It can change", Reason("nothing shows it", "it", ""), None, reasons)
+    mark, k3, c = Parameter.fiducial("K", "1", "x"), Parameter.interior("K", "k3"), Parameter.interior("K", "c")
+    for moved, because in (
+        ((), "nothing shows"),
+        ((c,), "nothing shows"),
+        ((c, mark), "marks do"),
+        ((mark, k3), "lens do"),
+    ):
+        assert because in bend.sentence(moved)[0]
