@@ -31,12 +31,14 @@ from benchmarks.measured_marks import CONTRAST, GROUND, drawn, measured, start_o
 from measure.boards.corners import junction
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.noise.damage import _opened
+from measure.noise.robust_estimation import robust_scale
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 
 Array = NDArray[np.float64]
 
 SEED, SNR, LEAST_CONTOUR = 5, 20.0, 12
 DISKS, RADII_PX, HIT_PX = 32, (2.5, 15.0), 1.0
+NOISES, SOLID = (4.0, 6.0, 9.0, 14.0, 20.0), 0.92
 MARKS_MM = 106.0 * np.array([(1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1)], float)
 FILM_MM, BENT_MM, GROSS_MM, GATE_MM = 0.01, 0.1, 1.0, 0.5
 
@@ -100,11 +102,17 @@ def blobs(_: int) -> str:
 
 def _first_looks(picture: Array, truth: Array) -> str:
     def regions() -> Array:
-        light = picture > threshold_local(picture, 4 * int(RADII_PX[1]) + 1, method="mean", offset=-CONTRAST / 2)
-        sizes = np.pi * np.array(RADII_PX) ** 2
-        found = regionprops(label(light))
-        whole = [each for each in found if sizes[0] < each.area < sizes[1] and each.solidity > 0.85]
-        return np.array([each.centroid[::-1] for each in whole])
+        """Cut at multiples of the picture's own noise; of regions about one place the most solid."""
+        above = picture - threshold_local(picture, 4 * int(RADII_PX[1]) + 1, method="mean")
+        noise, sizes = robust_scale(np.diff(picture)) / np.sqrt(2), np.pi * np.array(RADII_PX) ** 2
+        found = [each for level in NOISES for each in regionprops(label(above > level * noise))]
+        kept = list[Array]()
+        for each in sorted(found, key=lambda each: -each.solidity):
+            center = np.array(each.centroid[::-1])
+            apart = [np.hypot(*(center - other)) for other in kept]
+            if sizes[0] < each.area < sizes[1] and each.solidity > SOLID and min(apart, default=np.inf) > RADII_PX[0]:
+                kept.append(center)
+        return np.array(kept)
 
     def laplacians() -> Array:
         sigmas = np.array(RADII_PX) / np.sqrt(2)

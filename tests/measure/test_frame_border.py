@@ -67,7 +67,7 @@ def light_of(at_mm: float, is_notch: bool, blur_px: float) -> Array:
                 frame &= ~((out > 0) & (along < out * 0.7 / 1.6))
         return np.asarray(frame)
 
-    return drawn(exposed, 400, 400, blur_px, fineness=6)
+    return drawn(exposed, 400, 400, blur_px, fineness=4)
 
 
 def measured(camera: FiducialLayout, picture: Array) -> list[Measured]:
