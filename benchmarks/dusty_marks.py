@@ -1,30 +1,18 @@
-"""Marks and disks with specks of dust, alone and in frames, measured as `reseau measure` does and as they would be if
-the dust were known."""
+"""Frames of marks, and of disks with specks of dust, measured as `reseau measure` does."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from drawn import scan_of
 from numpy.typing import NDArray
 from true_marks import KIND, Kind, TrueMark, some_mark
 
-from benchmarks.measured_marks import CONTRAST, GROUND, Found, measured
+from benchmarks.measured_marks import CONTRAST, GROUND, Found
 from measure.fiducials.constellation import Placement
-from measure.fiducials.mark_fit import options_for
-from measure.fiducials.measure_frame import measure_frame
-from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.matching.match import match
-from measure.matching.window import ScanWindow
-from measure.scans.cache import WholePicture
-from measure.scans.metadata import NO_TAGS
-from measure.scans.scan import Scan
-from measure.targets.disks import PLAIN_MARGIN_PX
 from measure.targets.identification import TargetPrediction, measure_disks
 from synthetic_images.optics import reach_px, seen_coverage
 
@@ -58,17 +46,6 @@ class DustyMark:
         """(2,), nan where there is none."""
         return np.full(2, np.nan) if self.found is None else self.found.center_px - self.mark.place[:, 2]
 
-    @cached_property
-    def told(self) -> Found | None:
-        """The mark matched where it is seen, the dust being known; None where it does not converge."""
-        kind, options = self.mark.kind, FiducialOptions().match
-        if kind.name == "ellipse":
-            options = replace(options, freedom="ellipse", margin_px=PLAIN_MARGIN_PX, margin_blurs=0.0)
-        else:
-            options = options_for(kind.shape, options, kind.known if np.isfinite(kind.known) else None)
-        fit = match(ScanWindow(np.rint(self.grey), valid=self.seen), kind.shape, self.mark.place, options)
-        return Found(fit.center_px, fit.covariance_px2) if fit.converged else None
-
 
 def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -> tuple[Array, Mask]:
     """The picture with dark specks on so much of the pixels near the mark, and which pixels they leave."""
@@ -87,43 +64,6 @@ def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -
         speckled[near] = speckled[near] * (1 - cover) + (GROUND - CONTRAST) * cover
         seen[near] &= cover < 0.5 / DUST_SNR
     return speckled, seen
-
-
-def lone_mark(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -> DustyMark:
-    """A mark that no frame knows."""
-    noise = rng.standard_normal((mark.size, mark.size)) / DUST_SNR
-    speckled, seen = dusty(mark, grey + CONTRAST * noise, share, rng)
-    return DustyMark(mark, speckled, seen, measured(mark, speckled, rng))
-
-
-def frame_of_marks(kind: Kind, share: float, count: int, rng: np.random.Generator) -> list[DustyMark]:
-    """The first count of a frame's four corner and four side marks, alike but for the blur, from a placement that is
-    about right."""
-    layout = frame_layout(kind, count)
-    linear = some_mark(kind, BLUR_PX, rng, px_per_mm=PX_PER_MM).place[:, :2]
-    places = np.array([mark.xy_mm for mark in layout.marks])
-    side = int(PX_PER_MM * FRAME_MM * 1.6)
-    middle = side / 2 + rng.uniform(-0.5, 0.5, 2)
-    sign = int(rng.choice((-1, 1)))
-    ground = GROUND + (1 - sign) / 2 * CONTRAST
-    frame, parts = np.full((side, side, 1), ground, np.uint16), []
-    for center in places @ linear.T + middle:
-        some = some_mark(kind, BLUR_PX * float(np.exp(rng.normal(0, BLUR_SPREAD))), rng, px_per_mm=PX_PER_MM)
-        corner = np.rint(center).astype(int) - some.size // 2
-        mark = replace(some, place=np.column_stack([linear, center - corner]))
-        noise = rng.standard_normal((mark.size, mark.size)) / DUST_SNR
-        speckled, seen = dusty(mark, ground + CONTRAST * (sign * mark.picture + noise), share, rng)
-        frame[corner[1] :, corner[0] :, 0][: mark.size, : mark.size] = np.rint(speckled)
-        parts.append((mark, speckled, seen, corner))
-    scan = Scan(Path("dusty.tif"), WholePicture(frame), NO_TAGS)
-    result = measure_frame(scan, layout, about_right(linear, middle, sign, count, rng), FiducialOptions())
-    found = []
-    for index, (sighting, (*_, corner)) in enumerate(zip(result.detections, parts, strict=True)):
-        status, reason = result.verdict(index)
-        flagged = "" if status is Status.MEASURED else reason
-        fit = sighting.fit
-        found.append(None if fit is None else Found(fit.center_px - corner, fit.covariance_px2, flagged))
-    return [DustyMark(*part[:3], each) for part, each in zip(parts, found, strict=True)]
 
 
 def frame_layout(kind: Kind, count: int, at: float = AT_MM) -> FiducialLayout:

@@ -1,15 +1,10 @@
 """What each heuristic brings: the same pictures measured with it, and with it switched off.
 
-python -m benchmarks heuristics [--only NAME] [--count 24]
-
 Each row is one heuristic: the figure that it is there for, with it and without.
 """
 
-import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,12 +17,13 @@ from adjust.linear_algebra import fronts
 from adjust.solution.adjustment import adjust
 from benchmarks.dusty_marks import frame_of_disks
 from benchmarks.faint_marks import drawn_frame, measured_faint
+from benchmarks.harness import Row, replaced, rms
 from benchmarks.large_networks import strip
 from measure.flags import NO_REASON
 
 Array = NDArray[np.float64]
 
-SEED, SNR, LARGE_PX = 5, 20.0, 0.5
+SEED, LARGE_PX = 5, 0.5
 
 
 def faint(count: int) -> str:
@@ -38,7 +34,7 @@ def faint(count: int) -> str:
         for mark, found, _noise in measured_faint(frame, 2.0, rng):
             of += 1
             errors += [] if found is None else [found.center_px - mark.place[:, 2]]
-    return f"{len(errors)} of {of} found, {_rms(errors)} px"
+    return f"{len(errors)} of {of} found, {rms(errors):.4f} px"
 
 
 def dusty_disks(count: int) -> str:
@@ -61,21 +57,6 @@ def one_front(count: int) -> str:
     return f"{time.process_time() - start:.2f} s for {8 * count} images"
 
 
-def _rms(errors: Sequence[Array]) -> str:
-    return f"{np.sqrt(np.nanmean(np.square(errors))):.4f}" if len(errors) else "-"
-
-
-@contextmanager
-def put(where: Any, name: str, instead: Any) -> Iterator[None]:
-    """Another value in the place of one, for a while."""
-    before = getattr(where, name)
-    setattr(where, name, instead)
-    try:
-        yield
-    finally:
-        setattr(where, name, before)
-
-
 def _lone(disks: Sequence[Any], _predicted: Sequence[Array]) -> list[Any]:
     return [NO_REASON for _ in disks]
 
@@ -88,19 +69,15 @@ SWITCHED: dict[str, tuple[Study, Any, str, Any]] = {
 }
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--only", choices=SWITCHED)
-    parser.add_argument("--count", type=int, default=24)
-    given = parser.parse_args()
-    for name, (study, where, what, instead) in SWITCHED.items():
-        if given.only in (None, name):
-            run = partial(study, given.count)
-            kept = run()
-            with put(where, what, instead):
-                print(f"| {name} | {kept} | {run()} |", flush=True)
+COLUMNS = {"heuristic": "", "with it": "", "without it": ""}
 
 
-if __name__ == "__main__":
-    main()
+def cells(count: int = 24) -> Iterator[Row]:
+    yield from ({"heuristic": name, "count": count} for name in SWITCHED)
+
+
+def case(heuristic: str, count: int) -> Row:
+    study, where, name, instead = SWITCHED[heuristic]
+    kept = study(count)
+    with replaced(where, name, instead):
+        return {"with it": kept, "without it": study(count)}

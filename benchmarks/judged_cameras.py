@@ -1,15 +1,13 @@
 """What judging a camera's frames together finds, by simulated places: marks that are off, bent frames, given
 coordinates and scanners that are; and how often it tells what is not.
-
-python -m benchmarks judged_cameras [CAMERAS] [--seed 1]
 """
 
-import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from test_judgement import EIGHT, FILM_MM, FOUR, PX_PER_MM, SIGMA_PX, frames_of, layout_of, moved, weak
 
+from benchmarks.harness import Row
 from measure.fiducials.across_frames import CheckedFrames, check_frames
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement
@@ -21,20 +19,21 @@ Frames = list[FrameMeasurement]
 Made = Callable[[FiducialLayout, int, np.random.Generator], tuple[Frames, str]]
 
 
-def main() -> None:
-    """Print a line a kind of cameras, a column a number of frames."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("cameras", type=int, nargs="?", default=100)
-    parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    print(f"{'of ' + str(given.cameras) + ' cameras':>58} " + "".join(f"{count:>5} frames" for count in COUNTS))
-    for name, places, sigma_mm, made in kinds():
-        rng, cells = np.random.default_rng(given.seed), []
-        for count in COUNTS:
-            told = [outcome(made, layout_of(places, sigma_mm), count, rng) for _ in range(given.cameras)]
-            cells.append(f"{sum(right for right, _ in told):5}/{sum(wrong for _, wrong in told):<5}")
-        print(f"{name:>58} " + " ".join(cells))
-    print("as it should be / a good mark is weak, or another frame, or another cause, is told")
+COLUMNS = {"kind": "", **{f"{count} frames": "" for count in COUNTS}}
+
+
+def cells(cameras: int = 100) -> Iterator[Row]:
+    yield from ({"kind": kind[0], "cameras": cameras} for kind in kinds())
+
+
+def case(kind: str, cameras: int, seed: int) -> Row:
+    """As it should be / a good mark is weak, or another frame, or another cause, is told."""
+    places, sigma_mm, made = next(rest for name, *rest in kinds() if name == kind)
+    rng, row = np.random.default_rng(seed), {}
+    for count in COUNTS:
+        outcomes = [outcome(made, layout_of(places, sigma_mm), count, rng) for _ in range(cameras)]
+        row[f"{count} frames"] = f"{sum(right for right, _ in outcomes)}/{sum(wrong for _, wrong in outcomes)}"
+    return row
 
 
 def kinds() -> list[tuple[str, list[tuple[float, float]], float, Made]]:
@@ -60,25 +59,25 @@ def kinds() -> list[tuple[str, list[tuple[float, float]], float, Made]]:
 
 
 def outcome(made: Made, layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[bool, bool]:
-    """Whether what there is was told, and whether anything else was."""
+    """Whether what there is is named, and whether anything else is."""
     frames, expected = made(layout, count, rng)
     result = check_frames(frames, layout, [(PITCH_UM, PITCH_UM)] * count)
-    told = said(result)
+    named = causes(result)
     if count == 1 and expected not in ("", "mark"):
         expected = "frame"  # of one frame nobody can tell which it is
-    return told == {expected} - {""}, bool(told - {expected})
+    return named == {expected} - {""}, bool(named - {expected})
 
 
-def said(result: CheckedFrames) -> set[str]:
-    """The causes that are told, the first frame being the one that may be another."""
-    causes = {"mark" if where == ("0", "2") else "another mark" for where in weak(result.frames)}
+def causes(result: CheckedFrames) -> set[str]:
+    """The causes that are named, the first frame being the one that may be another."""
+    found = {"mark" if where == ("0", "2") else "another mark" for where in weak(result.frames)}
     for number, frame in enumerate(result.frames):
         for problem in frame.problems:
             if "no affine" in problem:
-                causes.add("another frame" if number else "frame")
+                found.add("another frame" if number else "frame")
             else:
-                causes.add("scanner" if "scanner's axes" in problem else "places")
-    return causes
+                found.add("scanner" if "scanner's axes" in problem else "places")
+    return found
 
 
 def good(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
@@ -118,7 +117,3 @@ def slightly_wrong_places(layout: FiducialLayout, count: int, rng: np.random.Gen
 
 def scanner(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
     return frames_of(layout, count, rng, camera_mm=0.005, scanner_mm=0.05, poses=POSES), "scanner"
-
-
-if __name__ == "__main__":
-    main()

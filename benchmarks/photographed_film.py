@@ -1,15 +1,13 @@
-"""Film photographed by a tilted camera, rendered, measured as projective and as affine: errors and claims of its marks.
+"""Film photographed by a tilted camera, measured as projective and as affine: errors and claims of its marks."""
 
-python -m benchmarks photographed_film [FRAMES] [--seed 1]
-"""
-
-import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from small_scene import CROSS
 
+from benchmarks.harness import Row, rms
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import BelievedFilm, FiducialOptions
@@ -42,21 +40,27 @@ LAYOUT = FiducialLayout(
 )
 
 
-def main() -> None:
-    """Print a line a tilt and a film model."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("frames", type=int, nargs="?", default=4)
-    parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    print("tilt, degrees | model | measured | largest error, px | rms error / rms claim | problems")
+COLUMNS = {
+    "tilt_deg": "g", "model": "", "measured": "d", "of": "d", "largest_px": ".3f", "error_over_claim": ".2f",
+    "problems": "",
+}  # fmt: skip
+
+
+def cells(frames: int = 4) -> Iterator[Row]:
     for tilt_deg in TILTS_DEG:
-        for model in ("projective", "affine"):
-            rows = [photographed(given.seed + number, tilt_deg, 40.0 * number, model) for number in range(given.frames)]
-            errors, sigmas = (np.concatenate([row[k] for row in rows]) for k in (0, 1))
-            ratio = float(np.sqrt(np.mean(errors**2) / np.mean(sigmas**2))) if len(errors) else np.nan
-            problems = sorted({str(problem)[:60] for row in rows for problem in row[3]})
-            marks = f"{sum(row[2] for row in rows)} of {8 * given.frames}"
-            print(f"{tilt_deg} | {model} | {marks} | {np.abs(errors).max(initial=0):.3f} | {ratio:.2f} | {problems}")
+        yield from ({"tilt_deg": tilt_deg, "model": model, "frames": frames} for model in ("projective", "affine"))
+
+
+def case(tilt_deg: float, model: str, frames: int, seed: int) -> Row:
+    rows = [photographed(seed + number, tilt_deg, 40.0 * number, model) for number in range(frames)]
+    errors, sigmas = (np.concatenate([row[k] for row in rows]) for k in (0, 1))
+    return {
+        "measured": sum(row[2] for row in rows),
+        "of": len(PLACES) * frames,
+        "largest_px": float(np.abs(errors).max(initial=0)),
+        "error_over_claim": rms(errors) / rms(sigmas),
+        "problems": "; ".join(sorted({str(problem)[:60] for row in rows for problem in row[3]})),
+    }
 
 
 def photographed(
@@ -84,7 +88,3 @@ def photographed(
     shape = (-1, 2)
     problems = tuple(str(problem) for problem in checked.problems)
     return np.reshape(errors, shape), np.reshape(sigmas, shape), len(errors), problems
-
-
-if __name__ == "__main__":
-    main()

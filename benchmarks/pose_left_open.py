@@ -1,24 +1,18 @@
 """Frames measured with their pose left open and with it set: whatever is found with the true pose set must be found
 with `pose = "auto"`, of every kind of mark.
 
-python -m benchmarks pose_left_open OUT.jsonl [--frames 300] [--first 0] [--seed 1] [--pitch 28] [--auto]
-
-One line a frame is added to OUT.jsonl, and frames that stand there already are left out. Then the table of all its
-lines is printed: how many marks are found with the true pose set, with the pose that auto took set, and with auto; how
-many have another status with auto than with the true pose set; and how many are weak, and how far off by their own
-claims. With --auto the poses are not set: for the study of weak marks.
+Told are how many marks are found with the true pose set, with the pose that auto took set, and with auto; how many have
+another status with auto than with the true pose set; and how many are weak, and how far off by their own claims. With
+--auto the poses are not set: for the study of weak marks.
 """
 
-import argparse
-import json
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.search import lines
+from benchmarks.harness import Row, table
 from benchmarks.search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, Case, case_of, draw_case
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
@@ -27,7 +21,6 @@ from measure.results import FrameMeasurement, MarkMeasurement
 from measure.tone.curve import Tone
 from synthetic_images.scene import Tones
 
-Json = dict[str, Any]
 Outline = tuple[tuple[float, float], ...]
 
 SAME_PX = 0.5  # two places of one mark
@@ -55,23 +48,15 @@ DRAWN = 4  # of twelve frames: of the kinds, disturbances and symmetries of the 
 WRONG_SIGMAS = 5.0
 
 
-def main() -> None:
-    """Measure the frames that are missing, and print."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--pitch", type=float, default=PITCH_UM)
-    parser.add_argument("--auto", action="store_true")
-    given = parser.parse_args()
-    done = {line["frame"] for line in lines(given.out)}
-    for index in range(given.first, given.first + given.frames):
-        if index not in done:
-            with given.out.open("a", encoding="utf-8") as file:
-                case = some_case(given.seed, index, given.pitch)
-                file.write(json.dumps({"frame": index, **compared(case, given.auto)}) + "\n")
-    print_table(lines(given.out))
+SUMS = ("visible", "true", "taken", "auto", "lost", "lost of taken", "other status")
+
+
+def cells(frames: int = 300, first: int = 0) -> Iterator[Row]:
+    yield from ({"frame": index} for index in range(first, first + frames))
+
+
+def case(frame: int, seed: int, pitch_um: float = PITCH_UM, auto: bool = False) -> Row:
+    return compared(some_case(seed, frame, pitch_um), auto)
 
 
 def some_case(seed: int, index: int, pitch_um: float) -> Case:
@@ -119,7 +104,7 @@ def solid_layout(rng: np.random.Generator, outline: Outline, at_mm: float, uneve
     return FiducialLayout(tuple(marks), (FRAME_MM, FRAME_MM))
 
 
-def compared(case: Case, only_auto: bool) -> Json:
+def compared(case: Case, only_auto: bool) -> Row:
     """How many marks are found with the pose left open, with the true one and with the one that auto took set."""
     auto = measured(case, "auto")
     taken = auto.pose.name if auto.pose else case.pose
@@ -180,28 +165,17 @@ def lost(found: list[np.ndarray], auto: FrameMeasurement) -> int:
     return sum(not any(np.hypot(*(place - other)) < SAME_PX for other in seen) for place in found)
 
 
-def print_table(rows: list[Json]) -> None:
+def report(rows: Sequence[Row]) -> Iterator[str]:
     """A line a kind."""
-    print(
-        f"{'kind':>16} frames visible  true taken  auto  lost of taken   other"
-        f" weak >{WRONG_SIGMAS:.0f} measured >{WRONG_SIGMAS:.0f} frames that lost"
-    )
+    columns = {"kind": "", "frames": "d", **dict.fromkeys(SUMS, "d")}
+    counts = {f"{status}{off}": "d" for status in ("weak", "measured") for off in ("", f" > {WRONG_SIGMAS:g}")}
+    lines = []
     for kind in (*sorted({row["kind"] for row in rows}), "all"):
         own = [row for row in rows if kind in (row["kind"], "all")]
-        sums = [sum(row[name] for row in own) for name in ("visible", "true", "taken", "auto", "lost", "lost of taken")]
-        losing = [row["frame"] for row in own if row["lost"] or row["lost of taken"]]
-        other = sum(row["other status"] for row in own)
-        claims = [
-            part
-            for off in ([x for row in own for x in row[f"{status} sigmas"]] for status in ("weak", "measured"))
-            for part in (len(off), sum(value > WRONG_SIGMAS for value in off))
-        ]
-        print(
-            f"{kind:>16} {len(own):6} {sums[0]:7} {sums[1]:5} {sums[2]:5} {sums[3]:5} {sums[4]:5} {sums[5]:5}",
-            f"   {other:6} {claims[0]:4} {claims[1]:2} {claims[2]:9} {claims[3]:2}",
-            losing,
-        )
-
-
-if __name__ == "__main__":
-    main()
+        line = {"kind": kind, "frames": len(own), **{name: sum(row[name] for row in own) for name in SUMS}}
+        for status in ("weak", "measured"):
+            sigmas = [value for row in own for value in row[f"{status} sigmas"]]
+            line |= {status: len(sigmas), f"{status} > {WRONG_SIGMAS:g}": sum(each > WRONG_SIGMAS for each in sigmas)}
+        lost = [row["frame"] for row in own if row["lost"] or row["lost of taken"]]
+        lines.append(line | {"frames that lost": " ".join(map(str, lost))})
+    return table(columns | counts | {"frames that lost": ""}, lines)

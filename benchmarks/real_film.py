@@ -1,35 +1,40 @@
 """Every fiducial of the real film at hand, mark by mark: the ground on which a change of `measure` is judged.
 
-    python -m benchmarks real_film DATA [--keep FILE.json] [--against FILE.json] [--frame NAME] [--tone linear]
-
-DATA is the folder of real scans: film_scans/aerial, reseau, reseau_sharpened, coarse, and film_rendered. Each scan is
-measured alone, with its orientation open, and checked as a camera of one frame. A row a scan: marks found, `measured`,
-their mean standard deviation, CPU seconds. --keep writes every mark to a file; --against compares with such a file and
-prints each mark whose status differs, or whose place differs by more than 0.005 px.
+Each scan is measured alone, with its orientation open, and checked as a camera of one frame. --keep writes every mark
+to a file; --against names such a file, and each mark whose status differs or whose place differs by more than 0.005 px is
+told. --tone linear takes grey values as light.
 """
 
-import argparse
 import json
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.reencoded_scans import CAMERAS
+from benchmarks.harness import DATA, Row
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
-from measure.results import Covariance
 from measure.scans.opening import open_scan
 from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path
 
 MOVED_PX = 0.005
+CAMERAS = {
+    "0b4cb981": "zeiss-rmk-a-153",
+    "000b3b38": "wild-rc10-153",
+    "08320661": "wild-rc10-153",
+    "0b50b18e": "wild-rc10-153",
+    "0a9a8c55": "register-glass-262",
+    "0cec8b13": "wild-rc8-153",
+    "d2ee9cf2": "wild-rc8-153",
+}
+COLUMNS = {"scan": "", "found": "d", "of": "d", "measured": "d", "sigma_px": ".4f", "cpu_s": ".1f"}
 
 
 class Task(NamedTuple):
@@ -67,72 +72,58 @@ def reseau() -> FiducialLayout:
     return FiducialLayout(tuple(marks), (53.0, 53.0))
 
 
-def measure_scan(task: Task, tone: Tone) -> dict[str, Any]:
-    begun = time.process_time()
-    with open_scan(task.scan) as scan:
-        pitch_um = task.pitch_um or scan.pitch_um
-        frame = measure_fiducials(scan.replace_tone(tone), task.layout, pitch_um, FiducialOptions())
+def cells() -> Iterator[Row]:
+    yield from ({"scan": task.name} for task in tasks(DATA))
+
+
+def case(scan: str, tone: str = "auto", against: str | None = None) -> Row:
+    task = next(task for task in tasks(DATA) if task.name == scan)
+    start_s = time.process_time()
+    with open_scan(task.scan) as opened:
+        pitch_um = task.pitch_um or opened.pitch_um
+        shown = opened.replace_tone(LINEAR if tone == "linear" else Tone.unknown())
+        frame = measure_fiducials(shown, task.layout, pitch_um, FiducialOptions())
     frame = check_frames([frame], task.layout, [pitch_um or (1.0, 1.0)]).frames[0]
+    cpu_s = time.process_time() - start_s
     marks = {
         mark.point: {
             "status": str(mark.status),
             "place_px": None if mark.center_px is None else np.round(mark.center_px, 4).tolist(),
-            "sigma_px": None
-            if mark.covariance is None
-            else round(float(np.sqrt(np.trace(mark.covariance.px2) / 2)), 4),
+            "sigma_px": mark.covariance and round(float(np.sqrt(np.trace(mark.covariance.px2) / 2)), 4),
             "reason": str(mark.reason),
         }
         for mark in frame.marks
     }
-    problems = [str(problem) for problem in frame.problems]
-    return {"marks": marks, "problems": problems, "seconds": round(time.process_time() - begun, 1)}
+    claims = [mark["sigma_px"] for mark in marks.values() if mark["status"] == "measured"]
+    return {
+        "found": len(claims) + sum(mark["status"] == "weak" for mark in marks.values()),
+        "of": len(marks),
+        "measured": len(claims),
+        "sigma_px": float(np.mean(claims)) if claims else None,
+        "cpu_s": cpu_s,
+        "marks": marks,
+        "problems": [str(problem) for problem in frame.problems],
+        "changes": changes(_marks_of(Path(against), scan), marks) if against else [],
+    }
 
 
-def sigma_px(covariance: Covariance) -> float:
-    return round(float(np.sqrt(np.trace(covariance.px2) / 2)), 4)
+def _marks_of(kept: Path, scan: str) -> Row:
+    rows = (json.loads(text)[1] for text in kept.read_text(encoding="utf-8").splitlines())
+    return next((dict(row["marks"]) for row in rows if row["scan"] == scan), {})
 
 
-def print_row(name: str, result: dict[str, Any]) -> None:
-    marks = result["marks"].values()
-    observed = [mark for mark in marks if mark["status"] in ("measured", "weak")]
-    plain = [mark["sigma_px"] for mark in observed if mark["status"] == "measured"]
-    mean = f"{np.mean(plain):.4f}" if plain else "-"
-    print(
-        f"{name:16} {len(observed):3} of {len(marks):3} {len(plain):9} {mean:>9} {result['seconds']:8.1f}", flush=True
-    )
-
-
-def print_changes(name: str, before: dict[str, Any], after: dict[str, Any]) -> None:
-    for point, new in after["marks"].items():
-        old = before["marks"].get(point, {"status": "none", "place_px": None, "sigma_px": None})
+def changes(before: Row, after: Row) -> list[str]:
+    """A line a mark that is measured otherwise."""
+    lines = []
+    for point in before.keys() & after.keys():
+        old, new = before[point], after[point]
         places = old["place_px"], new["place_px"]
-        moved = float(np.hypot(*np.subtract(*places))) if all(places) else np.nan
-        if old["status"] != new["status"] or moved > MOVED_PX:
+        moved_px = float(np.hypot(*np.subtract(*places))) if all(places) else np.nan
+        if old["status"] != new["status"] or moved_px > MOVED_PX:
             sigmas = f"{old['sigma_px']} -> {new['sigma_px']} px"
-            print(f"    {name} {point}: {old['status']} -> {new['status']}, moved {moved:.3f} px, sigma {sigmas}")
+            lines.append(f"{point}: {old['status']} -> {new['status']}, moved {moved_px:.3f} px, sigma {sigmas}")
+    return sorted(lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--keep", type=Path)
-    parser.add_argument("--against", type=Path)
-    parser.add_argument("--frame", default="")
-    parser.add_argument("--tone", choices=("auto", "linear"), default="auto")
-    options = parser.parse_args()
-    tone = LINEAR if options.tone == "linear" else Tone.unknown()
-    before = json.loads(options.against.read_text()) if options.against else {}
-    results = {}
-    print(f"{'scan':16} {'found':>10} {'measured':>9} {'sigma px':>9} {'CPU s':>8}")
-    for task in tasks(options.data):
-        if options.frame in task.name:
-            results[task.name] = measure_scan(task, tone)
-            print_row(task.name, results[task.name])
-            if task.name in before:
-                print_changes(task.name, before[task.name], results[task.name])
-            if options.keep:
-                options.keep.write_text(json.dumps(results, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+def report(rows: Sequence[Row]) -> list[str]:
+    return [f"{row['scan']} {line}" for row in rows for line in row["changes"]]

@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,7 +19,7 @@ MODULES_OF_EXTRAS = {"pipeline.review.server": "anyio", "pipeline.review.safety"
 READS_WRITING = "rapidocr-onnxruntime"  # installed for the files that it carries, without what it asks for
 
 
-@cache
+@pytest.fixture(scope="module")
 def found_there() -> dict[str, Any]:
     """What `every_command.py` says in the plain environment."""
     with TemporaryDirectory() as folder:
@@ -34,8 +33,8 @@ def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, env=plain_environment.plain_variables())
 
 
-def test_every_command_works_or_names_the_extra_that_it_needs() -> None:
-    calls = found_there()["calls"]
+def test_every_command_works_or_names_the_extra_that_it_needs(found_there: dict[str, Any]) -> None:
+    calls = found_there["calls"]
     assert {call["arguments"][0] for call in calls} == set().union(*GROUPS.values())
     for call in calls:
         told = f"{call['arguments']}: {call['messages']}"
@@ -47,8 +46,8 @@ def test_every_command_works_or_names_the_extra_that_it_needs() -> None:
             assert call["code"] in (DONE, LOOK), told
 
 
-def test_every_module_can_be_imported() -> None:
-    assert found_there()["modules"] == MODULES_OF_EXTRAS
+def test_every_module_can_be_imported(found_there: dict[str, Any]) -> None:
+    assert found_there["modules"] == MODULES_OF_EXTRAS
 
 
 def test_the_lock_file_holds_what_the_project_asks_for() -> None:

@@ -100,6 +100,7 @@ def test_juhls_table(over_points: Swept) -> None:
     assert step.sigmas.spread["r1"] < 0.25
 
 
+@pytest.mark.study
 @once
 def test_juhls_first_figure_falls_with_the_number_of_points(over_points: Swept) -> None:
     for name in PAPER_UM:

@@ -112,6 +112,7 @@ def camera_of(image: dict[str, Any], pixels: np.ndarray) -> np.ndarray:
     return np.stack([t["a1"] + t["a2"] * x + t["a3"] * y, t["b1"] + t["b2"] * x + t["b3"] * y], axis=1)
 
 
+@pytest.mark.study
 def test_half_of_the_marks_lie_outside_and_the_others_are_found(halves: Path) -> None:
     truth = truth_of(halves)
     for scan in read_measurement(halves / "out" / "measurement.db"):
@@ -127,6 +128,7 @@ def test_half_of_the_marks_lie_outside_and_the_others_are_found(halves: Path) ->
                 assert "another scan of its frame" in mark.reason
 
 
+@pytest.mark.study
 def test_joins_are_the_same_places_of_the_film(halves: Path) -> None:
     """Their errors are as large as their standard deviations say."""
     truth = truth_of(halves)
@@ -150,6 +152,7 @@ def test_joins_are_the_same_places_of_the_film(halves: Path) -> None:
     assert 0.8 < np.sqrt(np.mean(off**2)) < 1.25
 
 
+@pytest.mark.study
 def test_one_adjustment_knows_both_films_one_orientation_and_all_marks_in_one_frame(halves: Path) -> None:
     truth, result = truth_of(halves), json.loads((halves / "out" / "adjustment.json").read_text(encoding="utf-8"))
     assert result["converged"]
@@ -174,6 +177,7 @@ def test_one_adjustment_knows_both_films_one_orientation_and_all_marks_in_one_fr
     assert np.sqrt(np.mean(np.square(errors))) < 2.0
 
 
+@pytest.mark.study
 def test_the_report_shows_the_joins(halves: Path) -> None:
     page = (halves / "out" / "report.html").read_text(encoding="utf-8")
     assert "Frames scanned in parts" in page
@@ -188,6 +192,7 @@ def whole(halves: Path) -> Path:
     return halves / "frames" / "f.tif"
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("format", "reader"), [("opencv", opencv_px), ("colmap", colmap_px), ("asp", asp_px)])
 def test_formats_of_resampled_frames_are_of_the_whole(
     format: str, reader: Callable[[Path, str, np.ndarray], np.ndarray], halves: Path, whole: Path, tmp_path: Path
@@ -215,6 +220,7 @@ def test_formats_of_resampled_frames_are_of_the_whole(
                 assert np.hypot(*(place - there)) < 0.5, (image, row["point"])
 
 
+@pytest.mark.study
 def test_a_point_that_both_scans_show_goes_out_once(halves: Path, tmp_path: Path) -> None:
     comparator = read_comparator(halves / "comparator.csv")
     seen = [mark.point for mark in comparator if mark.kind == "target" and mark.status.is_observation]
@@ -231,6 +237,7 @@ def test_a_point_that_both_scans_show_goes_out_once(halves: Path, tmp_path: Path
     assert len(list(tmp_path.glob("mmvii/**/MesIm-*.xml"))) == 4
 
 
+@pytest.mark.study
 def test_the_whole_frame_is_resampled_from_both(halves: Path, whole: Path) -> None:
     """Targets lie where the truth has them, on either side of the seam, which the file states."""
     with tifffile.TiffFile(whole) as file:
@@ -300,6 +307,7 @@ def _with_frame(scan: MeasuredScan, pixel_from_camera: np.ndarray) -> MeasuredSc
     return replace(scan, frame=replace(scan.frame, pixel_from_camera=pixel_from_camera))
 
 
+@pytest.mark.study
 def test_a_scan_that_nothing_joins_costs_the_other_nothing(halves: Path, tmp_path: Path) -> None:
     """Its marks are left out with a sentence, and the other scan is adjusted alone."""
     for name in ("project.toml", "camera.toml", "points.csv", "images.csv"):
