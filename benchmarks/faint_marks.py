@@ -1,25 +1,21 @@
 """Faint marks in frames whose other marks are plainly there, against their truth and the Cramér-Rao bound.
 
-python -m benchmarks faint_marks [FRAMES] [--kind KIND ...] [--seed SEED] [--keep FILE]
-
-FRAMES: of every cell, each with three faint marks; 40 where none is given. Eight marks of one kind stand in a frame
+--frames: of every cell, each with three faint marks. Eight marks of one kind stand in a frame
 of 60 mm (10 px a mm), their blurs alike to 5 %: five have 20 times the contrast of the noise, three the SNR of a cell.
-The pictures and bounds are those of `marks`, the placements those of `dust`; what measures
-is what `reseau measure` runs, `measure.fiducials.measure_frame.measure_frame`. Ellipses are targets, and in no frame.
+A value is rms / bound and realised / claimed; -n: not found. The pictures and bounds are those of `marks`; what
+measures is what `reseau measure` runs, `measure.fiducials.measure_frame.measure_frame`.
 """
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from true_marks import KINDS, Kind, TrueMark, some_mark
+from true_marks import KIND, KINDS, Kind, TrueMark, some_mark
 
 from benchmarks.dusty_marks import BLUR_SPREAD, PX_PER_MM, about_right, frame_layout
-from benchmarks.kept_rows import KeptRows
+from benchmarks.harness import Row
 from benchmarks.measured_marks import CONTRAST, GROUND, Cell, Found, best_errors
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
@@ -90,37 +86,22 @@ def measured_faint(
         yield frame.marks[number], found, noises[number]
 
 
-def row(kind: Kind, blur_px: float, frames: int, seed: int) -> str:
-    """All SNR of a kind and blur."""
-    rng = np.random.default_rng([seed, KINDS.index(kind), int(10 * blur_px)])
-    pool = [drawn_frame(kind, blur_px, rng) for _ in range(min(POOL, frames))]
-    words = []
+COLUMNS = {"kind": "", "blur_px": "g", **{f"SNR {snr:g}": "" for snr in SNRS}}
+
+
+def cells(frames: int = 40) -> Iterator[Row]:
+    for kind in FRAMED:
+        yield from ({"kind": kind.name, "blur_px": blur_px, "frames": frames} for blur_px in BLURS_PX)
+
+
+def case(kind: str, blur_px: float, frames: int, seed: int) -> Row:
+    rng = np.random.default_rng([seed, KINDS.index(KIND[kind]), int(10 * blur_px)])
+    pool = [drawn_frame(KIND[kind], blur_px, rng) for _ in range(min(POOL, frames))]
+    row = {}
     for snr in SNRS:
         cell = Cell()
         for number in range(frames):
             for mark, found, noise in measured_faint(pool[number % len(pool)], snr, rng):
                 cell.add(mark, found, best_errors(mark, noise, 1 / snr, np.zeros(2)), mark.bound(1 / snr))
-        words.append(f"{cell.words():>18}")
-    return f"{kind.name:14}{blur_px:5.1f}" + "".join(words)
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("frames", type=int, nargs="?", default=40)
-    parser.add_argument("--kind", action="append", choices=[kind.name for kind in FRAMED])
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--keep", type=Path)
-    given = parser.parse_args()
-    rows = KeptRows(given.keep)
-    print(f"{given.frames} frames a cell, seed {given.seed}; rms / bound, realised / claimed; -n: not found")
-    print(f"{'':14}{'blur':>5}" + "".join(f"{f'SNR {snr:g}':>18}" for snr in SNRS))
-    for kind in FRAMED:
-        if not given.kind or kind.name in given.kind:
-            for blur_px in BLURS_PX:
-                key = f"faint {given.seed} {given.frames} {kind.name} {blur_px}"
-                rows.print(key, partial(row, kind, blur_px, given.frames, given.seed))
-
-
-if __name__ == "__main__":
-    main()
+        row[f"SNR {snr:g}"] = cell.words()
+    return row

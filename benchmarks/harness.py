@@ -7,6 +7,7 @@ may have
   An option of `case` on the command line leaves those rows that have its value, or makes one where none has it.
 - `COLUMNS`: what is printed of each row as soon as it is there, as format specifications by key.
 - `report(rows)`: the lines that follow when all rows are there.
+- `SEED`: the seed where the command line gives none.
 - `OWN_PROCESS = True`: each row is computed in a process of its own, with one thread. Its CPU seconds, user and system,
   and its peak memory are added to the row.
 
@@ -92,7 +93,7 @@ def _parser(module: ModuleType) -> argparse.ArgumentParser:
         f"python -m benchmarks {name}", description=module.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--cells", type=int, help="only the first so many rows")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=getattr(module, "SEED", 1))
     parser.add_argument("--keep", type=Path, help="file of rows: those in it are not computed again")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--json", action="store_true", help="one line of JSON in place of tables")

@@ -1,8 +1,8 @@
 """Every fiducial of the real film at hand, mark by mark: the ground on which a change of `measure` is judged.
 
 Each scan is measured alone, with its orientation open, and checked as a camera of one frame. --keep writes every mark
-to a file; --against names such a file, and each mark whose status differs or whose place differs by more than 0.005 px is
-told. --tone linear takes grey values as light.
+to a file; --against names such a file, and each mark whose status differs or whose place differs by more than 0.005 px
+is told. --tone linear takes grey values as light.
 """
 
 import json
