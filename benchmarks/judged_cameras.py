@@ -28,7 +28,7 @@ def cells(cameras: int = 100) -> Iterator[Row]:
 
 def case(kind: str, cameras: int, seed: int) -> Row:
     """As it should be / a good mark is weak, or another frame, or another cause, is told."""
-    places, sigma_mm, made = next(rest for name, *rest in kinds() if name == kind)
+    _, places, sigma_mm, made = next(each for each in kinds() if each[0] == kind)
     rng, row = np.random.default_rng(seed), {}
     for count in COUNTS:
         outcomes = [outcome(made, layout_of(places, sigma_mm), count, rng) for _ in range(cameras)]

@@ -85,11 +85,13 @@ def case(scan: str, tone: str = "auto", against: str | None = None) -> Row:
         frame = measure_fiducials(shown, task.layout, pitch_um, FiducialOptions())
     frame = check_frames([frame], task.layout, [pitch_um or (1.0, 1.0)]).frames[0]
     cpu_s = time.process_time() - start_s
-    marks = {
+    marks: dict[str, Row] = {
         mark.point: {
             "status": str(mark.status),
             "place_px": None if mark.center_px is None else np.round(mark.center_px, 4).tolist(),
-            "sigma_px": mark.covariance and round(float(np.sqrt(np.trace(mark.covariance.px2) / 2)), 4),
+            "sigma_px": None
+            if mark.covariance is None
+            else round(float(np.sqrt(np.trace(mark.covariance.px2) / 2)), 4),
             "reason": str(mark.reason),
         }
         for mark in frame.marks

@@ -14,6 +14,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 MKDOCS = DOCS.parent / ".venv-docs" / "bin" / "mkdocs"
 
 
+@pytest.mark.study
 def test_every_name_in_the_theory_exists() -> None:
     text = (DOCS / "method" / "theory.md").read_text(encoding="utf-8")
     names = set(re.findall(r"`((?:adjust|pipeline|measure)(?:\.\w+)+)`", text))
