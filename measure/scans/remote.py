@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
 
-Window = tuple[int, int, int, int]  # first column and row, width and height, px
-
-_PART = re.compile(r"(.+)#(?=page|window)(?:page=(\d+))?,?(?:window=(\d+),(\d+),(\d+),(\d+))?")
 if TYPE_CHECKING:
     from tifffile import TiffFile
 
+Window = tuple[int, int, int, int]  # first column and row, width and height, px
+
+_PART = re.compile(r"(.+)#(?=page|window)(?:page=(\d+))?,?(?:window=(\d+),(\d+),(\d+),(\d+))?")
 Made = TypeVar("Made")
 Extent = tuple[int, int]  # first byte, and the byte after the last
 
@@ -193,7 +193,9 @@ class Address(PosixPath):
         system = _file_system(self)
         starts, ends = [first for first, _ in extents], [after for _, after in extents]
         parts = _retry(self, lambda: _fetch_ranges(self, system.cat_ranges, starts, ends))
-        _count_traffic(len(parts), sum(map(len, parts)))
+        with _holding:
+            TRAFFIC.ranges += len(parts)
+            TRAFFIC.bytes += sum(map(len, parts))
         return parts
 
 
@@ -206,16 +208,15 @@ class Traffic:
 
 
 TRAFFIC = Traffic()
-_counting = Lock()
+_holding = Lock()
 
 
 def scan_path(text: str | Path) -> Path:
     """The file or the address that a text names, or the part of a file."""
     if isinstance(text, Path):
         return text
-    if is_scan_part(text):
-        return ScanPart(text)
-    return Address(text) if is_address(text) else Path(text)
+    kind = ScanPart if is_scan_part(text) else Address if is_address(text) else Path
+    return kind(text)
 
 
 def fetch_location(path: str | Path) -> str:
@@ -289,7 +290,6 @@ class _RemoteObject:
 
 
 _objects: OrderedDict[str, _RemoteObject] = OrderedDict()
-_holding = Lock()
 
 
 class _RemoteFile(BufferedIOBase):
@@ -331,37 +331,23 @@ def _remote_object(address: Address) -> _RemoteObject:
 def _query_object(address: Address) -> _RemoteObject:
     """Requests size and checksum anew; blocks of an unchanged content are kept."""
     system = _file_system(address)
-    info = _retry(address, lambda: _info(system, address.location))
+    info: Mapping[str, Any] = _retry(address, lambda: system.info(address.location))
     size, etag = info.get("size"), next((str(info[key]) for key in _CHECKSUMS if info.get(key)), "")
     if size is None:
         raise UnreachableError(f"{address}: its server does not say how large it is. Download it, and name the file.")
+
+    def fetch(start: int, end: int) -> bytes:
+        return address.ranges([(start, min(end, int(size)))])[0]
+
     with _holding:
         known = _objects.get(str(address))
         if known is None or (known.size, known.etag) != (size, etag):
-            known = _objects[str(address)] = _RemoteObject(int(size), etag, _block_cache(address, int(size)))
+            blocks = import_module("fsspec.caching").BlockCache(_BLOCK_BYTES, fetch, int(size), _MOST_BLOCKS)
+            known = _objects[str(address)] = _RemoteObject(int(size), etag, blocks)
         _objects.move_to_end(str(address))
         while len(_objects) > _KEPT_OBJECTS:
             _objects.popitem(last=False)
     return known
-
-
-def _block_cache(address: Address, size: int) -> Any:
-    def fetch(start: int, end: int) -> bytes:
-        return address.ranges([(start, min(end, size))])[0]
-
-    return import_module("fsspec.caching").BlockCache(_BLOCK_BYTES, fetch, size, _MOST_BLOCKS)
-
-
-def _info(system: Any, address: str) -> Mapping[str, Any]:
-    """fsspec takes whatever a server refuses for a file that is not there, and names the refusal as the cause."""
-    try:
-        info: Mapping[str, Any] = system.info(address)
-    except FileNotFoundError as error:
-        cause = error.__cause__
-        if isinstance(cause, Exception) and not isinstance(cause, FileNotFoundError) and _status(cause) != 404:
-            raise cause from None
-        raise
-    return info
 
 
 def _fetch_ranges(address: Address, cat_ranges: Any, starts: list[int], ends: list[int]) -> list[bytes]:
@@ -383,16 +369,22 @@ def _retry(address: Address, ask: Callable[[], Made]) -> Made:
             return ask()
         except MeasurementError:
             raise
-        except FileNotFoundError:
-            raise MissingError(f"there is no {address}: check its name, and that its store or server has it") from None
-        except Exception as error:  # each of fsspec's libraries has its own
+        except Exception as caught:  # each of fsspec's libraries has its own
+            error: BaseException = caught
+            if isinstance(error, FileNotFoundError):
+                # fsspec takes whatever a server refuses for a file that is not there, and names the refusal as the
+                # cause.
+                error = error.__cause__ or error
+                if isinstance(error, FileNotFoundError) or _status(error) == 404:
+                    message = f"there is no {address}: check its name, and that its store or server has it"
+                    raise MissingError(message) from None
             if wait_s is None:
                 raise UnreachableError(f"{address}: {_explanation(error)}. Tried {len(_WAITS_S) + 1} times.") from error
             time.sleep(wait_s)
     raise AssertionError
 
 
-def _explanation(error: Exception) -> str:
+def _explanation(error: BaseException) -> str:
     if isinstance(error, PermissionError) or _status(error) in (401, 403):
         return "its store or server forbids to read it (403): check your credentials and its permissions"
     if isinstance(error, TimeoutError):
@@ -400,7 +392,7 @@ def _explanation(error: Exception) -> str:
     return f"it cannot be reached ({type(error).__name__}: {public_text(str(error))})"
 
 
-def _status(error: Exception) -> int | None:
+def _status(error: BaseException) -> int | None:
     """The answer of a server, as aiohttp has it."""
     return getattr(error, "status", None)
 
@@ -424,9 +416,3 @@ def _file_system(address: Address) -> Any:
         raise MeasurementError(
             f"{address}: addresses that begin with {scheme}:// need the extra {extra!r}: pip install 'reseau[{extra}]'"
         ) from None
-
-
-def _count_traffic(ranges: int, size: int) -> None:
-    with _counting:
-        TRAFFIC.ranges += ranges
-        TRAFFIC.bytes += size

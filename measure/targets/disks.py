@@ -1,6 +1,6 @@
 """Round targets measured to the noise of the film: a blurred ellipse fitted by least-squares matching."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
 from measure.flags import DISK_UNLIKE_THE_OTHERS, LARGE_ERROR, NO_REASON, Cause, Code, Reason
+from measure.geometry import linear_scale
 from measure.marks.shapes import Disk, MarkShape
 from measure.matching.match import MatchOptions, mark_window, match
 from measure.matching.models import GREY
@@ -135,69 +136,40 @@ def fit_disk(
     Never raises for what the picture holds: a fit that fails, or shows that there is no disk, has a reason.
     """
     start = np.column_stack([pixel_from_disk, center_px])
-    radius = _mean_radius_px(pixel_from_disk)
+    radius = linear_scale(pixel_from_disk)
     sure = max(MARGIN * radius, LEAST_MARGIN_PX, _LEAST_REACH_PX - radius)
     sure = max(min(sure, longest_margin_px, _LONGEST_MARGIN_PX), _NARROWEST_MARGIN_PX)
     wide = max(sure, min(PLAIN_MARGIN_PX, longest_margin_px))
-    fit_with_ground = _fit_by_margin(scan, start, shape, sure, wide)
+    options = MatchOptions(
+        freedom="ellipse" if shape is UNIT_DISK else "affine",
+        margin_px=wide,
+        margin_blurs=0.0,
+        plain_px=sure,
+        max_shift_px=max(radius, _LEAST_SHIFT_PX),
+        linear_sigma=_FORM_SIGMA,
+        strain_sigma=_FORM_SIGMA,
+    )
+    window = read_window(scan, mark_window(shape, start, wide + BESIDE_PX))
+
+    def fit_with_ground(margin_px: float) -> FittedDisk:
+        fit = match(window, shape, start, replace(options, margin_px=margin_px))
+        return _assess(fit, covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn))
+
     disk = fit_with_ground(wide)
     soft = min(_MARGIN_BLURS * disk.blur_px, longest_margin_px)
     # In less ground than its blur reaches, a disk's blur, size and contrast may run away together.
     if soft > wide and not (disk.reason and disk.is_fitted):
         softer = fit_with_ground(soft)
         disk = disk if softer.reason else softer
-    if not disk.reason:
-        return disk
     # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better, as
     # it does how soft an edge is: what passes with less of it, at another place, may be the dust itself.
-    if disk.is_soft or not sure < wide:
+    if not disk.reason or disk.is_soft or not sure < wide:
         return disk
     narrow = fit_with_ground(sure)
     if narrow.reason or not disk.is_spoilt:
         return narrow
     agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
     return narrow if agree else replace(narrow, weakness=disk.reason.reword(f"with more ground: {disk.reason}"))
-
-
-def _fit_by_margin(
-    scan: Scan, start: Array, shape: MarkShape, sure_px: float, wide_px: float
-) -> Callable[[float], FittedDisk]:
-    """The fit from start (2, 3), pixels from the shape, by how much ground about it is used; its window holds wide_px
-    of ground, of which what is within sure_px is the disk's for sure."""
-    options = MatchOptions(
-        freedom="ellipse" if shape is UNIT_DISK else "affine",
-        margin_px=wide_px,
-        margin_blurs=0.0,
-        plain_px=sure_px,
-        max_shift_px=max(_mean_radius_px(start[:, :2]), _LEAST_SHIFT_PX),
-        linear_sigma=_FORM_SIGMA,
-        strain_sigma=_FORM_SIGMA,
-    )
-    window = read_window(scan, mark_window(shape, start, wide_px + BESIDE_PX))
-
-    def fit_with_ground(margin_px: float) -> FittedDisk:
-        fit = match(window, shape, start, replace(options, margin_px=margin_px))
-        loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
-        disk = FittedDisk(
-            center_px=fit.center_px,
-            covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss),
-            pixel_from_disk=fit.pixel_from_mark[:, :2],
-            contrast_dn=fit.contrast_dn,
-            noise_dn=fit.noise_dn,
-            blur_px=fit.blur_px,
-            damaged_fraction=fit.damaged_fraction,
-            appearance_covariance=_appearance_covariance(fit),
-            sloping=fit.sloping,
-            reason=NO_REASON if fit.converged else fit.reason,
-        )
-        return _assess(disk, fit)
-
-    return fit_with_ground
-
-
-def _mean_radius_px(pixel_from_disk: Array) -> float:
-    """Of the circle of an ellipse's area."""
-    return float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
 
 
 def _appearance_covariance(fit: MarkFit) -> Array:
@@ -209,9 +181,21 @@ def _appearance_covariance(fit: MarkFit) -> Array:
     return np.asarray(fit.covariance[np.ix_(figures, figures)] / np.outer(per, per))
 
 
-def _assess(disk: FittedDisk, fit: MarkFit) -> FittedDisk:
-    """The disk with its reason or weakness, where the fit's figures give one; residuals of a picture of something else
-    are alike in neighbouring pixels."""
+def _assess(fit: MarkFit, compression_px2: Array) -> FittedDisk:
+    """The disk of a fit with its reason or weakness, where the fit's figures give one; residuals of a picture of
+    something else are alike in neighbouring pixels."""
+    disk = FittedDisk(
+        center_px=fit.center_px,
+        covariance=fit.place_covariance.plus(Cause.COMPRESSION, compression_px2),
+        pixel_from_disk=fit.pixel_from_mark[:, :2],
+        contrast_dn=fit.contrast_dn,
+        noise_dn=fit.noise_dn,
+        blur_px=fit.blur_px,
+        damaged_fraction=fit.damaged_fraction,
+        appearance_covariance=_appearance_covariance(fit),
+        sloping=fit.sloping,
+        reason=NO_REASON if fit.converged else fit.reason,
+    )
     if disk.reason:
         return disk
     reason = weakness = NO_REASON
@@ -236,11 +220,6 @@ def _assess(disk: FittedDisk, fit: MarkFit) -> FittedDisk:
     return replace(disk, reason=reason, weakness=weakness)
 
 
-# Disks that may have dust on them, which may put them far off: on a small disk it may leave no residual that shows it,
-# and be taken for another size, form, contrast or blur of the disk, or for paint that slopes. So each disk's appearance
-# is compared with that of the others, by the noise that its fit gives and by how much the targets differ themselves.
-
-
 def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[Reason]:
     """Tests each disk of a scan for dust against the others.
 
@@ -253,6 +232,12 @@ def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[Reas
     -------
     Why each disk may be as far off as only dust is, empty where it is too large for dust and not soft, or well
     determined and like the others.
+
+    Notes
+    -----
+    Dust on a small disk may leave no residual that shows it, and be taken for another size, form, contrast or blur of
+    the disk, or for paint that slopes. So each disk's appearance is compared with that of the others, by the noise that
+    its fit gives and by how much the targets differ themselves.
     """
     if len(disks) < _FEWEST:
         return [disk.lone_doubt for disk in disks]
@@ -300,17 +285,16 @@ def _robust_deviations(appearances: Array, noise: Array) -> tuple[Array, Array]:
 def _appearance(disk: FittedDisk, predicted: Array) -> Array:
     """(5,) logarithm of size, stretch and shear against the predicted ellipse, those of the symmetric change that makes
     the one ellipse the other, and of contrast; the blur's variance, px²."""
-    root = _power(predicted @ predicted.T, 0.5)
-    fitted = disk.pixel_from_disk @ disk.pixel_from_disk.T
+    root = _root(predicted @ predicted.T)
     inverse = np.linalg.inv(root)
-    change = inverse @ _power(root @ fitted @ root, 0.5) @ inverse
+    change = inverse @ _root(root @ disk.pixel_from_disk @ disk.pixel_from_disk.T @ root) @ inverse
     values, vectors = np.linalg.eigh(change)
     log = (vectors * np.log(values)) @ vectors.T
     size, stretch, shear = (log[0, 0] + log[1, 1]) / 2, (log[0, 0] - log[1, 1]) / 2, log[0, 1]
     return np.array([size, stretch, shear, np.log(abs(disk.contrast_dn)), disk.blur_px**2])
 
 
-def _power(matrix: Array, exponent: float) -> Array:
-    """Of a symmetric, positive matrix (2, 2)."""
+def _root(matrix: Array) -> Array:
+    """The square root of a symmetric, positive matrix (2, 2)."""
     values, vectors = np.linalg.eigh(matrix)
-    return np.asarray((vectors * values**exponent) @ vectors.T)
+    return np.asarray((vectors * np.sqrt(values)) @ vectors.T)
