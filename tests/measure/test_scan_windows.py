@@ -1,6 +1,6 @@
 """Scans by windows, blocks and reductions: each is a part of the whole, and no part of a file is decoded twice."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from stored_picture import HEIGHT, WIDTH, picture
 
 from measure.scans.opening import open_scan
 from measure.scans.parallel import map_in_threads
+from measure.scans.scan import Scan
 from measure.targets.block_search import Block, Octave, Patches, search_blocks
 
 
@@ -43,13 +44,24 @@ def test_a_window_of_the_reduced_scan_is_that_part_of_it(tmp_path: Path) -> None
         np.testing.assert_allclose(scan.reduced_window(3, 20, 11, 31, 27), whole[11:38, 20:51], rtol=1e-5)
 
 
+def recorded_reads(scan: Scan, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """The segments, by row and column, that are decoded from now on."""
+    reads, original = list[tuple[int, int]](), scan._segments.read
+
+    def read(row: int, column: int, stored: Sequence[bytes] = ()) -> Any:
+        reads.append((row, column))
+        return original(row, column, stored)
+
+    monkeypatch.setattr(scan._segments, "read", read)
+    return reads
+
+
 def test_a_window_decodes_only_its_tiles_and_a_whole_pass_each_tile_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tifffile.imwrite(tmp_path / "s.tif", picture(), tile=(32, 32), compression="lzw")
     with open_scan(tmp_path / "s.tif") as scan:
-        reads, original = list[tuple[Any, ...]](), scan._segments.read
-        monkeypatch.setattr(scan._segments, "read", lambda *key: reads.append(key[:2]) or original(*key))
+        reads = recorded_reads(scan, monkeypatch)
         scan.window(33, 34, 20, 40)
         assert reads == [(1, 1), (2, 1)]
         scan.window(40, 40, 5, 5)
@@ -114,8 +126,7 @@ def test_a_search_by_blocks_decodes_each_segment_once(
     monkeypatch.setattr("measure.targets.block_search.ROW_BYTES", 100)
     tifffile.imwrite(tmp_path / "s.tif", picture(), photometric="minisblack", compression="lzw", **layout)
     with open_scan(tmp_path / "s.tif") as scan:
-        reads, original = list[tuple[Any, ...]](), scan._segments.read
-        monkeypatch.setattr(scan._segments, "read", lambda *key: reads.append(key) or original(*key))
+        reads = recorded_reads(scan, monkeypatch)
         search_blocks(scan, [Octave(4, 2, 100, lambda _: Patches.collect(()))])
         tall, wide = scan.segment_px
         assert len(reads) == len(set(reads)) == -(-HEIGHT // tall) * -(-WIDTH // wide)
