@@ -20,6 +20,7 @@ from measure.noise.noise_model import NoiseModel
 from measure.results import MarkFit
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone, MarkTone
+from measure.tone.score import tone_score
 from synthetic_images.tone_curve import coded
 
 FULL = 65535.0
@@ -326,3 +327,22 @@ def test_what_a_mark_says_of_the_curve_is_the_same_however_closely_the_fit_held_
         told = mark_tone_information(fit, drawn, drawn, everywhere, priors, departures, Tone.unknown(), FULL, landscape)
         rights.append(told.information.right_side)
     np.testing.assert_allclose(rights[1], rights[0], rtol=1e-6)
+
+
+def test_a_score_is_what_unknowns_and_priors_leave_of_the_departures() -> None:
+    """A least-squares fit of all at once has the departures that score and information give, for one picture as for
+    each of several."""
+    rng = np.random.default_rng(8)
+    design, changes, residuals = rng.normal(size=(3, 4, 50)), rng.normal(size=(3, 5, 50)), rng.normal(size=(3, 50))
+    priors, departures = np.array([0.0, 9.0, 4.0, 0.0]), np.array([0.0, 0.3, -0.2, 0.0])
+    each = tone_score(design, changes, residuals)
+    for k in range(3):
+        (*_, expected) = np.split(
+            np.linalg.lstsq(np.vstack([design[k], changes[k]]).T, -residuals[k], rcond=None)[0], [4]
+        )
+        np.testing.assert_allclose(np.linalg.solve(each.normal[k], each.value[k]), expected, atol=1e-9)
+    rows = np.vstack([np.vstack([design[0], changes[0]]).T, np.hstack([np.diag(np.sqrt(priors)), np.zeros((4, 5))])])
+    wanted = -np.concatenate([residuals[0], -np.sqrt(priors) * departures])
+    expected = np.linalg.lstsq(rows, wanted, rcond=None)[0][4:]
+    score = tone_score(design[0], changes[0], residuals[0], priors, departures)
+    np.testing.assert_allclose(np.linalg.solve(score.normal, score.value), expected, atol=1e-9)
