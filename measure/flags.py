@@ -160,10 +160,6 @@ class Reason(str):
 NO_REASON = Reason()
 
 
-# Every probability at which measuring refuses or doubts something, in one table, from which the documentation is
-# checked: what it is a probability of, and what depends on it.
-
-
 class Cause(StrEnum):
     """What a part of a covariance comes from, in the order in which the parts are listed."""
 

@@ -200,12 +200,6 @@ def _moved_line(line: Line, shift_px: Array) -> Line:
     return replace(line, outline_px=outline)
 
 
-# The revision of how scans are measured.
-#
-# Results that were kept are used again only where it is the same: it is raised whenever a scan would be measured
-# otherwise. tests/measure/test_revision.py fails where that was forgotten.
-
-
 @dataclass(frozen=True, eq=False)
 class SecondPlace:
     """offset_px (2,): the second place less the matched one; covariance_px2 (2, 2): of that difference."""

@@ -39,14 +39,6 @@ _REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
 _CLICK_REACH_PX = 6 * CLICK_SIGMA_PX  # about a click: its sigma three times, and as much for who points less well
 
 
-def first_search_px(
-    placement: Placement, layout: FiducialLayout, options: FiducialOptions, tolerance: float = 1.0
-) -> float:
-    """The search radius about where a placement puts a mark; tolerance: a share of how far it may lie off."""
-    search_px = tolerance * options.search_mm(layout) / float(np.mean(placement.pitch_mm))
-    return _REDUCED_PX * placement.reduction + search_px
-
-
 @dataclass(frozen=True, eq=False)
 class Frame:
     """A frame of n marks in one placement, as far as it is measured: each step of measuring makes another value.
@@ -102,12 +94,17 @@ class Frame:
     @property
     def first_search_px(self) -> float:
         """The search radius where only the placement predicts a mark."""
-        return first_search_px(self.placement, self.layout, self.options)
+        return self._reach_px(1.0)
 
     @property
     def near_px(self) -> float:
         """The same on film that is hardly deformed."""
-        return first_search_px(self.placement, self.layout, self.options, NARROW)
+        return self._reach_px(NARROW)
+
+    def _reach_px(self, share: float) -> float:
+        """How well the placement predicts marks that lie off by a share of what they may."""
+        search_px = share * self.options.search_mm(self.layout) / float(self.pitch_mm.mean())
+        return _REDUCED_PX * self.placement.reduction + search_px
 
     @cached_property
     def predicted_px(self) -> Array:

@@ -26,8 +26,8 @@ def pitch_problem(
     """
     found = {mark.point for mark in frame.marks if mark.kind == "fiducial" and mark.status.is_observation}
     marks = [mark for mark in layout.marks if mark.id in found]
-    is_told = any(Code.PITCH in problem.codes for problem in frame.problems)  # of pixels longer one way
-    if frame.pixel_from_camera is None or len(marks) < _LEAST_MARKS or is_told:
+    is_named = any(Code.PITCH in problem.codes for problem in frame.problems)  # of pixels longer one way
+    if frame.pixel_from_camera is None or len(marks) < _LEAST_MARKS or is_named:
         return None
     seen_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film mm for each pixel, across and down
     places = np.array([mark.xy_mm for mark in marks])
@@ -51,7 +51,7 @@ def pitch_problem(
 
 def without_lost(scan: Scan, marks: Sequence[MarkMeasurement]) -> tuple[MarkMeasurement, ...]:
     """The marks; those at places where the file does not give the pixels are `predicted` there, with that reason."""
-    return tuple(_told(scan, mark) for mark in marks)
+    return tuple(_check_loss(scan, mark) for mark in marks)
 
 
 def with_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:
@@ -59,12 +59,12 @@ def with_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:
     if not scan.damage:
         return frame
     marks = without_lost(scan, frame.marks)
-    told = f"{scan.damage[0].upper()}{scan.damage[1:]}. No mark is measured there: copy the file anew, or rescan."
-    problem = Reason(told, Code.DAMAGED_FILE)
+    sentence = f"{scan.damage[0].upper()}{scan.damage[1:]}. No mark is measured there: copy the file anew, or rescan."
+    problem = Reason(sentence, Code.DAMAGED_FILE)
     return replace(frame, marks=marks, problems=(problem, *(each for each in frame.problems if each != problem)))
 
 
-def _told(scan: Scan, mark: MarkMeasurement) -> MarkMeasurement:
+def _check_loss(scan: Scan, mark: MarkMeasurement) -> MarkMeasurement:
     if mark.center_px is None or not mark.status.is_observation:
         return mark
     half = int(np.ceil(mark.quality.get("size_px", 2 * _REACH_PX) / 2))

@@ -70,32 +70,23 @@ def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, mode
     """
     if len(camera_mm) < 2:
         raise ValueError(f"{len(camera_mm)} marks do not determine a frame; two or more do")
-    given = camera_mm @ turn.T
+    given, film = camera_mm @ turn.T, None
     radius_mm, center_mm = float(np.hypot(*given.T).max()), up_mm.mean(axis=0)
-    more = film_terms(model, given / radius_mm, (up_mm - center_mm) / radius_mm)
-    if more.shape[1]:
-        return _fit_film(model, turn, given, up_mm, sigma_mm, more)
-    solution, inverse, chi_square, residuals = _solve(given, up_mm, sigma_mm, more, AFFINITY_SIGMA)
-    linear, shift = _linear(solution, turn), solution[2:4]
+    unit, measured = given / radius_mm, (up_mm - center_mm) / radius_mm
+    terms = film_terms(model, unit, measured)
+    if terms.shape[1]:
+        solution, inverse, chi_square, _ = _solve(unit, measured, sigma_mm / radius_mm, terms, _FREE)
+        affine = np.column_stack([_linear(solution, np.eye(2)), solution[2:4]])
+        film = FilmFit(model, turn, radius_mm, center_mm, affine, solution[6:])
+        places = film.places_mm(camera_mm)
+        design = np.column_stack([camera_mm, np.ones(len(camera_mm))])
+        best = np.linalg.lstsq(design, places, rcond=None)[0].T if np.linalg.matrix_rank(design) == 3 else affine
+        up_from_camera, residuals = np.asarray(best, dtype=np.float64), up_mm - places
+    else:
+        solution, inverse, chi_square, residuals = _solve(given, up_mm, sigma_mm, terms, AFFINITY_SIGMA)
+        up_from_camera = np.column_stack([_linear(solution, turn), solution[2:4]])
     sigma = float(np.sqrt(np.sum(inverse[_LINEAR] ** 2, axis=1).mean()) / np.hypot(*solution[:2]))
-    up_from_camera = np.column_stack([linear, shift])
-    return FrameFit(up_from_camera, residuals, chi_square, 2 * len(camera_mm) - 4, sigma)
-
-
-def _fit_film(model: str, turn: Array, given: Array, up_mm: Array, sigma_mm: Array, terms: Array) -> FrameFit:
-    """With the terms (2n, k) of a film model beside an affine transformation."""
-    radius_mm, center_mm = float(np.hypot(*given.T).max()), up_mm.mean(axis=0)
-    unit, measured, sigma = given / radius_mm, (up_mm - center_mm) / radius_mm, sigma_mm / radius_mm
-    solution, inverse, chi_square, _ = _solve(unit, measured, sigma, terms, _FREE)
-    affine = np.column_stack([_linear(solution, np.eye(2)), solution[2:4]])
-    film = FilmFit(model, turn, radius_mm, center_mm, affine, solution[6:])
-    camera = given @ turn
-    places = film.places_mm(camera)
-    design = np.column_stack([camera, np.ones(len(camera))])
-    best = np.linalg.lstsq(design, places, rcond=None)[0].T if np.linalg.matrix_rank(design) == 3 else affine
-    linear_sigma = float(np.sqrt(np.sum(inverse[_LINEAR] ** 2, axis=1).mean()) / np.hypot(*solution[:2]))
-    best = np.asarray(best, dtype=np.float64)
-    return FrameFit(best, up_mm - places, chi_square, 2 * len(camera) - 4, linear_sigma, film)
+    return FrameFit(up_from_camera, residuals, chi_square, 2 * len(camera_mm) - 4, sigma, film)
 
 
 def _linear(solution: Array, turn: Array) -> Array:

@@ -196,22 +196,22 @@ class _Expected:
     differs: bool
 
 
-def _expect_from_others(own: Array, sigma: Array, spread: _Spread, fewest: int) -> list[_Expected | None]:
+def _expect_from_others(own: Array, sigma: Array, spread: _Spread, fewest: int) -> "list[_Expected | None]":
     """For each mark what the others let expect, None where they are fewer than so many.
 
     own, sigma (n,): each mark's figure and its standard deviation, infinite where it has none.
     """
-    return [_expect(own, sigma, index, spread, fewest) for index in range(len(own))]
-
-
-def _expect(own: Array, sigma: Array, index: int, spread: _Spread, fewest: int) -> _Expected | None:
-    others = np.isfinite(sigma) & (np.arange(len(own)) != index)
-    if others.sum() < fewest:
-        return None
-    mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
-    predicted = float(np.hypot(mean_sigma, apart))
-    off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
-    return _Expected(mean, predicted, bool(2 * ndtr(-off) * len(own) < MARK_UNLIKE_THE_OTHERS))
+    result: list[_Expected | None] = []
+    for index in range(len(own)):
+        others = np.isfinite(sigma) & (np.arange(len(own)) != index)
+        if others.sum() < fewest:
+            result.append(None)
+            continue
+        mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
+        predicted = float(np.hypot(mean_sigma, apart))
+        off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
+        result.append(_Expected(mean, predicted, bool(2 * ndtr(-off) * len(own) < MARK_UNLIKE_THE_OTHERS)))
+    return result
 
 
 def _mean(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:

@@ -124,10 +124,8 @@ def _read(
         return None
     if frame is None:
         return read_writing(scan, nets)
-    half = np.asarray(layout.frame_mm) / 2
-    corners_mm = half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
     matrix = frame.pixel_from_camera
-    frame_px = corners_mm @ matrix[:, :2].T + matrix[:, 2]
+    frame_px = _corners_px(matrix, layout)
     pixel_from_up = matrix[:, :2] @ up_from_camera(frame.placement.pose).T
     for known in known_lines:
         outline_px = np.array(known.outline_mm) @ pixel_from_up.T + matrix[:, 2]
@@ -218,10 +216,14 @@ def second_frame(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, op
 def _outline(frame: FrameMeasurement, layout: FiducialLayout) -> Array:
     """(4,) first and last column and row of the rectangle about a frame: col, row, col, row."""
     assert frame.pixel_from_camera is not None
-    matrix = frame.pixel_from_camera
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(layout.frame_mm) / 2
-    places = corners @ matrix[:, :2].T + matrix[:, 2]
+    places = _corners_px(frame.pixel_from_camera, layout)
     return np.concatenate([places.min(axis=0), places.max(axis=0)])
+
+
+def _corners_px(pixel_from_camera: Array, layout: FiducialLayout) -> Array:
+    """(4, 2) the corners of a frame, in the order in which they follow one another."""
+    corners_mm = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(layout.frame_mm) / 2
+    return np.asarray(corners_mm @ pixel_from_camera[:, :2].T + pixel_from_camera[:, 2])
 
 
 def _rests(scan: Scan, outline: Array) -> list[Window]:

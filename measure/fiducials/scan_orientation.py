@@ -15,7 +15,7 @@ from measure.annotations.fields import Line
 from measure.annotations.orientation_from_text import line_score, main_pose, writing_likelihoods
 from measure.array_types import Array
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame, first_search_px
+from measure.fiducials.frame import Frame
 from measure.fiducials.interior_orientation import FrameFit, fit_frame
 from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions
 from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark
@@ -84,7 +84,7 @@ def decide_pose(
     scan_from_up = frame.pixel_from_camera[:, :2] @ np.linalg.inv(up_from_camera(frame.placement.pose))
     blur_px = float(np.median([fit.blur_px for fit in fits]))
     drawings = Drawings([mark.mark for mark in layout.marks], scan_from_up, blur_px)
-    reach_px = first_search_px(frame.placement, layout, options)
+    reach_px = frame.first_search_px
     sites = [MarkSite(scan, fit, fit.center_px, frame.weights, drawings, reach_px) for fit in fits]
     # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
     usual = sorted(fits, key=lambda fit: abs(fit.contrast_dn))[len(fits) // 2]

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from operator import attrgetter
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -162,7 +163,7 @@ class FrameSearch:
     def search_scan(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements in the whole scan, of all poses, best first."""
         found: list[Placement] = []
-        for drawn_mm, alike in groupby(hypotheses, _drawn_mm):
+        for drawn_mm, alike in groupby(hypotheses, attrgetter("drawn_mm")):
             if self._responses is None or self._responses[0] != drawn_mm:
                 effort = self._caches, self._effort.half_px
                 views = self._views(drawn_mm)
@@ -179,7 +180,7 @@ class FrameSearch:
         """The placements of a frame that the scan holds all of, best first: its marks are then searched only where it
         has room for them, if that is a small part of the scan."""
         found: list[Placement] = []
-        for drawn_mm, alike in groupby(hypotheses, _drawn_mm):
+        for drawn_mm, alike in groupby(hypotheses, attrgetter("drawn_mm")):
             own = list(alike)
             room = room_mm(self.scan, self.layout, drawn_mm) + self._slack_mm(own)
             window_px = float(np.prod(2 * room / np.asarray(drawn_mm)))
@@ -258,16 +259,14 @@ class FrameSearch:
         if len(counts) == 0:
             return np.inf
         likely = comb(inside, counts) * np.sort(shares)[counts - 1] ** counts
-        return float(len(counts) * likely.min() * self._different_frames(search, same_px))
-
-    def _different_frames(self, search: PlacementSearch, same_px: int) -> float:
-        """same_px: of the reduced scan: places so near to one another that they answer alike."""
+        # How many frames differ; places within same_px (of the reduced scan) of one another answer alike.
         extent_mm = float(np.hypot(*np.ptp(self._camera_mm, axis=0)))
         span_px = extent_mm / float(search.pitch.mean()) / search.responses.reduction
         places = next(iter(search.responses.by_key.values())).map.size
         second = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
         polarities = 2 if len(self._signs) > 1 else 1
-        return places / same_px * second / same_px * len(search.distinct) * polarities
+        different = places / same_px * second / same_px * len(search.distinct) * polarities
+        return float(len(counts) * likely.min() * different)
 
     def _slack_mm(self, hypotheses: Sequence[PitchHypothesis]) -> float:
         """How far a turn, and a pitch that is wrong or longer one way, move a mark from where the frame's middle puts
@@ -292,7 +291,7 @@ class FrameSearch:
     def _placements(self, hypotheses: Sequence[PitchHypothesis], responses: Responses) -> list[Placement]:
         """The placements under hypotheses that share a drawing. Pose by pose, for the responses of all may be more
         than can be cached."""
-        marks, found = self.layout.marks, list[Placement]()
+        marks = self.layout.marks
         rotation_rad, misfit_mm = float(np.deg2rad(self.options.rotation_deg)), self.options.search_mm(self.layout)
         searches = {
             each.mm: PlacementSearch(
@@ -308,9 +307,8 @@ class FrameSearch:
             for search in searches.values():
                 search.search_pose(pose, responses.kinds[number * len(marks) : (number + 1) * len(marks)])
         self._searches |= searches
-        for search in searches.values():
-            found += [placement for each in search.placements.values() for placement in each]
-        return [placement for placement in found if self._shows_middle(placement)]
+        every = [each for search in searches.values() for own in search.placements.values() for each in own]
+        return [placement for placement in every if self._shows_middle(placement)]
 
     def _shows_middle(self, placement: Placement) -> bool:
         """Whether the scan's middle is in the frame, where it shows a part of it: two marks fit others as well, whose
@@ -320,10 +318,6 @@ class FrameSearch:
         linear, shift = placement.pixel_from_camera[:, :2], placement.pixel_from_camera[:, 2]
         middle_mm = np.linalg.solve(linear, np.array([self.scan.width_px, self.scan.height_px]) / 2 - shift)
         return bool((np.abs(middle_mm) < np.array(self.layout.frame_mm) / 2).all())
-
-
-def _drawn_mm(hypothesis: PitchHypothesis) -> Pair:
-    return hypothesis.drawn_mm
 
 
 def _pixel_from_up(pitch_mm: Pair) -> Array:

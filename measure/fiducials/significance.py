@@ -12,7 +12,7 @@ from scipy.special import bdtrc
 
 from measure.array_types import Array
 from measure.detection.localisation import highest_peak
-from measure.fiducials.frame import CLEAR_LIKENESS, Frame, first_search_px
+from measure.fiducials.frame import CLEAR_LIKENESS, Frame
 from measure.fiducials.search import FrameSearch
 from measure.flags import FRAME_BY_CHANCE, NO_FRAME, NO_REASON, Code, Reason
 from measure.scans.scan import Scan
@@ -75,10 +75,7 @@ def _doubt_by_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -
 
 def _share_at_full_resolution(search: FrameSearch, frame: Frame, found_px: dict[int, Array]) -> float:
     """Of the places that answer as strongly as the marks at reduced size, the share that does so in the scan itself."""
-    marks_px, apart_px = (
-        np.array([*found_px.values()]),
-        _APART * first_search_px(frame.placement, search.layout, search.options),
-    )
+    marks_px, apart_px = np.array([*found_px.values()]), _APART * frame.first_search_px
     others = [
         (index, place)
         for index, own in found_px.items()
@@ -95,7 +92,7 @@ def _doubt_by_neighbourhood(
     search: FrameSearch, frame: Frame, inside: Sequence[int], clear: dict[int, Array]
 ) -> Reason:
     """Where some marks were not found: whether places beside them look as much like marks as those that were."""
-    found, radius = len(clear), first_search_px(frame.placement, search.layout, search.options)
+    found, radius = len(clear), frame.first_search_px
     places = _neighbouring_places(search.scan, frame, inside, radius)
     weakest = min((_response(search, frame, index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
     hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in places)

@@ -7,6 +7,7 @@ than all others together.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -101,7 +102,7 @@ def find_frame(
             likely = [each for each in frames if _is_taken_if_given(each, attempt, at_given / tried)]
             rejected = [each for each in (found.faint, *frames) if each and each not in likely]
             unsure = (*found.unsure, *(frame for _, frame in likely))
-            found = replace(found, unsure=unsure, faint=min(rejected, key=_expected, default=None))
+            found = replace(found, unsure=unsure, faint=min(rejected, key=itemgetter(0), default=None))
     if found.is_taken:
         return found
     what_to_do = _pitch_to_try(found.unsure) or _too_faint(found.faint)
@@ -202,7 +203,7 @@ def _search_other_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int)
         for frame in frames
         if frame.accepted
     ]
-    return found, sorted(expected, key=_expected)
+    return found, sorted(expected, key=itemgetter(0))
 
 
 def _search_closer(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
@@ -219,11 +220,7 @@ def _search_closer(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> R
             )
             most = max(frames, key=lambda frame: frame.inliers.sum())
             results.append((2 * tried * min(as_measured, search.false_placements(place)), most))
-    return found, sorted(results, key=_expected)
-
-
-def _expected(result: tuple[float, Frame]) -> float:
-    return result[0]
+    return found, sorted(results, key=itemgetter(0))
 
 
 def _measure_in_likeliest_pose(search: FrameSearch, placement: Placement) -> list[Frame]:

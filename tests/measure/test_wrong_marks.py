@@ -52,12 +52,12 @@ def folder(rng: np.random.Generator, count: int) -> tuple[list[FrameMeasurement]
 
 def test_a_mark_of_four_that_is_wrong_is_named_beside_ten_frames_and_no_other_is() -> None:
     rng, right = np.random.default_rng(3), 0
-    for _ in range(10):
+    for _ in range(6):
         frames, wrong, _ = folder(rng, 10)
         found = named(checked(frames))
         assert found <= {("0", str(wrong))}
         right += bool(found)
-    assert right >= 6  # in nine of ten of 200 folders
+    assert right >= 4  # in nine of ten of 200 folders
 
 
 def test_a_lone_frame_with_a_wrong_mark_is_flagged_and_its_marks_cover_the_error() -> None:
