@@ -1,13 +1,16 @@
 """camera.toml: the camera as it is given, for the measurement (its marks) and for the adjustment (its priors)."""
 
+import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import cast, get_args
+from typing import Annotated, cast, get_args
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
 from adjust.functional_model.lens import Decentering, Distortion, Prior
@@ -16,14 +19,31 @@ from measure.marks import shapes
 from measure.marks.rendering import extent_px
 from pipeline.errors import InputError
 from pipeline.files.earlier_calibration import EarlierCalibration, read_calibration
-from pipeline.files.mark_table import Clicks, LearnedFrom, read_clicks, read_learned_from, read_mark
+from pipeline.files.mark_table import Clicks, Drawing, LearnedFrom, read_clicks, read_marks
+from pipeline.text.table_models import (
+    FLAG,
+    NOT_NEGATIVE,
+    NUMBER_OR_PAIR,
+    PAIR,
+    PATH,
+    POSITIVE,
+    SIGMA,
+    SIGMA_PAIR,
+    TABLE,
+    TEXT,
+    Key,
+    choice,
+    read_model,
+    subtable,
+    subtables,
+    whole,
+)
 from pipeline.text.tables import Table, read_toml
 from pipeline.text.text_file import SMALLEST_SIGMA
 from pipeline.text.wording import did_you_mean
 
 FIELD_RATIO = 50.0  # of principal distance and half the diagonal, either way: 2.3 degrees of field to 178
 
-Drawing = shapes.Mark | shapes.LearnedMark | None
 NO_MARK = "none"  # a fiducial that is not to be looked for in scans
 CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
@@ -35,7 +55,7 @@ def check_units(
     table: Table,
     frame_mm: tuple[float, float],
     distance_mm: float | None,
-    fiducials: Sequence[tuple[Table, shapes.Point, Drawing]],
+    fiducials: Sequence[tuple[Table, shapes.Point, shapes.Mark | shapes.LearnedMark | None]],
 ) -> None:
     """Raises InputError for lengths that are impossible in a frame of that size.
 
@@ -57,7 +77,7 @@ def check_units(
             raise entry.error("mark", f"is drawn {size_mm:.4g} mm large, in {frame}. Give its sizes in mm.")
 
 
-def _size_mm(mark: Drawing) -> float:
+def _size_mm(mark: shapes.Mark | shapes.LearnedMark | None) -> float:
     """Width or height, whichever is larger; 0 where nothing is drawn, or the frame's edges themselves are."""
     if mark is None or isinstance(mark, shapes.FrameCorner):
         return 0.0
@@ -66,7 +86,7 @@ def _size_mm(mark: Drawing) -> float:
     return float(np.ptp(extent_px(mark, np.eye(2, 3)), axis=0).max())
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class GivenFiducial:
     """A fiducial of the camera file; mark None: it can be adjusted but not measured. passed_over: and need not be.
     seen_mm: where a learned mark's template has its origin in the scan that it was first cut from."""
@@ -99,15 +119,114 @@ _WRITTEN = re.compile(
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=TABLE)
 class Source:
-    """Where the numbers of a camera file come from, and from how many calibration reports."""
+    """[source] of a camera file: where its numbers come from, and from how many calibration reports."""
 
-    text: str
-    reports: int
+    text: Annotated[str, TEXT] = Field(description="Where the numbers come from.")
+    reports: Annotated[int, whole()] = Field(default=0, description="How many calibration reports.")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class SigmaTable:
+    """[sigma] of a camera file."""
+
+    principal_distance_mm: Annotated[float | None, SIGMA] = Field(
+        default=None, description="Absent: 1 with fiducials, else free."
+    )
+    principal_point_mm: Annotated[shapes.Point | None, SIGMA_PAIR] = Field(
+        default=None, description="Absent: as the principal distance."
+    )
+    calibration: Annotated[str | None, PATH] = Field(
+        default=None, description="adjustment.json of an earlier calibration, with its covariance."
+    )
+    calibration_fiducials: Annotated[bool, FLAG] = Field(
+        default=True, description="Whether the earlier calibration says where the fiducials are."
+    )
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class DistortionTable:
+    """[distortion] of a camera file."""
+
+    family: Annotated[str, Key("name of a family", lambda table, key: _family(table))] = Field(
+        default="none", description="Distortion model."
+    )
+    decentering: Annotated[Decentering, choice("reduced", "paper")] = Field(
+        default="reduced", description="Decentering terms of torlegard."
+    )
+    r0_mm: Annotated[float, NOT_NEGATIVE] = Field(default=0.0, description="Radius of no distortion.")
+    r0_dm: Annotated[float | None, POSITIVE] = Field(default=None, description="The same of juhl.")
+    half_mm: Annotated[shapes.Point | None, NUMBER_OR_PAIR] = Field(
+        default=None, description="Unit of length of self-calibration sets; absent: half of frame_mm."
+    )
+    value: Annotated[object, Key("numbers by parameter", Table.table)] = Field(
+        default=None, description="Values of the parameters; absent: 0."
+    )
+    sigma: Annotated[object, Key("standard deviations by parameter", Table.table)] = Field(
+        default=None, description="Of the parameters; absent: fixed; all: of every parameter."
+    )
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class FiducialTable:
+    """[[fiducial]] of a camera file."""
+
+    id: Annotated[str, Key("text", lambda table, key: _fiducial_id(table))] = Field(description="Name of the mark.")
+    xy_mm: Annotated[shapes.Point, PAIR] = Field(description="Given coordinates.")
+    sigma_mm: Annotated[shapes.Point, SIGMA_PAIR] = Field(
+        default=(DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM), description="Of the given coordinates."
+    )
+    mark: Annotated[str | None, TEXT] = Field(
+        default=None, description='Name of a table [mark.NAME], or "none" to pass it over.'
+    )
+    seen_mm: Annotated[shapes.Point | None, PAIR] = Field(
+        default=None, description="Of a learned mark: where its template has its origin."
+    )
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class CameraTable:
+    """camera.toml."""
+
+    name: Annotated[str | None, TEXT] = Field(default=None, description="Absent: as the file.")
+    frame_mm: Annotated[shapes.Point | None, Key("[width, height]", lambda table, key: _frame(table))] = Field(
+        default=None, description="Of the exposed frame."
+    )
+    principal_distance_mm: Annotated[float | None, POSITIVE] = Field(
+        default=None, description="Absent: found from the points."
+    )
+    principal_point_mm: Annotated[shapes.Point | None, PAIR] = Field(
+        default=None, description="Absent: the origin, where fiducials lie about it."
+    )
+    number: Annotated[str, Key("digits", lambda table, key: _number(table))] = Field(
+        default="", description="Of the camera or its cone, as its plate has it."
+    )
+    writing: Annotated[tuple[shapes.WrittenPlace, ...], Key("list of places", lambda table, key: _writing(table))] = (
+        Field(default=(), description='Where the camera writes on its film, as "left: reads upward".')
+    )
+    sigma: Annotated[SigmaTable, subtable(SigmaTable)] = Field(
+        default=SigmaTable(), description="Prior standard deviations."
+    )
+    distortion: Annotated[DistortionTable, subtable(DistortionTable)] = Field(
+        default=DistortionTable(), description="Distortion of the lens."
+    )
+    fiducial: Annotated[tuple[FiducialTable, ...], subtables(FiducialTable)] = Field(
+        default=(), description="Fiducial marks, one table each."
+    )
+    mark: Annotated[Mapping[str, Drawing], Key("tables by name", lambda table, key: read_marks(table.table(key)))] = (
+        Field(default_factory=dict, description="Drawings of the marks.")
+    )
+    source: Annotated[Source | None, subtable(Source)] = Field(default=None, description="Where the numbers come from.")
+    clicks: Annotated[object, Key("table", Table.table)] = Field(
+        default=None, description="scan and px, columns and rows by fiducial, of marks to be learned."
+    )
+    learned_from: Annotated[LearnedFrom | None, subtable(LearnedFrom)] = Field(
+        default=None, description="As the program writes it beside learned marks."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
 class CameraFile:
     """A camera file as read: mm, a standard deviation of 0 fixes, inf frees.
 
@@ -190,52 +309,56 @@ class CameraFile:
 
 def read_camera(path: Path) -> CameraFile:
     """Read camera.toml. Raises InputError naming file, line and key."""
-    table = read_toml(path)
-    camera = parse_camera(table)
-    table.done()
-    return camera
+    return parse_camera(read_toml(path))
 
 
 def parse_camera(table: Table) -> CameraFile:
     """The camera that stands in a table: a whole camera file, or a part of another file in the same words."""
-    fiducials = _fiducials(table)
+    if "data_strip" in table:
+        raise table.error(
+            "data_strip",
+            'has become writing, which also says how it reads: writing = ["left: reads upward"], or "left".',
+        )
+    given = read_model(table, CameraTable)
+    entries = table.tables("fiducial")
+    fiducials = _fiducials(entries, given)
     default_sigma = DEFAULT_SIGMA_MM if fiducials else math.inf
-    default_point, point_sigma = _default_principal_point(fiducials)
-    sigma = table.table("sigma")
-    distance = table.number("principal_distance_mm", above=0.0) if "principal_distance_mm" in table else None
-    point = default_point
-    if "principal_point_mm" in table:
-        point, point_sigma = table.pair("principal_point_mm"), default_sigma
-    frame = table.pair("frame_mm") if "frame_mm" in table else None
-    if frame is not None and min(frame) <= 0.0:
-        raise table.error("frame_mm", f"must be two positive lengths, [width, height], not {list(frame)}.")
-    if frame is not None:
-        entries = zip(table.tables("fiducial"), fiducials, strict=True)
-        check_units(table, frame, distance, [(entry, one.xy_mm, one.mark) for entry, one in entries])
+    point, point_sigma = _default_principal_point(fiducials)
+    if given.principal_point_mm is not None:
+        point, point_sigma = given.principal_point_mm, default_sigma
+    if given.frame_mm is not None:
+        marks = [(entry, one.xy_mm, one.mark) for entry, one in zip(entries, fiducials, strict=True)]
+        check_units(table, given.frame_mm, given.principal_distance_mm, marks)
     learned = [one.id for one in fiducials if isinstance(one.mark, shapes.LearnedMark)]
+    distance_sigma = given.sigma.principal_distance_mm
     camera = CameraFile(
         path=table.file,
-        name=table.text("name", table.file.stem),
-        frame_mm=frame,
-        principal_distance_mm=distance,
+        name=table.file.stem if given.name is None else given.name,
+        frame_mm=given.frame_mm,
+        principal_distance_mm=given.principal_distance_mm,
         principal_point_mm=point,
-        principal_distance_sigma_mm=sigma.sigma("principal_distance_mm", default_sigma),
-        principal_point_sigma_mm=sigma.sigma_pair("principal_point_mm", (point_sigma, point_sigma)),
-        distortion=_distortion(table.table("distortion"), frame),
+        principal_distance_sigma_mm=default_sigma if distance_sigma is None else distance_sigma,
+        principal_point_sigma_mm=given.sigma.principal_point_mm or (point_sigma, point_sigma),
+        distortion=_distortion(table.table("distortion"), given),
         fiducials=fiducials,
-        number=_number(table),
-        writing=_writing(table),
-        source=_source(table.table("source")) if "source" in table else None,
-        clicks=read_clicks(table.table("clicks"), learned) if "clicks" in table else None,
-        learned_from=read_learned_from(table.table("learned_from")) if "learned_from" in table else None,
+        number=given.number,
+        writing=given.writing,
+        source=given.source,
+        clicks=read_clicks(table.table("clicks"), learned) if given.clicks is not None else None,
+        learned_from=given.learned_from,
     )
-    camera = replace(camera, calibration=read_calibration(sigma, camera.camera()))
-    sigma.done()
-    return camera
+    return replace(camera, calibration=read_calibration(table.table("sigma"), camera.camera()))
+
+
+def _frame(table: Table) -> shapes.Point:
+    frame = table.pair("frame_mm")
+    if min(frame) <= 0.0:
+        raise table.error("frame_mm", f"must be two positive lengths, [width, height], not {list(frame)}.")
+    return frame
 
 
 def _number(table: Table) -> str:
-    number = table.text("number", "")
+    number = table.text("number")
     if number and not number.isdigit():
         raise table.error("number", f'must be digits in quotes, as the plate has them: "13182", not {number!r}.')
     return number
@@ -243,13 +366,8 @@ def _number(table: Table) -> str:
 
 def _writing(table: Table) -> tuple[shapes.WrittenPlace, ...]:
     """Places as "left: reads upward", "right: plate reads downward", or "left" where the direction is not known."""
-    if "data_strip" in table:
-        raise table.error(
-            "data_strip",
-            'has become writing, which also says how it reads: writing = ["left: reads upward"], or "left".',
-        )
     places = []
-    for text in table.texts("writing") if "writing" in table else ():
+    for text in table.texts("writing"):
         match = _WRITTEN.fullmatch(text.strip())
         if match is None:
             raise table.error(
@@ -269,46 +387,34 @@ def written_place_text(place: shapes.WrittenPlace) -> str:
     return f"{place.side}: {' '.join(parts)}" if parts else place.side
 
 
-def _source(table: Table) -> Source:
-    source = Source(table.text("text"), int(table.number("reports", 0.0, least=0.0)))
-    table.done()
-    return source
+def _fiducial_id(table: Table) -> str:
+    id = table.text("id")
+    if not id or id != id.strip() or not id.isprintable():
+        raise table.error("id", f"must be text on one line without blanks at its ends, not {id!r}.")
+    return id
 
 
-def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
-    marks = _marks(table.table("mark"))
+def _fiducials(entries: Sequence[Table], given: CameraTable) -> tuple[GivenFiducial, ...]:
+    """The fiducials with their drawings. Raises InputError where two have one name or place, or none has a drawing."""
     fiducials: dict[str, GivenFiducial] = {}
-    for entry in table.tables("fiducial"):
-        id = entry.text("id")
-        if not id or id != id.strip() or not id.isprintable():
-            raise entry.error("id", f"must be text on one line without blanks at its ends, not {id!r}.")
-        if id in fiducials:
-            raise entry.error("id", f"fiducial {id!r} is given twice. Every mark has an id of its own.")
-        mark = entry.text("mark", choices=(*marks, NO_MARK)) if "mark" in entry else None
-        xy = entry.pair("xy_mm")
-        sigma = entry.sigma_pair("sigma_mm", (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM))
-        if any(0.0 < one < SMALLEST_SIGMA for one in sigma):
-            raise entry.error("sigma_mm", f"nothing is known to {min(sigma):g} mm. Write 0 for what is to be fixed.")
-        drawn = None if mark is None or mark not in marks else _placed(*marks[mark], xy)
-        for other in fiducials.values():
-            if other.xy_mm == xy:
-                raise entry.error("xy_mm", f"fiducial {other.id!r} has the same place. Every mark has one of its own.")
-        origin_mm = entry.pair("seen_mm") if "seen_mm" in entry else None
-        fiducials[id] = GivenFiducial(id, xy, sigma, drawn, mark == NO_MARK and drawn is None, origin_mm)
-        entry.done()
+    for entry, one in zip(entries, given.fiducial, strict=True):
+        if one.id in fiducials:
+            raise entry.error("id", f"fiducial {one.id!r} is given twice. Every mark has an id of its own.")
+        if one.mark is not None:
+            entry.text("mark", choices=(*given.mark, NO_MARK))
+        if any(0.0 < sigma < SMALLEST_SIGMA for sigma in one.sigma_mm):
+            raise entry.error(
+                "sigma_mm", f"nothing is known to {min(one.sigma_mm):g} mm. Write 0 for what is to be fixed."
+            )
+        other = next((other for other in fiducials.values() if other.xy_mm == one.xy_mm), None)
+        if other is not None:
+            raise entry.error("xy_mm", f"fiducial {other.id!r} has the same place. Every mark has one of its own.")
+        drawing = given.mark.get(one.mark or "")
+        drawn = None if drawing is None else _placed(drawing.mark, drawing.is_radial, one.xy_mm)
+        fiducials[one.id] = GivenFiducial(
+            one.id, one.xy_mm, one.sigma_mm, drawn, one.mark == NO_MARK and drawn is None, one.seen_mm
+        )
     return tuple(fiducials.values())
-
-
-def _marks(table: Table) -> Mapping[str, tuple[shapes.Mark | shapes.LearnedMark, bool]]:
-    """Every drawn mark by name, and whether it is turned with its place."""
-    marks = {}
-    for name in table.names():
-        entry = table.table(name)
-        mark = read_mark(entry)
-        radial = entry.text("rotate", "none", ("none", "radial")) == "radial"
-        entry.done()
-        marks[name] = (mark, radial)
-    return marks
 
 
 def _placed(
@@ -336,26 +442,27 @@ def _default_principal_point(fiducials: Sequence[GivenFiducial]) -> tuple[tuple[
     return (float(middle[0]), float(middle[1])), math.inf
 
 
-def _distortion(table: Table, frame_mm: tuple[float, float] | None) -> Distortion:
-    name = _family(table)
-    decentering = cast(Decentering, table.text("decentering", "reduced", ("reduced", "paper")))
-    # Juhl counts in decimetres.
-    in_dm = name == "juhl"
-    r0_mm = 100.0 * table.number("r0_dm", above=0.0) if in_dm else table.number("r0_mm", 0.0, least=0.0)
-    half_mm = _half(table, name, frame_mm) if family(name).needs == "half_mm" else (0.0, 0.0)
+def _distortion(table: Table, camera: CameraTable) -> Distortion:
+    given = camera.distortion
+    name, needs_half = given.family, family(given.family).needs == "half_mm"
+    in_dm = name == "juhl"  # Juhl counts in decimetres
+    for key, is_wrong in (("r0_mm", in_dm), ("r0_dm", not in_dm), ("half_mm", not needs_half)):
+        if is_wrong and key in table:
+            raise table.error(key, f"is no key of this table where the family is {name}. Take it out.")
+    r0_mm = 100.0 * table.number("r0_dm", above=0.0) if in_dm else given.r0_mm
+    half_mm = _half(table, given, camera.frame_mm) if needs_half else (0.0, 0.0)
     values, sigmas = table.table("value"), table.table("sigma")
-    table.done()
+    every = sigmas.sigma("all", 0.0)  # a set of 44 parameters is not named one by one
     known = parameter_names(name)
-    of_all = sigmas.sigma("all", 0.0)  # a set of 44 parameters is not named one by one
-    parameters = {each: Prior(values.number(each, 0.0), sigmas.sigma(each, of_all)) for each in known}
+    parameters = {each: Prior(values.number(each, 0.0), sigmas.sigma(each, every)) for each in known}
     values.done()
     sigmas.done()
-    named = {each: prior for each, prior in parameters.items() if each in values or each in sigmas or of_all > 0.0}
-    return Distortion(name, named, decentering, r0_mm, half_mm)
+    named = {each: prior for each, prior in parameters.items() if each in values or each in sigmas or every > 0.0}
+    return Distortion(name, named, given.decentering, r0_mm, half_mm)
 
 
 def _family(table: Table) -> str:
-    name = table.text("family", "none")
+    name = table.text("family")
     try:
         family(name)
     except ValueError as error:
@@ -363,17 +470,16 @@ def _family(table: Table) -> str:
     return name
 
 
-def _half(table: Table, name: str, frame_mm: tuple[float, float] | None) -> tuple[float, float]:
+def _half(table: Table, given: DistortionTable, frame_mm: shapes.Point | None) -> shapes.Point:
     """Half the frame, the unit of length of a self-calibration set."""
-    if "half_mm" in table:
-        half = table.number_or_pair("half_mm")
-        if min(half) <= 0.0:
-            raise table.error("half_mm", f"must be positive, not {list(half)}.")
-        return half
+    if given.half_mm is not None:
+        if min(given.half_mm) <= 0.0:
+            raise table.error("half_mm", f"must be positive, not {list(given.half_mm)}.")
+        return given.half_mm
     if frame_mm is None:
         raise table.error(
             "family",
-            f"{name} counts in halves of the frame, and its size is not known. Give the camera's frame_mm, or half_mm "
-            "in this table.",
+            f"{given.family} counts in halves of the frame, and its size is not known. Give the camera's frame_mm, or "
+            "half_mm in this table.",
         )
     return (frame_mm[0] / 2.0, frame_mm[1] / 2.0)

@@ -1,13 +1,16 @@
 """Fiducial marks in a camera file: drawn ones, templates with their pictures, and what is said of learned ones."""
 
+import dataclasses
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from measure.errors import MeasurementError
 from measure.geometry import POSES
@@ -15,21 +18,46 @@ from measure.marks import shapes
 from measure.marks.shapes import MarkTemplate, Point
 from pipeline.text.atomic import write_atomically
 from pipeline.text.names import image_name
+from pipeline.text.table_models import (
+    FLAG,
+    NOT_NEGATIVE,
+    NUMBER,
+    PAIR,
+    POSITIVE,
+    TABLE,
+    TEXT,
+    TEXTS,
+    Key,
+    choice,
+    read_model,
+    subtable,
+)
 from pipeline.text.tables import Table
 from pipeline.text.wording import numbers, quoted
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint16]
+Picture01 = Array | None  # values between 0 and 1 of the pixels of a template
 SavePicture = Callable[[str, Picture], str]
 
 _FULL = 65535
-KINDS = ("cross", "dot", "ring-cross", "ring-dot", "polygon", "parts", "template", "learned", "frame-corner")
-
-
 _ANY_CORNER = (-1.0, -1.0)  # which one it is says the fiducial's place
 
 
-@dataclass(frozen=True)
+def _vertices(table: Table, key: str) -> tuple[Point, ...]:
+    vertices = table.pairs(key)
+    if len(vertices) < 3:
+        raise table.error(key, f"a polygon needs at least three vertices, not {len(vertices)}.")
+    x, y = np.transpose(vertices)
+    if np.isclose(x @ np.roll(y, 1), y @ np.roll(x, 1), rtol=1e-9, atol=0.0):
+        raise table.error(key, "the polygon encloses no area. Give its corners in the order of its outline.")
+    return vertices
+
+
+VERTICES = Key("list of [x, y]", _vertices)
+
+
+@dataclasses.dataclass(frozen=True)
 class Clicks:
     """Where somebody saw the marks in one scan: px by fiducial, column and row.
 
@@ -42,17 +70,25 @@ class Clicks:
     who: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=TABLE)
 class LearnedFrom:
-    """The scan whose pictures the learned marks were first found by, the SHA-256 of its file, the pose in which it
-    lies, and whether clicks show that. alike: the scans that lie like it: itself; and all that were there, where the
-    marks were found by recurring in one place."""
+    """[learned_from] of a camera file: the scan whose pictures the learned marks were first found by, the SHA-256 of
+    its file, the pose in which it lies, and whether clicks show that. alike: the scans that lie like it: itself; and
+    all that were there, where the marks were found by recurring in one place."""
 
-    scan: str
-    sha256: str
-    pose: str
-    clicked: bool
-    alike: tuple[str, ...]
+    scan: Annotated[str, TEXT]
+    sha256: Annotated[str, TEXT]
+    pose: Annotated[str, choice(*POSES)]
+    clicked: Annotated[bool, FLAG] = False
+    alike: Annotated[tuple[str, ...], TEXTS] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """A mark as drawn; is_radial: whether it is turned with its place."""
+
+    mark: shapes.Mark | shapes.LearnedMark
+    is_radial: bool
 
 
 def read_clicks(table: Table, learned: Sequence[str]) -> Clicks:
@@ -68,19 +104,6 @@ def read_clicks(table: Table, learned: Sequence[str]) -> Clicks:
             "px", f"says nothing of {', '.join(missing) or 'any mark'}. Click all learned marks, or none."
         )
     return Clicks(scan, px)
-
-
-def read_learned_from(table: Table) -> LearnedFrom:
-    """As the program wrote it beside the templates."""
-    learned = LearnedFrom(
-        table.text("scan"),
-        table.text("sha256"),
-        table.text("pose", choices=POSES),
-        table.flag("clicked", False),
-        table.texts("alike"),
-    )
-    table.done()
-    return learned
 
 
 # A mark's template in a camera file, and the pictures beside it: `[mark.NAME]` of kind "template".
@@ -140,47 +163,105 @@ def _picture(shares: NDArray[np.float64] | NDArray[np.bool_]) -> Picture:
 
 def read_template(table: Table) -> MarkTemplate:
     """Raises InputError naming the key that is wrong."""
-    image = _image(table, "image")
-    if np.ptp(image) == 0.0:
-        path = table.path_value("image")
-        raise table.error("image", f"{path} shows nothing: all its pixels are alike. Cut out the mark with its ground.")
-    template = MarkTemplate(
-        image,
-        table.number("pitch_um", above=0.0),
-        table.pair("origin_px"),
-        turn_deg=table.number("turn_deg", 0.0),
-        detail_mm=table.number("detail_mm", 0.0, least=0.0),
+    return read_model(table, TemplateTable).mark(table)
+
+
+def read_marks(table: Table) -> dict[str, Drawing]:
+    """Every drawn mark by name. Raises InputError naming the key that is wrong."""
+    marks = {}
+    for name in table.names():
+        entry = table.table(name)
+        given = read_model(entry, MARK_TABLES[entry.text("kind", choices=tuple(MARK_TABLES))])
+        marks[name] = Drawing(given.mark(entry), given.rotate == "radial")
+    return marks
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class MarkTable:
+    """What every table [mark.NAME] has."""
+
+    kind: Annotated[str, TEXT] = Field(description="Shape of the mark.")
+    rotate: Annotated[str, choice("none", "radial")] = Field(
+        default="none", description="radial: drawn as on the positive x axis, turned with its place."
     )
-    return _learned(template, table.table("learned")) if "learned" in table else template
+
+    def mark(self, table: Table) -> shapes.Mark | shapes.LearnedMark:
+        """The mark. table: for messages."""
+        raise NotImplementedError
 
 
-def _learned(template: MarkTemplate, table: Table) -> MarkTemplate:
-    """The template with what the scans told of it."""
-    shares = table.table("shares")
-    steadiness, steady = (_of_pixels(table, key, template.image.shape) for key in ("steadiness", "steady"))
-    learned = replace(
-        template,
-        image=template.image * (table.number("range_dn", above=0.0) / float(np.ptp(template.image))),
-        noise_dn=table.number("noise_dn", least=0.0),
-        slope_noise_dn=table.number("slope_noise_dn", 0.0, least=0.0),
-        shares={scan: shares.number(scan, above=0.0) for scan in shares.names()},
-        steadiness=steadiness,
-        steady=None if steady is None else steady > 0.5,
-        learned_mm=table.number("size_mm", above=0.0),
-        alike=table.texts("alike") if "alike" in table else (),
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class LearnedTable(MarkTable):
+    """A mark that is to be learned from the scans."""
+
+    size_mm: Annotated[float, POSITIVE] = Field(description="Width of the template.")
+
+    def mark(self, table: Table) -> shapes.LearnedMark:
+        return shapes.LearnedMark(self.size_mm)
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class PaintedTable(MarkTable):
+    """A mark that is lighter or darker than its ground."""
+
+    polarity: Annotated[shapes.Polarity, choice("auto", "light", "dark")] = Field(
+        default="auto", description="Whether the mark is lighter than its ground."
     )
-    table.done()
-    return learned
 
 
-def _of_pixels(table: Table, key: str, shape: tuple[int, ...]) -> Array | None:
-    """A value between 0 and 1 for every pixel of the template; None where the file has none."""
-    if key not in table:
-        return None
-    values = _image(table, key) / _FULL
-    if values.shape != shape:
-        raise table.error(key, f"is a picture of {values.shape[::-1]} px, and the template has {shape[::-1]}.")
-    return values
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class FrameCornerTable(PaintedTable):
+    """Where two edges of the exposed frame meet."""
+
+    reach_mm: Annotated[float, NOT_NEGATIVE] = Field(
+        default=0.0, description="How far along its edges it is measured; 0: a sixth of half the frame."
+    )
+    radius_mm: Annotated[float, NOT_NEGATIVE] = Field(default=0.0, description="Of a rounded corner.")
+
+    def mark(self, table: Table) -> shapes.Mark:
+        if self.radius_mm and self.reach_mm and self.radius_mm >= self.reach_mm:
+            raise table.error(
+                "radius_mm", f"must be smaller than reach_mm ({self.reach_mm:g}), not {self.radius_mm:g}."
+            )
+        return shapes.frame_corner(_ANY_CORNER, self.reach_mm, self.radius_mm, self.polarity)
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class LearnedPicture:
+    """[mark.NAME.learned]: what the scans told of a template, as the program writes it."""
+
+    size_mm: Annotated[float, POSITIVE]
+    range_dn: Annotated[float, POSITIVE]
+    noise_dn: Annotated[float, NOT_NEGATIVE]
+    slope_noise_dn: Annotated[float, NOT_NEGATIVE] = 0.0
+    alike: Annotated[tuple[str, ...], TEXTS] = ()
+    steadiness: Annotated[Picture01, Key("path", lambda table, key: _image(table, key) / _FULL)] = None
+    steady: Annotated[Picture01, Key("path", lambda table, key: _image(table, key) / _FULL)] = None
+    shares: Annotated[Mapping[str, float], Key("numbers by scan", lambda table, key: _shares(table.table(key)))] = (
+        Field(default_factory=dict)
+    )
+
+    def applied(self, template: MarkTemplate, table: Table) -> MarkTemplate:
+        """The template with what the scans told of it."""
+        for key, values in (("steadiness", self.steadiness), ("steady", self.steady)):
+            if values is not None and values.shape != template.image.shape:
+                px = template.image.shape[::-1]
+                raise table.error(key, f"is a picture of {values.shape[::-1]} px, and the template has {px}.")
+        return replace(
+            template,
+            image=template.image * (self.range_dn / float(np.ptp(template.image))),
+            noise_dn=self.noise_dn,
+            slope_noise_dn=self.slope_noise_dn,
+            shares=self.shares,
+            steadiness=self.steadiness,
+            steady=None if self.steady is None else self.steady > 0.5,
+            learned_mm=self.size_mm,
+            alike=self.alike,
+        )
+
+
+def _shares(table: Table) -> dict[str, float]:
+    return {scan: table.number(scan, above=0.0) for scan in table.names()}
 
 
 def _image(table: Table, key: str) -> Array:
@@ -193,26 +274,53 @@ def _image(table: Table, key: str) -> Array:
         raise table.error(key, str(error)) from error
 
 
-def read_mark(table: Table) -> shapes.Mark | shapes.LearnedMark:
-    """One mark. Raises InputError naming the key that is wrong."""
-    kind = table.text("kind", choices=KINDS)
-    if kind == "learned":
-        return shapes.LearnedMark(table.number("size_mm", above=0.0))
-    polarity = cast(shapes.Polarity, table.text("polarity", "auto", ("auto", "light", "dark")))
-    if kind == "frame-corner":
-        reach, radius = table.number("reach_mm", 0.0, least=0.0), table.number("radius_mm", 0.0, least=0.0)
-        if radius and reach and radius >= reach:
-            raise table.error("radius_mm", f"must be smaller than reach_mm ({reach:g}), not {radius:g}.")
-        return shapes.frame_corner(_ANY_CORNER, reach, radius, polarity)
-    if kind == "template":
-        return replace(read_template(table), polarity=polarity)
-    return shapes.MarkShape(_parts(kind, table), polarity, true_mm=_true_mm(table))
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class TemplateTable(PaintedTable):
+    """A chip cut from a scan."""
+
+    image: Annotated[Array, Key("path", _image)] = Field(description="The chip.")
+    pitch_um: Annotated[float, POSITIVE] = Field(description="Of its pixels.")
+    origin_px: Annotated[Point, PAIR] = Field(description="Column and row of the point that is measured.")
+    turn_deg: Annotated[float, NUMBER] = Field(default=0.0, description="By which the chip is turned.")
+    detail_mm: Annotated[float, NOT_NEGATIVE] = Field(default=0.0, description="Size of its finest detail.")
+    learned: Annotated[LearnedPicture | None, subtable(LearnedPicture)] = Field(
+        default=None, description="As the program writes it."
+    )
+
+    def mark(self, table: Table) -> MarkTemplate:
+        if np.ptp(self.image) == 0.0:
+            path = table.path_value("image")
+            raise table.error(
+                "image", f"{path} shows nothing: all its pixels are alike. Cut out the mark with its ground."
+            )
+        template = MarkTemplate(
+            self.image,
+            self.pitch_um,
+            self.origin_px,
+            polarity=self.polarity,
+            turn_deg=self.turn_deg,
+            detail_mm=self.detail_mm,
+        )
+        return self.learned.applied(template, table.table("learned")) if self.learned else template
 
 
-def _true_mm(table: Table) -> tuple[shapes.Point, shapes.Point] | None:
-    """The rectangle in which the drawing is true; None: everywhere."""
-    if "true_mm" not in table:
-        return None
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class DrawnTable(PaintedTable):
+    """A mark drawn by its sizes."""
+
+    true_mm: Annotated[tuple[Point, Point] | None, Key("[[x, y], [x, y]]", lambda table, key: _true_mm(table))] = Field(
+        default=None, description="Corners of the rectangle in which the drawing is true; absent: everywhere."
+    )
+
+    def mark(self, table: Table) -> shapes.MarkShape:
+        return shapes.MarkShape(self.parts(table), self.polarity, true_mm=self.true_mm)
+
+    def parts(self, table: Table) -> tuple[shapes.Part, ...]:
+        """The simple shapes of the mark. table: for messages."""
+        raise NotImplementedError
+
+
+def _true_mm(table: Table) -> tuple[Point, Point]:
     corners = table.pairs("true_mm")
     if len(corners) != 2 or not np.all(np.less(*corners)):
         corner = "[[least x, least y], [greatest x, greatest y]]"
@@ -220,44 +328,100 @@ def _true_mm(table: Table) -> tuple[shapes.Point, shapes.Point] | None:
     return corners[0], corners[1]
 
 
-def _parts(kind: str, table: Table) -> tuple[shapes.Part, ...]:
-    if kind == "dot":
-        return shapes.dot(table.number("radius_mm", above=0.0))
-    if kind == "ring-dot":
-        return shapes.ring_dot(*_ring_sizes(table), table.number("radius_mm", above=0.0))
-    if kind == "polygon":
-        return shapes.polygon(_vertices(table))
-    if kind == "parts":
-        parts = tuple(_part(part) for part in table.tables("part"))
-        if not parts:
-            raise table.error("part", f"a mark of kind 'parts' needs at least one [[{table.place}.part]].")
-        return parts
-    arm, line, gap, angle = _cross_sizes(table)
-    if kind == "ring-cross":
-        return shapes.ring_cross(*_ring_sizes(table), arm, line, gap, angle)
-    return shapes.cross(arm, line, gap, angle)
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class DotTable(DrawnTable):
+    """A disk."""
+
+    radius_mm: Annotated[float, POSITIVE] = Field(description="Of the disk.")
+
+    def parts(self, table: Table) -> tuple[shapes.Part, ...]:
+        return shapes.dot(self.radius_mm)
 
 
-def _cross_sizes(table: Table) -> tuple[float, float, float, float]:
-    arm = table.number("arm_mm", above=0.0)
-    gap = table.number("gap_mm", 0.0, least=0.0)
-    if gap >= arm:
-        raise table.error("gap_mm", f"must be smaller than arm_mm ({arm:g}), not {gap:g}: no arm would be left.")
-    return arm, table.number("line_mm", above=0.0), gap, table.number("angle_deg", 0.0)
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class RingTable(DrawnTable):
+    """A mark with a ring."""
+
+    ring_mm: Annotated[float, POSITIVE] = Field(description="Mean radius of the ring.")
+    ring_line_mm: Annotated[float, POSITIVE] = Field(description="Width of the ring.")
 
 
-def _ring_sizes(table: Table) -> tuple[float, float]:
-    return table.number("ring_mm", above=0.0), table.number("ring_line_mm", above=0.0)
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class RingDotTable(RingTable, DotTable):
+    """A disk in a ring."""
+
+    def parts(self, table: Table) -> tuple[shapes.Part, ...]:
+        return shapes.ring_dot(self.ring_mm, self.ring_line_mm, self.radius_mm)
 
 
-def _vertices(table: Table) -> tuple[shapes.Point, ...]:
-    vertices = table.pairs("vertices_mm")
-    if len(vertices) < 3:
-        raise table.error("vertices_mm", f"a polygon needs at least three vertices, not {len(vertices)}.")
-    x, y = np.transpose(vertices)
-    if np.isclose(x @ np.roll(y, 1), y @ np.roll(x, 1), rtol=1e-9, atol=0.0):
-        raise table.error("vertices_mm", "the polygon encloses no area. Give its corners in the order of its outline.")
-    return vertices
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class CrossTable(DrawnTable):
+    """A cross."""
+
+    arm_mm: Annotated[float, POSITIVE] = Field(description="Half its length.")
+    line_mm: Annotated[float, POSITIVE] = Field(description="Width of its bars.")
+    gap_mm: Annotated[float, NOT_NEGATIVE] = Field(default=0.0, description="Half the gap in its middle.")
+    angle_deg: Annotated[float, NUMBER] = Field(default=0.0, description="0 upright, 45 diagonal.")
+
+    def parts(self, table: Table) -> tuple[shapes.Part, ...]:
+        return shapes.cross(*self.sizes(table))
+
+    def sizes(self, table: Table) -> tuple[float, float, float, float]:
+        """Arm, line, gap and angle. table: for messages."""
+        if self.gap_mm >= self.arm_mm:
+            message = f"must be smaller than arm_mm ({self.arm_mm:g}), not {self.gap_mm:g}: no arm would be left."
+            raise table.error("gap_mm", message)
+        return self.arm_mm, self.line_mm, self.gap_mm, self.angle_deg
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class RingCrossTable(RingTable, CrossTable):
+    """A cross in a ring."""
+
+    def parts(self, table: Table) -> tuple[shapes.Part, ...]:
+        return shapes.ring_cross(self.ring_mm, self.ring_line_mm, *self.sizes(table))
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class PolygonTable(DrawnTable):
+    """A wedge, notch or wing."""
+
+    vertices_mm: Annotated[tuple[Point, ...], VERTICES] = Field(description="Corners in the order of the outline.")
+
+    def parts(self, table: Table) -> tuple[shapes.Part, ...]:
+        return shapes.polygon(self.vertices_mm)
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class PartsTable(DrawnTable):
+    """Disks, rings, bars and polygons together."""
+
+    part: Annotated[tuple[shapes.Part, ...], Key("tables", lambda table, key: _parts(table))] = Field(
+        description="The simple shapes, one table each."
+    )
+
+    def parts(self, table: Table) -> tuple[shapes.Part, ...]:
+        return self.part
+
+
+MARK_TABLES: Mapping[str, type[MarkTable]] = {
+    "cross": CrossTable,
+    "dot": DotTable,
+    "ring-cross": RingCrossTable,
+    "ring-dot": RingDotTable,
+    "polygon": PolygonTable,
+    "parts": PartsTable,
+    "template": TemplateTable,
+    "learned": LearnedTable,
+    "frame-corner": FrameCornerTable,
+}
+
+
+def _parts(table: Table) -> tuple[shapes.Part, ...]:
+    parts = tuple(_part(part) for part in table.tables("part"))
+    if not parts:
+        raise table.error("part", f"a mark of kind 'parts' needs at least one [[{table.place}.part]].")
+    return parts
 
 
 def _part(table: Table) -> shapes.Part:
@@ -273,6 +437,6 @@ def _part(table: Table) -> shapes.Part:
         if part.from_mm == part.to_mm:
             raise table.error("to_mm", "is the same as from_mm: a bar needs two different ends.")
     else:
-        part = shapes.Polygon(_vertices(table))
+        part = shapes.Polygon(_vertices(table, "vertices_mm"))
     table.done()
     return part

@@ -9,6 +9,8 @@ from pydantic.dataclasses import dataclass
 from measure.fiducials.options import Reads
 from measure.geometry import POSES
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
+from pipeline.files.camera_file import CameraTable, DistortionTable, FiducialTable, SigmaTable, Source
+from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.target_table import TARGET_TABLES, TargetSettings, TieSettings, TieTable, read_targets, read_ties
 from pipeline.text.table_models import FLAG, PATH, PATHS, SIGMA, TABLE, TEXT, TRIPLE, Key, choice, key_rows, subtable
 from pipeline.text.tables import Table
@@ -100,7 +102,7 @@ def _pitch(table: Table) -> tuple[float, float]:
 
 
 def keys_text() -> str:
-    """The tables of all keys of project.toml, in Markdown."""
+    """The tables of all keys of project.toml and camera.toml, in Markdown."""
     tables: list[tuple[str, type]] = [
         ("project.toml", ProjectTable),
         ("[measure]", MeasureTable),
@@ -108,8 +110,14 @@ def keys_text() -> str:
         *((f'[targets], kind = "{kind}"', model) for kind, model in TARGET_TABLES.items()),
         ("[ties]", TieTable),
         ("[adjust]", AdjustSettings),
+        ("camera.toml", CameraTable),
+        ("[sigma]", SigmaTable),
+        ("[distortion]", DistortionTable),
+        ("[[fiducial]]", FiducialTable),
+        *((f'[mark.NAME], kind = "{kind}"', model) for kind, model in MARK_TABLES.items()),
+        ("[source]", Source),
     ]
-    lines = ["# Keys of project.toml", ""]
+    lines = ["# Keys of project.toml and camera.toml", ""]
     for title, model in tables:
         lines += [f"## {title}", "", "| key | type | unit | default | meaning |", "|---|---|---|---|---|"]
         lines += [f"| `{r.name}` | {r.type} | {r.unit} | {r.default} | {r.meaning} |" for r in key_rows(model)]

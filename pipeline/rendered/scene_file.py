@@ -110,9 +110,7 @@ def _camera(table: Table) -> CameraFile:
     if isinstance(table.values.get("camera"), str):
         camera = read_camera(camera_path(table.text("camera"), table.file.parent))
     else:
-        inline = table.table("camera")
-        camera = parse_camera(inline)
-        inline.done()
+        camera = parse_camera(table.table("camera"))
     if camera.frame_mm is None or camera.principal_distance_mm is None:
         raise table.error("camera", "a camera that is to take pictures needs frame_mm and principal_distance_mm.")
     return camera

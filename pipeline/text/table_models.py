@@ -48,6 +48,7 @@ NUMBER = Key("number", Table.number)
 POSITIVE = Key("number above 0", lambda table, key: table.number(key, above=0.0))
 NOT_NEGATIVE = Key("number, 0 or more", lambda table, key: table.number(key, least=0.0))
 SIGMA = Key('standard deviation, 0 or "free"', Table.sigma)
+SIGMA_PAIR = Key('standard deviation or [sx, sy], 0 or "free"', Table.sigma_pair)
 PAIR = Key("[x, y]", Table.pair)
 NUMBER_OR_PAIR = Key("number or [x, y]", Table.number_or_pair)
 TRIPLE = Key("[x, y, z]", Table.triple)
@@ -67,6 +68,11 @@ def choice(*words: str) -> Key:
 def subtable(model: type) -> Key:
     """A table below this one."""
     return Key("table", lambda table, key: read_model(table.table(key), model), model)
+
+
+def subtables(model: type) -> Key:
+    """An array of tables below this one."""
+    return Key("tables", lambda table, key: tuple(read_model(each, model) for each in table.tables(key)), model)
 
 
 def read_model(table: Table, model: type[Model]) -> Model:
