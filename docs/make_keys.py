@@ -1,4 +1,4 @@
-"""Writes docs/keys.md: all keys of project.toml and camera.toml, from the models that read them. Run in the project's root."""
+"""Writes docs/keys.md: all keys of the TOML files, from the models that read them. Run in the project's root."""
 
 from pathlib import Path
 
