@@ -42,7 +42,7 @@ from pipeline.provenance import of_file
 from pipeline.publishing.made_from import adjusted_from, differing, measured_from
 from pipeline.publishing.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
-from pipeline.report.load import adjusted, frame_data, measured, report_data
+from pipeline.report.load import adjusted_data, frame_data, measured_data, report_data
 from pipeline.report.page import write_frame_page, write_report
 from pipeline.results.adjustment_file import read_adjustment, write_adjustment
 from pipeline.results.comparator_file import (
@@ -99,7 +99,7 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
         return _measured_shard(project, reporter, work, work.shard)
     with unpublished(project) as new:
         digest = _measure(project, new, reporter, work)
-        data = measured(project, new.at) if len(project.scans) <= _ONE_BY_ONE else None
+        data = measured_data(project, new.at) if len(project.scans) <= _ONE_BY_ONE else None
         _publish(project, new)
     if project.images_path is not None:
         _fill_images(project, measured_scans(project.measurement_path, digest))
@@ -128,7 +128,7 @@ def run_adjust(project: Project, reporter: Reporter) -> Summary:
         earlier = project.adjustment_path
         if earlier.exists() and of_file(earlier) != of_file(new.at(earlier)):
             new.remove(project.check_path)  # it belongs to the earlier one
-        data = adjusted(project, new.at)
+        data = adjusted_data(project, new.at)
         new.publish()
     covariance = covariance_path(project.adjustment_path)
     return summarise(data, {"adjustment": project.adjustment_path, "covariance": covariance})
@@ -143,7 +143,7 @@ def run_check(project: Project, reporter: Reporter) -> Summary:
             marks = _given_marks(project, new)
             _check_adjusted(project, marks)
             _write_check(project, adjust_marks(project, marks), new)
-        data = adjusted(project, new.at)
+        data = adjusted_data(project, new.at)
         new.publish()
     return summarise(data, {"check": project.check_path})
 

@@ -161,7 +161,7 @@ def planned_network(setup: Setup) -> tuple[Network, Approximations]:
 
 
 def _image(setup: Setup, camera: str, image: SceneImage) -> network.Image:
-    observed = setup.settings.orientation_of(image.name)
+    observed = setup.settings.planned_orientation(image.name)
     exterior = None
     if observed is not None:
         sigmas = np.array([*observed.position_sigma, *np.radians(observed.angles_sigma_deg)])

@@ -47,7 +47,7 @@ def plot_sweep(swept: Swept, path: Path) -> None:
     axes = _axes(swept, places, shares)
     curves = [_curve(axes, number, places, each) for number, each in enumerate(shares.values())]
     key = [_key(axes, number, name) for number, name in enumerate(shares)]
-    chart = axes.drawn(swept.quantity, "expected standard deviation, first value = 1")
+    chart = axes.grid(swept.quantity, "expected standard deviation, first value = 1")
     height = max(axes.height, axes.top + ROW_PX * (len(key) + 1))
     svg.write_picture(path, axes.width, height, f"Expected precision over {swept.quantity}", chart, *curves, *key)
 

@@ -121,7 +121,7 @@ class Axes:
         span = self.height - self.top - self.bottom
         return self.height - self.bottom - _share(value, self.y_range, self.y_is_log) * span
 
-    def drawn(self, x_label: str, y_label: str) -> Markup:
+    def grid(self, x_label: str, y_label: str) -> Markup:
         """Grid, ticks and labels."""
         x_ticks = self.x_ticks
         if x_ticks is None:

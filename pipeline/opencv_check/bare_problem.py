@@ -215,7 +215,7 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     held = dict(zip(whole.lens.quantities[3:], whole.lens.parameters.tolist(), strict=True))
     model = fixed(whole.lens.distortion.family, held)
     known = replace(lens, covariance=solved.cofactor_of(own))
-    free = convert_lens(known, model, corners_mm, problem.freedom.distortion, held=problem.freedom.held)
+    free = convert_lens(known, model, corners_mm, problem.freedom.distortion, held=problem.freedom.held_interior)
     parameters, _ = opencv_values(whole.lens)
     _, by_lens = opencv_values(free.lens)
     covariance = by_lens @ free.lens.covariance @ by_lens.T

@@ -66,7 +66,7 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
     middle.
     Raises cv2.error where OpenCV refuses.
     """
-    pixels = _Pixels.of(images, start)
+    pixels = _Pixels.from_images(images, start)
     rounded = [each.astype(np.float32) for each in pixels.places]
     objects = [each.astype(np.float32) for each in pixels.objects]
     tilted = "tau_x" in freedom.names or bool(start[-2:].any())
@@ -99,7 +99,7 @@ def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Ar
     precision; what may be told from its solution is what is left of a gradient that is not quite 0.
     Raises cv2.error where OpenCV refuses.
     """
-    pixels = _Pixels.of(images, start)
+    pixels = _Pixels.from_images(images, start)
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_RECOMPUTE_EXTRINSIC
     flags |= 0 if "alpha" in freedom.names else cv2.CALIB_FIX_SKEW
     flags |= 0 if "fx" in freedom.names else cv2.CALIB_FIX_FOCAL_LENGTH
@@ -159,7 +159,7 @@ class _Pixels:
     size: tuple[int, int]
 
     @classmethod
-    def of(cls, images: Sequence[ImagePoints], start: Array) -> "_Pixels":
+    def from_images(cls, images: Sequence[ImagePoints], start: Array) -> "_Pixels":
         observed = np.concatenate([image.xy_mm for image in images])
         corners = np.array([np.minimum(observed.min(axis=0), start[2:4]), np.maximum(observed.max(axis=0), start[2:4])])
         mm = float((corners[1] - corners[0]).max()) / (PICTURE_PX - 1)

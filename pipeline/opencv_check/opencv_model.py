@@ -31,7 +31,7 @@ class Freedom:
     names: tuple[str, ...]
 
     @property
-    def held(self) -> tuple[str, ...]:
+    def held_interior(self) -> tuple[str, ...]:
         """Which of c, x0 and y0 are not."""
         return tuple(own for own, name in (("c", "fx"), ("x0", "cx"), ("y0", "cy")) if name not in self.names)
 

@@ -166,7 +166,7 @@ class DesignSettings:
     distance: Annotated[tuple[PlannedDistance, ...], _tables(PlannedDistance.read)] = ()
     orientation: Annotated[tuple[PlannedOrientation, ...], Key("tables", _orientations)] = ()
 
-    def orientation_of(self, image: str) -> PlannedOrientation | None:
+    def planned_orientation(self, image: str) -> PlannedOrientation | None:
         """How well that of an image is to be observed; None where it is not."""
         named = {each.image: each for each in self.orientation}
         return named.get(image) or named.get("")

@@ -63,15 +63,15 @@ def parse_scene(table: Table) -> SceneFile:
     camera = _camera(table)
     field_table = table.table("field")
     unit = field_table.text("unit", "m", ("m", "dm", "cm", "mm"))
-    field = _made(path, lambda: read_field(field_table, unit, seed))
+    field = _build(path, lambda: read_field(field_table, unit, seed))
     field_table.done()
     film_table, scanner_table, picture = table.table("film"), table.table("scan"), table.table("picture")
-    film = _made(path, lambda: _film(film_table))
-    scanner = _made(path, lambda: _scanner(scanner_table))
+    film = _build(path, lambda: _film(film_table))
+    scanner = _build(path, lambda: _scanner(scanner_table))
     laws = _Laws.read(film_table, scanner_table, film.kind)
-    images, on_all = table.tables("image"), _made(path, lambda: _writing(table))
+    images, on_all = table.tables("image"), _build(path, lambda: _writing(table))
     generators = [np.random.default_rng([seed, index, 0]) for index in range(len(images))]
-    made = _made(
+    made = _build(
         path,
         lambda: scene.Scene(
             name=table.text("name", path.stem),
@@ -90,14 +90,14 @@ def parse_scene(table: Table) -> SceneFile:
             corner_radius_mm=picture.number("corner_radius_mm", 0.0, least=0.0),
         ),
     )
-    given = _given(table.table("given"))
+    given = _read_given(table.table("given"))
     design = read_design(table.table("design"), given.point[0] if given.planimetry else math.inf, given.point[1])
     for part in (film_table, scanner_table, picture, table):
         part.done()
     return SceneFile(path, made, camera, unit, given, design)
 
 
-def _made(path: Path, make: Callable[[], Made]) -> Made:
+def _build(path: Path, make: Callable[[], Made]) -> Made:
     """A part of the scene; what it refuses is an error of the file."""
     try:
         return make()
@@ -280,7 +280,7 @@ def _exterior(table: Table) -> tuple[float, float, float, float, float, float]:
     return (x, y, z, omega, phi, kappa)
 
 
-def _given(table: Table) -> Given:
+def _read_given(table: Table) -> Given:
     given = Given(
         principal_distance_mm=table.number("principal_distance_error_mm", 0.0, least=0.0),
         principal_point_mm=table.number("principal_point_error_mm", 0.0, least=0.0),

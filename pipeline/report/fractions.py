@@ -107,7 +107,7 @@ def fraction_plot(axis: str, test: FractionTest) -> Markup:
     bars = _columns(axes, edges, test.counts)
     label = f"{axis} position less the pixel's centre (px)"
     title = f"Histogram of the fractional parts of the {axis} positions"
-    return svg.picture(axes.width, axes.height, title, *bars, band, axes.drawn(label, "marks"))
+    return svg.picture(axes.width, axes.height, title, *bars, band, axes.grid(label, "marks"))
 
 
 def histogram(label: str, values: Array) -> Markup:
@@ -118,7 +118,7 @@ def histogram(label: str, values: Array) -> Markup:
     counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
     axes = svg.Axes((edges[0], edges[-1]), (0.0, 1.1 * float(counts.max())), width=330.0, height=220.0)
     title = f"Histogram of the {label}"
-    return svg.picture(axes.width, axes.height, title, *_columns(axes, edges, counts), axes.drawn(label, "marks"))
+    return svg.picture(axes.width, axes.height, title, *_columns(axes, edges, counts), axes.grid(label, "marks"))
 
 
 def _columns(axes: svg.Axes, edges: Array, counts: NDArray[np.int64]) -> Iterator[Markup]:

@@ -102,7 +102,7 @@ def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) 
 
     def card(mark: Mark) -> Card:
         thumbnail = data.thumbnail(mark.image, mark.point, mark.kind) if data.thumbnail else None
-        picture = mark_pictures.drawn(mark, thumbnail, px_per_um, most_px) if thumbnail else None
+        picture = mark_pictures.mark_picture(mark, thumbnail, px_per_um, most_px) if thumbnail else None
         return Card(mark, picture, _causes(mark.covariance), mark.residual in suspects)
 
     return [

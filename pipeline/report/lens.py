@@ -251,7 +251,7 @@ def curves_plot(drawn: Curves, observed_radius_mm: float) -> Markup:
     room = 0.06 * max(high - low, 1e-3)
     axes = svg.Axes((0.0, float(drawn.radius_mm[-1])), (low - room, high + room), height=320.0)
     x = axes.x(drawn.radius_mm)
-    labels = axes.drawn("radius from the principal point (mm)", "displacement (µm)")
+    labels = axes.grid("radius from the principal point (mm)", "displacement (µm)")
     content = [_extrapolation(axes, observed_radius_mm), labels]
     for kind, (value, sigma) in curve_of.items():
         for half in (BAND * sigma, sigma) if kind == "first" else (BAND * sigma,):

@@ -40,7 +40,7 @@ from pipeline.text.wording import did_you_mean, listed
 At = Callable[[Path], Path]
 
 
-def measured(
+def measured_data(
     project: Project, at: At, most_frames: int | None = None, rows: Sequence[ComparatorPoint] | None = None
 ) -> ReportData:
     """The marks, and what measurement.db says of them where it is theirs. at: where each result stands now.
@@ -105,8 +105,8 @@ def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> Rep
     stored = _stored(project, at)
     if stored is not None and len(stored.names) > most_frames:
         needed = stored.names - {frame.image for frame in stored.plain}
-        return reduced(measured(project, at, rows=stored.rows(needed)), stored.scans(needed), camera_of, stored)
-    data = adjusted(project, at, most_frames)
+        return reduced(measured_data(project, at, rows=stored.rows(needed)), stored.scans(needed), camera_of, stored)
+    data = adjusted_data(project, at, most_frames)
     if frame_count(data) <= most_frames:
         return data
     return reduced(data, unread_scans(data, project), camera_of)
@@ -115,7 +115,7 @@ def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> Rep
 def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
     """All that is known of some images. Raises InputError for one that there is not."""
     stored = _stored(project, at)
-    data = adjusted(project, at, 0) if stored is None else measured(project, at, rows=stored.rows(images))
+    data = adjusted_data(project, at, 0) if stored is None else measured_data(project, at, rows=stored.rows(images))
     known = {row.image for row in data.comparator} if stored is None else stored.names
     for image in images:
         if image not in known:
@@ -135,9 +135,9 @@ def _camera_name(project: Project, image: str) -> str:
     return project.camera_of(image).name
 
 
-def adjusted(project: Project, at: At, most_frames: int | None = None) -> ReportData:
+def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> ReportData:
     """The same with the adjustment, where it is of these marks, and its check, where it is of that adjustment."""
-    data, path = measured(project, at, most_frames), at(project.adjustment_path)
+    data, path = measured_data(project, at, most_frames), at(project.adjustment_path)
     if not path.exists():
         return data
     adjustment, covariance, fingerprint = read_adjustment(path), read_covariance(path), of_file(path)

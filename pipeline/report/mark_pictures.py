@@ -53,7 +53,7 @@ def arrow_scale(marks: list[Mark]) -> float:
     return svg.round_step(ARROW_PX / max(*lengths, LEAST_UM)) if lengths else 1.0
 
 
-def drawn(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: float) -> Markup:
+def mark_picture(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: float) -> Markup:
     """The picture with its overlay: a crosshair where the centre was measured, the residual as an arrow from it."""
     rows, cols = thumbnail.pixels.shape
     zoom = SIZE_PX / (max(rows, cols) * thumbnail.step_px)  # page pixels to a pixel of the scan

@@ -31,7 +31,7 @@ class Source(Protocol):
 
     def window(self, col0: int, row0: int, width: int, height: int) -> Samples: ...
 
-    def known(self, col0: int, row0: int, width: int, height: int) -> Mask: ...
+    def valid_mask(self, col0: int, row0: int, width: int, height: int) -> Mask: ...
 
 
 class _ByWindows:
@@ -45,7 +45,7 @@ class _ByWindows:
     def window(self, col0: int, row0: int, width: int, height: int) -> Samples:
         return self.scan.samples(col0, row0, width, height)
 
-    def known(self, col0: int, row0: int, width: int, height: int) -> Mask:
+    def valid_mask(self, col0: int, row0: int, width: int, height: int) -> Mask:
         return self.scan.inside(col0, row0, width, height) | ~_inside_mask(self, col0, row0, width, height)
 
 
@@ -107,7 +107,7 @@ def interpolated(source: Source, columns: Array, rows: Array, degree: Degree) ->
     left, top = (int(np.floor(places[inside].min())) - MARGIN_PX for places in (columns, rows))
     right, bottom = (int(np.ceil(places[inside].max())) + MARGIN_PX for places in (columns, rows))
     window = source.window(left, top, right - left + 1, bottom - top + 1)
-    known = source.known(left, top, right - left + 1, bottom - top + 1)
+    known = source.valid_mask(left, top, right - left + 1, bottom - top + 1)
     at = np.array([rows[inside] - top, columns[inside] - left])
     if not known.all():  # what a spline touches of lost pixels is lost
         lost = maximum_filter(~known, size=degree + 2)

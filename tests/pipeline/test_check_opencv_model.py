@@ -116,7 +116,7 @@ def test_what_is_held_stays_and_its_share_is_not_taken_by_others() -> None:
     lens = Lens(Distortion("torlegard"), INTERIOR, lens_of("torlegard", k3=1e-6))
     whole = to_opencv_model(lens, FRAME_MM, RADIAL_TANGENTIAL)
     held = fixed("opencv", dict(zip(parameter_names("opencv"), whole.lens.parameters.tolist(), strict=True)))
-    found = convert_lens(lens, held, FRAME_MM, freedom.distortion, held=freedom.held)
+    found = convert_lens(lens, held, FRAME_MM, freedom.distortion, held=freedom.held_interior)
     np.testing.assert_allclose(found.lens.parameters[1:], whole.lens.parameters[1:], atol=1e-15)
     assert (found.lens.interior == INTERIOR).all()
     changed = found.by_source[:, 3]
@@ -127,4 +127,4 @@ def test_what_is_held_stays_and_its_share_is_not_taken_by_others() -> None:
 def test_one_focal_length_keeps_the_ratio() -> None:
     assert Freedom(("fx", "cx", "cy")).distortion == ()
     assert Freedom(("fx", "fy", "cx", "cy", "alpha")).distortion == ("b1", "b2")
-    assert Freedom(("fx", "fy")).held == ("x0", "y0")
+    assert Freedom(("fx", "fy")).held_interior == ("x0", "y0")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from measure.flags import NO_REASON, Status
 from pipeline.drawing.svg import Axes, round_step, ticks
 from pipeline.report import Thumbnail
-from pipeline.report.mark_pictures import SIZE_PX, arrow_scale, drawn
+from pipeline.report.mark_pictures import SIZE_PX, arrow_scale, mark_picture
 from pipeline.report.marks import Mark, natural
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.vectors import VectorField, all_images_plot, plane
@@ -57,7 +57,7 @@ def test_ticks_are_round_and_inside() -> None:
 def test_a_logarithmic_axis_has_its_powers_at_equal_distances() -> None:
     axes = Axes((1.0, 100.0), (0.1, 10.0), width=400.0, left=0.0, right=0.0, x_is_log=True, y_is_log=True)
     assert axes.x([1.0, 10.0, 100.0]) == pytest.approx([0.0, 200.0, 400.0])
-    drawn = axes.drawn("x", "y")
+    drawn = axes.grid("x", "y")
     assert all(f">{tick}</text>" in drawn for tick in ("0.1", "0.2", "0.5", "1", "2", "5", "10"))
     assert ">3</text>" not in drawn
 
@@ -99,7 +99,7 @@ def test_the_crosshair_stands_on_the_spot_in_the_picture(step: int) -> None:
     pixels = full.reshape(size // step, step, size // step, step).mean(axis=(1, 3))
     middle = (step - 1) / 2.0
     thumbnail = Thumbnail(1000.0 + 50.0 * pixels, (origin[0] + middle, origin[1] + middle), float(step))
-    svg = drawn(mark(center), thumbnail, 1.0, SIZE_PX)
+    svg = mark_picture(mark(center), thumbnail, 1.0, SIZE_PX)
     stored = picture_of(svg)
     weights = stored - stored.min()
     at = np.array(
@@ -113,7 +113,7 @@ def test_the_crosshair_stands_on_the_spot_in_the_picture(step: int) -> None:
 
 
 def test_a_large_picture_is_stored_small_and_a_flat_one_is_no_error() -> None:
-    svg = drawn(mark((50.0, 50.0)), Thumbnail(np.full((300, 200), 7, np.uint16), (0.0, 0.0)), 1.0, 92.0)
+    svg = mark_picture(mark((50.0, 50.0)), Thumbnail(np.full((300, 200), 7, np.uint16), (0.0, 0.0)), 1.0, 92.0)
     assert picture_of(svg).shape == (92, 61)
 
 
@@ -121,7 +121,7 @@ def test_the_residual_points_up_where_y_grows() -> None:
     """The comparator's y points up, the page's down."""
     residual = replace(RESIDUAL, vx_um=3.0, vy_um=4.0)
     thumbnail = Thumbnail(np.eye(41), (0.0, 0.0))
-    svg = drawn(mark((20.0, 20.0), residual), thumbnail, 2.0, SIZE_PX)
+    svg = mark_picture(mark((20.0, 20.0), residual), thumbnail, 2.0, SIZE_PX)
     x0, y0, x1, y1 = np.array(
         re.findall(r"-?\d+\.?\d*", re.findall(r'<path d="([^"]+)" class="arrow"', svg)[0]), dtype=float
     )

@@ -27,7 +27,7 @@ from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.provenance import fingerprint, scan_fingerprint
 from pipeline.publishing.made_from import measured_from
-from pipeline.report.load import adjusted
+from pipeline.report.load import adjusted_data
 from pipeline.results.comparator_file import mark_rows, read_comparator, write_comparator
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.summary import summarise
@@ -37,7 +37,7 @@ SAID = pytest.CaptureFixture[str]
 
 def shown(folder: Path) -> tuple[int, dict[str, Any]]:
     """Exit code and summary that `reseau report` has of what stands in the folder."""
-    data = adjusted(read_project(folder / "project.toml"), lambda path: path)
+    data = adjusted_data(read_project(folder / "project.toml"), lambda path: path)
     told = summarise(data, {})
     return told.verdict.exit_code, told.as_json()
 
