@@ -16,6 +16,9 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import cv2
+import numpy as np
+
 from pipeline.cli import run
 from pipeline.exchange.formats import FORMATS
 from pipeline.files.library import read_library
@@ -27,6 +30,17 @@ POOLS = ("archive.measure_archive", "archive.new_project", "resampling.resample_
 CERTIFICATE = (
     "calibrated_principal_distance_mm = 153.0\nangle_deg = [7.5, 15.0, 22.7, 30.0]\nradial_um = [1, 2, 1, -3]\n"
 )
+
+
+def chessboard(number: int) -> Any:
+    """A picture of a board of 5 x 4 inner corners, each number from another side."""
+    squares = 40 + 170 * (np.indices((5, 6)).sum(axis=0) % 2)
+    flat = np.pad(np.kron(squares, np.ones((40, 40))), 60, constant_values=210).astype(np.uint8)
+    turn = 0.45 * np.array([np.cos(1.3 * number), np.sin(1.3 * number), 0.1 * number])
+    camera = np.array([[420.0, 0.0, 200.0], [0.0, 420.0, 160.0], [0.0, 0.0, 1.0]])
+    shift = np.array([[-180.0], [-160.0], [600.0]])
+    seen = camera @ np.column_stack([np.asarray(cv2.Rodrigues(turn)[0])[:, :2], shift])
+    return cv2.warpPerspective(flat, seen, (400, 320), flags=cv2.INTER_AREA, borderValue=(210,))
 
 
 def calls(folder: Path) -> Iterator[tuple[str, Sequence[str | Path]]]:
@@ -77,6 +91,11 @@ def calls(folder: Path) -> Iterator[tuple[str, Sequence[str | Path]]]:
     yield "", ("init", small / "scans", "--out", folder / "new")
     yield "http", ("init", "https://localhost:1/scan.tif", "--out", folder / "http")
     yield "s3", ("init", "s3://none/scan.tif", "--out", folder / "s3")
+    board = folder / "board"
+    board.mkdir()
+    for number in range(5):
+        cv2.imwrite(str(board / f"{number}.png"), chessboard(number))
+    yield "", ("calibrate", board, "--board", "5x4", "--square", "20mm", "--lens", "opencv4", "--out", folder / "lens")
     yield "", ("cameras",)
     yield "", ("cameras", "wild-rc10-153")
     yield "", ("cameras", "--scan", small / "scans" / "a.tif")

@@ -42,6 +42,7 @@ class Adjustment(Estimates):
     left_out: by name, the images for which no orientation was found, and why; the network is that of the others.
     misread: sentences on images that are mirrored; what else there seems to be is theirs.
     unused: notes on what was given and has no part, the first of the notes.
+    unmodelled_mm: by camera, the standard deviation of what is not modelled, where it was estimated.
     """
 
     run: Run
@@ -61,6 +62,7 @@ class Adjustment(Estimates):
     left_out: Mapping[str, str] = field(default_factory=dict)
     misread: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
+    unmodelled_mm: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def residuals(self) -> Residuals:

@@ -12,6 +12,7 @@ from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import Network
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
+from adjust.solution.unmodelled_error import adjust_unmodelled
 from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
@@ -82,8 +83,10 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     """
     network, left_out = build_network(project, marks)
     options = adjustment_options(project)
-    network, untold = add_scanner_bends(project, network, partial(adjust, options=options))
-    adjustment = adjust(network, options=options)
+    adjusted = partial(adjust, options=options)
+    network, untold = add_scanner_bends(project, network, adjusted)
+    first = adjust_unmodelled(network, adjusted) if project.adjust.unmodelled == "estimate" else adjusted(network)
+    adjustment = first
     network = adjustment.network  # without images that are left out
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
@@ -94,7 +97,12 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
         *_misnamed(project, marks),
         *_not_corrected(network, uncorrected),
     )
-    return replace(adjustment, remarks=(*adjustment.remarks, *warnings), unused=_unmeasured(project, marks))
+    return replace(
+        adjustment,
+        remarks=(*adjustment.remarks, *warnings),
+        unused=(*_unmodelled(first), *_unmeasured(project, marks)),
+        unmodelled_mm=first.unmodelled_mm,
+    )
 
 
 def adjustment_options(project: Project) -> Options:
@@ -171,6 +179,16 @@ def _largest_sigmas(network: Network, change_mm: Array) -> float:
     """The largest change of an observation, in its standard deviations."""
     sigmas = np.sqrt(np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2))
     return float(np.max(np.abs(change_mm) / sigmas, initial=0.0))
+
+
+def _unmodelled(adjustment: Adjustment) -> tuple[str, ...]:
+    """A note on what was added to the standard deviations of each camera's targets."""
+    return tuple(
+        f"Camera {camera}: {UM_PER_MM * sigma_mm:.3g} µm are added to the standard deviations of all targets, for what "
+        "lens model, object and the picture's processing leave."
+        for camera, sigma_mm in adjustment.unmodelled_mm.items()
+        if sigma_mm > 0.0
+    )
 
 
 def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:

@@ -70,6 +70,10 @@ class AdjustSettings:
     film_sigma_um: Annotated[float, NOT_NEGATIVE] = Field(
         default=0.0, description="Film and scanner: added in quadrature to every comparator sigma."
     )
+    unmodelled: Annotated[Literal["none", "estimate"], choice("none", "estimate")] = Field(
+        default="none",
+        description="Standard deviation of what the model lacks, one a camera, added to its targets.",
+    )
     scanner: Annotated[
         ScannerSetting, Key("word or list of terms", lambda table, key: read_scanner(table, SCANNER_WORDS))
     ] = Field(default="none", description="Bend of the scanner: none, bend (degrees 2, 3), auto (by tests), or terms.")

@@ -346,7 +346,7 @@ def test_the_help_groups_all_commands_and_cuts_no_line_short(capsys: pytest.Capt
     titles = re.findall(r"^(\w+):$", text, flags=re.MULTILINE)
     assert titles == ["Options", "Measure", "Calibrate", "Archive", "Exchange", "Plan", "Tools"]
     assert "..." not in text.split("Measure:")[1]
-    assert len(re.findall(r"^  [a-z]+  +\S", text, flags=re.MULTILINE)) == 21
+    assert len(re.findall(r"^  [a-z]+  +\S", text, flags=re.MULTILINE)) == 22
 
 
 @pytest.mark.study

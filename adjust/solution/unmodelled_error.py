@@ -1,0 +1,82 @@
+"""What the model lacks, as a variance component: one standard deviation a camera, added to those of its marks."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import brentq
+
+from adjust.array_types import Array
+from adjust.problem.network import Network
+from adjust.solution.result import Adjustment
+
+ROUNDS = 6  # residuals hardly change with weights that are nearly alike: two or three do
+FIRST = 1e-3  # of the frame's diagonal, to begin with: residuals then pass for no blunder of the whole network
+SETTLED = 0.01  # relative change of a standard deviation that changes no weight noticeably
+
+
+def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment]) -> Adjustment:
+    """Adjust with the standard deviation of what is not modelled, estimated for each camera.
+
+    It is added in quadrature to those of the camera's targets and tie points, such that their v'Pv equals their
+    redundancy (Förstner's condition for a variance component, here an additive one). It is 0 where the given standard
+    deviations explain the residuals.
+
+    Parameters
+    ----------
+    network : marks with the standard deviations that the pictures say
+    adjusted : adjusts a network
+
+    Returns
+    -------
+    The adjustment with the added standard deviations, which stand in its `unmodelled_mm`.
+    """
+    sigma_mm = {each.name: FIRST * float(np.hypot(*each.frame_mm)) for each in network.cameras}
+    result = adjusted(add_unmodelled(network, sigma_mm))
+    for _ in range(ROUNDS):
+        if not result.converged:
+            break
+        found = {camera: _component_mm(result, sigma_mm, camera) for camera in sigma_mm}
+        settled = all(abs(found[each] - sigma_mm[each]) <= SETTLED * found[each] for each in found)
+        sigma_mm = found
+        if settled:
+            break
+        result = adjusted(add_unmodelled(network, sigma_mm))
+    return replace(result, unmodelled_mm=sigma_mm)
+
+
+def add_unmodelled(network: Network, sigma_mm: Mapping[str, float]) -> Network:
+    """The network whose targets and tie points have a standard deviation more, by their cameras."""
+    added = np.array([sigma_mm.get(camera, 0.0) for camera in _cameras(network)]) ** 2
+    covariance_mm2 = network.observations.covariance_mm2 + added[:, None, None] * np.eye(2)
+    return replace(network, observations=replace(network.observations, covariance_mm2=covariance_mm2))
+
+
+def _cameras(network: Network) -> list[str]:
+    """The camera of every mark that shows the object; "" for marks of the camera itself."""
+    camera, observations = {image.name: image.camera for image in network.images}, network.observations
+    shown = zip(observations.image, observations.kind, strict=True)
+    return [camera[image] if kind in ("target", "tie") else "" for image, kind in shown]
+
+
+def _component_mm(result: Adjustment, before_mm: Mapping[str, float], camera: str) -> float:
+    """The standard deviation that makes v'Pv of a camera's marks their redundancy, as the residuals are."""
+    rows = np.array(_cameras(result.network)) == camera
+    if not rows.any():
+        return 0.0
+    residuals = result.residuals
+    square = residuals.v_mm[rows] ** 2
+    given = np.diagonal(result.network.observations.covariance_mm2[rows], axis1=1, axis2=2) - before_mm[camera] ** 2
+    redundancy = float(residuals.redundancy[rows].sum())
+
+    def excess(variance: float) -> float:
+        return float((square / np.maximum(given + variance, 1e-300)).sum()) - redundancy
+
+    if redundancy < 1.0 or excess(0.0) <= 0.0:
+        return 0.0
+    return float(np.sqrt(brentq(excess, 0.0, _upper(square, redundancy))))
+
+
+def _upper(square: Array, redundancy: float) -> float:
+    """A variance with which v'Pv is below the redundancy."""
+    return 2.0 * float(square.sum()) / redundancy

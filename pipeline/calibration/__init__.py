@@ -1,0 +1,1 @@
+"""A digital camera from pictures of a board: `reseau calibrate`."""

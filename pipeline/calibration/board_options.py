@@ -1,0 +1,89 @@
+"""The board of `reseau calibrate`, as the command line describes it and as project.toml has it."""
+
+import re
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from pipeline.errors import InputError
+
+BoardKind = Literal["chessboard", "charuco", "aruco", "circle-grid", "asymmetric-circle-grid"]
+MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+
+
+@dataclass(frozen=True)
+class BoardOptions:
+    """columns, rows: inner corners (chessboard), squares (charuco), markers (aruco) or circles.
+
+    spacing_mm: side of a square, or from one marker or circle to the next. size_mm: of a marker or a circle.
+    """
+
+    kind: BoardKind
+    columns: int
+    rows: int
+    spacing_mm: float
+    size_mm: float | None = None
+    dictionary: str | None = None
+    legacy: bool = False
+
+    @property
+    def table(self) -> str:
+        """The table [targets] of project.toml."""
+        keys: dict[str, object] = {"kind": self.kind, "columns": self.columns, "rows": self.rows}
+        match self.kind:
+            case "chessboard":
+                keys |= {"square_mm": self.spacing_mm}
+            case "charuco":
+                keys |= {"square_mm": self.spacing_mm, "marker_mm": self._size, "dictionary": self._dictionary}
+                keys |= {"legacy": True} if self.legacy else {}
+            case "aruco":
+                gap_mm = self.spacing_mm - self._size
+                keys |= {"marker_mm": self._size, "gap_mm": gap_mm, "dictionary": self._dictionary}
+            case "circle-grid" | "asymmetric-circle-grid":
+                keys |= {"kind": "circle-grid", "spacing_mm": self.spacing_mm, "diameter_mm": self._size}
+                keys |= {"asymmetric": True} if self.kind == "asymmetric-circle-grid" else {}
+        return "[targets]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in keys.items())
+
+    @property
+    def _size(self) -> float:
+        if self.size_mm is None:
+            what = "the diameter of a circle" if "circle" in self.kind else "the side of a marker"
+            raise InputError(f"--marker is missing: {what}, such as --marker 18mm, is needed for {self.kind}.")
+        if not self.size_mm < self.spacing_mm:
+            raise InputError(
+                f"--marker {self.size_mm:g} mm is not smaller than --square {self.spacing_mm:g} mm, the distance from "
+                "one to the next. Exchange the two, or measure them again."
+            )
+        return self.size_mm
+
+    @property
+    def _dictionary(self) -> str:
+        if self.dictionary is None:
+            raise InputError(f"--dictionary is missing: the markers of {self.kind}, such as --dictionary 4X4_50.")
+        return self.dictionary
+
+
+def board_options(
+    kind: str, board: str, square: str, marker: str | None, dictionary: str | None, legacy: bool
+) -> BoardOptions:
+    """The board that the options of the command line describe. Raises InputError naming the option that is wrong."""
+    if kind not in get_args(BoardKind):
+        raise InputError(f"--kind {kind}: there is no such board; possible are {', '.join(get_args(BoardKind))}.")
+    counts = re.fullmatch(r"(\d{1,3})[x×*](\d{1,3})", board.strip(), flags=re.IGNORECASE)
+    if counts is None or not all(1 <= int(each) <= 500 for each in counts.groups()):
+        raise InputError(f"--board {board}: must be two counts of 1 to 500, COLUMNSxROWS, such as 9x6.")
+    size_mm = None if marker is None else _length_mm("--marker", marker)
+    columns, rows = map(int, counts.groups())
+    options = BoardOptions(kind, columns, rows, _length_mm("--square", square), size_mm, dictionary, legacy)  # type: ignore[arg-type]
+    options.table  # noqa: B018  what is missing is said before anything is read
+    return options
+
+
+def _length_mm(option: str, text: str) -> float:
+    found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(mm|cm|m|in)", text.strip())
+    if found is None or float(found[1]) == 0.0:
+        raise InputError(f"{option} {text}: must be a length with its unit (mm, cm, m, in), such as 25mm.")
+    return float(found[1]) * MM[found[2]]
+
+
+def _toml(value: object) -> str:
+    return f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)

@@ -1,0 +1,149 @@
+"""The lens model of a digital camera: the simplest that predicts pictures it was not fitted to as well as any."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import Camera
+from adjust.problem.network import Network
+from adjust.problem.parameter import Parameter
+from adjust.solution.result import Adjustment
+
+LensModel = Literal["opencv4", "opencv5", "opencv8", "fisheye"]
+PARAMETERS: Mapping[LensModel, tuple[str, ...]] = {
+    "opencv4": ("k1", "k2", "p1", "p2"),
+    "opencv5": ("k1", "k2", "p1", "p2", "k3"),
+    "opencv8": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}  # from the simplest on, each but the last with all of the one before
+FOLDS = 5
+FEWEST_PICTURES = 6  # of fewer none is left out
+WIDE = 1.0  # half the picture's diagonal over the principal distance, from which on a fisheye is tried: 45 degrees
+
+
+@dataclass(frozen=True)
+class LensScore:
+    """rms_mm: of pictures that were left out, a point; None where the model has no solution."""
+
+    model: LensModel
+    rms_mm: float | None
+
+
+@dataclass(frozen=True)
+class LensChoice:
+    model: LensModel
+    scores: tuple[LensScore, ...]
+
+
+def lens_of(model: LensModel, square_pixels: bool) -> Distortion:
+    """The distortion of a model, all parameters free; b1, by which fx and fy differ, unless pixels are square."""
+    family = "opencv_fisheye" if model == "fisheye" else "opencv"
+    names = PARAMETERS[model] if square_pixels else (*PARAMETERS[model], "b1")
+    return Distortion(family, {name: Prior(0.0, np.inf) for name in names})
+
+
+def choose_lens(
+    network: Network, camera: str, square_pixels: bool, adjusted: Callable[[Network], Adjustment]
+) -> LensChoice:
+    """Select the lens model of a camera by cross-validation over its pictures.
+
+    Fifths of the pictures are left out in turn; their points are predicted with the camera of the others, after a space
+    resection each. A richer model is taken where its predictions are better by more than the standard error of the
+    difference over the pictures.
+
+    Parameters
+    ----------
+    network : of one camera and its pictures
+    camera : its name
+    square_pixels : whether fx and fy are one
+    adjusted : adjusts a network
+    """
+    images = [image.name for image in network.images]
+    if len(images) < FEWEST_PICTURES:
+        return LensChoice("opencv4", ())
+    squares: dict[LensModel, np.ndarray | None] = {}
+    best: LensModel = "opencv4"
+    for model in PARAMETERS:
+        if model == "fisheye" and not _is_wide(network, camera, adjusted):
+            continue
+        squares[model] = _left_out(_with_lens(network, camera, lens_of(model, square_pixels)), images, adjusted)
+        if model != best and _is_better(squares[model], squares[best]):
+            best = model
+    scores = (LensScore(model, None if s is None else float(np.sqrt(s.mean()))) for model, s in squares.items())
+    return LensChoice(best, tuple(scores))
+
+
+def _is_better(squares: "np.ndarray | None", than: "np.ndarray | None") -> bool:
+    if squares is None or than is None:
+        return squares is not None
+    gain = than - squares
+    return bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
+
+
+def _is_wide(network: Network, camera: str, adjusted: Callable[[Network], Adjustment]) -> bool:
+    try:
+        result = adjusted(_with_lens(network, camera, lens_of("opencv4", True)))
+    except AdjustmentError:
+        return True
+    (given,) = (each for each in network.cameras if each.name == camera)
+    c_mm = result.value(Parameter.interior(camera, "c"))
+    return not result.converged or float(np.hypot(*given.frame_mm)) / 2.0 > WIDE * c_mm
+
+
+def _with_lens(network: Network, camera: str, lens: Distortion) -> Network:
+    cameras = (replace(each, distortion=lens) if each.name == camera else each for each in network.cameras)
+    return replace(network, cameras=tuple(cameras))
+
+
+def _left_out(
+    network: Network, images: Sequence[str], adjusted: Callable[[Network], Adjustment]
+) -> "np.ndarray | None":
+    """Mean squared length (m,) of the residuals of each picture, predicted by others; None without a solution."""
+    squares = []
+    for fold in (images[first::FOLDS] for first in range(FOLDS)):
+        try:
+            fitted = adjusted(_of_images(network, set(images) - set(fold)))
+            if not fitted.converged:
+                return None
+            cameras = tuple(_held(each, fitted) for each in network.cameras)
+            for image in fold:
+                predicted = adjusted(replace(_of_images(network, {image}), cameras=cameras))
+                squares.append(float((predicted.residuals.v_mm**2).sum(axis=1).mean()))
+        except AdjustmentError:
+            return None
+    return np.array(squares)
+
+
+def _of_images(network: Network, names: set[str]) -> Network:
+    observations = network.observations
+    rows = np.flatnonzero([image in names for image in observations.image])
+    taken = replace(
+        observations,
+        image=tuple(observations.image[row] for row in rows),
+        point=tuple(observations.point[row] for row in rows),
+        kind=tuple(observations.kind[row] for row in rows),
+        xy_mm=observations.xy_mm[rows],
+        covariance_mm2=observations.covariance_mm2[rows],
+    )
+    images = tuple(image for image in network.images if image.name in names)
+    return replace(network, images=images, observations=taken)
+
+
+def _held(camera: Camera, fitted: Adjustment) -> Camera:
+    """The camera as it was found, held fixed."""
+
+    def prior(name: str) -> Prior:
+        return Prior(fitted.value(Parameter.interior(camera.name, name)), 0.0)
+
+    parameters = {name: prior(name) for name in camera.distortion.parameters}
+    return replace(
+        camera,
+        principal_distance_mm=prior("c"),
+        x0_mm=prior("x0"),
+        y0_mm=prior("y0"),
+        distortion=replace(camera.distortion, parameters=parameters),
+    )

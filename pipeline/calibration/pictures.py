@@ -1,0 +1,108 @@
+"""The pictures of `reseau calibrate`, by the camera that took them."""
+
+import math
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from measure.errors import MeasurementError
+from measure.scans.jpeg import jpeg_colour_tags
+from measure.scans.metadata import DECODING_ERRORS
+from measure.scans.opening import read_head
+from pipeline.errors import InputError
+from pipeline.files.scan_files import folders_below
+from pipeline.text.names import SCAN_ENDINGS, names_below
+
+
+@dataclass(frozen=True)
+class CameraPictures:
+    """Pictures of one size and one focal length (of their Exif tags, None without)."""
+
+    name: str
+    width_px: int
+    height_px: int
+    focal_mm: float | None
+    images: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class BoardPictureFiles:
+    """files: of every image by its name; cameras: that of most pictures first; unreadable: by image, why."""
+
+    files: Mapping[str, Path]
+    cameras: tuple[CameraPictures, ...]
+    unreadable: Mapping[str, str]
+
+
+def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
+    """Find the pictures among files and below folders, and sort them by camera; what is below `out` is no picture.
+
+    Raises InputError where there is none that can be read.
+    """
+    paths = list(dict.fromkeys(_files(given, out.resolve())))
+    if not paths:
+        where = ", ".join(map(str, given))
+        raise InputError(f"{where}: there is no picture ({', '.join(SCAN_ENDINGS)}). Name the folder that has them.")
+    names = names_below(paths)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"two pictures are called {twice[0]!r} without their endings. Move one of them away.")
+    groups, unreadable = defaultdict[tuple[int, int, float | None], list[str]](list), dict[str, str]()
+    for name, path in zip(names, paths, strict=True):
+        try:
+            head = read_head(path)
+        except MeasurementError as error:
+            unreadable[name] = str(error)
+            continue
+        groups[head.width_px, head.height_px, _focal_mm(path)].append(name)
+    if not groups:
+        raise InputError(f"{next(iter(unreadable.values()))} No picture can be read.")
+    by_count = sorted(groups.items(), key=lambda group: -len(group[1]))
+    cameras = [
+        CameraPictures(name, *camera, tuple(images))
+        for name, (camera, images) in zip(_names([camera for camera, _ in by_count]), by_count, strict=True)
+    ]
+    return BoardPictureFiles(dict(zip(names, paths, strict=True)), tuple(cameras), unreadable)
+
+
+def _files(given: Iterable[Path], out: Path) -> Iterator[Path]:
+    for path in given:
+        if not path.is_dir():
+            if not path.exists():
+                raise InputError(f"{path}: there is no such file or folder.")
+            yield path
+            continue
+        for below in sorted(folders_below(path)):
+            folder = path / below
+            if folder.resolve() == out or out in folder.resolve().parents:
+                continue
+            for name in sorted(os.listdir(folder)):
+                if not name.startswith(".") and Path(name).suffix.lower() in SCAN_ENDINGS:
+                    yield folder / name
+
+
+def _focal_mm(path: Path) -> float | None:
+    """The focal length of a picture's Exif tags; None where it has none."""
+    try:
+        focal = jpeg_colour_tags(path).exif.get("FocalLength")
+    except (*DECODING_ERRORS, OSError):
+        return None
+    if isinstance(focal, tuple) and len(focal) == 2:  # a fraction, as the tag has it
+        focal = focal[0] / focal[1] if focal[1] else 0.0
+    return (round(focal, 3) or None) if isinstance(focal, float | int) and math.isfinite(focal) else None
+
+
+def _names(cameras: Sequence[tuple[int, int, float | None]]) -> list[str]:
+    """ "camera" where there is one; else what tells them apart."""
+    if len(cameras) == 1:
+        return ["camera"]
+    sizes = {(width, height) for width, height, _ in cameras}
+    focals = {focal for *_, focal in cameras}
+    names = []
+    for width, height, focal in cameras:
+        parts = [f"{width}x{height}"] if len(sizes) > 1 else []
+        parts += ["no-focal-length" if focal is None else f"{focal:g}mm"] if len(focals) > 1 else []
+        names.append("camera-" + "-".join(parts))
+    return names

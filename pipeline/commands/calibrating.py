@@ -1,0 +1,48 @@
+"""The command that calibrates a digital camera from pictures of a board."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.commands.shared import DONE, LOOK, AsJson, show
+
+LENSES = ("auto", "opencv4", "opencv5", "opencv8", "fisheye")
+OUT = Path("calibration")
+
+
+def calibrate(
+    pictures: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER_OR_FILES...", help="Pictures of the board.", show_default=False)
+    ],
+    board: Annotated[str, typer.Option(metavar="9x6", help="Inner corners, squares (charuco), markers or circles.")],
+    square: Annotated[str, typer.Option(metavar="25mm", help="Side of a square, or distance from one to the next.")],
+    kind: Annotated[
+        str, typer.Option(help="chessboard, charuco, aruco, circle-grid or asymmetric-circle-grid.")
+    ] = "chessboard",
+    marker: Annotated[str | None, typer.Option(metavar="18mm", help="Side of a marker, diameter of a circle.")] = None,
+    dictionary: Annotated[str | None, typer.Option(metavar="4X4_50", help="Of the markers.")] = None,
+    legacy: Annotated[bool, typer.Option("--legacy", help="The older ChArUco layout; else both are tried.")] = False,
+    lens: Annotated[str, typer.Option(help=f"{', '.join(LENSES)}.")] = "auto",
+    square_pixels: Annotated[bool, typer.Option("--square-pixels", help="One focal length for x and y.")] = False,
+    pitch_um: Annotated[float | None, typer.Option(metavar="UM", min=0.01, help="Side of a pixel, for mm.")] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the results go.")] = OUT,
+    ros: Annotated[bool, typer.Option("--ros", help="Write ROS's camera info as well.")] = False,
+    workers: Annotated[int | None, typer.Option(metavar="N", min=1, max=1024, help="Processes.")] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Calibrate a digital camera from pictures of a board."""
+    from pipeline.calibration.board_options import board_options
+    from pipeline.calibration.calibrate_stage import CalibrationOptions, calibrate
+    from pipeline.errors import InputError
+    from pipeline.progress import Reporter
+    from pipeline.text.wording import did_you_mean
+
+    if lens not in LENSES:
+        raise InputError(f"--lens {lens}: possible are {', '.join(LENSES)}.{did_you_mean(lens, LENSES)}")
+    given = board_options(kind, board, square, marker, dictionary, legacy)
+    options = CalibrationOptions(given, lens, square_pixels, pitch_um, ros)  # type: ignore[arg-type]
+    found = calibrate(pictures, out, options, Reporter(), workers)
+
+    show(as_json, found.as_json, found.print)
+    return LOOK if found.needs_look else DONE

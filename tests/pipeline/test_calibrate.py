@@ -1,0 +1,114 @@
+"""`reseau calibrate`: drawn pictures of a chessboard to intrinsics in pixels."""
+
+import io
+import json
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from test_check_corners import CENTER_PX, FOCAL_PX, SIZE_PX, TURNS, picture
+
+from pipeline.calibration.board_options import board_options
+from pipeline.calibration.pictures import find_pictures
+from pipeline.cli import run
+from pipeline.errors import InputError
+
+BOARD = ("--board", "7x5", "--square", "2cm")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("pictures")
+    for number in range(len(TURNS)):
+        Image.fromarray(picture(number)).save(made / f"p{number}.png")
+    Image.fromarray(np.full((SIZE_PX[1], SIZE_PX[0]), 128, np.uint8)).save(made / "grey.png")
+    (made / "torn.png").write_bytes((made / "p0.png").read_bytes()[:100])
+    return made
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path) -> dict[str, Any]:
+    """What the command prints; its files stand in the folder `calibration`."""
+    out, printed = folder / "calibration", io.StringIO()
+    with redirect_stdout(printed):
+        code = run(["calibrate", str(folder), *BOARD, "--lens", "opencv4", "--out", str(out), "--ros", "--json"])
+    assert code == 1  # two pictures are left out
+    return dict(json.loads(printed.getvalue()))
+
+
+def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any], folder: Path) -> None:
+    (camera,), out = result["cameras"], folder / "calibration"
+    assert list(result["unreadable"]) == ["torn"]
+    assert (camera["name"], camera["image_size_px"], camera["images_used"]) == ("camera", list(SIZE_PX), 5)
+    assert camera["images_left_out"] == {"grey": "the board was not found"}
+    for name, truth in (("fx", FOCAL_PX), ("fy", FOCAL_PX), ("cx", CENTER_PX[0]), ("cy", CENTER_PX[1])):
+        each = camera[f"{name}_px"]
+        assert abs(each["value"] - truth) < 4.0 * each["sigma"]
+        assert each["sigma"] == max(each["sigma_model"], each["sigma_clusters"]) < 1.0
+    assert camera["distortion"]["family"] == "opencv"
+    assert abs(camera["distortion"]["k1"]["value"]) < 4.0 * camera["distortion"]["k1"]["sigma"]
+    assert 0.0 < camera["rms_px"] < 0.1
+    assert camera["opencv"]["verdict"] == "agrees"
+    assert camera["opencv"]["fx_px"] == pytest.approx(camera["fx_px"]["value"], abs=0.2)
+    storage = cv2.FileStorage(str(out / "camera.yaml"), cv2.FILE_STORAGE_READ)
+    matrix = storage.getNode("camera_matrix").mat()
+    np.testing.assert_allclose(
+        matrix[[0, 1, 0, 1], [0, 1, 2, 2]], [camera[f"{k}_px"]["value"] for k in ("fx", "fy", "cx", "cy")]
+    )
+    assert storage.getNode("distortion_coefficients").mat().shape == (1, 4)
+    assert "distortion_model: plumb_bob" in (out / "camera-ros.yaml").read_text(encoding="utf-8")
+    assert (out / "out" / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--board", "7by5", "--square", "20mm"), "--board 7by5: must be two counts"),
+        (("--board", "7x5", "--square", "20"), "--square 20: must be a length with its unit"),
+        (("--board", "7x5", "--square", "20mm", "--kind", "charuco"), "--marker is missing"),
+        (("--board", "7x5", "--square", "20mm", "--kind", "chess"), "possible are chessboard"),
+        (("--board", "7x5", "--square", "20mm", "--lens", "fishey"), "Did you mean 'fisheye'?"),
+    ],
+)
+def test_a_wrong_option_is_named(options: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["calibrate", "nowhere", *options]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_pictures_are_sorted_by_size_and_results_are_no_pictures(tmp_path: Path) -> None:
+    for name, size in (("a", (40, 30)), ("b", (40, 30)), ("c", (20, 30)), ("out/d", (40, 30))):
+        path = tmp_path / f"{name}.png"
+        path.parent.mkdir(exist_ok=True)
+        Image.new("L", size).save(path)
+    found = find_pictures([tmp_path], tmp_path / "out")
+    assert [(camera.name, camera.images) for camera in found.cameras] == [
+        ("camera-40x30", ("a", "b")),
+        ("camera-20x30", ("c",)),
+    ]
+    with pytest.raises(InputError, match="there is no picture"):
+        find_pictures([tmp_path / "out"], tmp_path / "out")
+
+
+def test_pictures_of_other_focal_lengths_are_of_other_cameras(tmp_path: Path) -> None:
+    for name, focal in (("a", 24.0), ("b", 50.0)):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0x920A] = focal
+        Image.new("L", (40, 30)).save(tmp_path / f"{name}.jpg", exif=exif)
+    assert {camera.name for camera in find_pictures([tmp_path], tmp_path / "out").cameras} == {
+        "camera-24mm",
+        "camera-50mm",
+    }
+
+
+def test_boards_as_project_files_have_them() -> None:
+    circles = board_options("asymmetric-circle-grid", "4x11", "1in", "10mm", None, False)
+    assert (
+        'kind = "circle-grid"\ncolumns = 4\nrows = 11\nspacing_mm = 25.4\ndiameter_mm = 10.0\nasymmetric = true'
+        in circles.table
+    )
+    aruco = board_options("aruco", "3x2", "40mm", "30mm", "4X4_50", False)
+    assert "marker_mm = 30.0\ngap_mm = 10.0" in aruco.table
