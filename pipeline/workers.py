@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -27,6 +28,7 @@ from adjust.least_squares.malloc_tuning import keep_freed_memory
 
 KILLS = 2  # of its process, after which a task is given up: once may be chance, or another program's doing
 STARTS = 6  # of processes that are killed before they stand, one after another: then none will
+CHECKED_AGAIN_S = 0.05  # whether a pool that is ended has come to rest
 TASKS_A_CORE = 4  # handed out ahead: enough that no process waits, few enough that little is lost
 
 Task = TypeVar("Task")
@@ -83,8 +85,11 @@ class LocalPool(ThreadPoolExecutor):
     def end(self) -> None:
         """End the processes, whatever they have in hand."""
         self._ended = True
-        for process in multiprocessing.active_children():
-            process.terminate()
+        super().shutdown(wait=False, cancel_futures=True)
+        while any(thread.is_alive() for thread in self._threads):  # one may just have begun to start its process
+            for process in multiprocessing.active_children():
+                process.terminate()
+            time.sleep(CHECKED_AGAIN_S)
 
     def _call(self, call: Callable[[], Any]) -> Any:
         for _ in range(KILLS):

@@ -4,11 +4,12 @@ import multiprocessing
 import os
 import signal
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from pipeline.workers import WorkerKilled, worker_pool
+from pipeline.workers import LocalPool, WorkerKilled, worker_pool
 
 
 def square(number: int) -> int:
@@ -82,3 +83,24 @@ def test_what_a_task_raises_is_its_own() -> None:
         with pytest.raises(ValueError, match="invalid literal"):
             pool.submit(int, "a").result(60)
         assert pool.submit(square, 3).result(60) == 9
+
+
+def test_a_process_that_is_begun_while_the_pool_ends_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    begin = LocalPool._start
+
+    def late(pool: LocalPool) -> ProcessPoolExecutor:
+        time.sleep(0.4)
+        return begin(pool)
+
+    def interrupted() -> None:
+        with worker_pool(1, workers=1) as pool:
+            pool.submit(time.sleep, 20.0)
+            time.sleep(0.1)  # its thread has seen that the pool goes on
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(LocalPool, "_start", late)
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.monotonic() - start < 15.0
+    assert not multiprocessing.active_children()
