@@ -51,7 +51,6 @@ def drawn(rng: np.random.Generator, change: Array | float = 0.0) -> CameraCalibr
     return calibration(TRUE + change + error[AT], marks)
 
 
-@pytest.mark.study
 def test_false_alarms_come_as_often_as_stated() -> None:
     rng = np.random.default_rng(1)
     probabilities = np.array([compare([drawn(rng), drawn(rng)], HALF).same.probability for _ in range(160)])

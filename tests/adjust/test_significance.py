@@ -41,6 +41,8 @@ def test_a_pairs_f_test_is_that_of_the_adjustments_with_and_without_it() -> None
     assert pair.parameters == ("p1", "p2")
     assert pair.statistic == pytest.approx(f, rel=1e-3)
     assert pair.p == pytest.approx(stats.f.sf(f, 2, both.redundancy), rel=1e-2)
+    single = significance_of(both)["p1"]
+    assert single.p == pytest.approx(2.0 * stats.t.sf(abs(single.statistic), both.redundancy), rel=1e-6)
 
 
 def test_what_is_there_is_significant_and_what_is_not_is_not() -> None:

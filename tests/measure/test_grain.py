@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from measure.noise.grain import PATCH_PX, PLANE, grain_model, taken_out
+from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model, taken_out
 from measure.noise.noise_model import noise_model
 
 
@@ -35,6 +35,17 @@ def test_variance_and_power_of_grain_are_found_behind_a_fit_that_took_most_of_it
     assert power == pytest.approx(correlation.sum() + white**2, rel=0.25)
     # Without the model nearly all of the power at low frequencies is lost: that is what it is for.
     assert np.median([model.autocovariance_dn2.sum() for model in naive]) < 0.5 * power
+
+
+def test_the_autocorrelations_are_those_of_noise_smeared_by_gaussians() -> None:
+    """That of a Gaussian with itself, by sums over a fine grid."""
+    x = np.arange(-400, 401) / 20.0
+    for grain_px, kernel in zip(GRAIN_PX, _KERNELS[1:], strict=True):
+        smear = np.exp(-(x**2) / (2.0 * grain_px**2))
+        of_lag = [float(smear[: len(x) - 20 * lag] @ smear[20 * lag :]) / float(smear @ smear) for lag in range(4)]
+        middle = len(kernel) // 2
+        np.testing.assert_allclose(kernel[middle, middle : middle + 4], of_lag, atol=1e-6)
+        np.testing.assert_allclose(kernel[middle + 1, middle + 1], of_lag[1] ** 2, atol=1e-6)
 
 
 @pytest.mark.parametrize(("grain_px", "is_grain"), [(1.5, True), (2.8, False)])

@@ -90,7 +90,6 @@ def test_what_never_was_jpeg_is_not_taken_for_it(levels: int, tmp_path: Path) ->
             assert not scan.notes
 
 
-@pytest.mark.study
 def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_said() -> None:
     """Of a contrast of three, four and six rounding steps: the rms error over the claim, both measured at once. What
     residuals do not show falls with the square of the contrast: one that fell with it would be twice too large."""

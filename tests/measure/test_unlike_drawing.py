@@ -45,12 +45,11 @@ def test_noise_alone_hardly_is_hardly_taken_for_it(is_grain: bool) -> None:
     assert np.mean(shares) < 0.1
 
 
-@pytest.mark.study
 def test_ragged_lines_are_known_as_badly_as_they_are() -> None:
     """Each pixel's length of them lies elsewhere by 0.08 px, one standard deviation. The ground is clear, and would let
     a cross be known three times as well as it is."""
     rng, errors, known, by_noise = np.random.default_rng(4), [], [], []
-    for _ in range(12):
+    for _ in range(8):
         mark = some_mark(Kind("ragged", MarkShape((*ragged(0, rng), *ragged(1, rng)))), 1.0, rng)
         grey = 1000 * mark.picture + rng.normal(0, 10, (mark.size, mark.size))
         fit = match(ScanWindow(grey), CROSS, mark.place, MatchOptions())
