@@ -1,6 +1,7 @@
 """Pictures of a board to a calibrated camera: a project is written, measured, adjusted and checked."""
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -160,18 +161,22 @@ def _usable(
 ) -> tuple[tuple[CameraPictures, ...], dict[str, str]]:
     """The cameras with pictures that show the board, and why pictures are left out."""
     points = dict.fromkeys((name for camera in pictures.cameras for name in camera.images), 0)
+    reasons = dict.fromkeys(points, "the board was not found")
     for mark in marks:
         points[mark.image] += mark.status.is_observation
+        if not mark.status.is_observation and mark.reason:
+            reasons[mark.image] = str(mark.reason)
     left_out = {
-        name: "the board was not found" if count == 0 else f"only {counted(count, 'corner')} found"
+        name: reasons[name] if count == 0 else f"only {counted(count, 'corner')} found"
         for name, count in points.items()
         if count < FEWEST_POINTS
     }
     used = tuple(camera for camera in pictures.cameras if set(camera.images) - set(left_out))
     if not used:
         raise InputError(
-            f"the board was found in none of {counted(len(points), 'picture')}. Check --board (inner corners of a "
-            "chessboard, not squares), --kind, and that the whole board is in the picture."
+            f"the board was found in none of {counted(len(points), 'picture')}; of most: "
+            f"{Counter(reasons.values()).most_common(1)[0][0]}. Check --board (inner corners of a chessboard, not "
+            "squares), --kind, and that the whole board is in the picture."
         )
     return used, left_out
 

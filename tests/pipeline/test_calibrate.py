@@ -44,7 +44,7 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     (camera,), out = result["cameras"], folder / "calibration"
     assert list(result["unreadable"]) == ["torn"]
     assert (camera["name"], camera["image_size_px"], camera["images_used"]) == ("camera", list(SIZE_PX), 5)
-    assert camera["images_left_out"] == {"grey": "the board was not found"}
+    assert camera["images_left_out"] == {"grey": "the scan has no contrast: its grey values span 0.0 % of the scale"}
     for name, truth in (("fx", FOCAL_PX), ("fy", FOCAL_PX), ("cx", CENTER_PX[0]), ("cy", CENTER_PX[1])):
         each = camera[f"{name}_px"]
         assert abs(each["value"] - truth) < 4.0 * each["sigma"]
@@ -112,3 +112,11 @@ def test_boards_as_project_files_have_them() -> None:
     )
     aruco = board_options("aruco", "3x2", "40mm", "30mm", "4X4_50", False)
     assert "marker_mm = 30.0\ngap_mm = 10.0" in aruco.table
+
+
+def test_a_count_that_is_wrong_is_named_with_the_one_that_fits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.fromarray(picture(0)).save(tmp_path / "p0.png")
+    assert run(["calibrate", str(tmp_path), "--board", "6x5", "--square", "20mm", "--out", str(tmp_path / "out")]) == 2
+    assert "one of 7 x 5 is" in capsys.readouterr().err
