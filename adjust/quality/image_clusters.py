@@ -7,6 +7,8 @@ from adjust.least_squares.iteration import Linearised
 from adjust.least_squares.numbering import Numbering
 
 FEWEST_IMAGES = 5  # from which on the scatter over images tells a standard deviation, to about a third of it
+MOST_SHARED = 300  # quantities that images share: unknown points make them many, and the matrix is of all of them
+LARGEST_SHARE = 0.999  # of one image in what is known of some combination of unknowns: more rests on that image alone
 
 
 def shared_positions(numbering: Numbering) -> Indices:
@@ -31,29 +33,39 @@ def cluster_covariance(numbering: Numbering, end: Linearised, cofactor: Array) -
 
     Returns
     -------
-    None with fewer than FEWEST_IMAGES images.
+    None with fewer than FEWEST_IMAGES images, or where something rests on one image alone.
     """
     problem = numbering.problem
     images = problem.network.frame_numbers[problem.image_numbers]
     clusters = np.unique(images)
     if len(clusters) < FEWEST_IMAGES:
         return None
-    normal = np.asarray(np.linalg.inv(cofactor), dtype=np.float64)
+    root = np.asarray(np.linalg.cholesky(cofactor), dtype=np.float64)
+    moves = [_move(problem.columns, end, images == each, numbering, root) for each in clusters]
+    if any(move is None for move in moves):
+        return None
+    spread = np.array(moves) @ root.T
+    spread -= spread.mean(axis=0)
+    return np.asarray((len(clusters) - 1) / len(clusters) * spread.T @ spread)
+
+
+def _move(columns: Indices, end: Linearised, rows: Mask, numbering: Numbering, root: Array) -> Array | None:
+    """By how much the shared unknowns move without the observations of one image, in units of `root`.
+
+    root: the triangle L of their cofactor matrix L L', by which N becomes the unit matrix.
+    """
     shared = shared_positions(numbering)
-    moves = np.array([_move(problem.columns, end, images == each, numbering, shared, normal) for each in clusters])
-    moves -= moves.mean(axis=0)
-    return np.asarray((len(clusters) - 1) / len(clusters) * moves.T @ moves)
-
-
-def _move(columns: Indices, end: Linearised, rows: Mask, numbering: Numbering, shared: Indices, normal: Array) -> Array:
-    """By how much the shared unknowns move without the observations of one image."""
     columns, matrix, right = columns[rows], end.rows.matrix[rows], end.rows.right[rows].ravel()
     free = np.append(numbering.problem.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
     own = np.setdiff1d(np.unique(columns[free[columns]]), shared)
     by_shared, by_own = (_by_unknowns(columns, matrix, each, len(free)) for each in (shared, own))
     basis = np.linalg.qr(by_own)[0]
     by_shared, right = by_shared - basis @ (basis.T @ by_shared), right - basis @ (basis.T @ right)
-    return np.asarray(-np.linalg.solve(normal - by_shared.T @ by_shared, by_shared.T @ right))
+    by_shared = by_shared @ root
+    shares, axes = np.linalg.eigh(by_shared.T @ by_shared)
+    if shares.max(initial=0.0) > LARGEST_SHARE:
+        return None
+    return np.asarray(-axes @ (axes.T @ (by_shared.T @ right) / (1.0 - shares)))
 
 
 def _by_unknowns(columns: Indices, matrix: Array, positions: Indices, count: int) -> Array:

@@ -1,6 +1,6 @@
 """The result of an adjustment: estimates, residuals and their tests, messages; each computed where it is asked for."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
@@ -12,11 +12,13 @@ from adjust.least_squares.iteration import Iteration, factorise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
+from adjust.problem.parameter import Parameter
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.quality.contradiction import CalibrationTest, calibration_tests
 from adjust.quality.correlation import Correlation, correlations
+from adjust.quality.image_clusters import MOST_SHARED, cluster_covariance, shared_positions
 from adjust.quality.lens_reach import LensReach, lens_reach
 from adjust.quality.reliability import Reliability, reliability
 from adjust.quality.residuals import FurtherResidual, Group, Residuals, further_residuals, groups, residuals
@@ -105,6 +107,22 @@ class Adjustment(Estimates):
     def significance(self) -> Mapping[tuple[str, str], tuple[SignificanceTest, ...]]:
         """Tests by kind ("interior", "scanner", "board") and owner, of single parameters, then of groups."""
         return significance_tests(self)
+
+    def cluster_covariance_of(self, parameters: Sequence[Parameter]) -> Array | None:
+        """The covariance (k, k) of quantities of cameras or boards, by leaving out one image at a time.
+
+        It holds where errors within an image are correlated; what is fixed has zeros. None without a solution and where
+        images are too few (`adjust.quality.image_clusters`).
+        """
+        run, at = self.scaled, shared_positions(self.scaled.numbering)
+        if not self.converged or len(at) > MOST_SHARED:
+            return None
+        found = cluster_covariance(run.numbering, run.end, self.cofactor.part(at))
+        if found is None:
+            return None
+        place = {int(position): number for number, position in enumerate(at)}
+        numbers = [place.get(self.index(each), len(at)) for each in parameters]
+        return np.pad(found, (0, 1))[np.ix_(numbers, numbers)]
 
     def lens_reach(self, camera: Camera, frame_mm: tuple[float, float] | None = None) -> LensReach | None:
         """How far out the lens of a camera is known; None without a solution or without targets.

@@ -12,6 +12,7 @@ from adjust.solution.result import Adjustment
 
 ROUNDS = 6  # residuals hardly change with weights that are nearly alike: two or three do
 FIRST = 1e-3  # of the frame's diagonal, to begin with: residuals then pass for no blunder of the whole network
+PLAUSIBLE = 3e-4  # of the frame's diagonal, up to which it may be lens, board and processing: 1.5 px of 5000 px
 SETTLED = 0.01  # relative change of a standard deviation that changes no weight noticeably
 
 
@@ -20,7 +21,8 @@ def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment
 
     It is added in quadrature to those of the camera's targets and tie points, such that their v'Pv equals their
     redundancy (Förstner's condition for a variance component, here an additive one). It is 0 where the given standard
-    deviations explain the residuals.
+    deviations explain the residuals. Where it is implausibly large, the network is adjusted as it is given first, so
+    that blunders of the whole network are refused; what is left is a warning.
 
     Parameters
     ----------
@@ -30,6 +32,11 @@ def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment
     Returns
     -------
     The adjustment with the added standard deviations, which stand in its `unmodelled_mm`.
+
+    Raises
+    ------
+    AdjustmentError
+        As `adjusted` does.
     """
     sigma_mm = {each.name: FIRST * float(np.hypot(*each.frame_mm)) for each in network.cameras}
     result = adjusted(add_unmodelled(network, sigma_mm))
@@ -42,7 +49,16 @@ def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment
         if settled:
             break
         result = adjusted(add_unmodelled(network, sigma_mm))
-    return replace(result, unmodelled_mm=sigma_mm)
+    diagonal_mm = {each.name: float(np.hypot(*each.frame_mm)) for each in network.cameras}
+    if large := [each for each in sigma_mm if sigma_mm[each] > PLAUSIBLE * diagonal_mm[each] > 0.0]:
+        adjusted(network)
+    warnings = (
+        f"Camera {each}: errors of {1000.0 * sigma_mm[each]:.3g} µm are not modelled, one part in "
+        f"{diagonal_mm[each] / sigma_mm[each]:.0f} of the picture's diagonal. Look for pictures that are blurred or "
+        "moved, for a wrong size or count of the board, and whether the lens model suits."
+        for each in large
+    )
+    return replace(result, unmodelled_mm=sigma_mm, remarks=(*result.remarks, *warnings))
 
 
 def add_unmodelled(network: Network, sigma_mm: Mapping[str, float]) -> Network:

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from pipeline.errors import InputError
+from pipeline.text.wording import did_you_mean, quoted
 
 BoardKind = Literal["chessboard", "charuco", "aruco", "circle-grid", "asymmetric-circle-grid"]
+MOST = 500  # columns or rows, as `[targets]` takes them
 MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
@@ -24,6 +26,10 @@ class BoardOptions:
     size_mm: float | None = None
     dictionary: str | None = None
     legacy: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises InputError where an option of its kind is missing: before anything is read."""
+        assert self.table
 
     @property
     def table(self) -> str:
@@ -66,16 +72,17 @@ def board_options(
     kind: str, board: str, square: str, marker: str | None, dictionary: str | None, legacy: bool
 ) -> BoardOptions:
     """The board that the options of the command line describe. Raises InputError naming the option that is wrong."""
-    if kind not in get_args(BoardKind):
-        raise InputError(f"--kind {kind}: there is no such board; possible are {', '.join(get_args(BoardKind))}.")
+    kinds: dict[str, BoardKind] = {each: each for each in get_args(BoardKind)}
+    if kind not in kinds:
+        raise InputError(
+            f"--kind {kind}: there is no such board; possible are {', '.join(kinds)}.{did_you_mean(kind, kinds)}"
+        )
     counts = re.fullmatch(r"(\d{1,3})[x×*](\d{1,3})", board.strip(), flags=re.IGNORECASE)
-    if counts is None or not all(1 <= int(each) <= 500 for each in counts.groups()):
-        raise InputError(f"--board {board}: must be two counts of 1 to 500, COLUMNSxROWS, such as 9x6.")
+    if counts is None or not all(1 <= int(each) <= MOST for each in counts.groups()):
+        raise InputError(f"--board {board}: must be two counts of 1 to {MOST}, COLUMNSxROWS, such as 9x6.")
     size_mm = None if marker is None else _length_mm("--marker", marker)
     columns, rows = map(int, counts.groups())
-    options = BoardOptions(kind, columns, rows, _length_mm("--square", square), size_mm, dictionary, legacy)  # type: ignore[arg-type]
-    options.table  # noqa: B018  what is missing is said before anything is read
-    return options
+    return BoardOptions(kinds[kind], columns, rows, _length_mm("--square", square), size_mm, dictionary, legacy)
 
 
 def _length_mm(option: str, text: str) -> float:
@@ -86,4 +93,4 @@ def _length_mm(option: str, text: str) -> float:
 
 
 def _toml(value: object) -> str:
-    return f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)
+    return quoted(value) if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)

@@ -1,194 +1,197 @@
-"""Pictures of a board to a calibrated camera: a project is written, measured, adjusted and checked."""
+"""Pictures of a board to calibrated cameras: a project is written, measured, adjusted and checked."""
 
-import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
+from adjust.errors import AdjustmentError
 from adjust.problem.network import Network
 from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 from adjust.solution.unmodelled_error import adjust_unmodelled
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.adjusting.network import build_network
-from pipeline.calibration.board_options import BoardOptions
-from pipeline.calibration.intrinsics import CameraIntrinsics, camera_intrinsics, print_intrinsics, write_camera_files
-from pipeline.calibration.lens_choice import PARAMETERS, LensChoice, LensModel, choose_lens
+from pipeline.calibration.camera_yaml import camera_files
+from pipeline.calibration.intrinsics import CameraIntrinsics, camera_intrinsics
+from pipeline.calibration.lens_choice import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
+from pipeline.calibration.project_files import CalibrationOptions, write_project
 from pipeline.errors import InputError
-from pipeline.files.project_file import Project, read_project
+from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.results.check_file import read_check
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator
 from pipeline.stages import run_all, run_measure
 from pipeline.summary import Summary
 from pipeline.text.atomic import write_atomically
-from pipeline.text.csv_table import csv_line
 from pipeline.text.wording import counted, listed
 from pipeline.workers import WorkOptions
 
-ASSUMED_PITCH_UM = 5.0  # where nobody says it: results are in pixels, and it cancels
 GENEROUS = 2.0  # of the unmodelled standard deviation, for lens models that are poorer than the first
-FEWEST_POINTS = 4  # of a picture whose space resection is over-determined
-
-
-@dataclass(frozen=True)
-class CalibrationOptions:
-    """pitch_um: of a pixel, None where it is not known."""
-
-    board: BoardOptions
-    lens: LensModel | Literal["auto"] = "auto"
-    square_pixels: bool = False
-    pitch_um: float | None = None
-    ros: bool = False
+FEWEST_CORNERS = 4  # of a picture whose space resection is over-determined
+FEWEST_PICTURES = 3  # of a flat board that determine a principal distance and point
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """unreadable: by picture, why. not_calibrated: by camera, why each of its pictures is left out."""
+    """Calibrated cameras, and what is not calibrated.
+
+    unreadable: by picture, why. not_calibrated: by camera, why. files: what was written, report and project last.
+    """
 
     cameras: tuple[CameraIntrinsics, ...]
     unreadable: Mapping[str, str]
-    not_calibrated: Mapping[str, Mapping[str, str]]
+    not_calibrated: Mapping[str, str]
     files: tuple[Path, ...]
     summary: Summary
 
     @property
     def needs_look(self) -> bool:
-        """Whether pictures were left out, or the standard deviations of OpenCV's check do not agree."""
-        return bool(self.unreadable or self.not_calibrated) or any(
-            camera.left_out or (camera.check is not None and camera.check.verdict == "differs")
-            for camera in self.cameras
-        )
-
-    def print(self, console: Console) -> None:
-        """The cameras first, then the files and what can be done next."""
-        for calibrated in self.cameras:
-            print_intrinsics(calibrated, console)
-        for name, reason in self.unreadable.items():
-            console.print(f"{name} cannot be read: {reason}", markup=False, highlight=False, soft_wrap=True)
-        for camera, reasons in self.not_calibrated.items():
-            why = f"{camera} is not calibrated: {listed([f'{name} ({reason})' for name, reason in reasons.items()])}."
-            console.print(why, markup=False, highlight=False, soft_wrap=True)
-        project = self.files[-1]
-        for line in (
-            *map(str, self.files),
-            f"Next: open {self.files[-2]}",
-            f"Next: reseau export {project} opencv DIR, or colmap, micmac, metashape, asp",
-        ):
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+        """Whether pictures were left out, or the adjustment or its check has a problem."""
+        left_out = self.unreadable or self.not_calibrated or any(camera.left_out for camera in self.cameras)
+        return bool(left_out) or self.summary.verdict.exit_code != 0
 
     def as_json(self) -> dict[str, Any]:
         return {
             "cameras": [camera.as_json() for camera in self.cameras],
             "unreadable": dict(self.unreadable),
             "not_calibrated": dict(self.not_calibrated),
+            "problems": [problem.what for problem in self.summary.verdict.problems],
+            "files": list(map(str, self.files)),
         }
+
+    def print(self, console: Console) -> None:
+        """The cameras first, then what needs a look, the files, and what can be done next."""
+        for camera in self.cameras:
+            camera.print(console)
+        for line in self._lines():
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def _lines(self) -> list[str]:
+        report, project = self.files[-2:]
+        problems = [" ".join((f"- {problem.what}", problem.next_step)) for problem in self.summary.verdict.problems]
+        return [
+            *(f"- {name} cannot be read: {why}" for name, why in self.unreadable.items()),
+            *(f"- {camera} is not calibrated: {why}" for camera, why in self.not_calibrated.items()),
+            *problems,
+            *map(str, self.files),
+            f"Next: open {report}",
+            *([f"Next: mend what is named above in {project}, and run: reseau run {project}"] if problems else []),
+            f"Next: reseau export {project} opencv DIR, or colmap, micmac, metashape, asp",
+        ]
 
 
 def calibrate(
     given: Sequence[Path], out: Path, options: CalibrationOptions, reporter: Reporter, workers: int | None = None
 ) -> Calibration:
-    """Calibrate the cameras that took some pictures of a board; what is written stands in `out`.
+    """Calibrate the cameras that took some pictures of a board.
 
-    Raises InputError where there is no picture, or where too few show the board.
+    Each camera is adjusted by itself, so that one without a solution costs no other.
+
+    Parameters
+    ----------
+    given : picture files, and folders that are searched at any depth
+    out : folder of the project and the results
+    workers : processes that measure, None for one a core
+
+    Raises
+    ------
+    InputError
+        Where there is no picture, or no camera can be calibrated; the message says why.
     """
     pictures = find_pictures(given, out)
-    lenses = {camera.name: "opencv4" if options.lens == "auto" else options.lens for camera in pictures.cameras}
-    project = _write_project(out, pictures, options, lenses)
+    first: LensModel = "opencv4" if options.lens == "auto" else options.lens
+    lenses = dict.fromkeys((camera.name for camera in pictures.cameras), first)
+    project = write_project(out, pictures, options, lenses)
     work = WorkOptions(workers=workers)
     run_measure(project, reporter, work)
     marks = read_comparator(project.comparator)
-    used, left_out = _usable(pictures, marks)
-    choices = dict[str, LensChoice]()
-    if options.lens == "auto":
-        with reporter.stage("choosing the lens") as count:
-            for done, camera in enumerate(used):
-                count(camera.name, done, len(used))
-                choices[camera.name] = _choice(project, marks, camera, options)
-        lenses |= {name: choice.model for name, choice in choices.items()}
-    cameras = tuple(replace(camera, images=tuple(set(camera.images) - set(left_out))) for camera in used)
-    project = _write_project(out, pictures, options, lenses)
+    left_out = _left_out(pictures, marks)
+    choices: dict[str, LensChoice | None] = {}
+    adjustments, not_calibrated = dict[str, Adjustment](), dict[str, str]()
+    with reporter.stage("calibrating") as count:
+        for done, camera in enumerate(pictures.cameras):
+            count(camera.name, done, len(pictures.cameras))
+            own = [mark for mark in marks if mark.image in camera.images and mark.image not in left_out]
+            try:
+                choices[camera.name] = choice = _chosen_lens(project, own, camera, options, left_out)
+                lenses[camera.name] = choice.model if choice else first
+                adjustments[camera.name] = _adjusted(write_project(out, pictures, options, lenses), own)
+            except (AdjustmentError, InputError) as error:
+                not_calibrated[camera.name] = str(error)
+    if not adjustments:
+        raise InputError(_nothing(pictures, left_out, not_calibrated))
+    calibrated = tuple(camera for camera in pictures.cameras if camera.name in adjustments)
+    project = write_project(out, replace(pictures, cameras=calibrated), options, lenses)
     summary = run_all(project, reporter, work)
-    adjustment = adjust_marks(project, marks)
-    if not adjustment.converged:
-        raise InputError(
-            f"{out}: the calibration has no solution ({adjustment.termination}). {' '.join(adjustment.warnings[:1])} "
-            "Take pictures with the board tilted by 20 degrees and more in different directions, all over the picture."
-        )
     checks = read_check(project.check_path).cameras if project.check_path.exists() else {}
-    pixel_mm = _pitch_um(options) / 1000.0
-    reasons = {**left_out, **adjustment.left_out}
-    found = [
+    cameras = tuple(
         camera_intrinsics(
-            adjustment,
+            adjustments[camera.name],
             camera,
-            pixel_mm,
-            {name: why for name, why in reasons.items() if name in by_name(pictures, camera.name).images},
-            choices.get(camera.name),
-            checks.get(camera.name),
-            options.pitch_um,
+            options.pixel_mm,
+            left_out={
+                name: why
+                for name, why in (left_out | dict(adjustments[camera.name].left_out)).items()
+                if name in camera.images
+            },
+            lens=choices[camera.name],
+            pitch_um=options.pitch_um,
+            check=checks.get(camera.name),
         )
-        for camera in cameras
-    ]
-    files = dict(write_camera_files(found, out, options.ros))
+        for camera in calibrated
+    )
+    files = dict(camera_files(cameras, out, options.ros))
     for path, text in files.items():
         write_atomically(path, text)
-    calibrated = {camera.name for camera in cameras}
-    others = {
-        camera.name: {name: left_out[name] for name in camera.images}
-        for camera in pictures.cameras
-        if camera.name not in calibrated
-    }
-    return Calibration(tuple(found), pictures.unreadable, others, (*files, project.report_path, project.path), summary)
+    written = (*files, project.report_path, project.path)
+    return Calibration(cameras, pictures.unreadable, not_calibrated, written, summary)
 
 
-def by_name(pictures: BoardPictureFiles, name: str) -> CameraPictures:
-    return next(camera for camera in pictures.cameras if camera.name == name)
-
-
-def _pitch_um(options: CalibrationOptions) -> float:
-    return options.pitch_um or ASSUMED_PITCH_UM
-
-
-def _usable(
-    pictures: BoardPictureFiles, marks: Sequence[ComparatorPoint]
-) -> tuple[tuple[CameraPictures, ...], dict[str, str]]:
-    """The cameras with pictures that show the board, and why pictures are left out."""
-    points = dict.fromkeys((name for camera in pictures.cameras for name in camera.images), 0)
-    reasons = dict.fromkeys(points, "the board was not found")
+def _left_out(pictures: BoardPictureFiles, marks: Sequence[ComparatorPoint]) -> dict[str, str]:
+    """Why pictures are left out: those without a board, or with hardly any of it."""
+    corners = dict.fromkeys((name for camera in pictures.cameras for name in camera.images), 0)
+    reasons = dict.fromkeys(corners, "the board was not found")
     for mark in marks:
-        points[mark.image] += mark.status.is_observation
+        corners[mark.image] += mark.status.is_observation
         if not mark.status.is_observation and mark.reason:
             reasons[mark.image] = str(mark.reason)
-    left_out = {
-        name: reasons[name] if count == 0 else f"only {counted(count, 'corner')} found"
-        for name, count in points.items()
-        if count < FEWEST_POINTS
+    few = {name: count for name, count in corners.items() if count < FEWEST_CORNERS}
+    return {
+        name: f"only {counted(count, 'corner')} of the board found" if count else reasons[name]
+        for name, count in few.items()
     }
-    used = tuple(camera for camera in pictures.cameras if set(camera.images) - set(left_out))
-    if not used:
+
+
+def _chosen_lens(
+    project: Project,
+    marks: Sequence[ComparatorPoint],
+    camera: CameraPictures,
+    options: CalibrationOptions,
+    left_out: Mapping[str, str],
+) -> LensChoice | None:
+    """The lens by cross-validation; None where it is given. Raises InputError where too few pictures show the board."""
+    used = set(camera.images) - left_out.keys()
+    if len(used) < FEWEST_PICTURES:
+        others = _most_common(left_out[name] for name in camera.images if name in left_out)
         raise InputError(
-            f"the board was found in none of {counted(len(points), 'picture')}; of most: "
-            f"{Counter(reasons.values()).most_common(1)[0][0]}. Check --board (inner corners of a chessboard, not "
-            "squares), --kind, and that the whole board is in the picture."
+            f"the board is in {counted(len(used), 'picture')} of {camera.width_px} x {camera.height_px} px, and "
+            f"{FEWEST_PICTURES} or more with different tilts are needed{others and f' (others: {others})'}. Pictures "
+            "that were turned or cut are taken for another camera's: give them as they were taken."
         )
-    return used, left_out
-
-
-def _choice(
-    project: Project, marks: Sequence[ComparatorPoint], camera: CameraPictures, options: CalibrationOptions
-) -> LensChoice:
-    own = [mark for mark in marks if mark.image in camera.images]
-    network, _ = build_network(project, own)
+    if options.lens != "auto":
+        return None
+    network, _ = build_network(project, marks)
     adjusted = partial(adjust, options=adjustment_options(project))
     unmodelled_mm = adjust_unmodelled(network, adjusted).unmodelled_mm[camera.name]
-    return choose_lens(_alike(network, unmodelled_mm), camera.name, options.square_pixels, adjusted)
+    alike = _alike(network, unmodelled_mm)
+    return choose_lens(alike, options.square_pixels, options.pixel_mm, adjusted)
 
 
 def _alike(network: Network, unmodelled_mm: float) -> Network:
@@ -200,46 +203,32 @@ def _alike(network: Network, unmodelled_mm: float) -> Network:
     return replace(network, observations=replace(observations, covariance_mm2=covariance))
 
 
-def _write_project(
-    out: Path, pictures: BoardPictureFiles, options: CalibrationOptions, lenses: Mapping[str, LensModel]
-) -> Project:
-    """project.toml, a camera file for each camera, and images.csv where there are several."""
-    out.mkdir(parents=True, exist_ok=True)
-    pixel_mm = _pitch_um(options) / 1000.0
-    for camera in pictures.cameras:
-        write_atomically(out / f"{camera.name}.toml", _camera_text(camera, pixel_mm, lenses[camera.name], options))
-    names = [name for camera in pictures.cameras for name in camera.images]
-    scans = ", ".join(_quoted(os.path.relpath(pictures.files[name], out)) for name in names)
-    several = len(pictures.cameras) > 1
-    text = (
-        "# Written by `reseau calibrate`; `reseau run` goes on with it.\n"
-        + f'camera = "{pictures.cameras[0].name}.toml"\n'
-        + f"scans = [{scans}]\n"
-        + ("" if options.pitch_um else "# Nobody said how large a pixel is: of all in mm only ratios count.\n")
-        + f"pitch_um = {_pitch_um(options)!r}\n\n"
-        + options.board.table
-        + ('\n[object]\nunit = "mm"\nimages = "images.csv"\n' if several else '\n[object]\nunit = "mm"\n')
-        + '\n[adjust]\ntransformation = "none"\nunmodelled = "estimate"\n'
-    )
-    if several:
-        lines = ["image,camera"]
-        lines += [csv_line([name, f"{each.name}.toml"]) for each in pictures.cameras for name in each.images]
-        write_atomically(out / "images.csv", "\n".join([*lines, ""]))
-    write_atomically(out / "project.toml", text)
-    return read_project(out / "project.toml")
+def _adjusted(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
+    """The adjustment of one camera. Raises InputError or AdjustmentError where there is no solution."""
+    adjustment = adjust_marks(project, marks)
+    if not adjustment.converged:
+        why = " ".join(adjustment.warnings[:1])
+        raise InputError(
+            f"the adjustment has no solution ({adjustment.termination}). {why} Take pictures with the board tilted by "
+            "20 degrees and more in different directions, all over the picture."
+        )
+    return adjustment
 
 
-def _camera_text(camera: CameraPictures, pixel_mm: float, lens: LensModel, options: CalibrationOptions) -> str:
-    free = PARAMETERS[lens] if options.square_pixels else (*PARAMETERS[lens], "b1")
-    family = "opencv_fisheye" if lens == "fisheye" else "opencv"
-    return (
-        f"name = {_quoted(camera.name)}\n"
-        f"frame_mm = [{camera.width_px * pixel_mm!r}, {camera.height_px * pixel_mm!r}]\n"
-        f"principal_distance_mm = {camera.width_px * pixel_mm!r}\n\n"
-        '[sigma]\nprincipal_distance_mm = "free"\nprincipal_point_mm = "free"\n\n'
-        f'[distortion]\nfamily = "{family}"\n[distortion.sigma]\n' + "".join(f'{name} = "free"\n' for name in free)
+def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calibrated: Mapping[str, str]) -> str:
+    """Why no camera is calibrated."""
+    number = sum(len(camera.images) for camera in pictures.cameras)
+    if len(left_out) == number:
+        return (
+            f"the board was found in none of {counted(number, 'picture')}; of most: {_most_common(left_out.values())}. "
+            "Check --board (inner corners of a chessboard, not squares), --kind, and that the whole board is in the "
+            "picture."
+        )
+    return "; ".join(f"{camera}: {why}" for camera, why in not_calibrated.items()) + (
+        f" Left out: {listed([f'{name} ({why})' for name, why in left_out.items()])}." if left_out else ""
     )
 
 
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+def _most_common(reasons: Iterable[str]) -> str:
+    """ "" without any."""
+    return next((reason for reason, _ in Counter(reasons).most_common(1)), "")

@@ -12,8 +12,12 @@ from adjust.problem.camera import Camera
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
+from pipeline.types import Array
 
 LensModel = Literal["opencv4", "opencv5", "opencv8", "fisheye"]
+LensSetting = LensModel | Literal["auto"]
+Adjust = Callable[[Network], Adjustment]
+
 PARAMETERS: Mapping[LensModel, tuple[str, ...]] = {
     "opencv4": ("k1", "k2", "p1", "p2"),
     "opencv5": ("k1", "k2", "p1", "p2", "k3"),
@@ -27,10 +31,10 @@ WIDE = 1.0  # half the picture's diagonal over the principal distance, from whic
 
 @dataclass(frozen=True)
 class LensScore:
-    """rms_mm: of pictures that were left out, a point; None where the model has no solution."""
+    """rms_px: a point, of pictures that were left out; None where the model has no solution."""
 
     model: LensModel
-    rms_mm: float | None
+    rms_px: float | None
 
 
 @dataclass(frozen=True)
@@ -46,9 +50,7 @@ def lens_of(model: LensModel, square_pixels: bool) -> Distortion:
     return Distortion(family, {name: Prior(0.0, np.inf) for name in names})
 
 
-def choose_lens(
-    network: Network, camera: str, square_pixels: bool, adjusted: Callable[[Network], Adjustment]
-) -> LensChoice:
+def choose_lens(network: Network, square_pixels: bool, pixel_mm: float, adjusted: Adjust) -> LensChoice:
     """Select the lens model of a camera by cross-validation over its pictures.
 
     Fifths of the pictures are left out in turn; their points are predicted with the camera of the others, after a space
@@ -58,50 +60,51 @@ def choose_lens(
     Parameters
     ----------
     network : of one camera and its pictures
-    camera : its name
     square_pixels : whether fx and fy are one
+    pixel_mm : side of a pixel
     adjusted : adjusts a network
     """
     images = [image.name for image in network.images]
     if len(images) < FEWEST_PICTURES:
         return LensChoice("opencv4", ())
-    squares: dict[LensModel, np.ndarray | None] = {}
+    squares: dict[LensModel, Array | None] = {}
     best: LensModel = "opencv4"
     for model in PARAMETERS:
-        if model == "fisheye" and not _is_wide(network, camera, adjusted):
+        if model == "fisheye" and not _is_wide(_with_lens(network, lens_of("opencv4", square_pixels)), adjusted):
             continue
-        squares[model] = _left_out(_with_lens(network, camera, lens_of(model, square_pixels)), images, adjusted)
+        squares[model] = _prediction_errors(_with_lens(network, lens_of(model, square_pixels)), images, adjusted)
         if model != best and _is_better(squares[model], squares[best]):
             best = model
-    scores = (LensScore(model, None if s is None else float(np.sqrt(s.mean()))) for model, s in squares.items())
-    return LensChoice(best, tuple(scores))
+    rms_px = {
+        model: None if each is None else float(np.sqrt(each.mean())) / pixel_mm for model, each in squares.items()
+    }
+    return LensChoice(best, tuple(LensScore(model, rms) for model, rms in rms_px.items()))
 
 
-def _is_better(squares: "np.ndarray | None", than: "np.ndarray | None") -> bool:
+def _is_better(squares: Array | None, than: Array | None) -> bool:
     if squares is None or than is None:
         return squares is not None
     gain = than - squares
     return bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
-def _is_wide(network: Network, camera: str, adjusted: Callable[[Network], Adjustment]) -> bool:
+def _is_wide(network: Network, adjusted: Adjust) -> bool:
+    """Whether the field is so wide that a fisheye is likely; so it is where the usual model has no solution."""
     try:
-        result = adjusted(_with_lens(network, camera, lens_of("opencv4", True)))
+        result = adjusted(network)
     except AdjustmentError:
         return True
-    (given,) = (each for each in network.cameras if each.name == camera)
-    c_mm = result.value(Parameter.interior(camera, "c"))
-    return not result.converged or float(np.hypot(*given.frame_mm)) / 2.0 > WIDE * c_mm
+    (camera,) = network.cameras
+    c_mm = result.value(Parameter.interior(camera.name, "c"))
+    return not result.converged or float(np.hypot(*camera.frame_mm)) / 2.0 > WIDE * c_mm
 
 
-def _with_lens(network: Network, camera: str, lens: Distortion) -> Network:
-    cameras = (replace(each, distortion=lens) if each.name == camera else each for each in network.cameras)
-    return replace(network, cameras=tuple(cameras))
+def _with_lens(network: Network, lens: Distortion) -> Network:
+    (camera,) = network.cameras
+    return replace(network, cameras=(replace(camera, distortion=lens),))
 
 
-def _left_out(
-    network: Network, images: Sequence[str], adjusted: Callable[[Network], Adjustment]
-) -> "np.ndarray | None":
+def _prediction_errors(network: Network, images: Sequence[str], adjusted: Adjust) -> Array | None:
     """Mean squared length (m,) of the residuals of each picture, predicted by others; None without a solution."""
     squares = []
     for fold in (images[first::FOLDS] for first in range(FOLDS)):
@@ -109,9 +112,10 @@ def _left_out(
             fitted = adjusted(_of_images(network, set(images) - set(fold)))
             if not fitted.converged:
                 return None
-            cameras = tuple(_held(each, fitted) for each in network.cameras)
+            (camera,) = network.cameras
+            known = replace(network, cameras=(_held(camera, fitted),))
             for image in fold:
-                predicted = adjusted(replace(_of_images(network, {image}), cameras=cameras))
+                predicted = adjusted(_of_images(known, {image}))
                 squares.append(float((predicted.residuals.v_mm**2).sum(axis=1).mean()))
         except AdjustmentError:
             return None
@@ -119,18 +123,9 @@ def _left_out(
 
 
 def _of_images(network: Network, names: set[str]) -> Network:
-    observations = network.observations
-    rows = np.flatnonzero([image in names for image in observations.image])
-    taken = replace(
-        observations,
-        image=tuple(observations.image[row] for row in rows),
-        point=tuple(observations.point[row] for row in rows),
-        kind=tuple(observations.kind[row] for row in rows),
-        xy_mm=observations.xy_mm[rows],
-        covariance_mm2=observations.covariance_mm2[rows],
-    )
+    rows = np.flatnonzero([image in names for image in network.observations.image])
     images = tuple(image for image in network.images if image.name in names)
-    return replace(network, images=images, observations=taken)
+    return replace(network, images=images, observations=network.observations.only(rows))
 
 
 def _held(camera: Camera, fitted: Adjustment) -> Camera:
@@ -140,10 +135,7 @@ def _held(camera: Camera, fitted: Adjustment) -> Camera:
         return Prior(fitted.value(Parameter.interior(camera.name, name)), 0.0)
 
     parameters = {name: prior(name) for name in camera.distortion.parameters}
+    distortion = replace(camera.distortion, parameters=parameters)
     return replace(
-        camera,
-        principal_distance_mm=prior("c"),
-        x0_mm=prior("x0"),
-        y0_mm=prior("y0"),
-        distortion=replace(camera.distortion, parameters=parameters),
+        camera, principal_distance_mm=prior("c"), x0_mm=prior("x0"), y0_mm=prior("y0"), distortion=distortion
     )

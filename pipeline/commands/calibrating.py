@@ -1,13 +1,22 @@
 """The command that calibrates a digital camera from pictures of a board."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pipeline.commands.shared import DONE, LOOK, AsJson, show
 
-LENSES = ("auto", "opencv4", "opencv5", "opencv8", "fisheye")
+if TYPE_CHECKING:
+    from pipeline.calibration.lens_choice import LensSetting
+
+LENSES: "dict[str, LensSetting]" = {
+    "auto": "auto",
+    "opencv4": "opencv4",
+    "opencv5": "opencv5",
+    "opencv8": "opencv8",
+    "fisheye": "fisheye",
+}
 OUT = Path("calibration")
 
 
@@ -33,7 +42,8 @@ def calibrate(
 ) -> int:
     """Calibrate a digital camera from pictures of a board."""
     from pipeline.calibration.board_options import board_options
-    from pipeline.calibration.calibrate_stage import CalibrationOptions, calibrate
+    from pipeline.calibration.calibrate_stage import calibrate
+    from pipeline.calibration.project_files import CalibrationOptions
     from pipeline.errors import InputError
     from pipeline.progress import Reporter
     from pipeline.text.wording import did_you_mean
@@ -41,8 +51,7 @@ def calibrate(
     if lens not in LENSES:
         raise InputError(f"--lens {lens}: possible are {', '.join(LENSES)}.{did_you_mean(lens, LENSES)}")
     given = board_options(kind, board, square, marker, dictionary, legacy)
-    options = CalibrationOptions(given, lens, square_pixels, pitch_um, ros)  # type: ignore[arg-type]
+    options = CalibrationOptions(given, LENSES[lens], square_pixels, pitch_um, ros)
     found = calibrate(pictures, out, options, Reporter(), workers)
-
     show(as_json, found.as_json, found.print)
     return LOOK if found.needs_look else DONE

@@ -373,12 +373,22 @@ def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int)
     constants = []
     for name, camera in data.adjustment.cameras.items():
         if camera.is_calibrated:
-            value, sigma = value_and_sigma(camera.principal_distance_mm.value, camera.principal_distance_mm.sigma)
-            known = f"{value} mm, fixed" if sigma == "fixed" else f"{value} ± {sigma} mm"
-            constants.append(f"{name} has c = {known}")
+            constants.append(f"{name} has c = {_principal_distance(data, name, camera)}")
     if not constants:
         return f"Film transformations from {found}; no frame is oriented, and no camera calibrated{ending}"
     return f"Calibrated from {found}: {'; '.join(constants)}{ending}"
+
+
+def _principal_distance(data: ReportData, name: str, camera: CameraRecord) -> str:
+    """With its standard deviation: of a digital camera in pixels, whose size need not be known."""
+    given, unit_mm, unit = camera.principal_distance_mm, 1.0, "mm"
+    if data.adjustment and data.measurement and not camera.fiducials:
+        images = [image for image, each in data.adjustment.images.items() if each.camera in ("", name)]
+        pitches = {um for image in images if image in data.measurement for um in data.measurement[image].pitch_um}
+        if len(pitches) == 1:
+            unit_mm, unit = pitches.pop() / 1000.0, "px"
+    value, sigma = value_and_sigma(given.value / unit_mm, given.sigma / unit_mm)
+    return f"{value} {unit}, fixed" if sigma == "fixed" else f"{value} ± {sigma} {unit}"
 
 
 def _observed(data: ReportData, shots: list[Frame]) -> int:

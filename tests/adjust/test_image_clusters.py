@@ -8,7 +8,6 @@ from board_pictures import TRUTH, board_network
 
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
-from adjust.quality.image_clusters import cluster_covariance, shared_positions
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 
@@ -16,25 +15,15 @@ QUANTITIES = ("c", "x0", "y0", "k1", "k2")
 
 
 def scatter(result: Adjustment) -> np.ndarray:
-    run = result.scaled
-    positions = shared_positions(run.numbering)
-    assert [result.parameters[at].quantity for at in positions] == list(QUANTITIES)
-    covariance = cluster_covariance(run.numbering, run.end, result.cofactor.part(positions))
+    covariance = result.cluster_covariance_of([Parameter.interior("desk", each) for each in (*QUANTITIES, "p1")])
     assert covariance is not None
-    return np.asarray(np.sqrt(np.diagonal(covariance)))
+    assert not covariance[-1].any()  # what is fixed
+    return np.asarray(np.sqrt(np.diagonal(covariance)))[:-1]
 
 
 def without(network: Network, image: str) -> Network:
-    observations = network.observations
-    rows = [row for row, name in enumerate(observations.image) if name != image]
-    left = replace(
-        observations,
-        image=tuple(observations.image[row] for row in rows),
-        point=tuple(observations.point[row] for row in rows),
-        kind=tuple(observations.kind[row] for row in rows),
-        xy_mm=observations.xy_mm[rows],
-        covariance_mm2=observations.covariance_mm2[rows],
-    )
+    rows = np.flatnonzero([name != image for name in network.observations.image])
+    left = network.observations.only(rows)
     return replace(network, images=tuple(each for each in network.images if each.name != image), observations=left)
 
 
@@ -80,6 +69,5 @@ def test_it_holds_for_independent_errors_and_for_errors_that_pictures_share() ->
 
 def test_few_pictures_tell_no_scatter() -> None:
     result = adjust(board_network(np.random.default_rng(1), 4, 5e-4))
-    run = result.scaled
-    assert cluster_covariance(run.numbering, run.end, result.cofactor.part(shared_positions(run.numbering))) is None
+    assert result.cluster_covariance_of([Parameter.interior("desk", "c")]) is None
     assert result.value(Parameter.interior("desk", "c")) == pytest.approx(2.7, abs=0.02)

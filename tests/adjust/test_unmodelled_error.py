@@ -1,11 +1,14 @@
 """The standard deviation of what is not modelled, as a variance component of each camera."""
 
+import re
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
-from board_pictures import board_network
+from board_pictures import FRAME_MM, board_network
 
+from adjust.errors import AdjustmentError
 from adjust.solution.adjustment import adjust
 from adjust.solution.unmodelled_error import adjust_unmodelled
 
@@ -23,3 +26,24 @@ def test_there_is_none_where_the_given_standard_deviations_explain_the_residuals
     result = adjust_unmodelled(network, partial(adjust))
     assert result.unmodelled_mm == {"desk": 0.0}
     assert result.sigma0 == pytest.approx(5 / 6, rel=0.09)
+
+
+def test_what_is_wrong_with_a_picture_is_no_unmodelled_error_that_passes() -> None:
+    """One of eight pictures is mirrored: that is refused, or said, and not taken for a lens that is a little poor."""
+    network = board_network(np.random.default_rng(7), 8, 5e-4, given_mm=1e-4)
+    xy_mm = network.observations.xy_mm.copy()
+    rows = [row for row, image in enumerate(network.observations.image) if image == "p3"]
+    xy_mm[rows, 0] = FRAME_MM[0] - xy_mm[rows, 0]
+    mirrored = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
+    try:
+        said = " ".join(adjust_unmodelled(mirrored, adjust).warnings)
+    except AdjustmentError as error:
+        said = str(error)
+    assert "p3" in said
+    assert "mirrored" in said
+
+
+def test_an_implausible_one_is_a_warning() -> None:
+    """Errors of 5 µm, a part in 800 of the diagonal of 4 mm: no lens leaves so much."""
+    result = adjust_unmodelled(board_network(np.random.default_rng(9), 6, 5e-3, given_mm=1e-4), adjust)
+    assert any(re.search(r"are not modelled, one part in [78]\d\d of", warning) for warning in result.warnings)

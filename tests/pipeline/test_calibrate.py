@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,10 @@ from pipeline.calibration.pictures import find_pictures
 from pipeline.cli import run
 from pipeline.errors import InputError
 
+TOO_FEW = (
+    "the board is in 1 picture of 440 x 360 px, and 3 or more with different tilts are needed. Pictures that were turned "
+    "or cut are taken for another camera's: give them as they were taken."
+)
 BOARD = ("--board", "7x5", "--square", "2cm")
 
 
@@ -26,6 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number in range(len(TURNS)):
         Image.fromarray(picture(number)).save(made / f"p{number}.png")
     Image.fromarray(np.full((SIZE_PX[1], SIZE_PX[0]), 128, np.uint8)).save(made / "grey.png")
+    Image.fromarray(np.pad(picture(1), 20, constant_values=210)).save(made / "wider.png")
     (made / "torn.png").write_bytes((made / "p0.png").read_bytes()[:100])
     return made
 
@@ -43,7 +49,8 @@ def result(folder: Path) -> dict[str, Any]:
 def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any], folder: Path) -> None:
     (camera,), out = result["cameras"], folder / "calibration"
     assert list(result["unreadable"]) == ["torn"]
-    assert (camera["name"], camera["image_size_px"], camera["images_used"]) == ("camera", list(SIZE_PX), 5)
+    assert result["not_calibrated"] == {"camera-440x360": TOO_FEW}  # and costs the other camera nothing
+    assert (camera["name"], camera["image_size_px"], camera["images_used"]) == ("camera-400x320", list(SIZE_PX), 5)
     assert camera["images_left_out"] == {"grey": "the scan has no contrast: its grey values span 0.0 % of the scale"}
     for name, truth in (("fx", FOCAL_PX), ("fy", FOCAL_PX), ("cx", CENTER_PX[0]), ("cy", CENTER_PX[1])):
         each = camera[f"{name}_px"]
@@ -61,7 +68,7 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     )
     assert storage.getNode("distortion_coefficients").mat().shape == (1, 4)
     assert "distortion_model: plumb_bob" in (out / "camera-ros.yaml").read_text(encoding="utf-8")
-    assert (out / "out" / "report.html").exists()
+    assert re.search(r"c = 520\.\d+ ± 0\.\d+ px", (out / "out" / "report.html").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize(
