@@ -1,5 +1,6 @@
 """The grid of segments (tiles, strips) of a picture, and a cache of those decoded last."""
 
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +27,7 @@ class LostPart:
     why: str
 
 
-class Segments:
+class Segments(ABC):
     """A picture as its file stores it: a grid of tiles or strips, each decoded on its own.
 
     height_px, width_px: of the picture; segment_height_px, segment_width_px: of a segment, those at the right and lower
@@ -54,13 +55,14 @@ class Segments:
         after the other; else nothing."""
         return {}
 
+    @abstractmethod
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         """Segment (row, column) of the grid: (height, width, channels), values that grow with light. stored: as
         `fetch` gives it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
-        """Nothing is open."""
+        """Close the file, where one is open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +171,9 @@ class WholePicture(Segments):
     @property
     def lost(self) -> Sequence[LostPart]:
         return (LostPart(0, 0, self.width_px, self.height_px, self._damage),) if self._damage else ()
+
+    def close(self) -> None:
+        """Nothing is open."""
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         """All of it."""

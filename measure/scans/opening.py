@@ -196,6 +196,9 @@ class WindowSegments(Segments):
             for part in self._scan.lost
         )
 
+    def close(self) -> None:
+        """Nothing is open."""
+
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         """A band of rows."""
         first = row * self.segment_height_px

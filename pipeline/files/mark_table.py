@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -177,7 +178,7 @@ def read_marks(table: Table) -> dict[str, Drawing]:
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
-class MarkTable:
+class MarkTable(ABC):
     """What every table [mark.NAME] has."""
 
     kind: Annotated[str, TEXT] = Field(description="Shape of the mark.")
@@ -185,9 +186,9 @@ class MarkTable:
         default="none", description="radial: drawn as on the positive x axis, turned with its place."
     )
 
+    @abstractmethod
     def mark(self, table: Table) -> shapes.Mark | shapes.LearnedMark:
         """The mark. table: for messages."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
@@ -315,9 +316,9 @@ class DrawnTable(PaintedTable):
     def mark(self, table: Table) -> shapes.MarkShape:
         return shapes.MarkShape(self.parts(table), self.polarity, true_mm=self.true_mm)
 
+    @abstractmethod
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
         """The simple shapes of the mark. table: for messages."""
-        raise NotImplementedError
 
 
 def _true_mm(table: Table) -> tuple[Point, Point]:

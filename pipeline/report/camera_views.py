@@ -12,7 +12,8 @@ from pipeline.report.data import ReportData
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.numbers import fixed
 from pipeline.report.parameters import ParameterRow, high_correlations, parameter_rows
-from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, ResidualRecord
+from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord
+from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.check_file import CameraCheck
 from pipeline.results.covariance_file import Covariance
 

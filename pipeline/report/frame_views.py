@@ -17,7 +17,8 @@ from pipeline.report.data import ReportData
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
 from pipeline.report.verdict import suspect_rows
-from pipeline.results.adjustment_record import ImageRecord, ResidualRecord
+from pipeline.results.adjustment_record import ImageRecord
+from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.measured_record import MeasuredScan
 
 _WIDTH_PX = 1000.0  # plates of 20 mm on film of 230 are read

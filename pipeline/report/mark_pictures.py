@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.drawing import svg
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.vectors import LEAST_UM
-from pipeline.results.adjustment_record import ResidualRecord
+from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.thumbnail import Thumbnail
 
 SIZE_PX = 92.0  # a picture's width and height on the page

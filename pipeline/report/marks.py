@@ -10,7 +10,7 @@ import numpy as np
 from measure.flags import Code, Reason, Status
 from measure.results import Covariance, MarkMeasurement
 from pipeline.report.data import ReportData
-from pipeline.results.adjustment_record import ResidualRecord
+from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.types import Array

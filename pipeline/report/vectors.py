@@ -8,7 +8,8 @@ from markupsafe import Markup
 
 from pipeline.drawing import svg
 from pipeline.report.numbers import fixed
-from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord, ResidualRecord
+from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord
+from pipeline.results.assessment_record import ResidualRecord
 from pipeline.types import Array, Mask
 
 MARGIN_PX = 26.0

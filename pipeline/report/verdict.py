@@ -16,9 +16,8 @@ from pipeline.report.frame_problems import assumed_poses, frame_problems, images
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import spoken_name
-from pipeline.results.adjustment_record import (
-    AdjustmentRecord,
-    CameraRecord,
+from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord
+from pipeline.results.assessment_record import (
     ContradictionRecord,
     DistanceRecord,
     ObservedQuantity,

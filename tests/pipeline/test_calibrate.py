@@ -19,8 +19,8 @@ from pipeline.cli import run
 from pipeline.errors import InputError
 
 TOO_FEW = (
-    "the board is in 1 picture of 440 x 360 px, and 3 or more with different tilts are needed. Pictures that were turned "
-    "or cut are taken for another camera's: give them as they were taken."
+    "the board is in 1 picture of 440 x 360 px, and 3 or more with different tilts are needed. Pictures that were "
+    "turned or cut are taken for another camera's: give them as they were taken."
 )
 BOARD = ("--board", "7x5", "--square", "2cm")
 

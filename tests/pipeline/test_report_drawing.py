@@ -16,7 +16,7 @@ from pipeline.report.mark_pictures import SIZE_PX, arrow_scale, mark_picture
 from pipeline.report.marks import Mark, natural
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.vectors import VectorField, all_images_plot, plane
-from pipeline.results.adjustment_record import ResidualRecord
+from pipeline.results.assessment_record import ResidualRecord
 
 RESIDUAL = ResidualRecord("f1", "7", "target", *[0.0] * 16)
 

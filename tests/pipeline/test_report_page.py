@@ -14,7 +14,8 @@ from studies import parametrize_with_studies
 from measure.flags import CODE_MEANING, STATUS_MEANING, Code, Reason, Status
 from measure.results import FrameMeasurement
 from pipeline.report import Problem, ReportData, render_report, write_report
-from pipeline.results.adjustment_record import CorrelationRecord, Sigma0Record
+from pipeline.results.adjustment_record import Sigma0Record
+from pipeline.results.assessment_record import CorrelationRecord
 from pipeline.results.check_file import Check
 from pipeline.results.comparator_file import ComparatorPoint
 

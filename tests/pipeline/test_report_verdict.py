@@ -16,7 +16,8 @@ from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import frames
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
-from pipeline.results.adjustment_record import Quantity, SuspectRecord
+from pipeline.results.adjustment_record import Quantity
+from pipeline.results.assessment_record import SuspectRecord
 from pipeline.results.check_file import Check
 from pipeline.results.measured_record import MeasuredScan
 
