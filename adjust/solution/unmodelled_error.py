@@ -11,7 +11,7 @@ from adjust.problem.network import Network
 from adjust.solution.result import Adjustment
 
 ROUNDS = 6  # residuals hardly change with weights that are nearly alike: two or three do
-FIRST = 1e-3  # of the frame's diagonal, to begin with: residuals then pass for no blunder of the whole network
+FIRST = 1e-3  # of the frame's diagonal, to begin with: more than any lens leaves, less than a blunder does
 PLAUSIBLE = 3e-4  # of the frame's diagonal, up to which it may be lens, board and processing: 1.5 px of 5000 px
 SETTLED = 0.01  # relative change of a standard deviation that changes no weight noticeably
 
@@ -21,8 +21,8 @@ def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment
 
     It is added in quadrature to those of the camera's targets and tie points, such that their v'Pv equals their
     redundancy (Förstner's condition for a variance component, here an additive one). It is 0 where the given standard
-    deviations explain the residuals. Where it is implausibly large, the network is adjusted as it is given first, so
-    that blunders of the whole network are refused; what is left is a warning.
+    deviations explain the residuals. The first adjustment allows FIRST of the frame, so that blunders of the whole
+    network are refused before any error is taken for unmodelled. An implausibly large one is a warning.
 
     Parameters
     ----------
@@ -50,8 +50,7 @@ def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment
             break
         result = adjusted(add_unmodelled(network, sigma_mm))
     diagonal_mm = {each.name: float(np.hypot(*each.frame_mm)) for each in network.cameras}
-    if large := [each for each in sigma_mm if sigma_mm[each] > PLAUSIBLE * diagonal_mm[each] > 0.0]:
-        adjusted(network)
+    large = [each for each in sigma_mm if sigma_mm[each] > PLAUSIBLE * diagonal_mm[each] > 0.0]
     warnings = (
         f"Camera {each}: errors of {1000.0 * sigma_mm[each]:.3g} µm are not modelled, one part in "
         f"{diagonal_mm[each] / sigma_mm[each]:.0f} of the picture's diagonal. Look for pictures that are blurred or "

@@ -1,6 +1,6 @@
 """The lens model of a digital camera: the simplest that predicts pictures it was not fitted to as well as any."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,7 +18,7 @@ LensModel = Literal["opencv4", "opencv5", "opencv8", "fisheye"]
 LensSetting = LensModel | Literal["auto"]
 Adjust = Callable[[Network], Adjustment]
 
-PARAMETERS: Mapping[LensModel, tuple[str, ...]] = {
+PARAMETERS: dict[LensModel, tuple[str, ...]] = {
     "opencv4": ("k1", "k2", "p1", "p2"),
     "opencv5": ("k1", "k2", "p1", "p2", "k3"),
     "opencv8": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),

@@ -15,7 +15,9 @@ FRAME_MM = (3.2, 2.4)
 TRUTH = {"c": 2.7, "x0": 1.65, "y0": -1.18, "k1": -0.28, "k2": 0.09}
 
 
-def board_network(rng: np.random.Generator, images: int, sigma_mm: float, given_mm: float | None = None) -> Network:
+def board_network(
+    rng: np.random.Generator, images: int, sigma_mm: float, given_mm: float | None = None, k3: float = 0.0
+) -> Network:
     """Marks with errors of sigma_mm, to which given_mm is given; of each picture its own tilt and shift."""
     points = np.array([[25.0 * column, 25.0 * row, 0.0] for row in range(6) for column in range(9)])
     matrix = np.array([[TRUTH["c"], 0, TRUTH["x0"]], [0, TRUTH["c"], -TRUTH["y0"]], [0, 0, 1]])
@@ -24,7 +26,7 @@ def board_network(rng: np.random.Generator, images: int, sigma_mm: float, given_
         turn = rng.uniform(-0.5, 0.5, 3)
         rotation = np.asarray(cv2.Rodrigues(turn)[0]) @ np.diag([1.0, -1.0, -1.0])
         shift = np.array([*rng.uniform(-40, 40, 2), rng.uniform(300, 420)]) - rotation @ points.mean(axis=0)
-        lens = np.array([TRUTH["k1"], TRUTH["k2"], 0.0, 0.0])
+        lens = np.array([TRUTH["k1"], TRUTH["k2"], 0.0, 0.0, k3])
         projected = cv2.projectPoints(points, cv2.Rodrigues(rotation)[0], shift, matrix, lens)[0]
         places.append(np.asarray(projected, float).reshape(-1, 2) * [1.0, -1.0])
     count = len(points)

@@ -1,0 +1,35 @@
+"""The lens model of a digital camera by cross-validation over its pictures."""
+
+import numpy as np
+import pytest
+from board_pictures import board_network
+
+from adjust.solution.adjustment import adjust
+from pipeline.calibration import lens_choice
+from pipeline.calibration.lens_choice import LensChoice, LensModel, choose_lens
+
+PIXEL_MM = 0.005
+ERROR_PX = 0.1  # in x and y
+
+
+@pytest.fixture(scope="module")
+def choices() -> dict[float, LensChoice]:
+    """By the third radial term that the lens has."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delitem(lens_choice.PARAMETERS, "opencv8")  # as slow as both others together
+        return {
+            k3: choose_lens(
+                board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM, k3=k3), True, PIXEL_MM, adjust
+            )
+            for k3 in (0.0, -1.5)
+        }
+
+
+@pytest.mark.parametrize(("k3", "wanted"), [(0.0, "opencv4"), (-1.5, "opencv5")])
+def test_a_richer_lens_is_taken_where_it_predicts_other_pictures_better(
+    k3: float, wanted: LensModel, choices: dict[float, LensChoice]
+) -> None:
+    assert choices[k3].model == wanted
+    rms_px = {score.model: score.rms_px for score in choices[k3].scores}
+    assert set(rms_px) == {"opencv4", "opencv5"}
+    assert rms_px[wanted] == pytest.approx(np.sqrt(2.0) * ERROR_PX, rel=0.15)
