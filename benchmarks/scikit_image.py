@@ -28,7 +28,7 @@ from true_marks import KIND, TrueMark, some_mark
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from benchmarks.measured_marks import CONTRAST, GROUND, drawn, measured, start_off
-from measure.boards.corners import junction
+from measure.boards.corners import junctions
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.noise.damage import _opened
 from measure.noise.robust_estimation import robust_scale
@@ -171,7 +171,7 @@ def corners(count: int) -> str:
         grey = square_picture(center, board_steps(rng), 1.0, False)
         grey = grey + CORNER_NOISE * rng.standard_normal(grey.shape)
         start = np.rint(center)
-        ours.append(junction(grey, start, 7.0) - center)
+        ours.append(junctions(grey[None], start[None], 7.0)[0] - center)
         theirs.append(corner_subpix(grey, start[None, ::-1].astype(int), window_size=13)[0, ::-1] - center)
     lost = int(np.isnan(np.array(theirs)).any(axis=1).sum())
     return f"{_rms(theirs)} px, none for {lost} of {4 * count} | OpenCV {_rms(ours)} px"

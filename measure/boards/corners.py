@@ -1,8 +1,8 @@
 """Where two straight edges meet, to the noise of the picture: the crossings of a chessboard, the corners of a marker.
 
-The picture of two crossing edges under a Gaussian blur is known in closed form. With s1, s2 the signs of a point's
-distances from the edges it is the mean of s1 s2 over the blur, a bivariate normal integral: by Owen's T function exact
-for any angle between the edges; a single dark or light quarter is the same integral. Unknown are the point, both
+The picture of two crossing edges under a Gaussian blur is known: with s1, s2 the signs of a point's distances from the
+edges it is the mean of s1 s2 over the blur, a bivariate normal integral, for any angle between the edges; a single dark
+or light quarter is the same integral. All corners of a board are fitted at once. Unknown are the point, both
 directions, the blur, and the grey values: contrast, offset, gradient and, of a crossing, the bend of the tone curve,
 which widens light squares at the cost of dark ones. A crossing looks the same after a half turn whatever the tone
 curve, so its place does not depend on it; a quarter's does, by as much as the edges are moved.
@@ -16,25 +16,24 @@ calibrations measure.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from scipy.special import erf, ndtr, owens_t
 
+from measure.array_types import Array, Single
+from measure.boards.corner_surfaces import Surface, crossing
 from measure.flags import NO_REASON, Code, Reason
-from measure.matching.gauss_newton import gauss_newton
+from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow
-from measure.noise.noise_model import correlated, noise_model, products
+from measure.noise.noise_model import influence_covariances
 from measure.noise.robust_estimation import gauss_newton_step, robust_scale, tukey_weights
 from measure.results import Covariance, MarkMeasurement
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Surface = Callable[[Array, Array, float], tuple[Array, Array, Array, Array]]
-
+Indices = NDArray[np.intp]
 _SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
 _MAX_ITERATIONS = 30  # of a stage
 _UNDAMAGED = 0.05  # the robust weight below which a pixel shows something else
@@ -45,10 +44,13 @@ _MOST_SHIFT = 0.6  # of the reach: farther off, another corner's edges are neare
 _MOST_TURN_RAD = 0.35  # of an edge: twenty degrees, which no approximate place is wrong by
 _START_BLUR_PX, _LEAST_BLUR_PX = 0.8, 0.3  # the pixel's share included
 _DAMPING = 1e-9  # of a step: what hardly shows does not run away
+_GREY_DAMPING = 1e-12  # of grey values: nothing is singular
+_SPARE_PX = 2  # about the area: so far a corner may move from where it is expected
 _LONGEST_TURN_RAD = 0.15  # of an edge in a step: its picture is no longer linear in more
 _LARGEST_HALF_WINDOW_PX = 6  # about a junction: more shows what the lens does to longer edges
 _HALF_WINDOW = 0.85  # of the reach: the weight is 0.37 in the middle of the window's sides and 0.14 in its corners
 _SMOOTHING_PX = 1.0  # pixel noise has gone, the edges are still apart
+_BORDER_PX = 4  # reflected about each window: smoothing reaches as far
 _SUBPIX_BORDER_PX = 5  # what OpenCV wants of a picture beyond twice half a window
 _SUBPIX_END = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-4)  # iterations, px of the last step
 _NEIGHBOURS = 4  # crossings: the next ones along the rows and columns
@@ -62,7 +64,7 @@ class Corner:
     center_px (2,), covariance_px2 (2, 2): as matched; contrast_dn: the grey value between the two steps less that
     beside them, negative where it is dark between them; blur_px: the standard deviation; moved_px: from where the fit
     began. junction_px (2,): where the
-    gradients' lines meet (`junction`); None where they do not, and for a corner that is no crossing.
+    gradients' lines meet (`junctions`); None where they do not, and for a corner that is no crossing.
     """
 
     center_px: Array
@@ -76,173 +78,228 @@ class Corner:
     junction_px: Array | None = None
 
 
-def fit_corner(window: ScanWindow, start_px: Array, steps_px: Array, reach_px: Array, surface: Surface) -> Corner:
-    """Fit the corner near start_px (2,), in a window of the scan.
+@dataclass(frozen=True, eq=False)
+class CornerStart:
+    """Where a corner is expected: center_px (2,); steps_px (2, 2), whose columns run along the two edges; reach_px
+    (2,), how far along either of them, forth and back, grey values are used."""
 
-    steps_px (2, 2): its columns run along the two edges; reach_px (2,): how far along either of them, forth and back,
-    grey values are used. surface: `crossing` or `quarter`.
+    center_px: Array
+    steps_px: Array
+    reach_px: Array
+
+    @property
+    def half_px(self) -> int:
+        """Pixels on either side of the middle that hold all grey values used, and somewhat more."""
+        along = np.abs(self.steps_px / np.hypot(*self.steps_px)) @ self.reach_px
+        return int(np.ceil(along).max()) + _SPARE_PX
+
+
+def fit_corners(
+    read: Callable[[int, int, int], ScanWindow], starts: Sequence[CornerStart], surface: Surface
+) -> list[Corner]:
+    """Fit all corners of a board at once.
+
+    Parameters
+    ----------
+    read : gives the square window with its first column and row and its side in px
+    starts : the places expected
+    surface : `crossing` or `quarter`
     """
-    return _CornerFit(window, np.asarray(start_px, float), np.asarray(steps_px, float), reach_px, surface).run()
+    if not starts:
+        return []
+    half = max(start.half_px for start in starts)
+    firsts = [np.round(start.center_px).astype(int) - half for start in starts]
+    windows = [read(int(col), int(row), 2 * half + 1) for col, row in firsts]
+    return _CornerFits(windows, starts, surface).run()
 
 
-def crossing(u: Array, v: Array, correlation: float) -> tuple[Array, Array, Array, Array]:
-    """The mean of sign(u + z1) sign(v + z2) over standard normal z1, z2 of the given correlation, and its derivatives
-    by u, v and the correlation.
+class _CornerFits:
+    """The adjustments of n corners in progress. Arrays over pixels are (n, p): of each corner those that may count."""
 
-    Owen (1956), Tables for computing bivariate normal probabilities, Annals of Mathematical Statistics 27.
-    """
-    root = np.sqrt(max(1 - correlation**2, 1e-12))
-    u, v = (np.where(np.abs(place) < 1e-9, 1e-9, place) for place in (u, v))
-    across_u, across_v = (v - correlation * u) / root, (u - correlation * v) / root
-    value = np.sign(u) * np.sign(v) - 4 * (owens_t(u, across_u / u) + owens_t(v, across_v / v))
-    by_u = 2 * _density(u) * erf(across_u / np.sqrt(2))
-    by_v = 2 * _density(v) * erf(across_v / np.sqrt(2))
-    return value, by_u, by_v, 4 * _density(u) * _density(across_u) / root
-
-
-def quarter(u: Array, v: Array, correlation: float) -> tuple[Array, Array, Array, Array]:
-    """Twice the probability that u + z1 and v + z2 are both positive, less one, and its derivatives: as `crossing`, for
-    a corner that is alone."""
-    value, by_u, by_v, by_correlation = crossing(u, v, correlation)
-    return (
-        0.5 * (value - 1) + ndtr(u) + ndtr(v) - 1,
-        0.5 * by_u + _density(u),
-        0.5 * by_v + _density(v),
-        0.5 * by_correlation,
-    )
-
-
-def _density(place: Array) -> Array:
-    return np.asarray(np.exp(-0.5 * place**2) / np.sqrt(2 * np.pi))
-
-
-class _CornerFit:
-    """One corner's adjustment in progress."""
-
-    def __init__(self, window: ScanWindow, start_px: Array, steps_px: Array, reach_px: Array, surface: Surface) -> None:
-        self.grey, self.valid = np.asarray(window.grey, float), window.usable
-        self.origin = np.asarray(window.origin_px, float)
-        self.start, self.surface, self.reach = start_px - self.origin, surface, reach_px
-        self.row, self.col = np.mgrid[: self.grey.shape[0], : self.grey.shape[1]].astype(float)
-        self.along_from_pixel = np.linalg.inv(steps_px / np.hypot(*steps_px))
+    def __init__(self, windows: Sequence[ScanWindow], starts: Sequence[CornerStart], surface: Surface) -> None:
+        self.windows, self.surface = windows, surface
+        self.origin = np.array([window.origin_px for window in windows], float)
+        self.start = np.array([start.center_px for start in starts], float) - self.origin
+        self.reach = np.array([start.reach_px for start in starts], float)
+        steps = np.array([start.steps_px for start in starts], float)
+        self.along_from_pixel = np.linalg.inv(steps / np.linalg.norm(steps, axis=1, keepdims=True))
         self.center = self.start.copy()
         # An edge along a step has its normal a quarter turn on; the signs make the corner between the steps positive.
-        mirrored = np.linalg.det(steps_px) < 0
-        self.edges = np.arctan2(steps_px[1], steps_px[0]) + np.pi / 2 + np.pi * np.array([mirrored, not mirrored])
+        mirrored = np.linalg.det(steps) < 0
+        turn = np.pi * np.stack([mirrored, ~mirrored], axis=1)
+        self.edges = np.arctan2(steps[:, 1], steps[:, 0]) + np.pi / 2 + turn
         self.start_edges = self.edges.copy()
-        self.max_shift_px = _MOST_SHIFT * float(reach_px.min())
-        self.variance = _START_BLUR_PX**2
-        self.max_variance = (float(reach_px.min()) / 2) ** 2 + PIXEL_VARIANCE_PX2
+        self.max_shift_px = _MOST_SHIFT * self.reach.min(axis=1)
+        self.variance = np.full(len(starts), _START_BLUR_PX**2)
+        self.max_variance = (self.reach.min(axis=1) / 2) ** 2 + PIXEL_VARIANCE_PX2
         self.bends = surface is crossing
-        self.linear = np.zeros(5 if self.bends else 4)  # half the contrast, offset, gradient (2), bend
-        self.unknowns = _SHAPE_UNKNOWNS + len(self.linear)
-        self.scale_dn = 0.0
-        self.weights = self._area()
+        self.linear = np.zeros((len(starts), 5 if self.bends else 4))  # half the contrast, offset, gradient (2), bend
+        self.unknowns = _SHAPE_UNKNOWNS + self.linear.shape[1]
+        self._choose_pixels()
+        self.weights = self._area(np.arange(len(starts)))
         outside = Reason("too little of it is inside of the scan", Code.OUTSIDE)
-        self.reason = NO_REASON if self.weights.sum() > 2 * self.unknowns else outside
+        self.reasons = [NO_REASON if each.sum() > 2 * self.unknowns else outside for each in self.weights]
 
-    def run(self) -> Corner:
-        """Plain, then robust, until the corner stands still; or a reason why it does not."""
+    def _choose_pixels(self) -> None:
+        """The pixels of each corner's area and about it, as far as the corner may move; the lists are filled up."""
+        self.shape = self.windows[0].grey.shape
+        self.grey_size = self.windows[0].grey.size
+        row, col = np.indices(self.shape).reshape(2, -1).astype(float)
+        offset = np.stack([col, row]) - self.start[:, :, None]
+        near = np.abs(self.along_from_pixel @ offset) <= (self.reach + 0.5 + _SPARE_PX)[:, :, None]
+        lists = [np.flatnonzero(each) for each in near.all(axis=1)]
+        self.counts = [len(each) for each in lists]
+        self.pixels = np.zeros((len(lists), max(self.counts)), np.intp)
+        self.valid, self.grey = np.zeros(self.pixels.shape, np.float32), np.zeros(self.pixels.shape, np.float32)
+        for number, (chosen, window) in enumerate(zip(lists, self.windows, strict=True)):
+            here, usable = (number, slice(len(chosen))), window.usable.ravel()[chosen]
+            self.pixels[here], self.valid[here] = chosen, usable
+            self.grey[here] = np.where(usable, window.grey.ravel()[chosen], 0.0)
+        self.col, self.row = (axis[self.pixels] for axis in (col, row))
+
+    def run(self) -> list[Corner]:
+        """Plain, then robust, until the corners stand still; or a reason why one does not."""
+        scale = np.full(len(self.windows), np.inf)
         for stage, tolerance_px in enumerate(_STAGES_TOLERANCE_PX):
-            if not self.reason:
-                self.scale_dn = self._residual_scale() if stage else np.inf
-                self.reason = gauss_newton(self, tolerance_px, _MAX_ITERATIONS).reason
-        design, residuals = self._linearised()
-        covariance, noise, area = np.full((2, 2), np.inf), float("nan"), self._area()
-        used, junction_px = self.weights > _UNDAMAGED, None
-        if used.sum() > self.unknowns and not self.reason:
-            # The covariance that the residuals' own autocovariance gives.
-            model = noise_model(residuals, used, self.unknowns)
-            noise = float(np.sqrt(model.variance_dn2))
-            weighted = design * self.weights
-            inverse = np.linalg.pinv(products(weighted, design), hermitian=True)
-            covariance = (inverse @ products(weighted, correlated(weighted, model)) @ inverse)[:2, :2]
-            if not 2 * abs(self.linear[0]) > 4 * noise:
-                self.reason = Reason("no edges stand out from the noise", Code.CONTRAST)
-            elif self.bends:
-                # Damage is painted over with what was fitted.
-                undamaged = self.grey - np.where(self.weights < _UNDAMAGED * area, residuals, 0.0)
-                reach_px = float(self.reach.min())
-                place = junction(undamaged, self.center, reach_px)
-                junction_px = place + self.origin if np.hypot(*(place - self.center)) < reach_px / 2 else None
-        return Corner(
-            center_px=self.center + self.origin,
-            covariance_px2=(covariance + covariance.T) / 2,
-            contrast_dn=2 * float(self.linear[0]),
-            noise_dn=noise,
-            blur_px=float(np.sqrt(max(self.variance - PIXEL_VARIANCE_PX2, 0.0))),
-            damaged_fraction=float(1 - self.weights.sum() / max(area.sum(), 1e-9)),
-            moved_px=float(np.hypot(*(self.center - self.start))),
-            reason=self.reason,
-            junction_px=junction_px,
+            moving = np.array([number for number, reason in enumerate(self.reasons) if not reason], np.intp)
+            state = self._linearise(moving)
+            if stage:
+                scale[moving] = self._residual_scales(moving, state[1])
+            for left in reversed(range(_MAX_ITERATIONS)):
+                if not len(moving):
+                    break
+                moving = moving[self._step(moving, state, scale[moving]) >= tolerance_px]
+                moving = np.array([number for number in moving if not self.reasons[number]], np.intp)
+                if not left:
+                    self._refuse(moving, UNSETTLED)
+                state = self._linearise(moving)
+        return self._corners(*self._linearise(np.arange(len(self.windows))))
+
+    def _refuse(self, numbers: Indices, reason: Reason) -> None:
+        for number in numbers:
+            self.reasons[number] = self.reasons[number] or reason
+
+    def _corners(self, design: Single, residuals: Single) -> list[Corner]:
+        """The corners with their covariances, as the residuals' own autocovariances give them, and junctions."""
+        area, used = self._area(np.arange(len(self.windows))), self.weights > _UNDAMAGED
+        weighted = design * self.weights[:, None]
+        normal = (weighted @ design.swapaxes(1, 2)).astype(float)
+        influence = np.linalg.pinv(normal, hermitian=True)[:, :2].astype(np.float32) @ weighted
+        covariances, variances = influence_covariances(
+            self._pictures(influence), self._pictures(residuals), self._pictures(used), self.unknowns
         )
+        covariances = (covariances + covariances.swapaxes(1, 2)) / 2
+        fails = np.array([bool(reason) for reason in self.reasons]) | (used.sum(axis=1) <= self.unknowns)
+        covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
+        faint = ~fails & ~(np.abs(self.linear[:, 0]) > 2 * noise_dn)
+        self._refuse(np.flatnonzero(faint), Reason("no edges stand out from the noise", Code.CONTRAST))
+        junctions_px = np.full((len(self.windows), 2), np.nan)
+        if self.bends:  # damage is painted over with what was fitted
+            damage = self._pictures(np.where(self.weights < _UNDAMAGED * area, residuals, np.float32(0.0)))
+            greys = np.array([window.grey for window in self.windows]) - damage
+            reach_px = self.reach.min(axis=1)
+            junctions_px = junctions(greys, self.center, float(reach_px.min()))
+            far = ~(np.hypot(*(junctions_px - self.center).T) < reach_px / 2)
+            junctions_px[far | fails | faint] = np.nan
+        return [
+            Corner(
+                center_px=self.center[number] + self.origin[number],
+                covariance_px2=covariances[number],
+                contrast_dn=2 * float(self.linear[number, 0]),
+                noise_dn=float(noise_dn[number]),
+                blur_px=float(np.sqrt(max(self.variance[number] - PIXEL_VARIANCE_PX2, 0.0))),
+                damaged_fraction=float(1 - self.weights[number].sum() / max(area[number].sum(), 1e-9)),
+                moved_px=float(np.hypot(*(self.center[number] - self.start[number]))),
+                reason=self.reasons[number],
+                junction_px=None if np.isnan(junction[0]) else junction + self.origin[number],
+            )
+            for number, junction in enumerate(junctions_px)
+        ]
 
-    def _area(self) -> Array:
-        """Weights 0 to 1 of a parallelogram about the corner; its border is smooth, and it moves with the corner: a
+    def _pictures(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Windows (n, ..., height, width) with the values (n, ..., p) of the corners' pixels, 0 elsewhere."""
+        pictures = np.zeros((*values.shape[:-1], self.grey_size), values.dtype)
+        for picture, value, pixels, count in zip(pictures, values, self.pixels, self.counts, strict=True):
+            picture[..., pixels[:count]] = value[..., :count]
+        return pictures.reshape(*values.shape[:-1], *self.shape)
+
+    def _area(self, numbers: Indices) -> Single:
+        """Weights 0 to 1 of a parallelogram about each corner; its border is smooth, and it moves with the corner: a
         window that is not centred would prefer one half of an edge."""
-        offset = np.stack([self.col - self.center[0], self.row - self.center[1]])
-        along = np.abs(np.tensordot(self.along_from_pixel, offset, axes=1))
-        inside = np.clip(self.reach[:, None, None] + 0.5 - along, 0.0, 1.0)
-        return np.asarray(self.valid * inside[0] * inside[1])
+        dx, dy = self.col[numbers] - self.center[numbers, :1], self.row[numbers] - self.center[numbers, 1:]
+        area = self.valid[numbers]
+        for axis in range(2):
+            by_col, by_row = self.along_from_pixel[numbers, axis].T[:, :, None]
+            along = np.abs(by_col * dx + by_row * dy)
+            area = area * np.clip(self.reach[numbers, axis, None] + 0.5 - along, 0.0, 1.0)
+        return area.astype(np.float32)
 
-    def _residual_scale(self) -> float:
-        _, residuals = self._linearised()
-        return max(robust_scale(residuals[self.weights > 0]), _SCALE_FLOOR * 2 * abs(float(self.linear[0])), 1e-9)
+    def _residual_scales(self, numbers: Indices, residuals: Single) -> Array:
+        """(m,) under Tukey's weights."""
+        floor = _SCALE_FLOOR * 2 * np.abs(self.linear[numbers, 0])
+        robust = [robust_scale(each[used]) for each, used in zip(residuals, self.weights[numbers] > 0, strict=True)]
+        return np.asarray(np.maximum(np.maximum(robust, floor), 1e-9))
 
-    def _linearised(self) -> tuple[Array, Array]:
-        """(unknowns, height, width) derivatives and (height, width) residuals, at the best grey-value parameters."""
-        dx, dy = self.col - self.center[0], self.row - self.center[1]
-        sigma = np.sqrt(self.variance)
-        normals = np.stack([np.cos(self.edges), np.sin(self.edges)], axis=-1)
-        tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=-1)
-        u, v = ((normal[0] * dx + normal[1] * dy) / sigma for normal in normals)
-        value, by_u, by_v, by_correlation = self.surface(u, v, float(normals[0] @ normals[1]))
-        grey = np.stack([value, np.ones_like(dx), dx, dy, *([value**2 - 1] if self.bends else [])])
-        weighted = grey * self.weights
-        right = np.tensordot(weighted, self.grey, axes=2)
-        self.linear = np.asarray(np.linalg.lstsq(products(weighted, grey), right, rcond=1e-12)[0])
-        turning = [
-            by * (tangent[0] * dx + tangent[1] * dy) / sigma + by_correlation * (tangent @ other)
-            for by, tangent, other in zip((by_u, by_v), tangents, normals[::-1], strict=True)
+    def _linearise(self, numbers: Indices) -> tuple[Single, Single]:
+        """(m, unknowns, p) derivatives and (m, p) residuals of some corners, at the best grey-value parameters."""
+        sigma = np.sqrt(self.variance[numbers, None])
+        normals = np.stack([np.cos(self.edges[numbers]), np.sin(self.edges[numbers])], axis=-1)  # (m, 2 edges, 2)
+        tangents = np.stack([-normals[..., 1], normals[..., 0]], axis=-1)
+        dx = (self.col[numbers] - self.center[numbers, :1]).astype(np.float32)
+        dy = (self.row[numbers] - self.center[numbers, 1:]).astype(np.float32)
+
+        def along(direction: Array) -> Single:
+            across, down = (direction / sigma).astype(np.float32).T[:, :, None]
+            return np.asarray(across * dx + down * dy, np.float32)
+
+        u, v = (along(normals[:, edge]) for edge in range(2))
+        correlation = (normals[:, 0] * normals[:, 1]).sum(axis=1).astype(np.float32)[:, None]
+        value, by_u, by_v, by_correlation = self.surface(u, v, correlation)
+        grey = np.stack([value, np.ones_like(dx), dx, dy, *([value**2 - 1] if self.bends else [])], axis=1)
+        self.linear[numbers] = linear = gauss_newton_step(
+            grey, self.grey[numbers], self.weights[numbers], _GREY_DAMPING
+        )
+        linear = linear.astype(np.float32)
+        slope = linear[:, :1] + (2 * linear[:, 4:] * value if self.bends else np.float32(0.0))
+        by_u, by_v, by_correlation = (np.asarray(by * slope, np.float32) for by in (by_u, by_v, by_correlation))
+        scaled = (normals / sigma[..., None]).astype(np.float32)[..., None]
+        turned = [
+            (tangents[:, edge] * normals[:, 1 - edge]).sum(axis=1).astype(np.float32)[:, None] for edge in range(2)
         ]
         shape = [
-            -(by_u * normals[0, 0] + by_v * normals[1, 0]) / sigma,
-            -(by_u * normals[0, 1] + by_v * normals[1, 1]) / sigma,
-            *turning,
-            -(by_u * u + by_v * v) / (2 * self.variance),
+            -(by_u * scaled[:, 0, 0] + by_v * scaled[:, 1, 0]),
+            -(by_u * scaled[:, 0, 1] + by_v * scaled[:, 1, 1]),
+            *(by * along(tangents[:, edge]) + by_correlation * turned[edge] for edge, by in enumerate((by_u, by_v))),
+            (by_u * u + by_v * v) * (-0.5 / sigma**2).astype(np.float32),
         ]
-        slope = self.linear[0] + (2 * self.linear[4] * value if self.bends else 0.0)
-        return np.concatenate([slope * np.stack(shape), grey]), self.grey - np.tensordot(self.linear, grey, axes=1)
+        residuals = np.asarray(self.grey[numbers] - (linear[:, None] @ grey)[:, 0], np.float32)
+        return np.asarray(np.concatenate([np.stack(shape, axis=1), grey], axis=1), np.float32), residuals
 
-    def solve(self) -> Array | None:
-        """A Gauss-Newton step, shortened to what a linearisation can bear; None where an unknown shows nowhere."""
-        design, residuals = self._linearised()
-        self.weights = self._area() * tukey_weights(residuals, self.scale_dn)
-        used = self.weights > 0
-        if not np.all((design[:, used] != 0).any(axis=1)):
-            return None
-        step = gauss_newton_step(design[:, used], residuals[used], self.weights[used], _DAMPING)
-        return np.asarray(step / max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / _LONGEST_TURN_RAD, 1.0))
-
-    def step(self, step: Array) -> float:
-        """Take a step; its length in px."""
-        self.center += step[:2]
-        self.edges += step[2:4]
-        variance = np.clip(self.variance + step[4], self.variance / 2, self.variance * 2)
-        self.variance = float(np.clip(variance, _LEAST_BLUR_PX**2, self.max_variance))
-        return float(np.hypot(*step[:2]))
-
-    def failure(self) -> Reason:
-        """Why the corner is none that was expected here, empty where it may be one."""
-        if np.hypot(*(self.center - self.start)) > self.max_shift_px:
-            return Reason("the fit ran away to something else", Code.NO_FIT)
-        if np.abs(self.edges - self.start_edges).max() > _MOST_TURN_RAD:
-            return Reason("the edges here run otherwise than they should", Code.SIZE)
-        return NO_REASON
+    def _step(self, numbers: Indices, state: tuple[Single, Single], scale: Array) -> Array:
+        """Take a Gauss-Newton step, shortened to what a linearisation can bear; (m,) its lengths in px."""
+        design, residuals = state
+        relative = np.asarray(residuals / scale[:, None], np.float32)
+        self.weights[numbers] = weights = np.asarray(self._area(numbers) * tukey_weights(relative, 1.0), np.float32)
+        shown = np.abs(design * (weights > 0)[:, None]).max(axis=2) > 0
+        step = gauss_newton_step(design, residuals, weights, _DAMPING)
+        turn = np.abs(step[:, 2:4]).max(axis=1) / _LONGEST_TURN_RAD
+        step /= np.maximum(np.maximum(np.hypot(step[:, 0], step[:, 1]), turn), 1.0)[:, None]
+        step[~shown.all(axis=1)] = 0.0
+        self.center[numbers] += step[:, :2]
+        self.edges[numbers] += step[:, 2:4]
+        before = self.variance[numbers]
+        variance = np.clip(before + step[:, 4], before / 2, before * 2)
+        self.variance[numbers] = np.clip(variance, _LEAST_BLUR_PX**2, self.max_variance[numbers])
+        self._refuse(numbers[~shown.all(axis=1)], UNDETERMINED)
+        away = np.linalg.norm(self.center - self.start, axis=1) > self.max_shift_px
+        turned = np.abs(self.edges - self.start_edges).max(axis=1) > _MOST_TURN_RAD
+        self._refuse(numbers[away[numbers]], Reason("the fit ran away to something else", Code.NO_FIT))
+        self._refuse(numbers[turned[numbers]], Reason("the edges here run otherwise than they should", Code.SIZE))
+        return np.hypot(step[:, 0], step[:, 1])
 
 
-def junction(grey: Array, start_px: Array, reach_px: float) -> Array:
-    """Refine the junction near a place by `cv2.cornerSubPix`.
+def junctions(greys: NDArray[np.floating], starts_px: Array, reach_px: float) -> Array:
+    """Refine junctions near places by `cv2.cornerSubPix`.
 
     OpenCV's equations are Förstner's: sum of w g g' (x - x0) = 0 over a window, with the gradients g and the weight w =
     exp(-(dx² + dy²) / half²), where half is half the window's size. There is no zero zone. OpenCV takes differences of
@@ -250,26 +307,29 @@ def junction(grey: Array, start_px: Array, reach_px: float) -> Array:
 
     Parameters
     ----------
-    grey
-        Grey values (height, width).
-    start_px
-        (2,) column and row.
+    greys
+        Grey values (n, height, width) about each place.
+    starts_px
+        (n, 2) column and row, in these.
     reach_px
-        How far about the place the picture shows its edges and nothing else.
+        How far about the places the pictures show their edges and nothing else.
 
     Returns
     -------
     Array
-        (2,) column and row; not a number where OpenCV finds no place within its window.
+        (n, 2) column and row; not a number where OpenCV finds no place within its window.
     """
-    half = min(_LARGEST_HALF_WINDOW_PX, round(_HALF_WINDOW * reach_px), (min(grey.shape) - _SUBPIX_BORDER_PX) // 2)
+    number, *shape = greys.shape
+    half = min(_LARGEST_HALF_WINDOW_PX, round(_HALF_WINDOW * reach_px), (min(shape) - _SUBPIX_BORDER_PX) // 2)
     if half < 1:
-        return np.full(2, np.nan)
-    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SMOOTHING_PX)
-    start = np.asarray(start_px, np.float32)
-    found = cv2.cornerSubPix(smooth, start.reshape(1, 1, 2).copy(), (half, half), (-1, -1), _SUBPIX_END)
-    place = np.asarray(found, float).ravel()
-    return np.full(2, np.nan) if np.array_equal(place, start) else place
+        return np.full((number, 2), np.nan)
+    border = (_BORDER_PX, _BORDER_PX)
+    column = np.pad(greys.astype(np.float32), ((0, 0), border, border), mode="reflect")  # one below the other
+    smooth = cv2.GaussianBlur(column.reshape(-1, column.shape[2]), (0, 0), _SMOOTHING_PX)
+    offsets = np.stack([np.full(number, 0.0), np.arange(number) * column.shape[1]], axis=1) + _BORDER_PX
+    starts = (starts_px + offsets).astype(np.float32)
+    found = cv2.cornerSubPix(smooth, starts[:, None].copy(), (half, half), (-1, -1), _SUBPIX_END)[:, 0]
+    return np.where((found == starts).all(axis=1, keepdims=True), np.nan, found - offsets)
 
 
 def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple[MarkMeasurement, ...], ...]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from measure.boards.lattice import find_squares
 from measure.boards.markers import find_aruco, find_charuco
+from measure.boards.saddle_points import largest_lattice, saddle_strength
 from measure.boards.specs import (
     ArucoSpec,
     CharucoSpec,
@@ -25,12 +26,15 @@ Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 _UNEVEN = 0.25  # of a square, that a corner lies off an even grid: beside a line that is left out it is a half
+_TRUSTED = 0.1  # of a square, that no corner of the older detector is off, where its corners are taken
+_REFINED, _REFINING_END = 0.3, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)  # of a square; px
 _INTO_SQUARE = 0.3  # of its sides: where the grey value of a square is taken
 _CROSSING = 0.25  # of the board's contrast: more between all neighbours of the four squares makes a crossing
 _SMOOTHED_PX = 10.0  # squares from this side on are looked at over 3 x 3 pixels
 _MOST_LINES = 500  # of a board, along a side
 _THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _DRAWINGS = 3  # of the chessboard detector's random numbers for a second board: one in twenty missed one at the edge
+_CROSSINGS_SEEN = 0.8  # of a second board, but its four corners, before it is searched
 _LEAST = 3  # lines that a chessboard has in either direction
 _FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
 _LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
@@ -45,16 +49,16 @@ class WholePattern:
     is_bounded: bool
 
 
-def is_even(grid: Array, size_px: tuple[int, int]) -> bool:
+def is_even(grid: Array, size_px: tuple[int, int], farthest: float = np.inf) -> bool:
     """Whether the lines of corners (rows, columns, 2) lie evenly under one homography and a lens's radial distortion,
-    wherever the detector put single corners."""
+    wherever the detector put single corners; none may be farther off than so many steps."""
     rows, columns = grid.shape[:2]
     places = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
     view = robust_view(places, grid.reshape(-1, 2), size_px)
     if view is None:
         return False
     off = np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / _shorter_steps(grid)
-    return all(np.median(line) < _UNEVEN for line in (*off, *off.T))
+    return off.max() < farthest and all(np.median(line) < _UNEVEN for line in (*off, *off.T))
 
 
 def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:
@@ -118,8 +122,8 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
     is refused, with its count: its corners would have their neighbours' names."""
     size_px = (picture.shape[1], picture.shape[0])
     other_size: WholePattern | None = None
-    for grid in _grids(picture, spec):
-        pattern = whole_pattern(picture, grid) if is_even(grid, size_px) else None
+    for grid, farthest in _grids(picture, spec):
+        pattern = whole_pattern(picture, grid) if is_even(grid, size_px, farthest) else None
         if pattern is None:
             continue
         if pattern.grid.shape == grid.shape == (spec.rows, spec.columns, 2):
@@ -147,25 +151,29 @@ def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
     return f"{message}, and the rest may lie outside of the scan"
 
 
-def _grids(picture: Bytes, spec: ChessboardSpec) -> Iterator[Array]:
-    """(rows, columns, 2) grids of corners that may be the board, those of the most reliable detector first; the last is
-    of any count."""
-    for flags in (_THOROUGHLY, 0):
-        grid = _drawn_chessboard_grid(picture, spec, flags, drawings=1)
-        if grid is not None:
-            yield _right_handed(grid)
-    # The older detector can search for minutes in vain; its fast check refuses a picture without squares first.
+def _grids(picture: Bytes, spec: ChessboardSpec) -> Iterator[tuple[Array, float]]:
+    """(rows, columns, 2) grids of corners that may be the board, those of the quickest detector first, and how many
+    steps off even places each corner may be; the last is of any count."""
+    # The older detector takes a tenth of the time. It can search for minutes in vain; its fast check refuses a picture
+    # without squares first.
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     found, corners = cv2.findChessboardCorners(picture, (spec.columns, spec.rows), flags=flags)
     if found:
-        yield _right_handed(np.asarray(corners, float).reshape(spec.rows, spec.columns, 2))
+        grid = np.asarray(corners, float).reshape(spec.rows, spec.columns, 2)
+        half = max(round(_REFINED * float(_shorter_steps(grid).min())), 2)  # its own places are often some pixels off
+        cv2.cornerSubPix(picture, corners, (half, half), (-1, -1), _REFINING_END)
+        yield _right_handed(np.asarray(corners, float).reshape(grid.shape)), _TRUSTED
+    for flags in (_THOROUGHLY, 0):
+        drawn = _drawn_chessboard_grid(picture, spec, flags, drawings=1)
+        if drawn is not None:
+            yield _right_handed(drawn), np.inf
     cv2.setRNGSeed(1)
     flags = _THOROUGHLY | cv2.CALIB_CB_LARGER
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, (_LEAST, _LEAST), flags)
     if found:
         grid = np.asarray(corners, float).reshape(*meta.shape, 2)
         is_turned = meta.shape == (spec.columns, spec.rows)
-        yield _right_handed(grid.transpose(1, 0, 2) if is_turned else grid)
+        yield _right_handed(grid.transpose(1, 0, 2) if is_turned else grid), np.inf
 
 
 def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, drawings: int) -> Array | None:
@@ -181,10 +189,16 @@ def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, dra
 
 def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tuple[Array, ...]:
     """The middles of the chessboards beside those that were found, each painted over before the next is sought."""
+    columns, rows = np.clip(np.round(grid).astype(int), 0, np.array(picture.shape)[::-1] - 1).reshape(-1, 2).T
+    strength = float(np.median(saddle_strength(picture)[rows, columns]))
     picture, background = picture.copy(), int(np.median(picture))
     others: list[Array] = []
     while True:
         cv2.fillConvexPoly(picture, np.round(_outline(grid)).astype(np.int32), background)
+        if largest_lattice(picture, strength) < _CROSSINGS_SEEN * (
+            spec.columns * spec.rows - 4
+        ):  # searching takes long
+            return tuple(others)
         other = _drawn_chessboard_grid(picture, spec, _THOROUGHLY, _DRAWINGS)
         if other is None:
             return tuple(others)

@@ -1,13 +1,14 @@
 """Measure the points of a calibration board in a scan: corners by least-squares matching, dots as disks."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.boards.corners import Corner, Surface, crossing, fit_corner, quarter
+from measure.boards.corner_surfaces import Surface, crossing, quarter
+from measure.boards.corners import Corner, CornerStart, fit_corners
 from measure.boards.find import find_board
 from measure.boards.lattice import Place, find_grid
 from measure.boards.specs import (
@@ -122,8 +123,7 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     if isinstance(spec, CircleGridSpec):
         return _measure_circle_grid(scan, spec)
     board = find_board(scan, spec)
-    reach = _common_reach_px(board.corners.values()) if board.corners else 0.0
-    fitted = {name: _fit_found(scan, found, spec, reach) for name, found in board.corners.items()}
+    fitted = _fit_found(scan, board.corners, spec)
     notes = board.notes
     if isinstance(spec, ChessboardSpec) and fitted:
         fitted, notes = _named_by_colour(fitted, board.corners, spec)
@@ -155,18 +155,20 @@ def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Arr
     return replace(measured, marks=marks, ambiguous=why)
 
 
-def _fit_found(scan: Scan, found: FoundCorner, spec: BoardSpec, board_reach_px: float) -> Corner:
-    """Least-squares matching about a corner that was found."""
+def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) -> dict[str, Corner]:
+    """Least-squares matching about the corners that were found."""
+    board_reach_px = _common_reach_px(found.values()) if found else 0.0
+    starts = [
+        CornerStart(each.center_px, each.steps_px, _reach_px(np.hypot(*each.steps_px), spec, board_reach_px))
+        for each in found.values()
+    ]
+
+    def read(col: int, row: int, side: int) -> ScanWindow:
+        place_px = col, row, side, side
+        return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px))
+
     surface: Surface = quarter if isinstance(spec, ArucoSpec | SquareGridSpec) else crossing
-    steps_px = found.steps_px
-    sides_px = np.hypot(*steps_px)
-    reach = _reach_px(sides_px, spec, board_reach_px)
-    half = np.ceil(np.abs(steps_px / sides_px) @ reach).astype(int) + 2
-    col0, row0 = np.round(found.center_px).astype(int) - half
-    width, height = 2 * half + 1
-    place_px = int(col0), int(row0), int(width), int(height)
-    window = ScanWindow(scan.window(*place_px), (col0, row0), scan.inside(*place_px))
-    return fit_corner(window, found.center_px, steps_px, reach, surface)
+    return dict(zip(found, fit_corners(read, starts, surface), strict=True))
 
 
 def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:

@@ -88,11 +88,34 @@ def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
     noise, is_white = as_if_white(residuals, used, unknowns)
     if is_white:
         return noise
-    lags = autocovariance(np.where(used, residuals, 0.0), used, REACH_PX)
-    index = np.arange(-REACH_PX, REACH_PX + 1)
-    # The far lags are noise themselves: they fade out.
-    lags = lags * np.clip(REACH_PX + 1 - np.hypot(index[:, None], index), 0.0, 1.0)
+    lags = _faded(autocovariance(np.where(used, residuals, 0.0), used, REACH_PX))
     return replace(noise, autocovariance_dn2=lags * (noise.variance_dn2 / lags[REACH_PX, REACH_PX]))
+
+
+def influence_covariances(influences: Array, residuals: Array, used: Mask, unknowns: int) -> tuple[Array, Array]:
+    """The covariances (n, k, k) of n estimates that depend on their pixels by influences (n, k, height, width), and the
+    variances (n,) of a pixel, as the noise models of the residuals (n, height, width), where used, have them."""
+    kept, count = np.where(used, residuals, 0.0), np.maximum(used.sum(axis=(1, 2)), 1)
+    squares = (kept**2).sum(axis=(1, 2))
+    variances = squares / np.maximum(count - unknowns, 1)
+    correlation = _covariance_along(kept, used, 1) / np.maximum(squares / count, 1e-300)
+    shape = padded(residuals.shape[1:], REACH_PX)
+    index = np.arange(-REACH_PX, REACH_PX + 1)
+    is_white = np.abs(correlation) < 3 / np.sqrt(2 * count)
+    lags = _faded(autocovariance(kept, used, REACH_PX))
+    lags *= (variances / np.maximum(lags[:, REACH_PX, REACH_PX], 1e-300))[:, None, None]
+    lags[is_white] = np.where(np.add.outer(abs(index), abs(index)) == 0, variances[is_white, None, None], 0.0)
+    kernels = np.zeros((len(residuals), *shape))
+    kernels[:, index[:, None], index] = lags
+    filtered = fft.irfft2(fft.rfft2(influences, s=shape) * fft.rfft2(kernels).real[:, None], s=shape)
+    height, width = residuals.shape[1:]
+    return np.einsum("nkhw,nlhw->nkl", influences, filtered[..., :height, :width]), variances
+
+
+def _faded(lags: Array) -> Array:
+    """The far lags are noise themselves: they fade out."""
+    index = np.arange(-REACH_PX, REACH_PX + 1)
+    return np.asarray(lags * np.clip(REACH_PX + 1 - np.hypot(index[:, None], index), 0.0, 1.0))
 
 
 def as_if_white(
@@ -103,7 +126,7 @@ def as_if_white(
     count, kept = max(int(used.sum()), 1), np.where(used, residuals, 0.0)
     squares = float((kept**2).sum())
     variance = squares / max((count if information is None else information) - unknowns, 1)
-    correlation = _covariance_along(kept, used, 1) / (squares / count) if squares else 0.0
+    correlation = float(_covariance_along(kept, used, 1)) / (squares / count) if squares else 0.0
     return NoiseModel(variance, np.array([[variance]]), correlation), abs(correlation) < 3 / np.sqrt(2 * count)
 
 
@@ -147,14 +170,15 @@ def _filtered(images: NDArray[Real], spectrum: NDArray[Real], shape: list[int]) 
 
 
 def autocovariance(kept: Array, used: Mask, reach: int) -> Array:
-    """Mean products at all lags up to reach, averaged over opposite and mirrored lags: grain has no direction."""
-    shape = padded(kept.shape, reach)
+    """Mean products (..., lags, lags) of images (..., height, width) at all lags up to reach, averaged over opposite
+    and mirrored lags: grain has no direction."""
+    shape = padded(kept.shape[-2:], reach)
     spectra = np.abs(fft.rfft2(np.stack([kept, used]), s=shape)) ** 2
     products, pairs = fft.irfft2(spectra, s=shape)
     index = np.arange(-reach, reach + 1)
-    lags = (products / np.maximum(pairs, 1.0))[np.ix_(index, index)]
-    lags = (lags + lags[:, ::-1]) / 2
-    return np.asarray((lags + lags.T) / 2)
+    lags = (products / np.maximum(pairs, 1.0))[..., index[:, None], index]
+    lags = (lags + lags[..., ::-1]) / 2
+    return np.asarray((lags + lags.swapaxes(-1, -2)) / 2)
 
 
 def padded(shape: tuple[int, ...], reach: int) -> list[int]:
@@ -162,11 +186,15 @@ def padded(shape: tuple[int, ...], reach: int) -> list[int]:
     return [fft.next_fast_len(size + reach, real=True) for size in shape]
 
 
-def _covariance_along(kept: Array, used: Mask, lag: int) -> float:
-    """The mean product at a lag along a row or a column."""
-    products = (kept[:, lag:] * kept[:, :-lag]).sum(), (kept[lag:] * kept[:-lag]).sum()
-    pairs = (used[:, lag:] & used[:, :-lag]).sum(), (used[lag:] & used[:-lag]).sum()
-    return float(sum(product / max(count, 1) for product, count in zip(products, pairs, strict=True)) / 2)
+def _covariance_along(kept: Array, used: Mask, lag: int) -> Array:
+    """(...) the mean product of images (..., height, width) at a lag along a row or a column."""
+    products = kept[..., lag:] * kept[..., :-lag], kept[..., lag:, :] * kept[..., :-lag, :]
+    pairs = used[..., lag:] & used[..., :-lag], used[..., lag:, :] & used[..., :-lag, :]
+    sums = [
+        each.sum(axis=(-2, -1)) / np.maximum(both.sum(axis=(-2, -1)), 1)
+        for each, both in zip(products, pairs, strict=True)
+    ]
+    return np.asarray(sum(sums) / 2)
 
 
 # Weights of pixels: by noise that grows with light, and for grain by what the inverse of the noise's covariance matrix

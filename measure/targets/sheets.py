@@ -141,9 +141,12 @@ def robust_view(points: Array, observed_px: Array, size_px: tuple[int, int]) -> 
     if homography is None:
         return None
     off = np.hypot(*(cv2.perspectiveTransform(points[:, None], homography)[:, 0] - observed_px).T)
-    view = SheetView(np.eye(3), np.zeros(2), size_px)
+    view, before = SheetView(np.eye(3), np.zeros(2), size_px), np.zeros(len(points), bool)
     for _ in range(_SETTLING):
         near = off <= max(_FAR * float(np.median(off)), _LEAST_FAR_PX)
+        if np.array_equal(near, before):
+            break
+        before = near
         fitted = fitted_view(view, points[near], observed_px[near])
         if fitted is None:
             return None

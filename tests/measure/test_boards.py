@@ -19,6 +19,7 @@ from measure.boards.corners import one_definition
 from measure.boards.find import is_even, whole_pattern
 from measure.boards.markers import ReadMarkers, off_corners
 from measure.boards.measure import BoardMeasurement, measure_board
+from measure.boards.saddle_points import largest_lattice, saddle_strength
 from measure.boards.specs import (
     ArucoSpec,
     BoardSpec,
@@ -101,6 +102,19 @@ def test_a_chessboard_in_any_direction_keeps_its_names(turn_deg: float) -> None:
     errors = errors_px(board, truth_of(spec, homography))
     assert len(errors) == 30
     assert np.sqrt(np.mean(errors**2)) < 0.012
+
+
+def test_crossings_side_by_side_are_told_from_a_texture() -> None:
+    """All of a board but its four corners hang together, fainter and beside a texture too; of texture hardly any."""
+    spec = ChessboardSpec(6, 5, 24.0)
+    grey = picture_of(spec, board_from_pixel(), chessboard_dark(spec)) / 256.0
+    grains = np.random.default_rng(3).normal(0.0, 60.0, (HEIGHT, WIDTH))
+    texture = 128.0 + 60.0 / 0.14 * (cv2.GaussianBlur(grains, (0, 0), 2.0) / 60.0)
+    both = np.hstack([100.0 + 0.3 * grey, texture])
+    board, noise = (np.clip(each, 0, 255).astype(np.uint8) for each in (both, texture))
+    strength = float(np.percentile(saddle_strength(np.clip(grey, 0, 255).astype(np.uint8)), 99.9))
+    assert 26 <= largest_lattice(board, strength) <= 30
+    assert largest_lattice(noise, strength) < 0.5 * 26
 
 
 @pytest.mark.study

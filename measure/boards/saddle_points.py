@@ -1,0 +1,88 @@
+"""Saddle points of the grey values that lie side by side as a chessboard's crossings do: a quick look for a board."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from measure.array_types import Array, Mask
+
+Bytes = NDArray[np.uint8]
+
+_SMOOTHING_PX = 1.5
+_APART_PX = 3  # a saddle point is the strongest within it
+_STRENGTH = 0.02  # of those known: contrast enters with its square, so that a seventh of it will do
+_RING_PX, _RING_PLACES = 4.0, 16  # about a saddle point, where grey values go up and down twice
+_TWICE = 2.0  # times all other waves of the ring together
+_NEIGHBOURS = 8
+_LIKE = 3.0  # times the contrast that neighbours may have
+_LEAST_SINE = 0.3  # of the angle between the two lines
+_HALFWAY = 0.3  # of a step, that a crossing may lie off the middle of its neighbours
+
+
+@dataclass(frozen=True, eq=False)
+class SaddlePoints:
+    """places_px (n, 2); waves (n,) complex: contrast, and twice the direction in which it is light."""
+
+    places_px: Array
+    waves: NDArray[np.complexfloating]
+
+
+def saddle_strength(picture: Bytes) -> NDArray[np.float32]:
+    """(height, width) the negative determinant of the second derivatives of the smoothed grey values."""
+    smooth = cv2.GaussianBlur(picture, (0, 0), _SMOOTHING_PX).astype(np.float32)
+    across, down, both = (cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((2, 0), (0, 2), (1, 1)))
+    return np.asarray(both * both - across * down, np.float32)
+
+
+def largest_lattice(picture: Bytes, known_strength: float) -> int:
+    """How many saddle points at most hang together as a chessboard's crossings do.
+
+    A crossing belongs together with its neighbours along both lines: they are dark where it is light, and it lies in
+    their middle. known_strength: that of crossings that are known (`saddle_strength`); much fainter ones do not count.
+    """
+    points = _saddle_points(picture, known_strength)
+    number = len(points.places_px)
+    if number <= _NEIGHBOURS:
+        return number
+    near = np.asarray(cKDTree(points.places_px).query(points.places_px, _NEIGHBOURS + 1)[1])[:, 1:]
+    middles, ends = np.nonzero(_line_neighbours(points, near))
+    links = coo_array((np.ones(len(ends)), (middles, near[middles, ends])), shape=(number, number))
+    return int(np.bincount(connected_components(links, directed=False)[1]).max())
+
+
+def _line_neighbours(points: SaddlePoints, near: NDArray[np.intp]) -> Mask:
+    """(n, k): which of its k neighbours lie along the two lines through a saddle point; none where there are no two."""
+    steps = points.places_px[near] - points.places_px[:, None]
+    lengths, products = np.linalg.norm(steps, axis=-1), points.waves[near] * points.waves[:, None].conj()
+    contrast = np.abs(points.waves[near]) / np.abs(points.waves[:, None])
+    fits = (products.real < -0.5 * np.abs(products)) & (contrast < _LIKE) & (contrast > 1 / _LIKE)
+    off = np.linalg.norm(steps[:, :, None] + steps[:, None], axis=-1)
+    halfway = off < _HALFWAY * np.minimum(lengths[:, :, None], lengths[:, None])
+    paired = (halfway & fits[:, :, None] & fits[:, None]).any(axis=2)
+    columns, rows = np.moveaxis(steps / lengths[..., None], -1, 0)
+    crossing = np.abs(columns[:, :, None] * rows[:, None] - rows[:, :, None] * columns[:, None]) > _LEAST_SINE
+    return np.asarray((crossing & paired[:, :, None] & paired[:, None]).any(axis=2))
+
+
+def _saddle_points(picture: Bytes, known_strength: float) -> SaddlePoints:
+    strength = saddle_strength(picture)
+    highest = cv2.dilate(strength, np.ones((2 * _APART_PX + 1, 2 * _APART_PX + 1)))
+    rows, columns = np.nonzero((strength == highest) & (strength > _STRENGTH * known_strength))
+    angles = np.arange(_RING_PLACES) * 2 * np.pi / _RING_PLACES
+    smooth = cv2.GaussianBlur(picture, (0, 0), _SMOOTHING_PX)
+    ring = [
+        np.add.outer(place, _RING_PX * turn(angles)).astype(np.float32)
+        for place, turn in ((columns, np.cos), (rows, np.sin))
+    ]
+    if not len(rows):
+        return SaddlePoints(np.zeros((0, 2)), np.zeros(0, complex))
+    grey = cv2.remap(smooth, ring[0], ring[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    waves = np.fft.rfft(grey.astype(float), axis=1)[:, 1:]
+    power = np.abs(waves) ** 2
+    is_saddle = power[:, 1] > _TWICE * (power.sum(axis=1) - power[:, 1])
+    return SaddlePoints(np.stack([columns, rows], axis=1)[is_saddle].astype(float), waves[is_saddle, 1])
