@@ -138,17 +138,38 @@ def render(scene: SceneFile, out_dir: OutDir) -> int:
 
 def template(
     kind: Annotated[str, typer.Argument(metavar="KIND", help=choices_help(TEMPLATES), show_default=False)],
+    marks: Annotated[
+        str | None,
+        typer.Option(metavar="KIND[,KIND]", help="Of `camera`: its marks, in the corners and in the sides' middles."),
+    ] = None,
+    square: Annotated[
+        str | None, typer.Option(metavar="MM", help="Distance of the corner marks: 212, or 212x150.")
+    ] = None,
+    side: Annotated[str | None, typer.Option(metavar="MM", help="Distance of opposite side marks.")] = None,
+    frame: Annotated[
+        str | None, typer.Option(metavar="MM", help="The exposed frame; by default as the marks say.")
+    ] = None,
+    distance: Annotated[float | None, typer.Option("--c", metavar="MM", min=1.0, help="Principal distance.")] = None,
+    name: Annotated[str, typer.Option(metavar="NAME", help="Of the camera.")] = "my camera",
 ) -> int:
     """Print a commented file to start from, or all keys."""
     if kind not in TEMPLATES:
         possible = f"{', '.join(TEMPLATES)}.{did_you_mean(kind, TEMPLATES)}"
         raise InputError(f"there is no template {kind!r}; possible are {possible}")
-    if kind == "keys":
+    is_sized = any(option is not None for option in (marks, square, side, frame, distance))
+    if is_sized and (kind != "camera" or marks is None):
+        raise InputError("--square, --side, --frame and --c go with `reseau template camera --marks KIND`.")
+    if marks is not None:
+        from pipeline.files.camera_template import CameraSizes, camera_template
+
+        text = camera_template(CameraSizes.from_words(marks, square, side, frame, distance, name))
+    elif kind == "keys":
         from pipeline.files.project_tables import keys_text
 
-        typer.echo(keys_text(), nl=False)
-        return DONE
-    from importlib import resources
+        text = keys_text()
+    else:
+        from importlib import resources
 
-    typer.echo(resources.files("pipeline").joinpath("templates", f"{kind}.toml").read_text(encoding="utf-8"), nl=False)
+        text = resources.files("pipeline").joinpath("templates", f"{kind}.toml").read_text(encoding="utf-8")
+    typer.echo(text, nl=False)
     return DONE

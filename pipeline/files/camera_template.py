@@ -1,0 +1,222 @@
+"""A short camera file from the kind of its marks and their distances, for a camera that no library has."""
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from measure.marks.shapes import Point
+from pipeline.errors import InputError
+from pipeline.text.wording import did_you_mean, quoted
+
+FORMATS_MM = (56.0, 60.0, 70.0, 100.0, 130.0, 180.0, 228.0, 232.0, 240.0, 300.0)  # sides of frames
+_AERIAL_MM = 220.0  # about the distance of marks at which the sizes below are found
+_LEAST_SCALE = 0.5  # marks of small cameras are no smaller than half of these
+_RIM_MM = 1.0  # of the frame beyond its outermost mark
+_PLACES: Mapping[str, Mapping[str, Point]] = {  # of the marks, in their distances, as calibration reports number them
+    "square": {"1": (-0.5, -0.5), "2": (0.5, 0.5), "3": (-0.5, 0.5), "4": (0.5, -0.5)},
+    "side": {"5": (-0.5, 0.0), "6": (0.5, 0.0), "7": (0.0, 0.5), "8": (0.0, -0.5)},
+}
+_NAMES = {"square": "corner", "side": "side"}  # of their drawings
+
+
+@dataclass(frozen=True)
+class MarkKind:
+    """What a template draws of a kind: its lines in [mark.NAME], and how it lies to the frame's edge.
+
+    lines: by scale and the angle of a cross. reach_mm: how far it extends about its point. edge_mm: how far beyond the
+    point of a side mark the frame ends; None of marks that stand free. at: where the kind stands.
+    """
+
+    lines: Callable[[float, float], Sequence[str]]
+    reach_mm: float = 0.0
+    edge_mm: float | None = None
+    at: tuple[str, ...] = ("square", "side")
+
+
+def _mm(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _line(text: str, comment: str) -> str:
+    return f"{text:39} # {comment}"
+
+
+def _cross(scale: float, angle_deg: float) -> list[str]:
+    return [
+        _line(f"arm_mm = {_mm(1.75 * scale)}", "half its length"),
+        f"line_mm = {_mm(0.12 * scale)}",
+        _line(f"gap_mm = {_mm(0.25 * scale)}", "half the gap in its middle; 0: none"),
+        _line(f"angle_deg = {angle_deg:g}", "0 upright, 45 diagonal"),
+    ]
+
+
+def _ring(scale: float) -> list[str]:
+    return [_line(f"ring_mm = {_mm(0.8 * scale)}", "mean radius"), f"ring_line_mm = {_mm(0.17 * scale)}"]
+
+
+def _polygon(*vertices_mm: Point) -> MarkKind:
+    """A solid mark of a side, drawn as on the right one."""
+
+    def lines(scale: float, _: float) -> list[str]:
+        corners = ", ".join(f"[{_mm(scale * x)}, {_mm(scale * y)}]" for x, y in vertices_mm)
+        return [f"vertices_mm = [{corners}]", _line('rotate = "radial"', "drawn as on the right, x outwards")]
+
+    outermost = max(x for x, _ in vertices_mm)
+    return MarkKind(lines, 0.0, outermost or min(x for x, _ in vertices_mm), ("side",))
+
+
+def _parts(scale: float, _: float) -> list[str]:
+    arm, line = 1.2 * scale, 0.12 * scale
+    ends = (f"[{-arm:.3g}, 0.0]", f"[{arm:.3g}, 0.0]"), (f"[0.0, {-arm:.3g}]", f"[0.0, {arm:.3g}]")
+    lines = [
+        "[[mark.{name}.part]]",
+        'shape = "ring"',
+        f"radius_mm = {_mm(1.6 * scale)}",
+        f"line_mm = {_mm(0.17 * scale)}",
+    ]
+    for start, end in ends:
+        lines += [
+            "[[mark.{name}.part]]",
+            'shape = "bar"',
+            f"from_mm = {start}",
+            f"to_mm = {end}",
+            f"line_mm = {_mm(line)}",
+        ]
+    dot = f"center_mm = [{2.4 * scale:.3g}, 0.0]"
+    return [*lines, "[[mark.{name}.part]]", 'shape = "disk"', dot, f"radius_mm = {_mm(0.25 * scale)}"]
+
+
+MARK_KINDS: Mapping[str, MarkKind] = {
+    "cross": MarkKind(_cross, 1.75),
+    "dot": MarkKind(lambda scale, _: [f"radius_mm = {_mm(0.25 * scale)}"], 0.25),
+    "ring-cross": MarkKind(lambda scale, angle_deg: [*_ring(scale), *_cross(scale, angle_deg)], 1.75),
+    "ring-dot": MarkKind(lambda scale, _: [*_ring(scale), f"radius_mm = {_mm(0.2 * scale)}"], 0.9),
+    "wedge": _polygon((0.0, 0.0), (3.0, 1.8), (3.0, -1.8)),
+    "notch": _polygon((0.0, 0.0), (-2.5, 1.5), (-2.5, -1.5)),
+    "wing": _polygon((0.0, 0.0), (0.0, 4.1), (3.15, 6.4), (3.15, -6.4), (-3.1, -2.0), (-3.15, -1.8), (-3.15, 0.0)),
+    "parts": MarkKind(_parts, 2.65),
+    "frame-corner": MarkKind(lambda scale, _: [], 0.0, 0.0, ("square",)),
+    "learned": MarkKind(lambda scale, _: [_line(f"size_mm = {_mm(6 * scale)}", "width of its picture")], 3.0),
+}
+_WRITTEN = {"wedge": "polygon", "notch": "polygon", "wing": "polygon"}  # as formats have it
+
+
+@dataclass(frozen=True)
+class CameraSizes:
+    """What is known of a camera: kinds of its marks, of the corners and of the sides, and distances in mm, (width,
+    height). square: of corner marks; side: of side marks; frame: None: from these."""
+
+    marks: tuple[str, ...]
+    square: Point | None = None
+    side: Point | None = None
+    frame: Point | None = None
+    distance: float | None = None
+    name: str = "my camera"
+
+    @classmethod
+    def from_words(
+        cls, marks: str, square: str | None, side: str | None, frame: str | None, distance: float | None, name: str
+    ) -> "CameraSizes":
+        """As the command line has them. Raises InputError."""
+        kinds = tuple(kind.strip() for kind in marks.split(","))
+        sizes = (_size("--square", square), _size("--side", side), _size("--frame", frame))
+        return cls(kinds, *sizes, distance, name)
+
+    def __post_init__(self) -> None:
+        for kind in self.marks:
+            if kind not in MARK_KINDS:
+                raise InputError(
+                    f"--marks {kind!r}: possible are {', '.join(MARK_KINDS)}.{did_you_mean(kind, MARK_KINDS)} Other "
+                    "marks are drawn as polygon or parts in the file, or learned from clicks (`--marks learned`)."
+                )
+        if self.square is None and self.side is None:
+            raise InputError(
+                "the marks' distances are missing: --square 212 for four marks in the corners, --side 226 for four in "
+                "the middles of the sides, or both; in mm from mark to mark, WIDTHxHEIGHT where they differ."
+            )
+        places = len(self.kinds)
+        if len(self.marks) > places:
+            raise InputError(f"--marks names {len(self.marks)} kinds: two are for --square and --side, in this order.")
+        for place, (kind, _) in self.kinds.items():
+            if place not in MARK_KINDS[kind].at:
+                own = MARK_KINDS[kind].at[0]
+                both = f" With both, name two kinds, as --marks cross,{kind}." if own == "side" else ""
+                raise InputError(f"--marks {kind} goes with --{own}, not with --{place}.{both}")
+        half_mm = [max(side) / 2 for side in (self.square, self.side) if side]
+        if self.frame is not None and max(half_mm) > 0.6 * max(self.frame):
+            raise InputError(f"--frame {self.frame[0]:g}: smaller than the distances of the marks.")
+
+    @property
+    def kinds(self) -> dict[str, tuple[str, Point]]:
+        """By place, square or side, the kind of its marks and their distances."""
+        given = [(place, size) for place, size in (("square", self.square), ("side", self.side)) if size]
+        return {
+            place: (self.marks[min(number, len(self.marks) - 1)], size) for number, (place, size) in enumerate(given)
+        }
+
+    @property
+    def scale(self) -> float:
+        """Of the marks' sizes against those of aerial cameras."""
+        return min(1.0, max(_LEAST_SCALE, max(max(size) for _, size in self.kinds.values()) / _AERIAL_MM))
+
+    @property
+    def frame_mm(self) -> Point:
+        """As given; else as marks at the frame's edge say, or the smallest usual frame that holds all marks."""
+        if self.frame is not None:
+            return self.frame
+        for kind, size in self.kinds.values():
+            edge_mm = MARK_KINDS[kind].edge_mm
+            if edge_mm is not None:
+                return size[0] + 2 * self.scale * edge_mm, size[1] + 2 * self.scale * edge_mm
+        least = [
+            max(
+                size[axis] + 2 * (self.scale * MARK_KINDS[kind].reach_mm + _RIM_MM)
+                for kind, size in self.kinds.values()
+            )
+            for axis in (0, 1)
+        ]
+        usual = next((side for side in FORMATS_MM if max(least) <= side), None)
+        if usual is not None and min(least) == max(least):
+            return usual, usual
+        return float(math.ceil(least[0])), float(math.ceil(least[1]))
+
+
+def _size(option: str, text: str | None) -> Point | None:
+    """212, or 212x150. Raises InputError."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(?:mm)?(?:\s*[xX×]\s*(\d+(?:\.\d+)?)\s*(?:mm)?)?\s*", text)
+    width, height = (0.0, 0.0) if found is None else (float(found[1]), float(found[2] or found[1]))
+    if not 1.0 <= min(width, height) <= max(width, height) <= 2000.0:
+        raise InputError(f"{option} {text!r} is no distance in mm, as 212 or 212x150, of 1 to 2000 mm.")
+    return width, height
+
+
+def camera_template(sizes: CameraSizes) -> str:
+    """A complete camera file. Its lines say which values are typical ones, and where to look for better."""
+    given = [f"{kind}, {width:g} x {height:g} mm" for kind, (width, height) in sizes.kinds.values()]
+    distance = (
+        "# principal_distance_mm = 153.0" if sizes.distance is None else f"principal_distance_mm = {sizes.distance:g}"
+    )
+    lines = [
+        f"# Drawn by `reseau template camera`: {' and '.join(given)} from mark to mark.",
+        "# The marks' own sizes are typical ones: measure them in a scan, or see in `reseau review` how they fit.",
+        f"name = {quoted(sizes.name)}",
+        _line(f"frame_mm = [{sizes.frame_mm[0]:g}, {sizes.frame_mm[1]:g}]", "the exposed frame, width and height"),
+        _line(distance, "as on the plate: needed to orient frames from points"),
+        _line('# writing = ["left: reads upward"]', "where the camera writes on its film: tells how a scan lies"),
+        _line("fiducial = [", "sigma_mm: of a certificate some thousandths; 1.0 only places the datum"),
+    ]
+    for place, (_, size) in sizes.kinds.items():
+        for id, (right, up) in _PLACES[place].items():
+            xy_mm = f"[{right * size[0]:g}, {up * size[1]:g}]"
+            lines.append(f'    {{id = "{id}", xy_mm = {xy_mm}, sigma_mm = 1.0, mark = "{_NAMES[place]}"}},')
+    lines.append("]")
+    for place, (kind, _) in sizes.kinds.items():
+        lines += ["", f"[mark.{_NAMES[place]}]", f"kind = {quoted(_WRITTEN.get(kind, kind))}"]
+        if kind != "learned":
+            lines.append(_line('polarity = "auto"', "light or dark, where all scans have it so"))
+        own = MARK_KINDS[kind].lines(sizes.scale, 45.0 if place == "square" else 0.0)
+        lines += [line.replace("{name}", _NAMES[place]) for line in own]
+    return "\n".join(lines) + "\n"
