@@ -36,6 +36,7 @@ def validate_plan(network: Network) -> None:
         _board_faults,
         _observation_faults,
         _distance_faults,
+        _fiducial_distance_faults,
         _calibration_faults,
         _value_faults,
         _part_faults,
@@ -147,15 +148,29 @@ def _distance_faults(network: Network) -> Faults:
                 yield f"{what}: {end} is neither an object point nor an image. Correct the name."
             if end in network.point_by_id and end not in network.observed_points:
                 yield f"{what}: no image shows the point {end}. Measure it, or leave the distance out."
-        if each.start == each.end:
-            yield f"{what} has the same point at both ends. Correct one of them."
-        if not 0.0 < each.value < np.inf:
-            yield f"{what} must be a positive number, not {each.value:g}."
-        if not 0.0 < each.sigma < np.inf:
-            yield (
-                f"{what} needs a positive standard deviation, not {each.sigma:g}. An exact distance is not offered: "
-                f"give a standard deviation of a hundredth of what its ends have, or leave it out."
-            )
+        yield from _length_faults(what, each.start == each.end, each.value, each.sigma)
+
+
+def _fiducial_distance_faults(network: Network) -> Faults:
+    for camera in network.cameras:
+        for each in camera.distances:
+            what = f"the distance from fiducial {each.start} to {each.end} of camera {camera.name}"
+            for end in (each.start, each.end):
+                if end not in camera.fiducials:
+                    yield f"{what}: the camera has no fiducial {end}. Correct the name."
+            yield from _length_faults(what, each.start == each.end, each.value_mm, each.sigma_mm)
+
+
+def _length_faults(what: str, is_closed: bool, value: float, sigma: float) -> Faults:
+    if is_closed:
+        yield f"{what} has the same point at both ends. Correct one of them."
+    if not 0.0 < value < np.inf:
+        yield f"{what} must be a positive number, not {value:g}."
+    if not 0.0 < sigma < np.inf:
+        yield (
+            f"{what} needs a positive standard deviation, not {sigma:g}. An exact distance is not offered: "
+            f"give a standard deviation of a hundredth of what its ends have, or leave it out."
+        )
 
 
 def _calibration_faults(network: Network) -> Faults:

@@ -14,7 +14,7 @@ import json
 import math
 import sys
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,6 +63,7 @@ DIRECTIONS = {"ll": (-1, -1), "ur": (1, 1), "ul": (-1, 1), "lr": (1, -1)} | {
     "mb": (0, -1),
 }
 SEPARATIONS = {"lr_dist": "left to right", "tb_dist": "top to bottom", "llur_dist": "1 to 2", "ullr_dist": "3 to 4"}
+ENDS = {"lr_dist": ("ml", "mr"), "tb_dist": ("mb", "mt"), "llur_dist": ("ll", "ur"), "ullr_dist": ("ul", "lr")}
 
 ENOUGH = 5  # reports for a spread
 LEAST_SIGMA_MM = 0.005  # what the reports give as their own accuracy
@@ -322,6 +323,7 @@ def _camera(
     ]
     for mark in marks:
         lines += ["", *mark.lines(kind)]
+    lines += _distance_lines(kind, own, marks)
     for name, drawing in (kind.marks or {"learned": LEARNED}).items():
         lines += ["", f"[mark.{name}]", drawing.rstrip()]
     return "\n".join(lines) + "\n"
@@ -375,6 +377,23 @@ def _separation_lines(kind: Kind, own: Sequence[Report]) -> list[str]:
             median, spread = np.median(values), _spread(values)
             lines.append(f"# Separation {words}: {median:.3f} mm, spread {spread:.3f} ({len(values)} reports).")
     return lines
+
+
+def _distance_lines(kind: Kind, own: Sequence[Report], marks: Sequence[TypicalMark]) -> Iterator[str]:
+    """Distances between marks: with the standard deviations of their coordinates they have the separations' spread."""
+    by_place = {mark.place: mark for mark in marks}
+    for name, (start, end) in ENDS.items():
+        values = _separations(own, name, kind.gate_mm)
+        if not {start, end} <= by_place.keys() or len(values) < ENOUGH:
+            continue
+        direction = np.subtract(by_place[end].xy_mm, by_place[start].xy_mm)
+        direction /= np.linalg.norm(direction)
+        by_marks = sum(float(np.square(direction * by_place[place].sigma_mm).sum()) for place in (start, end))
+        weight = 1.0 / max(_spread(values), LEAST_SIGMA_MM) ** 2 - 1.0 / by_marks
+        if weight > 0.0:
+            yield from ("", "[[fiducial_distance]]", f'from = "{PLACES[start]}"', f'to = "{PLACES[end]}"')
+            yield f"mm = {np.median(values):.3f}"
+            yield f"sigma_mm = {weight**-0.5:.3f}                        # of {len(values)} reports"
 
 
 def _separations(own: Sequence[Report], name: str, gate_mm: float) -> np.ndarray:

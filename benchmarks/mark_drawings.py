@@ -71,7 +71,10 @@ EIGHT = dict.fromkeys(CORNERS, "corner") | dict.fromkeys(SIDES, "side")
 _RMK_BLOCK = [
     (0.0, 0.0), (1.2, 1.8), (-0.2, 3.4), (-0.2, 5.0), (4.0, 5.0), (4.0, -5.0), (-0.2, -5.0), (-0.2, -3.4), (1.2, -1.8),
 ]  # fmt: skip
-RMK = {"drawn": solid("dark", _RMK_BLOCK)}
+_RMK_TRUE = (
+    "true_mm = [[-1.2, -1.7], [1.4, 1.7]]    # about the point: the shoulders are rounded, and not alike in all\n"
+)
+RMK = {"drawn": solid("dark", _RMK_BLOCK).replace("polarity", f"{_RMK_TRUE}polarity")}
 RMK_EIGHT = {"corner": cross(2.0, 0.06, 0.0, 0), "side": RMK["drawn"]}
 
 # The pinhole that the reports give is hardly ever seen: the notch beside it is drawn, about the pinhole.

@@ -16,6 +16,24 @@ class Fiducial:
     x_mm: Prior
     y_mm: Prior
 
+    @property
+    def is_fixed(self) -> bool:
+        return self.x_mm.sigma == 0.0 and self.y_mm.sigma == 0.0
+
+
+@dataclass(frozen=True)
+class FiducialDistance:
+    """A measured distance between two fiducial marks, as certificates give it that know no coordinates."""
+
+    start: str
+    end: str
+    value_mm: float
+    sigma_mm: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.start} to {self.end}"
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -23,7 +41,7 @@ class Camera:
 
     principal_distance_mm None: unknown, an approximation is found from the points. The principal point likewise; it
     then starts at the centre of the frame, `center_mm` in the camera frame. frame_mm: width and height of the picture,
-    0 where they are not known.
+    0 where they are not known. distances: between fiducials, observed beside their coordinates or in place of them.
     """
 
     name: str
@@ -34,3 +52,4 @@ class Camera:
     fiducials: Mapping[str, Fiducial] = field(default_factory=dict)
     center_mm: tuple[float, float] = (0.0, 0.0)
     frame_mm: tuple[float, float] = (0.0, 0.0)
+    distances: tuple[FiducialDistance, ...] = ()

@@ -11,6 +11,7 @@ import numpy as np
 
 from adjust.array_types import Array, Indices
 from adjust.functional_model.rotation import cross_matrix, rotation_from_angles, vector_by_angles
+from adjust.problem.camera import FiducialDistance
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.problem.unknowns import Unknowns
@@ -45,13 +46,14 @@ def further_observations(network: Network, unknowns: Unknowns) -> tuple[FurtherO
     """All of a validated network."""
     return (
         *_distances(network, unknowns),
+        *(distance for _, distance in _fiducial_distances(network, unknowns)),
         *_calibrations(network, unknowns),
         *(antenna for _, antenna in _antennas(network, unknowns)),
     )
 
 
 class ObservedDistance(FurtherObservation):
-    """A distance between two points or stations; positions (6,): the coordinates of one and of the other."""
+    """A distance between two points, stations or fiducials; positions (2 d,): the coordinates of one and the other."""
 
     def computed(self, values: Array) -> Array:
         return np.array([np.linalg.norm(self._difference(values))])
@@ -62,7 +64,7 @@ class ObservedDistance(FurtherObservation):
         return np.concatenate([-direction, direction])[None, :]
 
     def _difference(self, values: Array) -> Array:
-        start, end = self.positions.reshape(2, 3)
+        start, end = self.positions.reshape(2, -1)
         return np.asarray(values[end] - values[start])
 
 
@@ -71,6 +73,14 @@ def _distances(network: Network, unknowns: Unknowns) -> Iterator[ObservedDistanc
     for each in network.distances:
         name, positions = (f"{each.start} to {each.end}",), np.concatenate([place[each.start], place[each.end]])
         yield ObservedDistance("distance", name, name, positions, np.array([each.value]), np.array([[each.sigma**2]]))
+
+
+def _fiducial_distances(network: Network, unknowns: Unknowns) -> Iterator[tuple[FiducialDistance, ObservedDistance]]:
+    for camera, each in network.observed_distances:
+        positions = np.concatenate([unknowns.fiducial[camera, end] for end in (each.start, each.end)])
+        label = (f"{each.name} of camera {camera}",)
+        value, variance = np.array([each.value_mm]), np.array([[each.sigma_mm**2]])
+        yield each, ObservedDistance("fiducial distance", label, label, positions, value, variance)
 
 
 @dataclass(frozen=True)
@@ -139,6 +149,16 @@ def _antennas(network: Network, unknowns: Unknowns) -> Iterator[tuple[str, Obser
 
 def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
     """The network with distances, calibrations and antennas as if they had been observed without error."""
+    of_fiducials = [
+        (each, replace(each, value_mm=float(observed.computed(values)[0])))
+        for each, observed in _fiducial_distances(network, unknowns)
+    ]
+    cameras = tuple(
+        replace(
+            camera, distances=tuple(exact for each in camera.distances for own, exact in of_fiducials if own is each)
+        )
+        for camera in network.cameras
+    )
     distances = tuple(
         replace(each, value=float(observed.computed(values)[0]))
         for each, observed in zip(network.distances, _distances(network, unknowns), strict=True)
@@ -156,7 +176,7 @@ def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
             exterior[antenna.axes] = antenna.computed(values)
             image = replace(image, exterior=replace(image.exterior, values=exterior))
         images.append(image)
-    return replace(network, distances=distances, calibrations=calibrations, images=tuple(images))
+    return replace(network, cameras=cameras, distances=distances, calibrations=calibrations, images=tuple(images))
 
 
 def square_sum(further: tuple[FurtherObservation, ...], values: Array) -> float:

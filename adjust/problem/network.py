@@ -17,7 +17,7 @@ from adjust.functional_model.line_of_sight import LineOfSight as LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND, Bend, is_term
 from adjust.functional_model.transformation import film_kind
-from adjust.problem.camera import Camera
+from adjust.problem.camera import Camera, FiducialDistance
 from adjust.problem.observations import Calibration, Distance, Observations
 
 Transformation = str  # as `adjust.functional_model.transformation` spells it
@@ -264,6 +264,17 @@ class Network:
         """(camera, id) of the fiducials that are seen in an image."""
         rows = np.flatnonzero([kind == "fiducial" for kind in self.observations.kind])
         return frozenset((self.images[self.image_numbers[row]].camera, self.observations.point[row]) for row in rows)
+
+    @cached_property
+    def observed_distances(self) -> tuple[tuple[str, FiducialDistance], ...]:
+        """Distances between fiducials, with the camera, of which images show both ends; none between fixed marks."""
+        return tuple(
+            (camera.name, each)
+            for camera in self.cameras
+            for each in camera.distances
+            if self.observed_fiducials.issuperset({(camera.name, each.start), (camera.name, each.end)})
+            and not (camera.fiducials[each.start].is_fixed and camera.fiducials[each.end].is_fixed)
+        )
 
     @cached_property
     def objectless_images(self) -> frozenset[str]:

@@ -1,7 +1,8 @@
 """The list of all quantities of a network: what is given of each, and where the iteration starts."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -93,10 +94,11 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
             quantities = _camera_quantities(each, approximations)
             idle = each.name in network.idle_cameras
             camera[each.name] = add("interior", each.name, "", _stopped(quantities) if idle else quantities)
+            datum = fiducial_datum(each, observed, idle)
             for id_, mark in each.fiducials.items():
                 hold = (each.name, id_) not in observed
                 pair = [
-                    (axis, _hold(prior) if hold else prior, None)
+                    (axis, _hold(prior) if hold or (id_, axis) in datum else prior, None)
                     for axis, prior in zip("xy", (mark.x_mm, mark.y_mm), strict=True)
                 ]
                 fiducial[each.name, id_] = add("fiducial", each.name, id_, pair)
@@ -138,6 +140,29 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
         )
     owned = camera, fiducial, scanner, point, transformation, exterior, join, board
     return Unknowns(parameters, given, sigma, start, *owned)
+
+
+def fiducial_datum(camera: Camera, observed: Collection[tuple[str, str]], idle: bool) -> frozenset[tuple[str, str]]:
+    """The coordinates (fiducial, axis) that are held where they are given, for distances alone place the marks.
+
+    Distances leave open where the marks lie and how they are turned: both coordinates of one mark and one of the mark
+    farthest from it settle that without strain. A principal point that is given says where they lie. Empty where there
+    are no distances, or a coordinate is given with a standard deviation.
+    """
+    marks = {id_: mark for id_, mark in camera.fiducials.items() if (camera.name, id_) in observed}
+    priors = [prior for mark in marks.values() for prior in (mark.x_mm, mark.y_mm)]
+    if not camera.distances or len(marks) < 2 or any(np.isfinite(prior.sigma) for prior in priors):
+        return frozenset()
+    places = {id_: np.array([mark.x_mm.value, mark.y_mm.value]) for id_, mark in marks.items()}
+    first, last = max(
+        combinations(places, 2), key=lambda pair: float(np.linalg.norm(places[pair[1]] - places[pair[0]]))
+    )
+    along = np.abs(places[last] - places[first])
+    across = (last, "y" if along[0] >= along[1] else "x")
+    is_placed = not idle and all(
+        point is not None and np.isfinite(point.sigma) for point in (camera.x0_mm, camera.y0_mm)
+    )
+    return frozenset({across} if is_placed else {(first, "x"), (first, "y"), across})
 
 
 def _hold(prior: Prior) -> Prior:

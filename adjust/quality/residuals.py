@@ -57,8 +57,8 @@ class Group:
 
     sigma0 is 0 and means nothing where the redundancy is below 1: there is no check. `target`, `fiducial`: in the
     comparator; `control`: given object coordinates, rms in millionths of the object unit; `datum`: given places of
-    fiducials (F5, F6); `interior`, `exterior`: given values of mixed units, rms 0; `distance`: rms 0. The first three
-    are always there.
+    fiducials (F5, F6); `interior`, `exterior`: given values of mixed units, rms 0; `distance`, `fiducial distance`: rms
+    0. The first three are always there.
     """
 
     sigma0: float

@@ -19,7 +19,7 @@ from adjust.solution.planning import Plan, plan
 from pipeline.design.setup import Setup, planned_network
 
 UM_PER_MM = 1000.0
-IN_MM = ("target", "tie", "fiducial", "datum", "scanner")
+IN_MM = ("target", "tie", "fiducial", "datum", "scanner", "fiducial distance")
 Array = NDArray[np.float64]
 
 DIRECTIONS = 36

@@ -8,6 +8,15 @@ the model of this program, whose correction k3 r^3 + k5 r^5 + k7 r^7 has no line
     r - C tan t = (c - C) tan t + k3 r^3 + k5 r^5 + k7 r^7        C: what the table refers to
 
 which is linear in c - C, k3, k5, k7.
+
+A certificate may give two principal points: that of autocollimation, PPA, where the axis meets the picture, and that
+of best symmetry, PPS, which its distortion counts from. The model has one, the PPA. With d = PPS - PPA the distortion
+k_n r^(n-1) x about the PPS is about the PPA, to the first order in d,
+
+    k_n r^(n-1) x - k_n r^(n-1) (d + (n - 1) x (x.d) / r^2)
+
+whose second part is for n = 3 a decentering distortion with P = -k_3 d, and for larger n is fitted by one over the disk
+of radius R that the table covers: P = -k_n d R^(n-3) 6 (3 n + 1) / (10 (n + 3)).
 """
 
 import math
@@ -19,10 +28,12 @@ import numpy as np
 from scipy.optimize import brentq
 
 from adjust.functional_model.lens import Distortion, Prior
+from adjust.problem.camera import FiducialDistance
+from measure.marks.shapes import Point
 from pipeline.exchange.formats import Convention
 from pipeline.exchange.incoming import ImportOptions, Incoming
-from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile
-from pipeline.text.tables import read_toml
+from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile, GivenFiducial, read_fiducial_distances
+from pipeline.text.tables import Table, read_toml
 from pipeline.types import Array
 
 CONVENTION = Convention(
@@ -38,11 +49,15 @@ _CURVE = 400  # places on the curve whose extremes are balanced
 @dataclass(frozen=True)
 class Certificate:
     """As it is printed. radius_mm (n,), tangent (n,) of the angle from the axis, radial_um (n,); sigma_um of one value;
-    principal_distance_mm: that which the table refers to."""
+    principal_distance_mm: that which the table refers to. principal_point_mm: that of autocollimation; symmetry_mm:
+    that of best symmetry, where it is given apart. fiducials, distances: coordinates and distances of the marks."""
 
     name: str
     principal_distance_mm: float
-    principal_point_mm: tuple[float, float] | None
+    principal_point_mm: Point | None
+    symmetry_mm: Point | None
+    fiducials: tuple[GivenFiducial, ...]
+    distances: tuple[FiducialDistance, ...]
     radius_mm: Array
     tangent: Array
     radial_um: Array
@@ -98,7 +113,8 @@ def read_certificate(path: Path) -> Certificate:
     certificate = Certificate(
         table.text("name", path.stem),
         distance,
-        table.pair("principal_point_mm") if "principal_point_mm" in table else None,
+        *_principal_points(table),
+        *_fiducials(table),
         radius_mm,
         tangent,
         radial_um,
@@ -106,6 +122,32 @@ def read_certificate(path: Path) -> Certificate:
     )
     table.done()
     return certificate
+
+
+def _principal_points(table: Table) -> tuple[Point | None, Point | None]:
+    """That of autocollimation and that of best symmetry; the latter None where the two are not told apart."""
+    keys = ("principal_point_mm", "autocollimation_mm", "symmetry_mm")
+    one, autocollimation, symmetry = (table.pair(key) if key in table else None for key in keys)
+    if one is not None and (autocollimation is not None or symmetry is not None):
+        raise table.error(
+            "principal_point_mm", "is one point, autocollimation_mm and symmetry_mm are two. Give either."
+        )
+    if symmetry is not None and autocollimation is None:
+        raise table.error(
+            "symmetry_mm", "needs autocollimation_mm. Give the only point that there is as principal_point_mm."
+        )
+    return one or autocollimation, symmetry
+
+
+def _fiducials(table: Table) -> tuple[tuple[GivenFiducial, ...], tuple[FiducialDistance, ...]]:
+    """[[fiducial]] with id and xy_mm, [[fiducial_distance]] between these."""
+    fiducials = []
+    for entry in table.tables("fiducial") if "fiducial" in table else ():
+        sigma_mm = entry.sigma_pair("sigma_mm", (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM))
+        fiducials.append(GivenFiducial(entry.text("id"), entry.pair("xy_mm"), sigma_mm, None))
+        entry.done()
+    distances = read_fiducial_distances(table, [each.id for each in fiducials])
+    return tuple(fiducials), distances
 
 
 def fit(certificate: Certificate) -> FittedTable:
@@ -150,8 +192,19 @@ def _curve(coefficients: Array, radius_mm: Array) -> Array:
     return np.asarray(sum(k * radius_mm**power for k, power in zip(coefficients, POWERS, strict=True)))
 
 
+def decentering(certificate: Certificate, fitted: FittedTable) -> Array:
+    """P1 and P2 (2,) by which the distortion about the point of symmetry is one about that of autocollimation."""
+    if certificate.symmetry_mm is None or certificate.principal_point_mm is None:
+        return np.zeros(2)
+    off_mm = np.subtract(certificate.symmetry_mm, certificate.principal_point_mm)
+    reach_mm, powers = float(certificate.radius_mm.max()), np.array(POWERS)
+    parts = fitted.coefficients * reach_mm ** (powers - 3) * 0.6 * (3 * powers + 1) / (powers + 3)
+    return np.asarray(-off_mm * parts.sum())
+
+
 def _camera(certificate: Certificate, fitted: FittedTable) -> CameraFile:
     names = [f"k{power}" for power in POWERS]
+    off = {name: Prior(p) for name, p in zip(("p1", "p2"), decentering(certificate, fitted).tolist(), strict=True) if p}
     point_sigma = math.inf if certificate.principal_point_mm is None else DEFAULT_SIGMA_MM
     given = zip(names, fitted.coefficients.tolist(), fitted.sigmas[1:].tolist(), strict=True)
     return CameraFile(
@@ -162,8 +215,9 @@ def _camera(certificate: Certificate, fitted: FittedTable) -> CameraFile:
         principal_point_mm=certificate.principal_point_mm,
         principal_distance_sigma_mm=float(fitted.sigmas[0]),
         principal_point_sigma_mm=(point_sigma, point_sigma),
-        distortion=Distortion("torlegard", {name: Prior(k, sigma) for name, k, sigma in given if sigma > 0.0}),
-        fiducials=(),
+        distortion=Distortion("torlegard", {name: Prior(k, sigma) for name, k, sigma in given if sigma > 0.0} | off),
+        fiducials=certificate.fiducials,
+        distances=certificate.distances,
     )
 
 
@@ -176,6 +230,11 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
         if certificate.principal_point_mm is None
         else f"gives no standard deviation of the principal point: {DEFAULT_SIGMA_MM:g} mm is assumed"
     )
+    off = decentering(certificate, fitted)
+    apart = (
+        f"{certificate.name}: the distortion counts from the principal point of symmetry, the camera file's principal "
+        f"point is that of autocollimation: p1 {off[0]:.3g}, p2 {off[1]:.3g} stand for their distance."
+    )
     over = len(certificate.radial_um) - int((fitted.sigmas > 0.0).sum())
     return [
         f"{certificate.name}: equivalent principal distance {fitted.equivalent_mm:.4f} mm, its standard deviation "
@@ -184,6 +243,7 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
         f"{certificate.name}: k3 {k3:.4g}, k5 {k5:.4g}, k7 {k7:.4g}; residuals of the table {rms:.2f} um rms, "
         f"{largest:.2f} um at most, {over} values more than unknowns.",
         f"{certificate.name}: the certificate {point}.",
+        *([apart] if off.any() else []),
     ]
 
 

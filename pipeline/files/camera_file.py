@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
 from adjust.functional_model.lens import Decentering, Distortion, Prior
-from adjust.problem.camera import Camera, Fiducial
+from adjust.problem.camera import Camera, Fiducial, FiducialDistance
 from measure.marks import shapes
 from measure.marks.rendering import extent_px
 from pipeline.errors import InputError
@@ -214,6 +214,9 @@ class CameraTable:
     fiducial: Annotated[tuple[FiducialTable, ...], subtables(FiducialTable)] = Field(
         default=(), description="Fiducial marks, one table each."
     )
+    fiducial_distance: Annotated[object, Key("tables", Table.tables)] = Field(
+        default=(), description="Measured distances between fiducials: from, to, mm, sigma_mm."
+    )
     mark: Annotated[Mapping[str, Drawing], Key("tables by name", lambda table, key: read_marks(table.table(key)))] = (
         Field(default_factory=dict, description="Drawings of the marks.")
     )
@@ -233,8 +236,8 @@ class CameraFile:
     principal_distance_mm and principal_point_mm are None where the file leaves them to the points. number: of the
     camera or its lens cone, as its plate in the picture has it; "" where the file is of a type. writing: where the
     camera writes on its film, as far as the file says. calibration: an earlier one, which takes the place of the
-    standard deviations of all that it gives. clicks: None where nobody has shown the learned marks; learned_from: None
-    before they are learned.
+    standard deviations of all that it gives. distances: observed between the fiducials. clicks: None where nobody has
+    shown the learned marks; learned_from: None before they are learned.
     """
 
     path: Path
@@ -252,6 +255,7 @@ class CameraFile:
     source: Source | None = None
     clicks: Clicks | None = None
     learned_from: LearnedFrom | None = None
+    distances: tuple[FiducialDistance, ...] = ()
 
     @property
     def learned(self) -> tuple[GivenFiducial, ...]:
@@ -304,6 +308,9 @@ class CameraFile:
             },
             center_mm=center_mm,
             frame_mm=self.frame_mm or (0.0, 0.0),
+            distances=tuple(
+                one for one in self.distances if {one.start, one.end} <= {each.id for each in self.fiducials}
+            ),
         )
 
 
@@ -346,6 +353,7 @@ def parse_camera(table: Table) -> CameraFile:
         source=given.source,
         clicks=read_clicks(table.table("clicks"), learned) if given.clicks is not None else None,
         learned_from=given.learned_from,
+        distances=read_fiducial_distances(table, [one.id for one in fiducials]),
     )
     return replace(camera, calibration=read_calibration(table.table("sigma"), camera.camera()))
 
@@ -415,6 +423,22 @@ def _fiducials(entries: Sequence[Table], given: CameraTable) -> tuple[GivenFiduc
             one.id, one.xy_mm, one.sigma_mm, drawn, one.mark == NO_MARK and drawn is None, one.seen_mm
         )
     return tuple(fiducials.values())
+
+
+def read_fiducial_distances(table: Table, ids: Sequence[str]) -> tuple[FiducialDistance, ...]:
+    """[[fiducial_distance]]: from and to, of the ids of the fiducials, mm and sigma_mm."""
+    distances = []
+    for entry in table.tables("fiducial_distance") if "fiducial_distance" in table else ():
+        start, end = (entry.text(key) for key in ("from", "to"))
+        for key, id_ in (("from", start), ("to", end)):
+            if id_ not in ids:
+                raise entry.error(key, f"there is no fiducial {id_!r}.{did_you_mean(id_, ids)}")
+        if start == end:
+            raise entry.error("to", "is the same as from: a distance has two ends.")
+        length, sigma = (entry.number(key, above=0.0) for key in ("mm", "sigma_mm"))
+        distances.append(FiducialDistance(start, end, length, sigma))
+        entry.done()
+    return tuple(distances)
 
 
 def _placed(

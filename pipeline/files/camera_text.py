@@ -1,10 +1,11 @@
 """A camera as the text of a camera file: what `read_camera` reads back."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Prior
+from adjust.problem.camera import FiducialDistance
 from measure.marks import shapes
 from pipeline.files.camera_file import NO_MARK, CameraFile, GivenFiducial, written_place_text
 from pipeline.files.mark_table import LearnedFrom, SavePicture, template_lines
@@ -42,11 +43,21 @@ def camera_text(camera: CameraFile, save: SavePicture) -> str:
             lines.append(f"mark = {quoted(marks[fiducial.mark])}")
         elif fiducial.passed_over:
             lines.append(f"mark = {quoted(NO_MARK)}")
+    lines += fiducial_distance_lines(camera.distances)
     if camera.learned_from is not None:
         lines += _learned_from_lines(camera.learned_from)
     for mark, name in marks.items():
         lines += _mark_lines(mark, name, save)
     return "\n".join(lines) + "\n"
+
+
+def fiducial_distance_lines(distances: Iterable[FiducialDistance]) -> list[str]:
+    """Tables [[fiducial_distance]]."""
+    lines = []
+    for one in distances:
+        lines += ["", "[[fiducial_distance]]", f"from = {quoted(one.start)}", f"to = {quoted(one.end)}"]
+        lines += [f"mm = {one.value_mm!r}", f"sigma_mm = {one.sigma_mm!r}"]
+    return lines
 
 
 def _learned_from_lines(learned: LearnedFrom) -> list[str]:

@@ -17,7 +17,9 @@ from pipeline.types import Array
 LONGEST_PX = 46.0
 WIDTH_PX = 400.0
 MARGIN_PX = 58.0
-_AS_IT_LIES = Film("similarity", np.array([0.0, 0.0, 1.0, 0.0]), np.zeros(2))  # of a camera that is calibrated
+BETTER = 2.0  # how many times as well as coordinates distances must be known to tell the form
+_CALIBRATED = Film("similarity", np.array([0.0, 0.0, 1.0, 0.0]), np.zeros(2))  # the camera as it lies
+_MEASURED = Film("congruent", np.zeros(3), np.zeros(2))  # the same of fiducials between which distances were measured
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,29 @@ class Figure:
 def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figure | None:
     """A camera's fiducials free of its datum; None where its datum takes up all that they tell."""
     camera = stored.cameras[name]
+    if _is_measured(name, stored):
+        return figure_of_films(name, camera.fiducials, covariance, {}, _MEASURED)
     films = {} if camera.is_calibrated else stored.films(stored.images_of(name))
     return figure_of_films(name, camera.fiducials, covariance, films)
 
 
+def _is_measured(name: str, stored: AdjustmentRecord) -> bool:
+    """Whether distances tell the form of a camera's fiducials, much better than given coordinates do."""
+    sigmas = [row.sigma_mm for row in stored.fiducial_distances if row.camera == name]
+    given = [each.given for mark in stored.cameras[name].fiducials.values() for each in (mark.x_mm, mark.y_mm)]
+    least = min((each.sigma for each in given if each is not None), default=np.inf)
+    return bool(sigmas) and BETTER * max(sigmas) < least
+
+
 def figure_of_films(
-    name: str, fiducials: Mapping[str, FiducialRecord], covariance: Covariance, films: Mapping[str, Film]
+    name: str,
+    fiducials: Mapping[str, FiducialRecord],
+    covariance: Covariance,
+    films: Mapping[str, Film],
+    otherwise: Film = _CALIBRATED,
 ) -> Figure | None:
-    """The figure of fiducials of which nothing but these films, by image, holds them; of none: of a calibrated camera.
+    """The figure of fiducials that nothing but these films, by image, holds; where there are none, after the kind of
+    transformation that `otherwise` has.
 
     The datum that calibrated fiducials stand in is itself uncertain, by a shift, a rotation and a scale that they
     share. The covariance is that after the S-transformation (Baarda 1973) to the marks. Of films the datum takes up all
@@ -77,7 +94,7 @@ def figure_of_films(
     """
     known = {id: (mark.given_mm, mark.xy_mm) for id, mark in fiducials.items() if mark.given_mm is not None}
     given, estimated = np.array(list(known.values()), dtype=float).reshape(-1, 2, 2).swapaxes(0, 1)
-    left = corrections_to_given(list(films.values()) or [_AS_IT_LIES], estimated, given) if known else None
+    left = corrections_to_given(list(films.values()) or [otherwise], estimated, given) if known else None
     if left is None:
         return None
     unknowns = [Parameter.fiducial(name, id, axis) for id in known for axis in "xy"]

@@ -20,6 +20,7 @@ from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord
 from pipeline.results.assessment_record import (
     ContradictionRecord,
     DistanceRecord,
+    FiducialDistanceRecord,
     ObservedQuantity,
     ResidualRecord,
     SuspectRecord,
@@ -27,6 +28,7 @@ from pipeline.results.assessment_record import (
 from pipeline.results.check_file import Check, PixelCalibration
 from pipeline.text.wording import counted, listed
 
+Observed = DistanceRecord | FiducialDistanceRecord | ObservedQuantity
 Level = Literal["good", "look", "failed"]
 Evidence = Callable[[ReportData, list[Frame]], Iterable[Problem]]
 
@@ -43,6 +45,10 @@ CONFIDENCE = 0.99  # of the global test, and that no good observation of the who
 DISTANCES = (
     "beyond chance",
     "Look for a wrong point or unit in the file of distances; two distances that contradict each other are both named.",
+)
+FIDUCIAL_DISTANCES = (
+    "beyond chance (v in µm)",
+    "Compare the camera file with the certificate; two distances that contradict each other are both named.",
 )
 CALIBRATION = (
     "The images contradict the earlier calibration",
@@ -142,6 +148,10 @@ def _further_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     heading, remedy = DISTANCES
     if bad := _outlying(adjustment, adjustment.distances):
         yield Problem(f"{counted(len(bad), 'distance')} {heading}: {_named(bad, [row.name for row in bad])}.", remedy)
+    heading, remedy = FIDUCIAL_DISTANCES
+    if bad := _outlying(adjustment, adjustment.fiducial_distances):
+        count = counted(len(bad), "distance between fiducials", "distances between fiducials")
+        yield Problem(f"{count} {heading}: {_named(bad, [row.name for row in bad])}.", remedy)
     heading, remedy = CALIBRATION
     tests = [test for test in adjustment.calibration_tests if test.p < CONTRADICTED]
     yield from (Problem(f"{heading}: {contradiction(test, adjustment.cameras)}.", remedy) for test in tests)
@@ -154,7 +164,7 @@ def _further_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         yield Problem(f"{count} {heading}: {_named(bad, [row.name for row in bad])}.", remedy)
 
 
-def _named(rows: Sequence[DistanceRecord | ObservedQuantity], names: Sequence[str]) -> str:
+def _named(rows: Sequence[Observed], names: Sequence[str]) -> str:
     return listed([f"{n} (v = {row.v:.4g}, w = {fixed(row.w, 1)})" for n, row in zip(names, rows, strict=True)])
 
 
@@ -170,9 +180,7 @@ def contradiction(test: ContradictionRecord, cameras: Mapping[str, CameraRecord]
     )
 
 
-def _outlying(
-    adjustment: AdjustmentRecord, rows: Sequence[DistanceRecord | ObservedQuantity]
-) -> list[DistanceRecord | ObservedQuantity]:
+def _outlying(adjustment: AdjustmentRecord, rows: Sequence[Observed]) -> list[Observed]:
     limit = critical_w(len(rows)) * (adjustment.sigma0 if adjustment.sigma0 > 1.0 else 1.0)
     return [row for row in rows if abs(row.w) > limit]
 

@@ -45,6 +45,7 @@ from pipeline.results.assessment_record import (
     ContradictionRecord,
     CorrelationRecord,
     DistanceRecord,
+    FiducialDistanceRecord,
     NullDirectionRecord,
     ObservedQuantity,
     OuterRecord,
@@ -126,6 +127,7 @@ def adjustment_record(
         refraction=network.line_of_sight.refraction,
         earth_curvature=network.line_of_sight.curvature,
         distances=_distances(adjustment),
+        fiducial_distances=_fiducial_distances(adjustment),
         calibrations=_observed(adjustment, "calibration"),
         calibration_tests=tuple(map(_contradiction, adjustment.contradictions)),
         antennas=_observed(adjustment, "antenna"),
@@ -301,6 +303,24 @@ def _distances(adjustment: Adjustment) -> tuple[DistanceRecord, ...]:
     return tuple(
         DistanceRecord(given.start, given.end, *_numbers(row))
         for given, row in zip(adjustment.network.distances, rows, strict=True)
+    )
+
+
+def _fiducial_distances(adjustment: Adjustment) -> tuple[FiducialDistanceRecord, ...]:
+    rows = (row for row in adjustment.further if row.group == "fiducial distance")
+    return tuple(
+        FiducialDistanceRecord(
+            camera,
+            each.start,
+            each.end,
+            row.observed,
+            row.sigma,
+            1e3 * row.v,
+            row.redundancy,
+            row.w,
+            1e3 * row.detectable,
+        )
+        for (camera, each), row in zip(adjustment.network.observed_distances, rows, strict=True)
     )
 
 

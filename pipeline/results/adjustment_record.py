@@ -24,6 +24,7 @@ from pipeline.results.assessment_record import (
     ContradictionRecord,
     CorrelationRecord,
     DistanceRecord,
+    FiducialDistanceRecord,
     NullDirectionRecord,
     ObservedQuantity,
     ReliabilityRecord,
@@ -391,6 +392,7 @@ class AdjustmentRecord:
     refraction: bool = False
     earth_curvature: bool = False
     distances: tuple[DistanceRecord, ...]
+    fiducial_distances: tuple[FiducialDistanceRecord, ...] = ()
     calibrations: tuple[ObservedQuantity, ...]
     calibration_tests: tuple[ContradictionRecord, ...] = ()
     antennas: tuple[ObservedQuantity, ...]

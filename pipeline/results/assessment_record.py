@@ -63,6 +63,29 @@ class DistanceRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class FiducialDistanceRecord:
+    """A given distance between two fiducials of a camera, mm; its residual and detectable error in µm."""
+
+    camera: str
+    start: str = field(metadata={KEY: "from"})
+    end: str = field(metadata={KEY: "to"})
+    mm: float
+    sigma_mm: float
+    v_um: float
+    redundancy: float
+    w: float
+    detectable_um: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.start} to {self.end} of {self.camera}"
+
+    @property
+    def v(self) -> float:
+        return self.v_um
+
+
+@dataclass(frozen=True, slots=True)
 class ObservedQuantity:
     """A quantity of an earlier calibration (mm) or a coordinate of an antenna (object unit), as observed."""
 

@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from simulated import FIDUCIALS
 from studies import parametrize_with_studies
 
+from adjust.functional_model.lens import Lens, Prior
+from adjust.functional_model.physical import TORLEGARD_NAMES
+from adjust.problem.camera import FiducialDistance
 from pipeline.cli import DONE, WRONG_INPUT, run
+from pipeline.errors import InputError
 from pipeline.exchange.certificate import balanced_mm, fit, read_certificate
 from pipeline.exchange.xml_tree import read_xml
 from pipeline.files.camera_file import CameraFile, read_camera
@@ -268,6 +272,55 @@ def test_what_a_calibration_does_not_say_is_no_knowledge(tmp_path: Path, capsys:
     calibration.write_text("<calibration><width>600</width><height>400</height><f>500</f></calibration>")
     imported("metashape", [calibration], tmp_path, *PITCH)
     assert "no standard deviations. The calibration is held fixed" in " ".join(capsys.readouterr().out.split())
+
+
+def test_two_principal_points_of_a_certificate_are_one_lens(tmp_path: Path) -> None:
+    """Distortion about the point of symmetry, a camera file with that of autocollimation: the same places where
+    nothing but k3 is, and to a fifth of what it matters where k5 is."""
+    ppa, pps = np.array([0.004, -0.012]), np.array([-0.076, 0.078])
+    for k, left_um in (((4.0e-7, 0.0, 0.0), 0.01), ((4.0e-7, -5.0e-12, 0.0), 0.15)):
+        table = [distortion_um(153.0, 153.0, k, angle) for angle in ANGLES]
+        points = {"autocollimation_mm": f"{ppa.tolist()}", "symmetry_mm": f"{pps.tolist()}"}
+        camera = read_camera(
+            imported("certificate", [printed(tmp_path / "c.toml", 153.0, table, **points)], tmp_path) / "camera.toml"
+        )
+        assert camera.principal_point_mm == tuple(ppa)
+        angle, radius = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False), np.array([40.0, 80.0, 110.0])
+        xy = (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)).reshape(-1, 2)
+        about, s2 = xy - (pps - ppa), np.square(xy).sum(axis=1, keepdims=True)
+        r2 = np.square(about).sum(axis=1, keepdims=True)
+        true_um = 1e3 * about * (k[0] * r2 + k[1] * r2**2 + k[2] * r2**3)
+        assert camera.distortion.parameters.keys() >= {"p1", "p2"}
+        values = [camera.distortion.parameters.get(name, Prior(0.0)).value for name in TORLEGARD_NAMES]
+        lens = Lens(camera.distortion, np.array([153.0, *ppa]), np.array(values))
+        found_um = lens.displacement(xy).value_um
+        off = found_um - true_um
+        assert np.abs(off - off.mean(axis=0)).max() < left_um
+        assert np.abs(true_um - 1e3 * xy * (k[0] * s2 + k[1] * s2**2)).max() > 0.8  # it matters
+
+
+def test_a_certificate_of_distances(tmp_path: Path) -> None:
+    lines = ["[[fiducial]]", 'id = "1"', "xy_mm = [-106, 106]", "[[fiducial]]", 'id = "3"', "xy_mm = [106, -106]"]
+    lines += ["[[fiducial_distance]]", 'from = "1"', 'to = "3"', "mm = 299.816", "sigma_mm = 0.005"]
+    table = printed(tmp_path / "c.toml", 153.0, [1.0, 2.0, 1.0, -1.0, -2.0, 3.0])
+    table.write_text("\n".join([table.read_text(), *lines]) + "\n")
+    camera = read_camera(imported("certificate", [table], tmp_path) / "camera.toml")
+    assert camera.distances == (FiducialDistance("1", "3", 299.816, 0.005),)
+    table.write_text(table.read_text().replace('to = "3"', 'to = "33"'))
+    with pytest.raises(InputError, match=r"no fiducial '33'\. Did you mean '3'"):
+        read_certificate(table)
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        ({"symmetry_mm": "[0.0, 0.01]"}, "needs autocollimation_mm"),
+        ({"principal_point_mm": "[0, 0]", "symmetry_mm": "[0.0, 0.01]"}, "Give either"),
+    ],
+)
+def test_principal_points_that_do_not_go_together(tmp_path: Path, points: dict[str, str], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        read_certificate(printed(tmp_path / "c.toml", 153.0, [1.0, 2.0, 1.0, -1.0, -2.0, 3.0], **points))
 
 
 def test_the_calibrated_distance_balances_the_distortion(tmp_path: Path) -> None:

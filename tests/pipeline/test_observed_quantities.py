@@ -16,6 +16,7 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.network import EXTERIOR_NAMES
 from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
+from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
 from pipeline.opencv_check.check import check_against_opencv
@@ -268,3 +269,68 @@ def test_a_mistake_in_the_datum_gets_a_message(
         adjusted(tmp_path)
     for word in words:
         assert word in str(error.value)
+
+
+def fiducial_project(folder: Path, distances: list[tuple[str, str, float]], extra: str = "") -> Path:
+    """Eight affine frames of the fiducials alone, whose coordinates are free, and distances between them."""
+    place = {"1": (-106.0, 106.0), "2": (106.0, 106.0), "3": (106.0, -106.0), "4": (-106.0, -106.0)}
+    true = {id_: np.array(xy) + shift for (id_, xy), shift in zip(place.items(), [0.0, 0.03, -0.02, 0.05], strict=True)}
+    lines = ['name = "K"', "frame_mm = [228.0, 228.0]"]
+    for id_, (x, y) in place.items():
+        lines += ["[[fiducial]]", f'id = "{id_}"', f"xy_mm = [{x}, {y}]", 'sigma_mm = "free"']
+    for start, end, error in distances:
+        length = float(np.linalg.norm(true[end] - true[start])) + error if end in true and start in true else 100.0
+        lines += ["[[fiducial_distance]]", f'from = "{start}"', f'to = "{end}"', f"mm = {length!r}", "sigma_mm = 0.005"]
+    (folder / "camera.toml").write_text("\n".join([*lines, extra]) + "\n", encoding="utf-8")
+    rows, rng = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"], np.random.default_rng(3)
+    for image in "abcdefgh":
+        film = np.eye(2) + 1e-3 * rng.standard_normal((2, 2))
+        for id_, xy in true.items():
+            x, y = (film @ xy + 3.0 + 0.003 * rng.standard_normal(2)).tolist()
+            rows.append(f"{image},{id_},fiducial,{x!r},{y!r},0.003,0.003")
+    (folder / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "project.toml").write_text('camera = "camera.toml"\n', encoding="utf-8")
+    return folder / "project.toml"
+
+
+ALL_SIX = [("1", "2", 0.0), ("2", "3", 0.0), ("3", "4", 0.0), ("4", "1", 0.0), ("1", "3", 0.0), ("2", "4", 0.0)]
+
+
+def test_distances_between_fiducials_through_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Affine films tell no form; six distances of a certificate do, with one to spare, and their table is written."""
+    project = fiducial_project(tmp_path, ALL_SIX)
+    assert run(["run", str(project)]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "1 to 3: 299.81" in printed
+    written = read_adjustment(tmp_path / "out" / "adjustment.json")
+    assert [(row.camera, row.start, row.end) for row in written.fiducial_distances] == [("K", *p[:2]) for p in ALL_SIX]
+    assert sum(row.redundancy for row in written.fiducial_distances) == pytest.approx(
+        3.0, abs=0.3
+    )  # affinity by them alone
+    mm = {id_: np.array(mark.xy_mm) for id_, mark in written.cameras["K"].fiducials.items()}
+    assert np.linalg.norm(mm["3"] - mm["1"]) == pytest.approx(212.0 * np.sqrt(2.0), abs=0.012)
+
+
+def test_a_wrong_distance_of_a_certificate_is_named(tmp_path: Path) -> None:
+    project = fiducial_project(tmp_path, [*ALL_SIX[:4], ("1", "3", 0.4), ("2", "4", 0.0)])
+    result = adjusted(project.parent)
+    write_adjustment(result, tmp_path / "adjustment.json")
+    verdict = judge(ReportData("t", adjustment=read_adjustment(tmp_path / "adjustment.json")))
+    assert any("beyond chance" in each.what and "1 to 3 of K" in each.what for each in verdict.problems)
+
+
+@pytest.mark.parametrize(
+    ("distance", "extra", "words"),
+    [
+        (("1", "9", 0.0), "", r"fiducial_distance.* to: there is no fiducial '9'"),
+        (("1", "1", 10.0), "", "a distance has two ends"),
+        (("1", "2", -300.0), "", "mm: must be greater than 0"),
+        (("1", "2", 0.0), "weight = 2", "weight"),
+    ],
+)
+def test_what_is_no_distance_between_fiducials_is_refused(
+    tmp_path: Path, distance: tuple[str, str, float], extra: str, words: str
+) -> None:
+    project = fiducial_project(tmp_path, [distance], extra)
+    with pytest.raises(InputError, match=words):
+        read_project(project)

@@ -1,0 +1,196 @@
+"""Distances between fiducial marks as observations: against an adjustment written out here, and by simulation."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from film_realisations import CAMERA, NOISE_MM, NOMINAL_MM, Frames, frames
+from numpy.typing import NDArray
+from scipy.optimize import approx_fprime
+from studies import parametrize_with_studies
+
+from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Fiducial, FiducialDistance
+from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
+
+Array = NDArray[np.float64]
+SIGMA_MM = 0.004
+
+
+def with_distances(drawn: Frames, rng: np.random.Generator, noise: float = 1.0, sigma_mm: float = np.inf) -> Frames:
+    """Frames whose marks are given with a standard deviation, and all distances between them."""
+    camera = drawn.network.cameras[0]
+    pairs = combinations(range(len(drawn.places_mm)), 2)
+    distances = tuple(
+        FiducialDistance(
+            str(i + 1),
+            str(j + 1),
+            float(np.linalg.norm(drawn.places_mm[j] - drawn.places_mm[i]) + noise * SIGMA_MM * rng.standard_normal()),
+            SIGMA_MM,
+        )
+        for i, j in pairs
+    )
+    marks = {
+        id_: Fiducial(Prior(mark.x_mm.value, sigma_mm), Prior(mark.y_mm.value, sigma_mm))
+        for id_, mark in camera.fiducials.items()
+    }
+    cameras = (replace(camera, fiducials=marks, distances=distances),)
+    return replace(drawn, network=replace(drawn.network, cameras=cameras))
+
+
+def held(marks: int) -> list[int]:
+    """Which of all coordinates the distances leave open, as a frame of four corners or eight marks has them: both of
+    the first of the two marks farthest apart, and the one across of the other."""
+    first, last = max(
+        combinations(range(marks), 2), key=lambda pair: np.linalg.norm(np.diff(NOMINAL_MM[list(pair)], axis=0))
+    )
+    along = np.abs(NOMINAL_MM[last] - NOMINAL_MM[first])
+    return [2 * first, 2 * first + 1, 2 * last + (1 if along[0] >= along[1] else 0)]
+
+
+def written_out(drawn: Frames, similar: bool) -> tuple[Array, Array, float]:
+    """Places (m, 2), their standard deviations and v'Pv: each comparator coordinate is a similarity or an affinity of
+    the place, each distance that of two places."""
+    network, marks = drawn.network, len(drawn.places_mm)
+    observed = network.observations.xy_mm.reshape(-1, marks, 2)
+    distances = network.cameras[0].distances
+    pairs = np.array([(int(each.start) - 1, int(each.end) - 1) for each in distances])
+    free = np.setdiff1d(np.arange(2 * marks), held(marks))
+    of_film = 4 if similar else 6
+
+    def places_of(x: Array) -> Array:
+        places = NOMINAL_MM[:marks].ravel().copy()
+        places[free] = x[: len(free)]
+        return places.reshape(-1, 2)
+
+    def weighted(x: Array) -> Array:
+        places, rows = places_of(x), []
+        for own, p in zip(observed, x[len(free) :].reshape(len(observed), of_film), strict=True):
+            matrix = np.array([[p[2], -p[3]], [p[3], p[2]]]) if similar else p[2:].reshape(2, 2)
+            rows.append(((places @ matrix.T + p[:2]) - own).ravel() / NOISE_MM)
+        lengths = np.linalg.norm(places[pairs[:, 1]] - places[pairs[:, 0]], axis=1)
+        rows.append((lengths - [each.value_mm for each in distances]) / SIGMA_MM)
+        return np.concatenate(rows)
+
+    film = [0.0, 0.0, 1.0, 0.0] if similar else [0.0, 0.0, 1.0, 0.0, 0.0, 1.0]
+    x = np.concatenate([NOMINAL_MM[:marks].ravel()[free], *[film] * len(observed)])
+    for _ in range(6):
+        jacobian = approx_fprime(x, weighted, 1e-6)
+        x = x - np.linalg.lstsq(jacobian, weighted(x))[0]
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    sigmas = np.zeros(2 * marks)
+    sigmas[free] = np.sqrt(np.diag(covariance))[: len(free)]
+    return places_of(x), sigmas.reshape(-1, 2), float(weighted(x) @ weighted(x))
+
+
+def places(result: Adjustment, marks: int) -> tuple[Array, Array]:
+    names = [[f"FID.{CAMERA}.{i + 1}.{axis}" for axis in "xy"] for i in range(marks)]
+    values = np.array([[result.value(name) for name in pair] for pair in names])
+    sigmas = np.array([[result.sigma(name) for name in pair] for pair in names])
+    return values, sigmas
+
+
+@pytest.mark.parametrize(("marks", "kind"), [(4, "affine"), (8, "affine"), (4, "similarity"), (8, "similarity")])
+def test_places_by_distances_are_those_of_the_adjustment_written_out(marks: int, kind: str) -> None:
+    rng = np.random.default_rng(marks)
+    drawn = with_distances(frames(kind, 3, marks, 1.0, 0.05, rng), rng)
+    result = adjust(drawn.network, drawn.start)
+    assert result.converged
+    expected, sigmas, vpv = written_out(drawn, kind == "similarity")
+    values, claimed = places(result, marks)
+    np.testing.assert_allclose(values, expected, atol=2e-7)
+    np.testing.assert_allclose(claimed, result.sigma0 * sigmas, rtol=1e-4, atol=1e-9)
+    unknowns = 2 * marks - 3 + 3 * (4 if kind == "similarity" else 6)
+    redundancy = 3 * 2 * marks + marks * (marks - 1) // 2 - unknowns
+    assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(redundancy, abs=1e-6)
+    assert result.sigma0**2 * redundancy == pytest.approx(vpv, rel=1e-5)
+    assert result.groups["fiducial distance"].redundancy == pytest.approx(
+        sum(row.redundancy for row in result.further if row.group == "fiducial distance")
+    )
+
+
+def in_datum(true: Array) -> Array:
+    """True places (m, 2) moved to where the held coordinates have them."""
+    first, last = held(len(true))[0] // 2, held(len(true))[2] // 2
+    axis = held(len(true))[2] % 2
+    off = true - true[first]
+    radius, wanted = np.linalg.norm(off[last]), (NOMINAL_MM[last] - NOMINAL_MM[first])[axis]
+    direction = np.arcsin(wanted / radius) if axis else np.arccos(wanted / radius)
+    now = np.arctan2(off[last, 1], off[last, 0])
+    near = min((direction, np.pi - direction, -direction), key=lambda a: abs(np.angle(np.exp(1j * (a - now)))))
+    c, s = np.cos(near - now), np.sin(near - now)
+    return np.asarray(NOMINAL_MM[first] + off @ np.array([[c, s], [-s, c]]))
+
+
+@parametrize_with_studies("count", (16, 1000))
+def test_claimed_standard_deviations_hold(count: int) -> None:
+    rng = np.random.default_rng(5)
+    normalised, sigma0 = [], []
+    for _ in range(count):
+        drawn = with_distances(frames("affine", 2, 4, 1.0, 0.05, rng), rng)
+        result = adjust(drawn.network, drawn.start)
+        values, claimed = places(result, 4)
+        free = claimed > 0.0
+        errors = (values - in_datum(drawn.places_mm))[free]
+        normalised += list(errors / claimed[free] * result.sigma0)
+        sigma0.append(result.sigma0**2)
+    chance = 3.0 / np.sqrt(2.0 * count)  # the coordinates of one network are correlated
+    assert np.sqrt(np.mean(np.square(normalised))) == pytest.approx(1.0, abs=chance)
+    assert np.mean(sigma0) == pytest.approx(1.0, abs=chance)
+
+
+def test_given_coordinates_and_distances_weigh_together() -> None:
+    """Coordinates to 1 mm place the marks, distances to 4 um give their form."""
+    rng = np.random.default_rng(6)
+    drawn = with_distances(frames("affine", 3, 4, 1.0, 0.3, rng), rng, sigma_mm=1.0)
+    result = adjust(drawn.network, drawn.start)
+    values, _ = places(result, 4)
+    for i, j in combinations(range(4), 2):
+        true_mm = np.linalg.norm(drawn.places_mm[j] - drawn.places_mm[i])
+        assert np.linalg.norm(values[j] - values[i]) == pytest.approx(true_mm, abs=4.0 * SIGMA_MM)
+    moved = values - NOMINAL_MM[:4]
+    assert np.linalg.norm(moved.mean(axis=0)) < 1e-3  # of the datum nothing but the given coordinates speaks
+
+
+def test_a_wrong_distance_is_told() -> None:
+    rng = np.random.default_rng(7)
+    drawn = with_distances(frames("affine", 3, 8, 1.0, 0.05, rng), rng)
+    camera = drawn.network.cameras[0]
+    wrong = replace(camera.distances[5], value_mm=camera.distances[5].value_mm + 0.05)
+    distances = (*camera.distances[:5], wrong, *camera.distances[6:])
+    result = adjust(replace(drawn.network, cameras=(replace(camera, distances=distances),)), drawn.start)
+    rows = [row for row in result.further if row.group == "fiducial distance"]
+    worst = max(rows, key=lambda row: abs(row.w))
+    assert worst.name == f"{wrong.name} of camera {CAMERA}"
+    assert worst.v == pytest.approx(-0.05 * worst.redundancy, abs=3.0 * SIGMA_MM)
+    assert worst.detectable < 0.05
+
+
+def test_a_distance_to_a_mark_that_no_image_shows_says_nothing() -> None:
+    rng = np.random.default_rng(8)
+    drawn = with_distances(frames("affine", 2, 4, 1.0, 0.05, rng), rng)
+    camera = drawn.network.cameras[0]
+    unseen = replace(camera, fiducials={**camera.fiducials, "5": Fiducial(Prior(0.0, np.inf), Prior(112.0, np.inf))})
+    farther = replace(unseen, distances=(*camera.distances, FiducialDistance("1", "5", 100.0, SIGMA_MM)))
+    alone, result = (adjust(replace(drawn.network, cameras=(one,)), drawn.start) for one in (camera, farther))
+    np.testing.assert_allclose(places(result, 4)[0], places(alone, 4)[0], atol=1e-9)
+    assert len(result.further) == len(alone.further)
+
+
+@pytest.mark.parametrize(
+    ("distance", "words"),
+    [
+        (FiducialDistance("1", "9", 150.0, 0.01), "has no fiducial 9"),
+        (FiducialDistance("1", "1", 150.0, 0.01), "same point at both ends"),
+        (FiducialDistance("1", "2", -150.0, 0.01), "must be a positive number"),
+        (FiducialDistance("1", "2", 150.0, 0.0), "needs a positive standard deviation"),
+    ],
+)
+def test_what_is_no_distance_is_refused(distance: FiducialDistance, words: str) -> None:
+    drawn = frames("affine", 1, 4, 1.0, 0.05, np.random.default_rng(9))
+    camera = replace(drawn.network.cameras[0], distances=(distance,))
+    with pytest.raises(AdjustmentError, match=words):
+        adjust(replace(drawn.network, cameras=(camera,)), drawn.start)
