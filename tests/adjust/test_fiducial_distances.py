@@ -13,7 +13,9 @@ from studies import parametrize_with_studies
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Fiducial, FiducialDistance
+from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import adjust
+from adjust.solution.planning import plan
 from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -153,6 +155,19 @@ def test_given_coordinates_and_distances_weigh_together() -> None:
         assert np.linalg.norm(values[j] - values[i]) == pytest.approx(true_mm, abs=4.0 * SIGMA_MM)
     moved = values - NOMINAL_MM[:4]
     assert np.linalg.norm(moved.mean(axis=0)) < 1e-3  # of the datum nothing but the given coordinates speaks
+
+
+def test_a_plan_expects_the_form_of_the_distances_and_the_datum_of_the_coordinates() -> None:
+    rng = np.random.default_rng(10)
+    drawn = with_distances(frames("affine", 3, 4, 1.0, 0.0, rng, 0.0), rng, 0.0, sigma_mm=1.0)
+    planned, result = plan(drawn.network, drawn.start), adjust(drawn.network, drawn.start)
+    parameters = [Parameter.fiducial(CAMERA, str(i + 1), axis) for i in range(4) for axis in "xy"]
+    form = np.array([[1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])  # x of the first less that of the second
+    assert planned.sigmas(parameters, form)[0] == pytest.approx(SIGMA_MM * np.sqrt(3.0 / 4.0), rel=0.35)
+    datum = np.sqrt(3.0 / 8.0)  # mm: two shifts and a turn of eight coordinates known to 1 mm
+    np.testing.assert_allclose([planned.sigma(each) for each in parameters], datum, rtol=1e-3)
+    redundancy = {row.name: row.redundancy for row in planned.adjustment.further}
+    np.testing.assert_allclose(list(redundancy.values()), [row.redundancy for row in result.further], atol=1e-4)
 
 
 def test_a_wrong_distance_is_told() -> None:
