@@ -34,6 +34,7 @@ _MOST_LOST = 0.85  # of what tells a mark's place: what is left may be an end of
 _MOST_UNLIKE = 0.03  # of a mark that its drawing may lack: with more gone, what is left may still be another's
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _LEAST_SCATTER_MM = 2 * SCATTER_MM  # of few marks, which may agree by chance better than film keeps them
+_UNSETTLED = {Code.NO_FIT, Code.OFF_PLACE, Code.SIZE, Code.POLARITY}  # of marks that may fit under another tone curve
 _SAME_MARK_PX = 5.0  # two fits of one mark lie nearer to one another, two marks do not: each is some 14 px large
 _REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
 _CLICK_REACH_PX = 6 * CLICK_SIGMA_PX  # about a click: its sigma three times, and as much for who points less well
@@ -71,7 +72,7 @@ class Frame:
         none = np.zeros(len(layout.marks), dtype=bool)
         places = placement.places_px(np.array([mark.xy_mm for mark in layout.marks]))
         detections = tuple(Detection(place, False, None) for place in places)
-        tone = FrameTone(scan.tone)
+        tone = FrameTone(scan.tone.prior)
         return cls(
             scan, layout, options, placement, placement.pixel_from_camera, detections, none, none.copy(), tone=tone
         )
@@ -206,7 +207,17 @@ class Frame:
     @property
     def agrees(self) -> bool:
         """Whether enough marks agree, clear or not: three, and three in ten of those in the scan."""
-        return int(self.inliers.sum()) >= max(self._least, int(np.ceil(_AGREEING_SHARE * self.inside)))
+        return int(self.inliers.sum()) >= self._enough
+
+    @property
+    def may_settle(self) -> bool:
+        """Whether it might be accepted, but for one mark, if all marks that something was found of were fitted."""
+        found = sum(each.fit is not None for each in self.detections)
+        return found + len(self._unsettled) >= self._enough - 1
+
+    def is_nearer_than(self, other: "Frame | None") -> bool:
+        """Whether it lacks less to be accepted than another one."""
+        return other is None or (int(self.inliers.sum()), self._clear) > (int(other.inliers.sum()), other._clear)
 
     @property
     def accepted(self) -> bool:
@@ -241,6 +252,16 @@ class Frame:
         return sum(fit is not None and fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
 
     @property
+    def _unsettled(self) -> list[int]:
+        """The marks of which something was found that came to no fit."""
+        return [i for i, each in enumerate(self.detections) if each.fit is None and _UNSETTLED & {*each.reason.codes}]
+
+    @property
+    def _enough(self) -> int:
+        """How many marks have to agree."""
+        return max(self._least, int(np.ceil(_AGREEING_SHARE * self.inside)))
+
+    @property
     def _least(self) -> int:
         return 2 if self.options.part else max(min(_AGREEING, len(self.detections)), 2)
 
@@ -259,15 +280,20 @@ class Frame:
         fractions = [fit.damaged_fraction for fit in self.fits if fit is not None]
         return float(np.median(fractions)) if len(fractions) >= _CHECKED else 0.0
 
-    def misfit(self, ids: Sequence[str]) -> str:
+    def misfit(self, ids: Sequence[str]) -> Reason:
         """A sentence for a frame that is not accepted. ids: of its marks, in the order of the detections."""
         found = f"{int(self.inliers.sum())} of {len(self.detections)} marks were found where the others put them"
-        if not self.agrees:
-            return f"the constellation does not fit: only {found}{self._marks_outside(ids)}"
-        return (
-            f"{found}, but only {self._clear} of them look plainly like their drawings, where {self._least} have to: "
-            "compare the drawings with the scan, or say by which curve it stores light (tone)"
-        )
+        if self.agrees:
+            return Reason(
+                f"{found}, but only {self._clear} of them look plainly like their drawings, where {self._least} have "
+                "to: compare the drawings with the scan, or say by which curve it stores light (tone)"
+            )
+        if self._unsettled and self.may_settle:
+            names = ", ".join(ids[index] for index in self._unsettled)
+            return Reason(
+                f"only {found}, and the fit of {names} did not converge, with whatever tone curve it began", Code.NO_FIT
+            )
+        return Reason(f"the constellation does not fit: only {found}{self._marks_outside(ids)}")
 
     def _marks_outside(self, ids: Sequence[str]) -> str:
         """A part of a sentence on marks that the others put outside of the scan."""

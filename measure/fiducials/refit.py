@@ -59,8 +59,8 @@ def refit_frame(frame: Frame) -> Frame:
 def _refit_with_tone(frame: Frame) -> Frame:
     """Far from the right curve noise is not even, and may hide it: where what the marks say does not agree, other
     curves are begun with, too."""
-    prior = frame.scan.tone
-    best = _refit_from_curve(frame, prior, prior)
+    prior = frame.scan.tone.prior
+    best = _refit_from_curve(frame, prior, frame.scan.tone)
     for power in _OTHER_STARTS if best.tone.disagreement > _AGREED and _depends_on_tone(best) else ():
         other = _refit_from_curve(best, prior, prior.shift_to_power(power))
         best = other if other.tone.disagreement < best.tone.disagreement else best

@@ -30,18 +30,20 @@ def lost_frame(scan: Scan, layout: FiducialLayout) -> FrameMeasurement:
     return FrameMeasurement(scan.name, marks)
 
 
-def absent_frame(scan: Scan, layout: FiducialLayout, reason: str, rotation_deg: float) -> FrameMeasurement:
+def absent_frame(scan: Scan, layout: FiducialLayout, reason: Reason, rotation_deg: float) -> FrameMeasurement:
     """Of a scan in which no frame was found; reason: why, a part of a sentence; rotation_deg: by how much turned it was
     sought."""
     also = "; parts of the scan's file are damaged" if scan.damage else ""
-    codes = (Code.NO_FRAME, Code.DAMAGED_FILE) if scan.damage else (Code.NO_FRAME,)
+    codes = (Code.NO_FRAME, *reason.codes, *([Code.DAMAGED_FILE] if scan.damage else []))
     why = Reason(f"not found: {reason}{also}", *codes)
     marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, why) for mark in layout.marks)
-    problem = Reason(
-        f"no fiducial was measured: {reason}; look whether the camera is that of the scan, the pitch right, and the "
-        f"film laid within {rotation_deg:g} degrees of upright or of a quarter turn.",
-        Code.NO_FRAME,
+    remedy = (
+        "look whether the camera is that of the scan, the pitch right, and the film laid within "
+        f"{rotation_deg:g} degrees of upright or of a quarter turn"
     )
+    if Code.NO_FIT in reason.codes:
+        remedy = "compare the drawings of these marks with the scan, or set tone under [measure] in the project"
+    problem = Reason(f"no fiducial was measured: {reason}; {remedy}.", Code.NO_FRAME)
     return FrameMeasurement(scan.name, marks, None, None, (problem,))
 
 

@@ -1,6 +1,7 @@
 """The search for a camera's frame in a scan: hypotheses about its pixel pitch, placements, expected false alarms."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
@@ -26,6 +27,7 @@ from measure.fiducials.options import FiducialOptions
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
+from measure.tone.curve import Tone
 
 Pair = tuple[float, float]
 
@@ -140,7 +142,10 @@ def centred_places_px(scan: Scan, layout: FiducialLayout, pixel_from_camera: Arr
 
 
 class FrameSearch:
-    """The search in one scan; it draws and correlates the marks once for hypotheses that share a drawing."""
+    """The search in one scan; it draws and correlates the marks once for hypotheses that share a drawing.
+
+    unsettled: placements with marks that were not fitted, where another tone curve may fit them; among: those in which
+    marks are fitted, None for all."""
 
     def __init__(
         self,
@@ -156,20 +161,32 @@ class FrameSearch:
         self._signs = mark_signs(layout.marks)
         self._responses: tuple[Pair, Responses] | None = None
         self._searches: dict[Pair, PlacementSearch] = {}
+        self.unsettled: list[Placement] = []
+        self.among: list[Placement] | None = None
+        self._found: dict[tuple[PitchHypothesis, ...], list[Placement]] = {}
         # Of dilations there are two for each of the views of one pose.
         self._caches = ByteCache[Map](2 * effort.cache_bytes // 3), ByteCache[Dilation](effort.cache_bytes // 3)
         self._effort = effort
 
     def search_scan(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements in the whole scan, of all poses, best first."""
-        found: list[Placement] = []
+        key, found = tuple(hypotheses), list[Placement]()
+        if key in self._found:
+            return self._found[key]
         for drawn_mm, alike in groupby(hypotheses, attrgetter("drawn_mm")):
             if self._responses is None or self._responses[0] != drawn_mm:
                 effort = self._caches, self._effort.half_px
                 views = self._views(drawn_mm)
                 self._responses = drawn_mm, correlate_scan(self.scan, views, self._signs, self.surroundings, *effort)
             found += self._placements(list(alike), self._responses[1])
-        return _best_first(found)
+        return self._found.setdefault(key, _best_first(found))
+
+    def replace_tone(self, tone: Tone) -> "FrameSearch":
+        """The same search where marks are fitted through another tone curve. Its placements are these, which the
+        stored grey values give; only in those that are unsettled marks are fitted again."""
+        search = copy(self)
+        search.scan, search.among = self.scan.replace_tone(tone), self.unsettled
+        return search
 
     def search_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
         """The placements of a frame that lies about in the middle of the scan, best first. Only the windows are read

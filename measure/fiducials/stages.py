@@ -1,4 +1,5 @@
-"""The search for a frame as a list of attempts: where, under which pitches, and what beside a mark counts.
+"""The search for a frame as a list of attempts: where, under which pitches, through which tone curve, and what beside
+a mark counts.
 
 One loop makes them in their order, as far as what was found before does not settle it; one limit decides on what they
 find: the expected number of false frames in all attempts so far, or in those under the given pitch, which is likelier
@@ -20,7 +21,7 @@ from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch, Hypotheses, is_searched_by_windows, slightly_longer
 from measure.fiducials.significance import doubt_frame, false_frames
-from measure.flags import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE
+from measure.flags import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE, Reason
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.results import Pose
@@ -30,6 +31,7 @@ from measure.scans.scan import Scan
 Result = tuple[list[Placement], list[tuple[float, Frame]]]
 
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
+_NOTHING = Reason("nothing in the scan looks like two or more of the camera's marks")
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 
 
@@ -46,7 +48,7 @@ class Found:
     is_taken: bool = False
     unsure: tuple[Frame, ...] = ()
     faint: tuple[float, Frame] | None = None
-    misfit: str = "nothing in the scan looks like two or more of the camera's marks"
+    misfit: Reason = _NOTHING
 
     @property
     def is_complete(self) -> bool:
@@ -63,7 +65,8 @@ class Attempt:
 
     find: the result by so many hypotheses in all. is_settled: by what was found before. is_given: under what is
     believed of the scan beforehand: what is found there takes the place of what was found before, taken or not.
-    at_given: under the given pitch.
+    at_given: under the given pitch. first: the attempt of which this one fits the marks again, beginning with another
+    tone curve: its placements are no further hypotheses.
     """
 
     search: FrameSearch
@@ -72,6 +75,7 @@ class Attempt:
     is_settled: Callable[[Found], bool]
     is_given: bool = False
     at_given: bool = False
+    first: "Attempt | None" = None
 
 
 def find_frame(
@@ -85,19 +89,22 @@ def find_frame(
     is_given : whether the first is that which the user or the file gives.
     """
     found, every, at_given = Found(FrameSearch(scan, layout, options)), 0, 0
+    ids = [mark.id for mark in layout.marks]
     for attempt in _attempts(found.search, hypotheses, is_given):
         if attempt.is_settled(found):
             continue
-        every += len(attempt.hypotheses)
-        at_given += len(attempt.hypotheses) if attempt.is_given or attempt.at_given else 0
+        if attempt.first is None:
+            every += len(attempt.hypotheses)
+            at_given += len(attempt.hypotheses) if attempt.is_given or attempt.at_given else 0
         tried = at_given if attempt.at_given else every
         placements, frames = attempt.find(attempt.search, attempt.hypotheses, tried)
         expected, frame = frames[0] if frames else (np.inf, None)
         if expected <= FRAMES_BY_CHANCE:
             found = replace(found, search=attempt.search, placements=placements, frame=frame, is_taken=True)
         elif attempt.is_given:
-            misfit = frame.misfit([mark.id for mark in layout.marks]) if frame else Found.misfit
-            found = replace(found, placements=placements, frame=frame, is_taken=False, misfit=misfit)
+            if attempt.first is None or (frame is not None and frame.is_nearer_than(found.frame)):
+                misfit = frame.misfit(ids) if frame else _NOTHING
+                found = replace(found, placements=placements, frame=frame, is_taken=False, misfit=misfit)
         else:
             likely = [each for each in frames if _is_taken_if_given(each, attempt, at_given / tried)]
             rejected = [each for each in (found.faint, *frames) if each and each not in likely]
@@ -106,7 +113,7 @@ def find_frame(
     if found.is_taken:
         return found
     what_to_do = _pitch_to_try(found.unsure) or _too_faint(found.faint)
-    return replace(found, frame=None, misfit=found.misfit + what_to_do)
+    return replace(found, frame=None, misfit=found.misfit.reword(found.misfit + what_to_do))
 
 
 def _is_taken_if_given(result: tuple[float, Frame], attempt: Attempt, at_given: float) -> bool:
@@ -125,13 +132,31 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
     in_windows = is_given and not wide.options.part and is_searched_by_windows(wide.scan, wide.layout, given[0].mm)
     return [
         *([Attempt(wide, given, _search_middle, lambda _: False, True)] if in_windows else []),
-        Attempt(wide, given, _search_scan, lambda found: found.is_complete, True),
-        *(Attempt(wide, group, _search_other_pitch, lambda found: found.is_undoubted) for group in others),
+        *_through_tone_curves(Attempt(wide, given, _search_scan, lambda found: found.is_complete, True)),
         *(
+            each
+            for group in others
+            for each in _through_tone_curves(
+                Attempt(wide, group, _search_other_pitch, lambda found: found.is_undoubted)
+            )
+        ),
+        *(  # here a mark need not look plainly like itself, whatever the curve
             Attempt(close, group, _search_closer, lambda found: found.is_taken, at_given=group is near)
             for close in closer
             for group in (near, nearly)
             if group
+        ),
+    ]
+
+
+def _through_tone_curves(first: Attempt) -> list[Attempt]:
+    """An attempt, and those that begin with other tone curves where it leaves no frame that is taken."""
+    search = first.search
+    return [
+        first,
+        *(
+            replace(first, search=search.replace_tone(tone), is_settled=lambda found: found.is_taken, first=first)
+            for tone in search.scan.tone.starting_curves
         ),
     ]
 
@@ -158,9 +183,7 @@ def _result(frame: Frame | None) -> list[tuple[float, Frame]]:
 def best_frame(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
     """The frame in the best of these placements, as above. A frame is no other one where all its marks are among those
     of an accepted one that was tried before it."""
-    if not found:
-        return None
-    placements, frames = [found[0], *_rivals(found)], list[Frame]()
+    placements, frames = _places_to_try(search, found), list[Frame]()
     for placement in placements:
         frame = _measure_in_its_pose(search, placement)
         if any(before.accepted and before.contains(frame) for before in frames):
@@ -172,7 +195,7 @@ def best_frame(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
     if sure:
         return max(sure, key=lambda frame: frame.measured_count)
     accepted = [frame for frame in frames if frame.accepted]
-    return accepted[0] if accepted else max(frames, key=lambda frame: int(frame.inliers.sum()))
+    return accepted[0] if accepted else max(frames, key=lambda frame: int(frame.inliers.sum()), default=None)
 
 
 def _is_outdone(search: FrameSearch, frame: Frame, placements: Sequence[Placement]) -> bool:
@@ -185,6 +208,8 @@ def _measure_in_its_pose(search: FrameSearch, placement: Placement) -> Frame:
     """The frame in a placement. At the right place in a wrong pose unlike marks are not found under one another's
     names: where that is so, the pictures there decide the pose, and the frame is measured in it."""
     frame = measure_frame(search.scan, search.layout, placement, search.options)
+    if frame.may_settle and not frame.accepted and search.among is None:
+        search.unsettled.append(placement)
     if frame.accepted or not frame.inliers.any() or search.options.pose != "auto":
         return frame
     pose = likeliest_pose(search, frame)
@@ -235,8 +260,14 @@ def _measure_in_likeliest_pose(search: FrameSearch, placement: Placement) -> lis
 
 def _likely_placements(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
     """The best placement and its rivals, without those that have many false ones as good."""
-    places = (*found[:1], *_rivals(found))
+    places = _places_to_try(search, found)
     return [place for place in places if tried * search.false_placements(place) <= PLACEMENTS_BY_CHANCE]
+
+
+def _places_to_try(search: FrameSearch, found: Sequence[Placement]) -> list[Placement]:
+    """The best placement and its rivals, of those in which the search fits marks."""
+    places = [*found[:1], *(_rivals(found) if found else ())]
+    return places if search.among is None else [place for place in places if place in search.among]
 
 
 def _rivals(found: Sequence[Placement]) -> list[Placement]:

@@ -31,6 +31,7 @@ _DECLARED_SIGMA = 0.1  # of the standard deviations above
 # By how much pictures' own curves may differ from the scanner's: variances of each departure that are tried.
 _SCATTERS = (0.0, *np.geomspace(0.003, 30.0, 17))
 _CONTRADICTED = np.log(1000.0)  # log-odds, at which the pictures outweigh the curve that the file declares
+_STARTS, _ANOTHER = (1.0, 1.6, 0.5, 2.4), 0.3  # powers to begin with, and how far they lie at least from what was tried
 
 
 def power(exponent: float) -> Array:
@@ -123,7 +124,8 @@ class Tone:
     base (nodes,): light, 0 to 1, at evenly spaced codes. mean (k,), covariance (k, k): of the departures from it, each
     in units of the standard deviation that it has where nothing is known. source: where the curve is from, a part of a
     sentence; is_declared: by the file, which the pictures may contradict. other_scans: the curve before other scans of
-    the scanner gave information, and that information; None where none did.
+    the scanner gave information, and that information; None where none did. before: the curve as it was believed
+    before this scan, where this one is to begin with, or estimated from it; None of that curve itself.
     """
 
     base: Array = field(default_factory=lambda: power(1.0))
@@ -132,6 +134,7 @@ class Tone:
     source: str = "grey values are taken as light"
     is_declared: bool = False
     other_scans: "tuple[Tone, tuple[ToneInformation, ...]] | None" = field(default=None, compare=False)
+    before: "Tone | None" = field(default=None, compare=False)
 
     @classmethod
     def unknown(cls) -> "Tone":
@@ -150,6 +153,21 @@ class Tone:
     def is_known(self) -> bool:
         return not self.covariance.any()
 
+    @property
+    def prior(self) -> "Tone":
+        """The curve as it was believed before this scan."""
+        return self.before or self
+
+    @property
+    def starting_curves(self) -> tuple["Tone", ...]:
+        """Other curves to begin with, where this one is not known: noise and grain may hide a mark that is fitted
+        through a curve far from the right one."""
+        curves = list[Tone]() if self.is_known else [self]
+        for power in _STARTS if curves else ():
+            apart = min(abs(power - each.equivalent_power(0.1, 0.9)[0]) for each in curves)
+            curves += [self.shift_to_power(power)] if apart > _ANOTHER else []
+        return tuple(curves[1:])
+
     def vague_prior(self) -> "Tone":
         """The base with departures of which only the prior is known: the curve lies between linear and sRGB."""
         mean = np.zeros(_COUNT)
@@ -157,10 +175,10 @@ class Tone:
         return replace(self, mean=mean, covariance=np.eye(_COUNT))
 
     def shift_to_power(self, value: float) -> "Tone":
-        """The curve with the departure that makes it most like a power."""
+        """The curve to begin with that has the departure which makes it most like a power."""
         mean = self.mean.copy()
         mean[0] += (value - self.equivalent_power(0.1, 0.9)[0]) / _POWER_SIGMA
-        return self.replace_departures(mean)
+        return replace(self, mean=mean, before=self.prior)
 
     def replace_departures(self, mean: Array) -> "Tone":
         return replace(self, mean=mean)

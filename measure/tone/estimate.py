@@ -1,7 +1,7 @@
 """The tone curve of a scan estimated from its marks, and what its uncertainty adds to their places."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,7 +63,8 @@ class FrameTone:
         least, greatest = min(mark.least for mark in marks.values()), max(mark.greatest for mark in marks.values())
         step = estimate.tone.mean - matched_by.mean
         information = None if prior.is_known else ToneInformation.pooled(each, estimate.scatter)
-        return cls(estimate.tone, information, least, greatest, estimate.scatter, float(step @ step))
+        tone = estimate.tone if prior.is_known else replace(estimate.tone, before=prior)
+        return cls(tone, information, least, greatest, estimate.scatter, float(step @ step))
 
     @property
     def disagreement(self) -> float:

@@ -10,11 +10,14 @@ from drawn_frames import ALIKE
 
 from measure.detection.correlation import CLOSE, GRAINY
 from measure.fiducials import stages
+from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch, PitchHypothesis, pitch_hypotheses
 from measure.fiducials.stages import Attempt, Found, find_frame
-from measure.flags import FRAMES_BY_CHANCE
+from measure.flags import FRAMES_BY_CHANCE, Reason
+from measure.scans.scan import Scan
+from measure.tone.curve import Tone
 
 GIVEN = PitchHypothesis((0.05, 0.05), 0.04, (0.05, 0.05))
 SCAN = scan_of(np.zeros((400, 400)))
@@ -26,9 +29,16 @@ class Stand:
     def __init__(self, name: str) -> None:
         self.name, self.is_complete, self.accepted, self.measured_count = name, False, False, 0
         self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
+        self.may_settle = self.is_sure = False
 
-    def misfit(self, ids: Sequence[str]) -> str:
-        return f"not {self.name}"
+    def misfit(self, ids: Sequence[str]) -> Reason:
+        return Reason(f"not {self.name}")
+
+    def is_nearer_than(self, other: "Stand | None") -> bool:
+        return other is None
+
+    def contains(self, other: "Stand") -> bool:
+        return False
 
 
 def found_by(
@@ -107,3 +117,29 @@ def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
     looks_each = [True, False] if is_given else [False]
     assert [each.search.surroundings for each in close] == [CLOSE for _ in looks_each] + [GRAINY for _ in looks_each]
     assert [each.at_given for each in close] == 2 * looks_each
+
+
+def test_marks_are_fitted_through_other_tone_curves_only_where_the_first_leaves_them_unsettled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of two placements the first shows nothing, and the second is fitted beginning with a power of 0.5."""
+    nothing, unsettled = (Placement("0", np.eye(2, 3), 1.0, 4, 1, 1, GIVEN.mm) for _ in range(2))
+    begun: list[tuple[bool, float]] = []
+
+    def measure(scan: Scan, _: object, place: Placement, __: object) -> Any:
+        power = scan.tone.equivalent_power(0.1, 0.9)[0]
+        begun.append((place is unsettled, round(power, 1)))
+        frame = Stand("right")
+        frame.accepted = frame.is_complete = place is unsettled and power < 0.7
+        frame.may_settle, frame.is_sure = place is unsettled, frame.accepted
+        return frame
+
+    monkeypatch.setattr(stages, "measure_frame", measure)
+    monkeypatch.setattr(stages, "_rivals", lambda found: list(found[1:]))
+    monkeypatch.setattr(stages, "_is_outdone", lambda *_: False)
+    monkeypatch.setattr(FrameSearch, "search_scan", lambda *_: [nothing, unsettled])
+    scan, options = SCAN.replace_tone(Tone.unknown()), FiducialOptions(pose="0")
+    found = find_frame(scan, ALIKE, [[GIVEN]], True, options)
+    assert found.is_taken
+    assert begun == [(False, 1.6), (True, 1.6), (True, 1.0), (True, 0.5)]
+    assert found.search.scan.tone.prior is scan.tone  # what the marks say is added to what was believed

@@ -4,6 +4,7 @@ import csv
 
 import numpy as np
 import pytest
+from drawn import scan_of
 from numpy.typing import NDArray
 from real_data import DATA, needs
 
@@ -16,6 +17,7 @@ from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.opening import open_scan
 from measure.scans.scan import Scan
+from measure.tone.curve import Tone
 
 SCANS = DATA / "film_scans"
 pytestmark = needs("film_scans")
@@ -140,3 +142,17 @@ def test_a_reseau_is_not_seen_in_a_frame_of_another_camera() -> None:
         result = measure_fiducials(scan, lattice(), (RESEAU_PITCH_UM, RESEAU_PITCH_UM))
     assert not any(mark.status.is_observation for mark in result.marks)
     assert "no fiducial was measured" in result.problems[0]
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("exponent", [0.3, 1.0, 2.0])
+def test_the_curve_by_which_a_scan_stores_light_does_not_decide_whether_its_frame_exists(exponent: float) -> None:
+    """Squared grey values are light to a power of 0.47: far from the one that is tried first."""
+    ring_cross_corners = square(WILD)
+    with open_scan(SCANS / "aerial" / "08320661.jpeg") as scan:
+        grey, full, pitch_um = scan.window(0, 0, scan.width_px, scan.height_px), scan.full_scale_dn, scan.pitch_um
+        at_first = measure_fiducials(scan.replace_tone(Tone.unknown()), ring_cross_corners, pitch_um)
+    bent = scan_of(65535 * (grey.astype(float) / full) ** exponent).replace_tone(Tone.unknown())
+    result = measure_fiducials(bent, ring_cross_corners, pitch_um)
+    off = observations(result, ring_cross_corners)[1] - observations(at_first, ring_cross_corners)[1]
+    assert np.hypot(*off.T).max() < 0.1

@@ -9,11 +9,14 @@ import pytest
 from true_marks import KIND, TrueMark, some_mark
 
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame
+from measure.fiducials.frame import Frame, orient_frame
+from measure.fiducials.mark_fit import not_found
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
+from measure.fiducials.rows import absent_frame
 from measure.flags import Cause, Status
 from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.matching.gauss_newton import UNSETTLED
 from measure.results import Covariance
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
@@ -120,6 +123,22 @@ def test_a_frame_in_which_marks_lie_as_they_should_but_look_unlike_their_drawing
     assert refused.misfit("12345678").startswith(
         "8 of 8 marks were found where the others put them, but only 2 of them look"
     )
+
+
+def test_a_frame_whose_marks_do_not_converge_says_so_and_not_that_camera_and_pitch_are_wrong() -> None:
+    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    failed = [replace(each, fit=None, reason=UNSETTLED) for each in frame.detections[2:]]
+    refused = orient_frame(replace(frame, detections=(*frame.detections[:2], *failed)))
+    assert refused.may_settle
+    reason = refused.misfit("12345678")
+    assert "only 2 of 8 marks" in reason
+    assert "the fit of 3, 4, 5, 6, 7, 8 did not converge" in reason
+    (problem,) = absent_frame(frame.scan, frame.layout, reason, 6.0).problems
+    assert "set tone under [measure]" in problem
+    assert "pitch" not in problem
+    nothing = [replace(each, fit=None, reason=not_found(4.0)) for each in frame.detections[2:]]
+    refused = orient_frame(replace(frame, detections=(*frame.detections[:2], *nothing)))
+    assert "pitch right" in absent_frame(frame.scan, frame.layout, refused.misfit("12345678"), 6.0).problems[0]
 
 
 def test_wings_of_three_marks_under_wrong_names_claim_no_more_than_the_stretch_that_these_make() -> None:

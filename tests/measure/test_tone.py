@@ -346,3 +346,14 @@ def test_a_score_is_what_unknowns_and_priors_leave_of_the_departures() -> None:
     expected = np.linalg.lstsq(rows, wanted, rcond=None)[0][4:]
     score = tone_score(design[0], changes[0], residuals[0], priors, departures)
     np.testing.assert_allclose(np.linalg.solve(score.normal, score.value), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("tone", "powers"), [
+    (Tone.unknown(), [1.0, 0.5, 2.4]),
+    (Tone.declared(power(2.2), "the file says so"), [1.0, 1.6, 0.5]),
+    (Tone(power(2.2)), []),
+])  # fmt: skip
+def test_curves_to_begin_with_are_others_than_the_one_believed(tone: Tone, powers: list[float]) -> None:
+    starts = tone.starting_curves
+    assert [start.equivalent_power(0.1, 0.9)[0] for start in starts] == pytest.approx(powers, abs=0.04)
+    assert all(start.prior is tone and np.array_equal(start.covariance, tone.covariance) for start in starts)
