@@ -1,8 +1,11 @@
 """What a command says when it is done: the verdict, the problems, the main numbers, where the files are."""
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +16,7 @@ from rich.text import Text
 from measure.flags import Status
 from measure.results import Pose
 from pipeline.archive.status import NAMED, ArchiveStatus, archive_status, worst_named
-from pipeline.archive.verdicts import NEXT_STEP, Verdict
+from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
 from pipeline.files.project_file import Project
 from pipeline.report.data import Problem, ReportData
 from pipeline.report.fiducials import Figure, figure
@@ -31,7 +34,8 @@ FRAME_ROWS = 50  # of frames at most in a table in the terminal: the report has 
 @dataclass(frozen=True)
 class Summary:
     """The end of a command. poses: of the scans, each with its evidence, as measurement.db has them. files: what was
-    written, by a word for it. forms: of the fiducials of cameras of which nothing else was adjusted."""
+    written, by a word for it. forms: of the fiducials of cameras of which nothing else was adjusted. verdicts: numbers
+    of scans. parts: in how many the scans are measured, where these are those of one."""
 
     verdict: ReportVerdict
     frames: Mapping[str, Mapping[str, int]]
@@ -40,6 +44,8 @@ class Summary:
     check: Check | None
     files: Mapping[str, Path] = field(default_factory=dict)
     forms: Mapping[str, Figure] = field(default_factory=dict)
+    verdicts: Mapping[Verdict, int] = field(default_factory=dict)
+    parts: int = 0
 
     def as_json(self) -> dict[str, object]:
         return {
@@ -64,8 +70,12 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
         counts[mark.status] += 1
     if data.totals:
         frames = {name: {str(s): counts.get(s, 0) for s in Status} for name, counts in data.totals.marks.items()}
-    poses = {name: scan.frame.pose for name, scan in current_scans(data).items() if scan.frame.pose}
-    return Summary(judge(data), frames, poses, data.adjustment, data.check, files, _forms(data))
+    scans = current_scans(data)
+    poses = {name: scan.frame.pose for name, scan in scans.items() if scan.frame.pose}
+    verdicts = Counter(map(scan_verdict, scans.values()))
+    if data.totals:
+        verdicts = Counter({each: data.totals.count(each) for each in Verdict})
+    return Summary(judge(data), frames, poses, data.adjustment, data.check, files, _forms(data), verdicts)
 
 
 def _forms(data: ReportData) -> dict[str, Figure]:
@@ -80,10 +90,11 @@ def _forms(data: ReportData) -> dict[str, Figure]:
 def print_summary(summary: Summary, console: Console) -> None:
     """The summary for a person; file paths are never folded."""
     console.print(Text(summary.verdict.sentence, style=STYLES[summary.verdict.level]))
-    for problem in summary.verdict.problems:
-        console.print(Text(f"- {problem.what}"))
-        if problem.next_step:
-            console.print(Text(f"  {problem.next_step}", style="dim"))
+    for next_step, problems in groupby(summary.verdict.problems, attrgetter("next_step")):
+        for problem in problems:
+            console.print(Text(f"- {problem.what}"))
+        if next_step:
+            console.print(Text(f"  {next_step}", style="dim"))
     if summary.frames:
         console.print(_frame_table(summary.frames, summary.poses))
         for name, pose in summary.poses.items():
@@ -97,6 +108,8 @@ def print_summary(summary: Summary, console: Console) -> None:
     for note in summary.verdict.notes:
         console.print(Text(note, style="dim"))
     for word, path in summary.files.items():
+        if word == "report":  # is the next step
+            continue
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
 
 
@@ -183,7 +196,8 @@ def shard_summary(project: Project, path: Path, shard: tuple[int, int]) -> Summa
     """What `measure --shard` says: of the scans of that part."""
     status = archive_status(project, path)
     own = tuple(scan for scan in status.scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
-    return _scan_summary(ArchiveStatus(own), {f"part {shard[0]} of {shard[1]}": path})
+    summary = _scan_summary(ArchiveStatus(own), {f"part {shard[0]} of {shard[1]}": path})
+    return replace(summary, parts=shard[1])
 
 
 def _scan_summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
@@ -195,4 +209,6 @@ def _scan_summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
     if more:
         problems.append(Problem(f"{more} more need a look.", "Run `reseau status` with --verdict or --csv."))
     level: Level = "good" if status.all_good else "look"
-    return Summary(ReportVerdict(level, sentence, tuple(problems), ()), {}, {}, None, None, files)
+    return Summary(
+        ReportVerdict(level, sentence, tuple(problems), ()), {}, {}, None, None, files, verdicts=status.counts
+    )

@@ -1,7 +1,8 @@
 """Run every command on a small project and import every module: python -P every_command.py FOLDER
 
-Prints one JSON object. calls: of each call its arguments, exit code, messages, and the extra that the call needs.
-modules: those that cannot be imported, with the package that is missing. Imports only what a plain installation has.
+Prints one JSON object. calls: of each call its arguments, exit code, messages, the extra that the call needs, and the
+next steps that it prints. modules: those that cannot be imported, with the package that is missing. Imports only what
+a plain installation has.
 """
 
 import importlib
@@ -103,10 +104,11 @@ def calls(folder: Path) -> Iterator[tuple[str, Sequence[str | Path]]]:
 
 def call(arguments: Sequence[str | Path]) -> dict[str, Any]:
     """Run one command here."""
-    messages = io.StringIO()
-    with redirect_stdout(io.StringIO()), redirect_stderr(messages):
-        code = run([str(argument) for argument in arguments])
-    return {"arguments": [str(argument) for argument in arguments], "code": code, "messages": messages.getvalue()}
+    words, output, messages = [str(argument) for argument in arguments], io.StringIO(), io.StringIO()
+    with redirect_stdout(output), redirect_stderr(messages):
+        code = run(words)
+    steps = [line for line in output.getvalue().splitlines() if line.startswith("Next: ")]
+    return {"arguments": words, "code": code, "messages": messages.getvalue(), "steps": steps}
 
 
 def modules_not_imported() -> dict[str, str]:

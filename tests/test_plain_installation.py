@@ -1,6 +1,7 @@
 """What a user has who installed no extra: every command works or names the extra that it needs."""
 
 import json
+import re
 import subprocess
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -44,6 +45,18 @@ def test_every_command_works_or_names_the_extra_that_it_needs(found_there: dict[
             assert call["messages"].count("reseau: ") == 1, told
         else:
             assert call["code"] in (DONE, LOOK), told
+
+
+def test_every_command_ends_with_its_next_steps(found_there: dict[str, Any]) -> None:
+    """All but those whose output is a file, or files for another program that are described in full."""
+    for call in found_there["calls"]:
+        name, *others = call["arguments"]
+        if call["extra"] or name in ("template", "export") or {"--json", "--frames", "wild-rc10-153"} & {*others}:
+            assert not call["steps"]
+        else:
+            assert 1 <= len(call["steps"]) <= 3, call
+        for command in re.findall(r"reseau (\w+)", " ".join(call["steps"])):
+            assert command in set().union(*GROUPS.values())
 
 
 def test_every_module_can_be_imported(found_there: dict[str, Any]) -> None:

@@ -191,7 +191,7 @@ def status_csv(status: ArchiveStatus) -> str:
 
 def print_status(status: ArchiveStatus, console: Console, every: bool = False) -> None:
     """Totals, and what to do; then the scans that need a look. every: name all of them."""
-    table = Table("verdict", "scans", "what it means", "what to do next")
+    table = Table("verdict", "scans", "what it means", "remedy")
     for verdict, count in status.counts.items():
         if count:
             table.add_row(str(verdict), str(count), Text(MEANING[verdict]), Text(NEXT_STEP[verdict]))

@@ -57,6 +57,14 @@ class Calibration:
         left_out = self.unreadable or self.not_calibrated or any(camera.left_out for camera in self.cameras)
         return bool(left_out) or self.summary.verdict.exit_code != 0
 
+    @property
+    def report(self) -> Path:
+        return self.files[-2]
+
+    @property
+    def project(self) -> Path:
+        return self.files[-1]
+
     def as_json(self) -> dict[str, Any]:
         return {
             "cameras": [camera.as_json() for camera in self.cameras],
@@ -67,23 +75,18 @@ class Calibration:
         }
 
     def print(self, console: Console) -> None:
-        """The cameras first, then what needs a look, the files, and what can be done next."""
+        """The cameras first, then what needs a look, then the files but the report."""
         for camera in self.cameras:
             camera.print(console)
         for line in self._lines():
             console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def _lines(self) -> list[str]:
-        report, project = self.files[-2:]
-        problems = [" ".join((f"- {problem.what}", problem.next_step)) for problem in self.summary.verdict.problems]
         return [
             *(f"- {name} cannot be read: {why}" for name, why in self.unreadable.items()),
             *(f"- {camera} is not calibrated: {why}" for camera, why in self.not_calibrated.items()),
-            *problems,
-            *map(str, self.files),
-            f"Next: open {report}",
-            *([f"Next: mend what is named above in {project}, and run: reseau run {project}"] if problems else []),
-            f"Next: reseau export {project} opencv DIR, or colmap, micmac, metashape, asp",
+            *(" ".join((f"- {each.what}", each.next_step)) for each in self.summary.verdict.problems),
+            *(str(file) for file in self.files if file != self.report),
         ]
 
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from pipeline.commands.next_steps import command_step, print_next
 from pipeline.commands.shared import (
     DONE,
     LOOK,
@@ -46,7 +47,10 @@ def choose(project: ProjectFile, as_json: AsJson = False) -> int:
     settings = read(project)
     choice, record = run_choose(settings, Reporter())
     show(as_json, lambda: record, lambda console: print_choice(choice, console, settings.choice_path))
-    return DONE if choice.chosen and choice.chosen.model == choice.given else LOOK
+    is_as_given = choice.chosen is not None and choice.chosen.model == choice.given
+    set_first = "" if is_as_given else "after the selected model is set in project.toml and camera.toml"
+    print_next(as_json, command_step("run", project, why=set_first))
+    return DONE if is_as_given else LOOK
 
 
 def block(
@@ -66,7 +70,9 @@ def block(
     summary = run_adjust(oriented.project, reporter)
     if not as_json:
         say(*block_lines(oriented))
-    code = finish(summary, as_json)
+    code = finish(summary, as_json, None)
+    files = f"{out_dir / 'comparator.csv'} and {out_dir / 'images.csv'}"
+    print_next(as_json, f"name {files} in a copy of project.toml without scans, then reseau run that copy")
     return max(code, LOOK) if oriented.left_out else code
 
 
@@ -92,7 +98,14 @@ def compare(
     when = None if times is None else _numbers(times)
     comparison, record = run_compare(adjustments, camera, when, "flat" if flat else "space", level, out)
     show(as_json, lambda: record, lambda console: print_comparison(comparison, record, console))
-    return LOOK if record.verdict == DRIFT else DONE
+    has_drift = record.verdict == DRIFT
+    print_next(
+        as_json,
+        "use each calibration for the photographs of its time"
+        if has_drift
+        else "use any of them; one project with the photographs of all gives the smallest standard deviations",
+    )
+    return LOOK if has_drift else DONE
 
 
 def design(
@@ -109,6 +122,9 @@ def design(
 
     planned = run_design(scene, out_dir, Reporter())
     show(as_json, planned.content, lambda console: print_design(planned, console))
+    if planned.has_findings:
+        print_next(as_json, command_step("design", scene, why="after the scene is changed as the tables suggest"))
+    print_next(as_json, command_step("render", scene, "DIR", why="synthetic scans of this plan"))
     return LOOK if planned.has_findings else DONE
 
 

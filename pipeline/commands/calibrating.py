@@ -1,13 +1,16 @@
 """The command that calibrates a digital camera from pictures of a board."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pipeline.commands.next_steps import command_step, page_step, print_next
 from pipeline.commands.shared import DONE, LOOK, AsJson, show
 
 if TYPE_CHECKING:
+    from pipeline.calibration.calibrate_stage import Calibration
     from pipeline.calibration.lens_choice import LensSetting
 
 LENSES: "dict[str, LensSetting]" = {
@@ -54,4 +57,12 @@ def calibrate(
     options = CalibrationOptions(given, LENSES[lens], square_pixels, pitch_um, ros)
     found = calibrate(pictures, out, options, Reporter(), workers)
     show(as_json, found.as_json, found.print)
+    print_next(as_json, *_steps(found))
     return LOOK if found.needs_look else DONE
+
+
+def _steps(found: "Calibration") -> Iterator[str]:
+    yield page_step(found.report)
+    if found.summary.verdict.problems:
+        yield command_step("run", found.project, why="after the remedies above")
+    yield command_step("export", found.project, "opencv", "DIR", why="or colmap, metashape, micmac, ...")

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from pipeline.commands.next_steps import command_step, print_next
 from pipeline.commands.shared import (
     DONE,
     LOOK,
@@ -48,6 +49,11 @@ def resample(
 
     results = resample(read(project, max_pixels), out_dir, pitch_um, lens, fast, Reporter())
     show(as_json, lambda: resampled_json(results), lambda _: say(*map(line, results)))
+    same = [*(("--pitch-um", f"{pitch_um:g}") if pitch_um else ()), *(("--lens",) if lens else ())]
+    print_next(
+        as_json,
+        command_step("export", project, "micmac", "DIR", *same, why="or metashape, ...: cameras of these frames"),
+    )
     return LOOK if any(result.problem for result in results) else DONE
 
 
@@ -97,6 +103,11 @@ def import_(
     *files, folder = paths
     done = run_import(format, files, folder, ImportOptions(pitch_um, sigma_px, from_middle, fiducials))
     say(done.readme_text, f"{folder}: {counted(len(done.files), 'file')}")
+    print_next(
+        False,
+        command_step("template project > project.toml", why=f"and name the files of {folder} in it"),
+        command_step("run", "project.toml"),
+    )
     return DONE
 
 
@@ -122,6 +133,7 @@ def convert(
     done = run_convert(file, out_dir, ConvertOptions(family, r0_mm, named, camera))
     files = f"{out_dir}: {counted(len(done.files), 'file')}"
     show(as_json, done.as_json, lambda _: say(*done.lines(), files))
+    print_next(as_json, f'camera = "{out_dir / "camera.toml"}" in project.toml, then reseau run')
     return LOOK if done.misfit_um > misfit_um else DONE
 
 
@@ -133,6 +145,7 @@ def render(scene: SceneFile, out_dir: OutDir) -> int:
     with Reporter().stage("rendering") as count:
         render_project(scene, out_dir, count)
     say(str(out_dir / "project.toml"))
+    print_next(False, command_step("run", out_dir / "project.toml"))
     return DONE
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipeline.archive.verdicts import Verdict
+from pipeline.commands.next_steps import command_step, print_next, verdict_steps
 from pipeline.commands.shared import (
     DONE,
     LOOK,
@@ -29,6 +30,8 @@ from pipeline.text.wording import counted
 if TYPE_CHECKING:
     from pipeline.files.project_file import Project
 
+LIBRARY_STEP = command_step("cameras NAME > camera.toml", why="a camera file to start from; or: reseau template camera")
+
 
 def demo(
     folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the demonstration goes.")] = Path(
@@ -40,7 +43,7 @@ def demo(
     from pipeline.demo import run_demo
     from pipeline.progress import Reporter
 
-    return finish(run_demo(folder, Reporter()), as_json)
+    return finish(run_demo(folder, Reporter()), as_json, folder / "project.toml")
 
 
 def init(
@@ -124,6 +127,7 @@ def status(
     every = archive_status(read(project))
     shown = every.of(verdict)
     show(as_json, partial(status_json, shown), printed)
+    print_next(as_json or as_csv, *verdict_steps(project, shown.counts), command_step("run", project))
     return DONE if every.all_good else LOOK
 
 
@@ -140,7 +144,7 @@ def merge(
     if not as_json:
         left_out = {one.path: f", {one.damaged} not as written and left out" if one.damaged else "" for one in taken}
         say(*(f"{o.path}: {counted(o.results, 'result')}, {o.new} of them new{left_out[o.path]}" for o in taken))
-    return finish(summary, as_json)
+    return finish(summary, as_json, project)
 
 
 def report(
@@ -185,7 +189,14 @@ def review(
         from pipeline.review.server import serve
     except ModuleNotFoundError:
         raise missing_extra("reseau review", "Starlette and Uvicorn", "review") from None
-    serve(read(project, max_pixels), port, who, not no_browser, typer.echo)
+
+    def say_address(address: str) -> None:
+        say(address)
+        print_next(
+            False, "decide in the browser; end with Ctrl-C", command_step("run", project, why="applies the decisions")
+        )
+
+    serve(read(project, max_pixels), port, who, not no_browser, say_address)
     return DONE
 
 
@@ -221,6 +232,7 @@ def cameras(
         typer.echo(library_path(names[0].removeprefix(PREFIX)).read_text(encoding="utf-8"), nl=False)
     else:
         show(as_json, library_json, print_library)
+        print_next(as_json, command_step("init", "FOLDER", why="finds the camera of each scan"), LIBRARY_STEP)
     return DONE
 
 
@@ -240,6 +252,11 @@ def _name_cameras(
     if len(given) == 1 and not given[0].is_dir():
         identification = identify(given[0], tried, pitch_um, reporter, max_pixels)
         show(as_json, identification.as_json, lambda console: print_identification(identification, console))
+        if identification.best:
+            names = (name for trial in identification.best for name in trial.cameras)
+            print_next(as_json, *(f'camera = "{PREFIX}{name}" in project.toml' for name in names))
+        else:
+            print_next(as_json, LIBRARY_STEP)
         return DONE if identification.best else LOOK
     with reporter.stage("looked at") as count:
         found = group_scans(find_scan_files(given)[0], count, max_pixels, by_folder=False)
@@ -247,6 +264,7 @@ def _name_cameras(
     if not grouped.groups:
         raise InputError("\n".join(grouped.unread.values()))
     show(as_json, grouped.as_json, lambda console: print_groups(grouped, console))
+    print_next(as_json, command_step("init", *given, why="writes a project with these cameras"))
     return DONE if grouped.all_named else LOOK
 
 

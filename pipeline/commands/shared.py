@@ -49,17 +49,20 @@ def read(path: Path, max_pixels: int | None = None) -> "Project":
 def run_stage(
     path: Path, stage: "Callable[[Project, Reporter], Summary]", as_json: bool, max_pixels: int | None = None
 ) -> int:
-    """Run a stage on a project and tell its summary; the exit code."""
+    """Run a stage on a project and print its summary; the exit code."""
     from pipeline.progress import Reporter
 
-    return finish(stage(read(path, max_pixels), Reporter()), as_json)
+    return finish(stage(read(path, max_pixels), Reporter()), as_json, path)
 
 
-def finish(summary: "Summary", as_json: bool) -> int:
-    """Tell a summary; its exit code."""
+def finish(summary: "Summary", as_json: bool, project: Path | None) -> int:
+    """Print a summary and the next steps; its exit code. project: its file; None: the caller prints the steps."""
+    from pipeline.commands.next_steps import print_next, summary_steps
     from pipeline.summary import print_summary
 
     show(as_json, summary.as_json, lambda console: print_summary(summary, console))
+    if project is not None:
+        print_next(as_json, *summary_steps(project, summary))
     return summary.verdict.exit_code
 
 

@@ -66,7 +66,7 @@ def print_library(console: Console) -> None:
     for kind, source in sources.items():
         console.print(f"{kind}: {source}", highlight=False)
     console.print(
-        'camera = "library:NAME" in the project takes one; `reseau cameras NAME` prints its file, to start from. '
+        'camera = "library:NAME" in project.toml takes one. '
         "Marks whose shape is not known are learned from the scans, or passed over.",
         highlight=False,
     )

@@ -40,6 +40,10 @@ class FrameTotals:
     places_px: Mapping[str, NDArray[np.float64]]
     sigmas_um: Mapping[str, NDArray[np.float64]]
 
+    def count(self, verdict: str) -> int:
+        """The number of frames with a verdict."""
+        return sum(counts.get(verdict, 0) for counts in self.verdicts.values())
+
 
 @dataclass(frozen=True)
 class ReportData:

@@ -1,0 +1,75 @@
+"""The last lines of a command: up to three steps that its result calls for, the most urgent first.
+
+A step is a command that can be copied, with a comment that says what it is for.
+"""
+
+import shlex
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from pipeline.archive.verdicts import Verdict
+from pipeline.terminal import plain
+from pipeline.text.wording import counted
+
+if TYPE_CHECKING:
+    from pipeline.summary import Summary
+
+MOST = 3
+
+
+def print_next(as_json: bool, *steps: str) -> None:
+    """Print the first of the steps, each once, on stdout; none beside JSON."""
+    for step in [] if as_json else list(dict.fromkeys(steps))[:MOST]:
+        typer.echo(plain(f"Next: {step}"))
+
+
+def command_step(words: str, *arguments: Path | str, why: str = "") -> str:
+    """`reseau WORDS ARGUMENTS`, as it can be copied, and why."""
+    line = " ".join(("reseau", words, *(shlex.quote(str(argument)) for argument in arguments)))
+    return f"{line}  # {why}" if why else line
+
+
+def page_step(path: Path) -> str:
+    """The step that opens a page."""
+    return f"open {shlex.quote(str(path))}"
+
+
+def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
+    """What the summary of a stage of the chain calls for. project: its file."""
+    files, adjustment = summary.files, summary.adjustment
+    if summary.parts:
+        stores = shlex.quote(str(next(iter(files.values())).parent))
+        words = f"merge {shlex.quote(str(project))} {stores}/measurement.*-of-{summary.parts}.db"
+        yield command_step(words, why="when all parts are measured")
+        return
+    if "report" in files:
+        yield page_step(files["report"])
+    yield from verdict_steps(project, summary.verdicts)
+    if "covariance" in files:
+        yield command_step("check", project, why="compares the adjustment with OpenCV's calibration")
+        yield command_step("report", project)
+    elif "check" in files:
+        yield command_step("report", project)
+    elif "report" not in files:
+        yield command_step("run", project, why="adjusts, checks and writes the report")
+    elif adjustment is not None and adjustment.converged:
+        if any(camera.is_calibrated for camera in adjustment.cameras.values()):
+            yield command_step("export", project, "opencv", "DIR", why="or colmap, metashape, micmac, ...")
+        else:
+            yield command_step("resample", project, "DIR", why="rectifies the scans")
+
+
+def verdict_steps(project: Path, counts: Mapping[Verdict, int]) -> Iterator[str]:
+    """What scans of these verdicts need. counts: of scans, by verdict."""
+    failed, stale = counts.get(Verdict.FAILED, 0), counts.get(Verdict.WAITING, 0) + counts.get(Verdict.OLD, 0)
+    doubtful = counts.get(Verdict.LOOK, 0) + counts.get(Verdict.POOR, 0)
+    if failed:
+        why = f"{counted(failed, 'scan')} could not be measured: mend or replace the files first"
+        yield command_step("measure", project, "--retry", why=why)
+    if stale:
+        yield command_step("measure", project, why=f"{counted(stale, 'scan')} not measured yet, or stale")
+    if doubtful:
+        yield command_step("review", project, why=f"settle the doubtful marks of {counted(doubtful, 'scan')}")
