@@ -7,6 +7,7 @@ import numpy as np
 from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import STRAIGHT, LineOfSight, sight_vectors
+from adjust.functional_model.rotation import cross_matrix
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film
 from adjust.linear_algebra.small_matrices import applied, product
@@ -71,3 +72,15 @@ def rays(rotation: Array, vector: Array) -> tuple[Array, Array]:
     depth = in_camera[..., 2:]
     # A point in the plane of the lens has no image: its ray is kept finite and W = 0 tells.
     return -in_camera[..., :2] / np.where(depth == 0.0, 1.0, depth), in_camera
+
+
+def ray_by_orientation(ray: Array, inverse_depth: Array) -> Array:
+    """Derivatives (n, 2, 6) of rays (n, 2) by a small turn of their points about the camera and by a shift of these.
+
+    With p = (u, v, -1) along the ray, the point moves by t x p + s / depth.
+    """
+    point = np.column_stack([ray, -np.ones(len(ray))])
+    moved = np.concatenate(
+        [-cross_matrix(point), inverse_depth[:, None, None] * np.broadcast_to(np.eye(3), (len(ray), 3, 3))], axis=2
+    )
+    return np.asarray(moved[:, :2] + ray[:, :, None] * moved[:, 2:])

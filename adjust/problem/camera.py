@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 
 from adjust.functional_model.lens import Distortion, Prior
 
+Corners = tuple[tuple[float, float], tuple[float, float]]
+
 
 @dataclass(frozen=True)
 class Fiducial:
@@ -53,3 +55,15 @@ class Camera:
     center_mm: tuple[float, float] = (0.0, 0.0)
     frame_mm: tuple[float, float] = (0.0, 0.0)
     distances: tuple[FiducialDistance, ...] = ()
+
+    def frame_corners(self, frame_mm: tuple[float, float] | None = None) -> Corners | None:
+        """The lower left and the upper right corner of the picture in the camera frame; None where its size is unknown.
+
+        frame_mm: its size where it is not the camera's own. It lies about 0 with fiducial marks, else below and to the
+        right of the scan's first pixel.
+        """
+        width, height = frame_mm or self.frame_mm
+        if not width or not height:
+            return None
+        left, top = (-width / 2.0, height / 2.0) if self.fiducials else (0.0, 0.0)
+        return (left, top - height), (left + width, top)

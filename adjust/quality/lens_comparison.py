@@ -18,6 +18,7 @@ from scipy.special import fdtrc
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Lens
+from adjust.functional_model.projection import ray_by_orientation
 
 Use = Literal["space", "flat"]
 
@@ -199,11 +200,8 @@ class _View:
         moves = np.array([(ones, zeros), (zeros, ones), (-y, x), (x, y)]).transpose(2, 1, 0)
         field_moves = self._field_change(self.equations.xy_jacobian @ moves[: len(self.ray)])
         frame = np.concatenate([field_moves, -1e3 * moves[len(self.ray) :]])
-        u, v = self.ray.T
-        one = np.ones_like(u)
-        turns = [(u * v, one + v * v), (one + u * u, u * v), (-v, u)]
-        stations = [(one, 0 * u), (0 * u, one), (u, v)] if use == "flat" else []
-        bundle = self.c_um * np.array([*turns, *stations]).transpose(2, 1, 0)
+        changes = ray_by_orientation(self.ray, np.ones(len(self.ray)))  # turns, then shifts over flat ground
+        bundle = self.c_um * (changes if use == "flat" else changes[:, :, :3])
         orientation = np.concatenate([bundle, np.zeros((len(self.marks_mm), *bundle.shape[1:]))])
         return np.concatenate([frame, orientation], axis=2).reshape(2 * len(points), -1)
 

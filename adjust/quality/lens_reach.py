@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.problem.camera import Camera
+from adjust.problem.camera import Camera, Corners
 from adjust.problem.estimates import Estimates
 from adjust.problem.images import adjusted_image, adjusted_lens
 from adjust.problem.parameter import Parameter
@@ -26,7 +26,7 @@ class LensReach:
     corner_mm: float
     sigma_um: float
     corner_sigma_um: float
-    frame_mm: tuple[tuple[float, float], tuple[float, float]] | None
+    frame_mm: Corners | None
 
     @property
     def share(self) -> float:
@@ -50,11 +50,8 @@ def lens_reach(estimates: Estimates, camera: Camera, frame_mm: tuple[float, floa
     radius_mm = max(farthest)
     if radius_mm == 0.0:
         return None
-    corner_mm, corners = np.nan, None
-    if frame_mm is not None:
-        width, height = frame_mm
-        left, top = (-width / 2.0, height / 2.0) if camera.fiducials else (0.0, 0.0)
-        corners = (left, top - height), (left + width, top)
+    corner_mm, corners = np.nan, None if frame_mm is None else camera.frame_corners(frame_mm)
+    if corners is not None:
         corner_mm = float(np.linalg.norm(np.abs(np.array(corners) - principal_point).max(axis=0)))
     within = max(_sigma_um(estimates, camera, radius) for radius in np.linspace(0.0, radius_mm, RADII + 1)[1:])
     beyond = _sigma_um(estimates, camera, corner_mm) if np.isfinite(corner_mm) else np.nan

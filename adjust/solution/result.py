@@ -20,6 +20,7 @@ from adjust.quality.contradiction import CalibrationTest, calibration_tests
 from adjust.quality.correlation import Correlation, correlations
 from adjust.quality.image_clusters import MOST_SHARED, cluster_covariance, shared_positions
 from adjust.quality.lens_reach import LensReach, lens_reach
+from adjust.quality.projection_uncertainty import ProjectionUncertainty, projection_uncertainty
 from adjust.quality.reliability import Reliability, reliability
 from adjust.quality.residuals import FurtherResidual, Group, Residuals, further_residuals, groups, residuals
 from adjust.quality.run import Run
@@ -134,6 +135,29 @@ class Adjustment(Estimates):
         """
         has_lens = self.converged and camera.name not in self.network.idle_cameras
         return lens_reach(self, camera, frame_mm) if has_lens else None
+
+    def projection_uncertainty(
+        self, camera: str = "", distance: float = np.inf, places_mm: Array | None = None
+    ) -> ProjectionUncertainty:
+        """Standard deviations of the images of points that stand fixed in the scene.
+
+        Parameters
+        ----------
+        camera : its name; may be left out where there is one
+        distance : of the points from the camera, in object units; by default they are infinitely far
+        places_mm : (..., 2) where they are seen, in the camera frame; by default a grid over the picture
+
+        Returns
+        -------
+        ProjectionUncertainty
+            See docs/method/reliability.md for what is taken out of it.
+
+        Raises
+        ------
+        AdjustmentError
+            Without a solution, for a camera that there is not, or one that shows no target.
+        """
+        return projection_uncertainty(self, self.cluster_covariance_of, camera, distance, places_mm)
 
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:

@@ -1,0 +1,240 @@
+"""How well a camera projects: the covariance of the image of a point that stands fixed in the scene.
+
+A change of the lens that a turn and a shift of the camera make good is none: no picture shows it. So the change dl of
+interior orientation and distortion is taken together with the turn t and the shift s of the camera that fit it best
+over all targets that were observed, at their distances:
+
+    dq = B dl + P (t, s),    (t, s) = -(sum P' W P)^-1 sum P' W B dl
+
+B and P are the derivatives of the camera point of a fixed ray by the calibration and by the orientation, W the weights.
+The covariance is that of dq, and that of the common orientation beside it, sigma0² P (sum P' W P)^-1 P'. Both together
+are mrcal's cross-reprojection uncertainty (mrcal.secretsauce.net, "Projection uncertainty"). At infinity a shift shows
+nothing. On film the camera frame is that of the marks: what the interior orientation of a scan makes of a change of the
+marks' coordinates is taken out as well.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.array_types import Array
+from adjust.errors import AdjustmentError
+from adjust.functional_model.film_kinds import FilmKind
+from adjust.functional_model.line_of_sight import sight_vectors
+from adjust.functional_model.projection import ImageModel, ray_by_orientation, rays
+from adjust.functional_model.transformation import film_kind
+from adjust.problem.camera import Camera
+from adjust.problem.estimates import Estimates
+from adjust.problem.images import adjusted_image, adjusted_lens, adjusted_places
+from adjust.problem.parameter import Parameter
+
+GRID = 25  # places along the longer side of a picture
+RANK = 1e-9  # of the normal matrix of an orientation, in equal columns: below it a direction is left alone
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectionUncertainty:
+    """Standard deviations of projected points over the picture of a camera.
+
+    Attributes
+    ----------
+    camera : str
+    distance : float
+        From the camera to the points in object units, inf at infinity.
+    median_distance : float
+        Of the targets that were observed.
+    places_mm : Array (..., 2)
+        Of the points, in the camera frame.
+    covariance_mm2 : Array (..., 2, 2)
+        By the model; nan where the lens shows nothing.
+    cluster_covariance_mm2 : Array (..., 2, 2) or None
+        By leaving out one image at a time; None where images are too few.
+    """
+
+    camera: str
+    distance: float
+    median_distance: float
+    places_mm: Array
+    covariance_mm2: Array
+    cluster_covariance_mm2: Array | None
+
+    @property
+    def sigma_model_mm(self) -> Array:
+        """(...) by the model, in the direction that is known worst."""
+        return _largest_sigma(self.covariance_mm2)
+
+    @property
+    def sigma_clusters_mm(self) -> Array | None:
+        """(...) by leaving out images."""
+        return None if self.cluster_covariance_mm2 is None else _largest_sigma(self.cluster_covariance_mm2)
+
+    @property
+    def sigma_mm(self) -> Array:
+        """(...) the one to use: the larger."""
+        clusters = self.sigma_clusters_mm
+        return self.sigma_model_mm if clusters is None else np.maximum(self.sigma_model_mm, clusters)
+
+
+def projection_uncertainty(
+    estimates: Estimates,
+    clusters: Callable[[Sequence[Parameter]], Array | None],
+    camera: str = "",
+    distance: float = np.inf,
+    places_mm: Array | None = None,
+) -> ProjectionUncertainty:
+    """See `Adjustment.projection_uncertainty`; clusters: the covariance of some quantities by leaving out images."""
+    if not distance > 0.0:
+        raise AdjustmentError(f"The distance of projected points must be positive, in object units, not {distance}.")
+    field = ProjectionField(estimates, only_camera(estimates, camera))
+    covariances = estimates.sigma0**2 * estimates.cofactor_of(field.parameters), clusters(field.parameters)
+    places = frame_grid(field.corners_mm, GRID) if places_mm is None else np.asarray(places_mm, dtype=float)
+    flat, shape = places.reshape(-1, 2), (*places.shape[:-1], 2, 2)
+    model, robust = (
+        None if each is None else field.covariance_mm2(each, flat, distance).reshape(shape) for each in covariances
+    )
+    assert model is not None
+    return ProjectionUncertainty(field.camera.name, distance, field.median_distance, places, model, robust)
+
+
+def only_camera(estimates: Estimates, name: str = "") -> Camera:
+    """The camera of a name, or the only one. Raises AdjustmentError where no such camera was calibrated."""
+    network = estimates.network
+    cameras = {each.name: each for each in network.cameras if each.name not in network.idle_cameras}
+    if not estimates.converged or not cameras:
+        raise AdjustmentError("No camera is calibrated: the adjustment has no solution, or shows no targets.")
+    if not name and len(cameras) == 1:
+        return next(iter(cameras.values()))
+    if name not in cameras:
+        raise AdjustmentError(f"There is no calibrated camera {name!r}. Name one of: {', '.join(cameras)}.")
+    return cameras[name]
+
+
+class ProjectionField:
+    """The change of a camera's projection with all that its calibration knows, freed of the orientation.
+
+    parameters: of the calibration. corners_mm: of its picture, or of what was observed where the size is not known.
+    median_distance: of the observed targets, object units.
+    """
+
+    def __init__(self, estimates: Estimates, camera: Camera) -> None:
+        self.camera, self._sigma0 = camera, estimates.sigma0
+        self._lens = adjusted_lens(estimates, camera.name)
+        self.parameters = [Parameter.interior(camera.name, name) for name in self._lens.quantities]
+        self._marks = _MarkFrame.of(estimates, camera)
+        if self._marks is not None:
+            marks = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
+            self.parameters += marks
+        self._align(estimates)
+
+    def _align(self, estimates: Estimates) -> None:
+        """The orientation (6, 6) by its observations, and how it follows the calibration (6, k)."""
+        normal, right, distances, places = np.zeros((6, 6)), 0.0, list[Array](), list[Array]()
+        network = estimates.network
+        observations, of_image = network.observations, np.array(network.observations.image)
+        for image in network.images:
+            rows = np.flatnonzero((of_image == image.name) & ~observations.is_fiducial)
+            if image.camera != self.camera.name or not len(rows):
+                continue
+            model = adjusted_image(estimates, image.name)
+            ray, depth = _targets(model, adjusted_places(estimates, [observations.point[row] for row in rows]))
+            places.append(model.camera_from_comparator(observations.xy_mm[rows]))
+            by, turn = self._derivatives(places[-1], ray, 1.0 / depth)
+            weights = 2.0 / np.trace(observations.covariance_mm2[rows], axis1=1, axis2=2)
+            weighted = (weights[:, None, None] * turn).reshape(-1, 6).T
+            normal += weighted @ turn.reshape(-1, 6)
+            right = right + weighted @ by.reshape(-1, by.shape[2])
+            distances.append(depth * np.sqrt(1.0 + (ray**2).sum(axis=1)))
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
+        self._orientation = np.linalg.pinv(normal * np.outer(scale, scale), rcond=RANK, hermitian=True)
+        self._orientation *= np.outer(scale, scale)
+        self._following = -self._orientation @ right
+        self.median_distance = float(np.median(np.concatenate(distances)))
+        observed = np.concatenate(places)
+        self.corners_mm = self.camera.frame_corners() or np.array([observed.min(axis=0), observed.max(axis=0)])
+
+    def covariance_mm2(self, covariance: Array, places_mm: Array, distance: float) -> Array:
+        """(n, 2, 2) of points at places (n, 2), from the covariance of `parameters`; nan where there is no image."""
+        ray, found = self._lens.ray_from_observed(places_mm)
+        found &= ~self._lens.folded_over(places_mm)
+        result = np.full((len(places_mm), 2, 2), np.nan)
+        ray = ray[found]
+        by, turn = self._derivatives(places_mm[found], ray, np.sqrt(1.0 + (ray**2).sum(axis=1)) / distance)
+        free = by + turn @ self._following
+        calibration = covariance if self._marks is None else self._marks.reduced(covariance, len(self._lens.values))
+        common = self._sigma0**2 * turn @ self._orientation @ turn.swapaxes(1, 2)
+        result[found] = free @ calibration @ free.swapaxes(1, 2) + common
+        return result
+
+    def _derivatives(self, xy_mm: Array, ray: Array, inverse_depth: Array) -> tuple[Array, Array]:
+        """Of the camera points of fixed points, by the calibration (n, 2, k) and by a turn and shift (n, 2, 6)."""
+        at = self._lens.equations(xy_mm, ray)
+        calibration = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
+        by: Array = -np.linalg.solve(at.xy_jacobian, calibration)
+        if self._marks is not None:
+            by = np.concatenate([by, -self._marks.design(xy_mm)], axis=2)
+        orientation = ray_by_orientation(ray, inverse_depth)
+        return by, np.asarray(-np.linalg.solve(at.xy_jacobian, at.ray_jacobian @ orientation), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _MarkFrame:
+    """What the interior orientation of a scan makes of a change of the fiducial marks' coordinates.
+
+    by_marks (q, 2 f): the q centred parameters of the film transformation by the coordinates, by least squares.
+    """
+
+    model: ImageModel
+    kind: FilmKind
+    half_mm: float
+    by_marks: Array
+
+    @classmethod
+    def of(cls, estimates: Estimates, camera: Camera) -> "_MarkFrame | None":
+        """By the first image of a camera on film; None for a digital camera."""
+        images = (image for image in estimates.network.images if image.camera == camera.name)
+        image = next((image for image in images if image.transformation != "none"), None)
+        if image is None or not camera.fiducials:
+            return None
+        model = adjusted_image(estimates, image.name)
+        kind = film_kind(image.transformation, model.film.mirrored)
+        keys = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
+        marks = estimates.values_of(keys).reshape(-1, 2)
+        half = float(np.abs(marks - marks.mean(axis=0)).max()) or 1.0
+        frame = cls(model, kind, half, np.empty((0, 0)))
+        by_marks = np.linalg.pinv(frame.design(marks).reshape(2 * len(marks), -1)).astype(np.float64)
+        return cls(model, kind, half, by_marks)
+
+    def design(self, xy_mm: Array) -> Array:
+        """(n, 2, q) how camera points move with the parameters."""
+        film = self.model.film
+        comparator_mm, _ = film.comparator_from_camera(xy_mm)
+        return self.kind.design(film.parameters, comparator_mm, film.center_mm, np.array(self.half_mm))
+
+    def reduced(self, covariance: Array, lens: int) -> Array:
+        """(lens + q, lens + q) from the covariance of the lens and of all marks."""
+        reduction = np.zeros((lens + len(self.by_marks), len(covariance)))
+        reduction[:lens, :lens] = np.eye(lens)
+        reduction[lens:, lens:] = self.by_marks
+        return np.asarray(reduction @ covariance @ reduction.T)
+
+
+def frame_grid(corners_mm: Sequence[Sequence[float]] | Array, longer: int) -> Array:
+    """(rows, columns, 2) places over a frame between its lower left and upper right corner, the upper row first."""
+    low, high = np.asarray(corners_mm, float)
+    counts = np.maximum(np.rint(longer * (high - low) / (high - low).max()), 3).astype(int)
+    x, y = np.linspace(low[0], high[0], counts[0]), np.linspace(high[1], low[1], counts[1])
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def _targets(model: ImageModel, xyz: Array) -> tuple[Array, Array]:
+    """The rays (n, 2) of object points, and how far before the camera (n,) these are."""
+    ray, in_camera = rays(model.rotation, sight_vectors(model.line_of_sight, model.station, xyz).vector)
+    return ray, np.abs(in_camera[:, 2])
+
+
+def _largest_sigma(covariance: Array) -> Array:
+    """(...) the standard deviation in the worst direction of covariances (..., 2, 2); nan stays."""
+    half_sum = 0.5 * (covariance[..., 0, 0] + covariance[..., 1, 1])
+    half_difference = 0.5 * (covariance[..., 0, 0] - covariance[..., 1, 1])
+    return np.asarray(np.sqrt(half_sum + np.hypot(half_difference, covariance[..., 0, 1])))

@@ -1,0 +1,196 @@
+"""The covariance of projected points: against mrcal, against simulated calibrations, and what it is free of."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from board_pictures import TRUTH, board_network
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from simulated import FIDUCIALS, HALF_MM, Truth, camera_point, field_points, rotation, simulated
+
+from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.functional_model.rotation import rotation_from_vector
+from adjust.initial_values.approximations import approximate
+from adjust.problem.images import adjusted_image, adjusted_lens
+from adjust.problem.network import Approximations, Board
+from adjust.problem.parameter import Parameter
+from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
+
+Array = NDArray[np.float64]
+
+PIXEL_MM = 0.005
+FREE = Prior(0.0, np.inf)
+MRCAL_PX = np.array([(-20.0, -20.0), (0, 0), (320, 240), (100, 100), (600, 50), (639, 479), (300, 420), (50, 240)])
+MRCAL_SIGMA_PX = {  # mrcal 2.5.2, "cross-reprojection-rrp-Jfp", LENSMODEL_OPENCV4 and a bent board, the same pictures
+    np.inf: (3.7571, 2.3593, 0.0590, 0.3118, 0.5585, 1.8466, 0.1919, 0.3391),
+    350.0: (3.6885, 2.2856, 0.0081, 0.1025, 0.4495, 1.7881, 0.0281, 0.1398),
+    100.0: (3.8035, 2.4542, 0.1481, 0.7051, 0.8537, 1.9850, 0.4989, 0.7488),
+}
+BOARD_MM = np.array([(1.6, -1.2), (0.3, -0.4), (2.8, -2.0), (1.6, -0.3), (0.6, -1.8)])
+FILM_MM = np.array([(0.0, 0.0), (70.0, 60.0), (-80.0, 40.0), (20.0, -90.0), (-60.0, -60.0)])
+
+
+def test_it_is_what_mrcal_says_of_the_same_pictures() -> None:
+    network = board_network(np.random.default_rng(3), 12, 5e-4)
+    lens = Distortion("opencv", dict.fromkeys(("k1", "k2", "p1", "p2", "b1"), FREE))
+    places = {each.id: np.array([each.X.value, each.Y.value, 0.0]) for each in network.points if each.X and each.Y}
+    result = adjust(
+        replace(network, cameras=(replace(network.cameras[0], distortion=lens),), boards=(Board("b", places),))
+    )
+    for distance, sigma_px in MRCAL_SIGMA_PX.items():
+        found = result.projection_uncertainty("desk", distance, MRCAL_PX * PIXEL_MM * [1.0, -1.0])
+        np.testing.assert_allclose(found.sigma_model_mm / PIXEL_MM, sigma_px, rtol=2e-3, atol=6e-5)
+
+
+Projection = Callable[[Array], Array]
+
+
+def places_after_alignment(projected: Projection, in_camera: Array, fitted: Array, fixed: Array) -> Array:
+    """Where fixed points (n, 3) in the true camera's axes are projected, for the turn and shift of the camera by which
+    the points in_camera (m, 3) come nearest to where they were fitted (m, 2)."""
+
+    scale = float(np.abs(in_camera).max())
+
+    def moved(vector: Array, points: Array) -> Array:
+        return projected(points @ rotation_from_vector(vector[:3]).T + scale * vector[3:])
+
+    def misses(vector: Array) -> Array:
+        return (moved(vector, in_camera) - fitted).ravel()
+
+    return moved(np.asarray(least_squares(misses, np.zeros(6), method="lm").x), fixed)
+
+
+def board_sample(
+    rng: np.random.Generator, true: Adjustment, start: Approximations, distance: float
+) -> tuple[Array, Array, Array]:
+    """Claimed covariances of places on the board's pictures, where these are projected, and where they are."""
+    network = true.network
+    noise = 5e-4 * rng.normal(size=network.observations.xy_mm.shape)
+    observations = replace(network.observations, xy_mm=network.observations.xy_mm + noise)
+    result = adjust(replace(network, observations=observations), start)
+    xyz = np.array([[getattr(each, axis).value for axis in "XYZ"] for each in network.points])
+    models = [(adjusted_image(true, each.name), adjusted_image(result, each.name)) for each in network.images]
+    in_camera = np.concatenate([(xyz - model.station) @ model.rotation.T for model, _ in models])
+    fitted = np.concatenate([model.camera_from_object(xyz)[0] for _, model in models])
+    ray, _ = adjusted_lens(true, "desk").ray_from_observed(BOARD_MM)
+    where = places_after_alignment(projection(result, "desk"), in_camera, fitted, points_along(ray, distance))
+    return result.projection_uncertainty("desk", distance, BOARD_MM).covariance_mm2, where, BOARD_MM
+
+
+def film_sample(rng: np.random.Generator, points: Array, distance: float) -> tuple[Array, Array, Array]:
+    """The same over a frame of film; places count in the frame of the true marks, by an affine interior orientation."""
+    truth = Truth()
+    network, start = simulated(rng, truth, points=points, free=dict.fromkeys(truth.distortion, np.inf))
+    result = adjust(network, start)
+    marks = np.array([[result.value(Parameter.fiducial("K", id, axis)) for axis in "xy"] for id in FIDUCIALS])
+    true_marks = np.column_stack([np.array(list(FIDUCIALS.values())), np.ones(len(FIDUCIALS))])
+    film = np.linalg.lstsq(true_marks, marks, rcond=None)[0]
+    stations, attitudes = np.array(truth.stations), [rotation(*each) for each in truth.attitudes]
+    seen = zip(stations, attitudes, strict=True)
+    in_camera = np.concatenate([(points - station) @ turn.T for station, turn in seen])
+    fitted = np.concatenate(
+        [adjusted_image(result, f"f{i}").camera_from_object(points)[0] for i in range(len(stations))]
+    )
+    level = replace(truth, stations=((0.0, 0.0, 0.0),), attitudes=((0.0, 0.0, 0.0),))
+    fixed = points_along((FILM_MM - [truth.x0, truth.y0]) / truth.c, distance)
+    places = camera_point(level, 0, fixed)
+    where = places_after_alignment(projection(result, "K"), in_camera, fitted, fixed)
+    where = np.linalg.solve(film[:2].T, (where - film[2]).T).T
+    return result.projection_uncertainty("K", distance, places).covariance_mm2, where, places
+
+
+def projection(result: Adjustment, camera: str) -> Projection:
+    lens = adjusted_lens(result, camera)
+    return lambda points: lens.camera_from_ray(-points[:, :2] / points[:, 2:])[0]
+
+
+def points_along(ray: Array, distance: float) -> Array:
+    """(n, 3) at a distance along rays (n, 2), or so far that a shift shows nothing."""
+    direction = np.column_stack([ray, -np.ones(len(ray))])
+    return np.asarray(min(distance, 1e9) * direction / np.linalg.norm(direction, axis=1)[:, None])
+
+
+def spread(samples: list[tuple[Array, Array, Array]]) -> float:
+    """The root mean square of errors over what is claimed of them, of all places and both coordinates."""
+    ratios = [
+        error @ np.linalg.solve(covariance, error)
+        for claimed, where, places in samples
+        for covariance, error in zip(claimed, where - places, strict=True)
+    ]
+    return float(np.sqrt(np.mean(ratios) / 2.0))
+
+
+def true_board(images: int) -> Adjustment:
+    return adjust(board_network(np.random.default_rng(11), images, 0.0, given_mm=5e-4))
+
+
+def test_simulated_calibrations_scatter_as_it_says() -> None:
+    rng, true = np.random.default_rng(5), true_board(4)
+    start = approximate(true.network)
+    assert 0.7 < spread([board_sample(rng, true, start, 350.0) for _ in range(6)]) < 1.3
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("distance", [np.inf, 350.0, 150.0])
+def test_three_hundred_boards_scatter_as_it_says(distance: float) -> None:
+    rng, true = np.random.default_rng(6), true_board(6)
+    start = approximate(true.network)
+    assert 0.95 < spread([board_sample(rng, true, start, distance) for _ in range(300)]) < 1.05
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("distance", [np.inf, 1500.0])
+def test_three_hundred_films_scatter_as_it_says(distance: float) -> None:
+    """The marks' frame is given to 1 mm, and the standard deviations are some micrometres."""
+    rng = np.random.default_rng(7)
+    points = field_points(rng, 40)
+    assert 0.95 < spread([film_sample(rng, points, distance) for _ in range(300)]) < 1.05
+
+
+def test_the_datum_of_the_marks_has_no_part_in_it() -> None:
+    rng = np.random.default_rng(2)
+    network, start = simulated(rng, points=field_points(rng, 40))
+    result = adjust(network, start)
+    sigma_mm = result.projection_uncertainty("K", 1500.0, FILM_MM).sigma_model_mm
+    assert result.sigma(Parameter.interior("K", "x0")) > 0.3
+    assert sigma_mm.max() < 0.005
+
+
+def test_it_covers_the_picture_and_stops_where_the_lens_does() -> None:
+    result = true_board(4)
+    found = result.projection_uncertainty()
+    assert found.places_mm.shape == (19, 25, 2)
+    np.testing.assert_allclose(found.places_mm[[0, -1], [0, -1]], [(0.0, 0.0), (3.2, -2.4)])
+    assert 300 < found.median_distance < 450
+    assert np.isfinite(found.sigma_mm).all()
+    camera = replace(result.network.cameras[0], distortion=Distortion("opencv", {"k1": FREE}))
+    folding = adjust(replace(result.network, cameras=(camera,)))
+    far = folding.projection_uncertainty(places_mm=np.array([(TRUTH["x0"] + 9.0, 0.0)]))
+    assert np.isnan(far.sigma_mm).all()
+
+
+def test_the_larger_of_both_standard_deviations_is_shown() -> None:
+    found = adjust(board_network(np.random.default_rng(3), 6, 5e-4)).projection_uncertainty()
+    assert found.sigma_clusters_mm is not None
+    np.testing.assert_array_equal(found.sigma_mm, np.maximum(found.sigma_model_mm, found.sigma_clusters_mm))
+
+
+@pytest.mark.parametrize(
+    ("camera", "distance", "message"),
+    [("desks", 1.0, "There is no calibrated camera 'desks'. Name one of: desk"), ("", 0.0, "must be positive")],
+)
+def test_what_cannot_be_projected_is_said(camera: str, distance: float, message: str) -> None:
+    with pytest.raises(AdjustmentError, match=message):
+        true_board(4).projection_uncertainty(camera, distance)
+
+
+def test_the_frame_of_film_lies_about_its_middle() -> None:
+    rng = np.random.default_rng(2)
+    network, start = simulated(rng)
+    camera = replace(network.cameras[0], frame_mm=(2 * HALF_MM, 2 * HALF_MM))
+    found = adjust(replace(network, cameras=(camera,)), start).projection_uncertainty()
+    np.testing.assert_allclose(found.places_mm[0, 0], (-HALF_MM, HALF_MM))
