@@ -1,7 +1,7 @@
 """Peaks of a correlation map: its highest local maxima, and the highest place about given ones."""
 
+import cv2
 import numpy as np
-from skimage.feature import peak_local_max
 
 from measure.array_types import Array
 from measure.detection.correlation import Map
@@ -13,17 +13,19 @@ def local_maxima(response: Map, count: int, least: float, apart_px: int = 3) -> 
     Parameters
     ----------
     response : (rows, columns).
-    count, least : how many at most, and how high each is at least.
+    count, least : how many at most, and what each is higher than.
     apart_px : how far peaks lie from one another.
 
     Returns
     -------
     (n, 2) column and row, and (n,) heights, the highest first.
     """
-    rows, cols = peak_local_max(
-        response, min_distance=apart_px, threshold_abs=least, exclude_border=False, num_peaks=count
-    ).T
-    return np.column_stack([cols, rows]).astype(float), response[rows, cols].astype(float)
+    square = np.ones((2 * apart_px + 1, 2 * apart_px + 1), np.uint8)
+    highest = cv2.dilate(response, square, borderType=cv2.BORDER_REPLICATE)
+    rows, cols = np.nonzero((response == highest) & (response > least))
+    heights = response[rows, cols].astype(float)
+    order = np.argsort(-heights, kind="stable")[:count]
+    return np.column_stack([cols, rows]).astype(float)[order], heights[order]
 
 
 def highest_about(response: Map, places: Array, radius_px: float) -> tuple[Array, Array]:
