@@ -7,6 +7,7 @@ from markupsafe import Markup
 
 from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import parameter_from_text
+from adjust.quality.distortion_curves import Curves, distortion_curves, is_defined_over_frame
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import ReportData
 from pipeline.report.frame_views import residuals_by_image
@@ -27,7 +28,7 @@ CURVE_TABLE_ROWS = 6
 class LensView:
     """The distortion of a camera. rows: of the curves' table, by their positions."""
 
-    curves: lens.Curves
+    curves: Curves
     plot: Markup
     rows: list[int]
     certificate: lens.Certificate
@@ -68,7 +69,7 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
     covariance = known if is_calibrated else None
     radius_mm, frame_mm = _observed_radius_mm(camera, rows), data.frame_mm.get(name)
     figure = fiducials.figure(name, stored, known) if known else None
-    over_frame = lens.is_defined_over_frame(camera.lens())
+    over_frame = is_defined_over_frame(camera.lens())
     return CameraView(
         name=name,
         record=camera,
@@ -125,9 +126,9 @@ def _lens_view(
     if not parameter_names(camera.distortion.family) or largest == 0.0:
         return None
     known = lens.lens(name, camera, covariance)
-    if lens.is_defined_over_frame(known):
+    if is_defined_over_frame(known):
         largest = min(largest, *known.distortion.half_mm)
-    curves = lens.curves(known, largest)
+    curves = distortion_curves(known, largest)
     lens_map = None
     if rows:
         on = vectors.plane(vectors.VectorField.from_residuals(rows).places_mm, frame_mm, PLOT_PX)

@@ -6,17 +6,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from markupsafe import Markup
 
-from adjust.functional_model.families import family, parameter_names
+from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
+from adjust.quality.distortion_curves import (
+    Curves,
+    directions,
+    displacement_cofactor,
+    distortion_curves,
+    function_sigmas,
+    is_defined_over_frame,
+    radial_part,
+)
 from pipeline.drawing import svg
 from pipeline.report.vectors import Plane, grid_mm, longest_vector, strokes_and_dots
 from pipeline.results.adjustment_record import CameraRecord
 from pipeline.results.covariance_file import Covariance
 from pipeline.types import Array
 
-RADII = 80
-DIRECTIONS = 36
 FRAME_GRID = 17
 BAND = 1.959964  # sigmas to a probability of 95 %
 
@@ -29,21 +36,6 @@ _NEAR_AXIS = 1e-3  # of the largest radius: there the distortion is linear in it
 MAP_GRID = 15  # vectors along the longer side
 LONGEST = 1.5  # of the grid's mesh
 ARCS = 180  # of the circle about what was observed
-
-
-@dataclass(frozen=True)
-class Curves:
-    """Over the radius (n,) in mm, in um.
-
-    radial: the mean over all directions of the outward displacement; asymmetric: the largest displacement, over all
-    directions, that is left when the radial part is taken out (decentering and affinity); each with its sigma.
-    """
-
-    radius_mm: Array
-    radial_um: Array
-    radial_sigma_um: Array
-    asymmetric_um: Array
-    asymmetric_sigma_um: Array
 
 
 @dataclass(frozen=True)
@@ -85,56 +77,6 @@ def lens(name: str, camera: CameraRecord, covariance: Covariance | None = None) 
     return replace(known, covariance=covariance.of(Parameter.interior(name, each) for each in known.quantities))
 
 
-def is_defined_over_frame(lens: Lens) -> bool:
-    """Whether the family is defined over the frame, and not over the radius."""
-    return family(lens.distortion.family).needs == "half_mm"
-
-
-def curves(lens: Lens, largest_radius_mm: float) -> Curves:
-    """The curves from the principal point out to a radius, or as far as the lens makes an image."""
-    radius = np.linspace(0.0, largest_radius_mm, RADII)[1:]
-    outward = _directions()
-    imaged = lens.displacement((radius[:, None, None] * outward).reshape(-1, 2)).imaged.reshape(len(radius), -1)
-    radius = radius[np.logical_and.accumulate(imaged.all(axis=1))]
-    radial, radial_by, rest, rest_by = _radial_part(lens, radius)
-    size = np.hypot(rest[..., 0], rest[..., 1])
-    worst = size.argmax(axis=1)
-    at = np.arange(len(radius))
-    largest = size[at, worst]
-    unit = rest[at, worst] / np.maximum(largest, 1e-12)[:, None]
-    by_largest = np.einsum("rik,ri->rk", rest_by[at, worst], unit)
-    return Curves(radius, radial, _sigmas(lens, radial_by), largest, _sigmas(lens, by_largest))
-
-
-def _radial_part(lens: Lens, radius_mm: Array) -> tuple[Array, Array, Array, Array]:
-    """The mean outward displacement (r,) in um at radii with its derivatives (r, 1 + k) by c and the parameters, and
-    what is left (r, DIRECTIONS, 2) in each direction, with its derivatives."""
-    outward = _directions()
-    moved = lens.displacement((radius_mm[:, None, None] * outward).reshape(-1, 2))
-    value = moved.value_um.reshape(len(radius_mm), DIRECTIONS, 2)
-    by = moved.by_unknowns_um.reshape(len(radius_mm), DIRECTIONS, 2, -1)
-    radial = np.einsum("rdi,di->r", value, outward) / DIRECTIONS
-    radial_by = np.einsum("rdik,di->rk", by, outward) / DIRECTIONS
-    rest = value - radial[:, None, None] * outward
-    return radial, radial_by, rest, by - radial_by[:, None, None, :] * outward[:, :, None]
-
-
-def _displacement_cofactor(lens: Lens) -> Array:
-    """(1 + k, 1 + k) of c and the parameters, on which a displacement about the principal point depends."""
-    return np.delete(np.delete(lens.covariance, [1, 2], axis=0), [1, 2], axis=1)
-
-
-def _sigmas(lens: Lens, by: Array) -> Array:
-    """Standard deviations (n,) of what has these derivatives (n, 1 + k)."""
-    variance: Array = np.einsum("rk,kl,rl->r", by, _displacement_cofactor(lens), by)
-    return np.sqrt(np.maximum(variance, 0.0))
-
-
-def _directions() -> Array:
-    angles = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
-    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
 def largest_effects_um(lens: Lens, radius_mm: float) -> dict[str, float]:
     """By parameter: the largest displacement that a change of 1 of the parameter makes, at a radius.
 
@@ -142,7 +84,7 @@ def largest_effects_um(lens: Lens, radius_mm: float) -> dict[str, float]:
     """
     along = np.linspace(-1.0, 1.0, FRAME_GRID)
     in_frame = grid_mm(half * along for half in lens.distortion.half_mm)
-    moved = lens.displacement(in_frame if is_defined_over_frame(lens) else radius_mm * _directions())
+    moved = lens.displacement(in_frame if is_defined_over_frame(lens) else radius_mm * directions())
     sizes = np.hypot(moved.by_unknowns_um[:, 0, 1:], moved.by_unknowns_um[:, 1, 1:]).max(axis=0)
     return dict(zip(parameter_names(lens.distortion.family), sizes.tolist(), strict=True))
 
@@ -156,7 +98,7 @@ def certificate(lens: Lens, largest_radius_mm: float) -> Certificate:
     """
     radius = np.linspace(0.0, largest_radius_mm, _CERTIFICATE_RADII)[1:]
     radius = np.concatenate([[_NEAR_AXIS * largest_radius_mm], radius])
-    radial_um, radial_by, *_ = _radial_part(lens, radius)
+    radial_um, radial_by, *_ = radial_part(lens, radius)
     c = float(lens.interior[0])
     tangent = (radius - radial_um / 1e3) / c
     by = -radial_by / (1e3 * c)
@@ -170,8 +112,8 @@ def certificate(lens: Lens, largest_radius_mm: float) -> Certificate:
     by_at = np.stack([np.interp(at, tangent, column) for column in by.T], axis=1)
     slope = np.interp(at, tangent, np.gradient(tangent, radius))
     distortion_by = -by_at / slope[:, None] - at[:, None] * calibrated_by
-    sigmas = _sigmas(lens, np.vstack([calibrated_by, -near * by[0] / tangent[0], distortion_by])).tolist()
-    drawn = curves(lens, largest_radius_mm)
+    sigmas = function_sigmas(lens, np.vstack([calibrated_by, -near * by[0] / tangent[0], distortion_by])).tolist()
+    drawn = distortion_curves(lens, largest_radius_mm)
     asymmetric = zip(
         np.interp(radii, drawn.radius_mm, drawn.asymmetric_um).tolist(),
         np.interp(radii, drawn.radius_mm, drawn.asymmetric_sigma_um).tolist(),
@@ -215,7 +157,7 @@ def lens_map(lens: Lens, on: Plane, observed_radius_mm: float = np.inf) -> LensM
     point = lens.interior[1:]
     xy = xy[lens.displacement(xy - point).imaged]  # a fisheye's image does not fill the corners
     moved = lens.displacement(xy - point)
-    covariance = np.einsum("nik,kl,njl->nij", moved.by_unknowns_um, _displacement_cofactor(lens), moved.by_unknowns_um)
+    covariance = np.einsum("nik,kl,njl->nij", moved.by_unknowns_um, displacement_cofactor(lens), moved.by_unknowns_um)
     largest = longest_vector(moved.value_um, covariance)
     beyond = np.hypot(*(xy - point).T) > observed_radius_mm
     px_per_um = svg.round_step(LONGEST * mesh_mm * on.px_per_mm / largest[0]) if largest[0] > 0.0 else 1.0

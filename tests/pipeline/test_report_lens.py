@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.problem.parameter import Parameter
+from adjust.quality.distortion_curves import distortion_curves
 from pipeline.report.fiducials import Figure, figure_of_films, figure_plot
-from pipeline.report.lens import curves, curves_plot, largest_effects_um, lens, lens_map
+from pipeline.report.lens import curves_plot, largest_effects_um, lens, lens_map
 from pipeline.report.parameters import high_correlations, parameter_rows
 from pipeline.report.vectors import Plane
 from pipeline.results.adjustment_record import (
@@ -44,7 +45,7 @@ def test_the_radial_curve_of_torlegard_is_its_polynomial_and_its_sigma_follows()
     """dr = k3 r³ + k5 r⁵; with the correlation of k3 and k5 its variance is a quadratic form in (r³, r⁵)."""
     k3, k5, s3, s5, rho = 1.7e-7, -5.4e-12, 3e-9, 2e-13, -0.97
     matrix = np.array([[s3**2, rho * s3 * s5], [rho * s3 * s5, s5**2]])
-    drawn = curves(
+    drawn = distortion_curves(
         lens("A", camera("torlegard", k3=k3, k5=k5), covariance("A", ("k3", "k5"), matrix)), RADIUS_MM
     )  # fmt: skip
     r = drawn.radius_mm
@@ -57,7 +58,7 @@ def test_the_radial_curve_of_torlegard_is_its_polynomial_and_its_sigma_follows()
 def test_decentering_moves_a_point_by_three_times_its_profile_at_most() -> None:
     """Along the direction of (p1, p2) the decentering displacement is 3 sqrt(p1² + p2²) r², all of it radial."""
     p1, sigma = 8e-7, 9e-8
-    drawn = curves(
+    drawn = distortion_curves(
         lens("A", camera("torlegard", p1=p1), covariance("A", ("p1",), np.array([[sigma**2]]))), RADIUS_MM
     )  # fmt: skip
     np.testing.assert_allclose(drawn.asymmetric_um, 3e3 * p1 * drawn.radius_mm**2, rtol=1e-10)
@@ -86,7 +87,7 @@ def test_the_band_of_the_opencv_family_knows_that_c_and_k1_move_together() -> No
     c, k1, sigma_c, sigma_k = 20.0, -0.12, 0.02, 2e-3
     off = -0.9 * sigma_c * sigma_k
     matrix = np.array([[sigma_c**2, off], [off, sigma_k**2]])
-    drawn = curves(lens("A", camera("opencv", c, k1=k1), covariance("A", ("c", "k1"), matrix)), 9.0)
+    drawn = distortion_curves(lens("A", camera("opencv", c, k1=k1), covariance("A", ("c", "k1"), matrix)), 9.0)
     r = drawn.radius_mm[-1]
     nodes, weights = np.polynomial.hermite_e.hermegauss(5)
     pairs = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2) @ np.linalg.cholesky(matrix).T + (c, k1)
@@ -132,7 +133,9 @@ def test_of_a_set_over_the_frame_the_effect_is_the_largest_within_it() -> None:
 
 
 def test_the_curve_shows_where_no_target_was() -> None:
-    drawn = curves(lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]]))), RADIUS_MM)
+    drawn = distortion_curves(
+        lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]]))), RADIUS_MM
+    )
     assert "no targets here" in curves_plot(drawn, 100.0)
     assert "no targets here" not in curves_plot(drawn, RADIUS_MM)
 
