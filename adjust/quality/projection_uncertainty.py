@@ -29,7 +29,7 @@ from adjust.problem.estimates import Estimates
 from adjust.problem.images import adjusted_image, adjusted_lens, adjusted_places
 from adjust.problem.parameter import Parameter
 
-GRID = 25  # places along the longer side of a picture
+GRID = 33  # places along the longer side of a picture
 RANK = 1e-9  # of the normal matrix of an orientation, in equal columns: below it a direction is left alone
 
 

@@ -4,10 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
+from typing import Any, Literal
 
 import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.display.camera_plots import CameraPlots, PlottedResult, adjusted_camera_plots
+from adjust.display.tables import data_frame, parameter_columns, residual_columns
 from adjust.least_squares.iteration import Iteration, factorise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
@@ -20,7 +23,7 @@ from adjust.quality.contradiction import CalibrationTest, calibration_tests
 from adjust.quality.correlation import Correlation, correlations
 from adjust.quality.image_clusters import MOST_SHARED, cluster_covariance, shared_positions
 from adjust.quality.lens_reach import LensReach, lens_reach
-from adjust.quality.projection_uncertainty import ProjectionUncertainty, projection_uncertainty
+from adjust.quality.projection_uncertainty import ProjectionUncertainty, only_camera, projection_uncertainty
 from adjust.quality.reliability import Reliability, reliability
 from adjust.quality.residuals import FurtherResidual, Group, Residuals, further_residuals, groups, residuals
 from adjust.quality.run import Run
@@ -34,7 +37,7 @@ from adjust.solution.warnings import run_warnings
 
 
 @dataclass(frozen=True, repr=False)
-class Adjustment(Estimates):
+class Adjustment(Estimates, PlottedResult):
     """An adjusted network and what its observations say of it.
 
     run: the last adjustment, in reduced coordinates; scaled: the same with the priors that the cofactor matrix has.
@@ -158,6 +161,38 @@ class Adjustment(Estimates):
             Without a solution, for a camera that there is not, or one that shows no target.
         """
         return projection_uncertainty(self, self.cluster_covariance_of, camera, distance, places_mm)
+
+    def plots(self, camera: str = "", pixel_mm: float | None = None) -> CameraPlots:
+        """What the plots of a camera show.
+
+        Parameters
+        ----------
+        camera : its name; may be left out where there is one
+        pixel_mm : side of a pixel of a digital camera; plots are then in px
+
+        Raises
+        ------
+        AdjustmentError
+            Without a solution, or for a camera that there is not.
+        """
+        shown = only_camera(self, camera)
+
+        def uncertainty(distance: float) -> ProjectionUncertainty:
+            return self.projection_uncertainty(shown.name, distance)
+
+        return adjusted_camera_plots(self, shown, self.residuals.v_mm, uncertainty, pixel_mm)
+
+    def to_pandas(self, table: Literal["parameters", "residuals"] = "parameters") -> Any:
+        """A table as pandas.DataFrame: one row a quantity, or one row an observation.
+
+        Raises
+        ------
+        ImportError
+            Where pandas is not installed.
+        """
+        if table == "residuals":
+            return data_frame(residual_columns(self.network.observations, self.residuals))
+        return data_frame(parameter_columns(self))
 
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:

@@ -163,7 +163,7 @@ def test_the_datum_of_the_marks_has_no_part_in_it() -> None:
 def test_it_covers_the_picture_and_stops_where_the_lens_does() -> None:
     result = true_board(4)
     found = result.projection_uncertainty()
-    assert found.places_mm.shape == (19, 25, 2)
+    assert found.places_mm.shape == (25, 33, 2)
     np.testing.assert_allclose(found.places_mm[[0, -1], [0, -1]], [(0.0, 0.0), (3.2, -2.4)])
     assert 300 < found.median_distance < 450
     assert np.isfinite(found.sigma_mm).all()

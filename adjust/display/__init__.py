@@ -1,0 +1,1 @@
+"""Results as plots of Matplotlib and as tables of pandas, where these are installed."""

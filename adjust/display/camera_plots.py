@@ -1,0 +1,320 @@
+"""Plots of a calibrated camera by Matplotlib: residuals, distortion, uncertainty of projected points, coverage."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adjust.array_types import Array, Mask
+from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Lens
+from adjust.problem.camera import Camera
+from adjust.problem.estimates import Estimates
+from adjust.problem.images import adjusted_image, adjusted_lens
+from adjust.problem.parameter import Parameter
+from adjust.quality.distortion_curves import distortion_curves, is_defined_over_frame
+from adjust.quality.projection_uncertainty import ProjectionUncertainty
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import LogNorm
+
+BAND = 1.959964  # standard deviations to a probability of 95 %
+LONGEST = 0.08  # of the picture's longer side, drawn for the longest residuals
+CELLS = 8  # of the coverage along the longer side
+FEWEST_LEVELS = 5
+ROUND = (1.0, 2.0, 5.0)
+TARGET, FIDUCIAL, OUTLINE = "#1f5fa8", "#c2571a", "#777777"
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPlots:
+    """What the plots of one camera show, in its frame.
+
+    Attributes
+    ----------
+    name : str
+    lens : Lens
+        With its covariance.
+    places_mm, vectors_mm : Array (n, 2)
+        Of the observations, and their residuals along the camera's axes.
+    is_fiducial : Mask (n,)
+    images : int
+        How many show its targets.
+    corners_mm : Array (2, 2)
+        The lower left and the upper right corner of the picture.
+    uncertainty : Callable
+        The uncertainty of points at a distance, over the picture.
+    pixel_mm : float or None
+        Side of a pixel; with it plots are in px, y down.
+    """
+
+    name: str
+    lens: Lens
+    places_mm: Array
+    vectors_mm: Array
+    is_fiducial: Mask
+    images: int
+    corners_mm: Array
+    uncertainty: Callable[[float], ProjectionUncertainty]
+    pixel_mm: float | None = None
+
+    def plot_residuals(self, axes: "Axes | None" = None) -> "Axes":
+        """Draw the residuals of all images as vectors over the picture.
+
+        Parameters
+        ----------
+        axes : of Matplotlib; a new figure without
+        """
+        axes = self._frame(axes)
+        places, vectors = self._places(self.places_mm), self._lengths(self.vectors_mm)
+        sizes = np.hypot(*vectors.T)
+        longest = max(float(np.percentile(sizes, 99)) if len(sizes) else 0.0, 1e-9)
+        to_vector = longest / (LONGEST * self._longer_side)
+        for rows, color, label in ((~self.is_fiducial, TARGET, "targets"), (self.is_fiducial, FIDUCIAL, "fiducials")):
+            if rows.any():
+                style: dict[str, Any] = {"color": color, "label": label, "width": 0.0025}
+                style |= {"angles": "xy", "scale_units": "xy", "scale": to_vector}
+                quiver = axes.quiver(*places[rows].T, *vectors[rows].T, **style)
+        key = _round_below(longest)
+        axes.quiverkey(quiver, 0.95, -0.1, key, f"{key:g} {self._short_unit}", labelpos="W")
+        if self.is_fiducial.any():
+            axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.06), ncols=2, frameon=False, fontsize="small")
+        rms = np.sqrt((sizes**2).mean())
+        axes.set_title(f"{self.name}: residuals, rms {rms:.3g} {self._short_unit} a point", loc="left", fontsize=10)
+        return axes
+
+    def plot_distortion(self, axes: "Axes | None" = None) -> "Axes":
+        """Draw the distortion over the radius with its 95 % bands; grey where no target was observed.
+
+        Parameters
+        ----------
+        axes : of Matplotlib; a new figure without
+        """
+        axes = _axes(axes, (7.0, 4.0))
+        corners = np.stack(np.meshgrid(*self.corners_mm.T), axis=-1).reshape(-1, 2)
+        reach = float(np.hypot(*(corners - self.lens.interior[1:]).T).max())
+        if is_defined_over_frame(self.lens):
+            reach = min(reach, *self.lens.distortion.half_mm)
+        curves = distortion_curves(self.lens, reach)
+        radius, um = curves.radius_mm * self._per_mm, 1e-3 * self._lengths_per_mm
+        drawn = [(curves.radial_um, curves.radial_sigma_um, TARGET, "radial")]
+        if (curves.asymmetric_um > 1e-6).any():
+            label = "asymmetric, largest of all directions"
+            drawn.append((curves.asymmetric_um, curves.asymmetric_sigma_um, FIDUCIAL, label))
+        for value, sigma, color, label in drawn:
+            axes.plot(radius, um * value, color=color, label=label)
+            axes.fill_between(
+                radius, um * (value - BAND * sigma), um * (value + BAND * sigma), color=color, alpha=0.25, linewidth=0
+            )
+        observed = self._observed_radius_mm * self._per_mm
+        if observed < radius[-1]:
+            axes.axvspan(observed, radius[-1], color="#dddddd", zorder=0, label="no targets")
+        axes.set_xlim(0.0, radius[-1])
+        axes.set_xlabel(f"radius from the principal point ({self._long_unit})")
+        axes.set_ylabel(f"displacement ({self._short_unit})")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize="small")
+        axes.set_title(f"{self.name}: distortion, 95 % bands", loc="left", fontsize=10)
+        return axes
+
+    def plot_uncertainty(self, distance: float = np.inf, axes: "Axes | None" = None) -> "Axes":
+        """Draw the standard deviation of projected points over the picture, with contours.
+
+        Parameters
+        ----------
+        distance : of the points from the camera in object units; by default they are infinitely far
+        axes : of Matplotlib; a new figure without
+        """
+        found = self.uncertainty(distance)
+        axes = self._frame(axes)
+        places, sigma = self._places(found.places_mm), found.sigma_mm * self._lengths_per_mm
+        levels = contour_levels(sigma)
+        filled = axes.contourf(
+            places[..., 0],
+            places[..., 1],
+            sigma,
+            levels=levels,
+            cmap="viridis_r",
+            norm=_log_norm(levels),
+            extend="both",
+        )
+        lines = axes.contour(places[..., 0], places[..., 1], sigma, levels=levels, colors="black", linewidths=0.6)
+        axes.clabel(lines, fmt="%g", fontsize=8)
+        colours = axes.figure.colorbar(filled, ax=axes, format="%g", shrink=0.8)
+        colours.set_label(f"standard deviation ({self._short_unit})")
+        where = "at infinity" if np.isinf(distance) else f"at a distance of {distance_text(distance)}"
+        axes.set_title(f"{self.name}: projected points {where}", loc="left", fontsize=10)
+        return axes
+
+    def plot_coverage(self, axes: "Axes | None" = None) -> "Axes":
+        """Draw where targets were observed, and how many in each cell of the picture.
+
+        Parameters
+        ----------
+        axes : of Matplotlib; a new figure without
+        """
+        axes = self._frame(axes)
+        places, corners = (
+            self._places(self.places_mm[~self.is_fiducial]),
+            np.sort(self._places(self.corners_mm), axis=0),
+        )
+        sides = np.diff(corners, axis=0)[0]
+        counts = np.maximum(np.rint(CELLS * sides / sides.max()), 1).astype(int)
+        edges = [np.linspace(low, high, count + 1) for low, high, count in zip(*corners, counts, strict=True)]
+        number, *_ = np.histogramdd(places, bins=edges)
+        shown = axes.pcolormesh(*edges, np.ma.masked_equal(number.T, 0), cmap="Blues", vmin=0, alpha=0.8)
+        axes.figure.colorbar(shown, ax=axes, shrink=0.8, label="targets in a cell")
+        axes.plot(*places.T, ".", color="black", markersize=1.5)
+        title = f"{self.name}: {len(places)} targets in {self.images} images, {(number > 0).mean():.0%} of the cells"
+        axes.set_title(title, loc="left", fontsize=10)
+        return axes
+
+    def _frame(self, axes: "Axes | None") -> "Axes":
+        """Axes of the picture with its outline."""
+        low, high = np.sort(self._places(self.corners_mm), axis=0)
+        width, height = high - low
+        axes = _axes(axes, (7.0, min(1.0 + 6.0 * float(height / width), 9.0)))
+        axes.plot(*np.transpose([low, (high[0], low[1]), high, (low[0], high[1]), low]), color=OUTLINE, linewidth=0.8)
+        axes.set_aspect("equal")
+        if self.pixel_mm is not None:
+            axes.invert_yaxis()
+        axes.set_xlabel("column (px)" if self.pixel_mm is not None else "x' (mm)")
+        axes.set_ylabel("row (px)" if self.pixel_mm is not None else "y' (mm)")
+        return axes
+
+    def _places(self, places_mm: Array) -> Array:
+        return places_mm * self._per_mm * ([1.0, 1.0] if self.pixel_mm is None else [1.0, -1.0])
+
+    def _lengths(self, vectors_mm: Array) -> Array:
+        """Residuals along the axes of the plot."""
+        return vectors_mm * self._lengths_per_mm * ([1.0, 1.0] if self.pixel_mm is None else [1.0, -1.0])
+
+    @property
+    def _longer_side(self) -> float:
+        return float(np.ptp(self._places(self.corners_mm), axis=0).max())
+
+    @property
+    def _observed_radius_mm(self) -> float:
+        targets = self.places_mm[~self.is_fiducial] - self.lens.interior[1:]
+        return float(np.hypot(*targets.T).max(initial=0.0))
+
+    @property
+    def _per_mm(self) -> float:
+        return 1.0 if self.pixel_mm is None else 1.0 / self.pixel_mm
+
+    @property
+    def _lengths_per_mm(self) -> float:
+        """Of residuals and standard deviations: µm or px."""
+        return 1e3 if self.pixel_mm is None else 1.0 / self.pixel_mm
+
+    @property
+    def _long_unit(self) -> str:
+        return "mm" if self.pixel_mm is None else "px"
+
+    @property
+    def _short_unit(self) -> str:
+        return "µm" if self.pixel_mm is None else "px"
+
+
+def adjusted_camera_plots(
+    estimates: Estimates,
+    camera: Camera,
+    v_mm: Array,
+    uncertainty: Callable[[float], ProjectionUncertainty],
+    pixel_mm: float | None = None,
+) -> CameraPlots:
+    """The plots of a camera from its adjustment; v_mm (n, 2): the residuals in the comparator."""
+    observations = estimates.network.observations
+    of_image, places, moved, is_fiducial = np.array(observations.image), [], [], []
+    images = [each for each in estimates.network.images if each.camera == camera.name]
+    for image in images:
+        rows, model = np.flatnonzero(of_image == image.name), adjusted_image(estimates, image.name)
+        places.append(model.camera_from_comparator(observations.xy_mm[rows]))
+        moved.append(model.camera_from_comparator(observations.xy_mm[rows] + v_mm[rows]) - places[-1])
+        is_fiducial.append(observations.is_fiducial[rows])
+    observed = np.concatenate(places)
+    lens = adjusted_lens(estimates, camera.name)
+    keys = [Parameter.interior(camera.name, each) for each in lens.quantities]
+    return CameraPlots(
+        name=camera.name,
+        lens=replace(lens, covariance=estimates.sigma0**2 * estimates.cofactor_of(keys)),
+        places_mm=observed,
+        vectors_mm=np.concatenate(moved),
+        is_fiducial=np.concatenate(is_fiducial),
+        images=len(images),
+        corners_mm=np.array(camera.frame_corners() or (observed.min(axis=0), observed.max(axis=0))),
+        uncertainty=uncertainty,
+        pixel_mm=pixel_mm,
+    )
+
+
+class PlottedResult(ABC):
+    """A result whose cameras can be plotted; `plots` gives what each plot shows."""
+
+    @abstractmethod
+    def plots(self, camera: str = "") -> CameraPlots:
+        """What the plots of a camera show; its name may be left out where there is one."""
+
+    def plot_residuals(self, camera: str = "", axes: "Axes | None" = None) -> "Axes":
+        """Draw the residuals of all images as vectors over the picture."""
+        return self.plots(camera).plot_residuals(axes)
+
+    def plot_distortion(self, camera: str = "", axes: "Axes | None" = None) -> "Axes":
+        """Draw the distortion over the radius with its 95 % bands."""
+        return self.plots(camera).plot_distortion(axes)
+
+    def plot_uncertainty(self, distance: float = np.inf, camera: str = "", axes: "Axes | None" = None) -> "Axes":
+        """Draw the standard deviation of projected points over the picture, by default of points at infinity."""
+        return self.plots(camera).plot_uncertainty(distance, axes)
+
+    def plot_coverage(self, camera: str = "", axes: "Axes | None" = None) -> "Axes":
+        """Draw where targets were observed, and how many in each cell of the picture."""
+        return self.plots(camera).plot_coverage(axes)
+
+
+def contour_levels(values: Array) -> list[float]:
+    """Round levels over values: 1, 2 and 5 times powers of ten, or where these are few, round steps."""
+    finite = values[np.isfinite(values)]
+    if not finite.size or not finite.max() > 0.0:
+        raise AdjustmentError("No point of the picture has a standard deviation: nothing was estimated of the camera.")
+    low, high = max(float(finite.min()), 1e-3 * float(finite.max())), float(finite.max())
+    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
+    levels = sorted(float(f"{m * power:.3g}") for power in powers for m in ROUND if low <= m * power <= high)
+    if len(levels) >= FEWEST_LEVELS:
+        return levels
+    step = _round_below(max(high - low, 1e-3 * high) / FEWEST_LEVELS)
+    return [float(f"{k * step:.6g}") for k in range(int(np.ceil(low / step)), int(high / step) + 1)] or [high]
+
+
+def distance_text(distance: float) -> str:
+    """Four digits of a distance in object units."""
+    return np.format_float_positional(distance, precision=4, fractional=False, trim="-")
+
+
+def _round_below(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above a value."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(f"{max(m for m in ROUND if m * power <= value * (1.0 + 1e-9)) * power:.3g}")
+
+
+def _axes(axes: "Axes | None", size_in: tuple[float, float]) -> "Axes":
+    """The axes, or those of a new figure. Raises ImportError without Matplotlib."""
+    if axes is not None:
+        return axes
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError:
+        raise ImportError(
+            'Plots need Matplotlib, which this installation lacks. Install: pip install "reseau[plots]".'
+        ) from None
+    return plt.subplots(figsize=size_in, layout="constrained")[1]
+
+
+def _log_norm(levels: list[float]) -> "LogNorm | None":
+    """Colours by ratios where the levels span more than one power of ten."""
+    from matplotlib.colors import LogNorm
+
+    return LogNorm(levels[0], levels[-1]) if len(levels) > 1 and levels[-1] > 10.0 * levels[0] else None
