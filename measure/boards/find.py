@@ -35,6 +35,7 @@ _MOST_LINES = 500  # of a board, along a side
 _THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _DRAWINGS = 3  # of the chessboard detector's random numbers for a second board: one in twenty missed one at the edge
 _CROSSINGS_SEEN = 0.8  # of a second board, but its four corners, before it is searched
+_PLAIN_CORNERS = 8  # of a board of markers: two of them, which nothing else is read as
 _LEAST = 3  # lines that a chessboard has in either direction
 _FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
 _LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
@@ -244,7 +245,21 @@ def _find_in_picture(picture: Bytes, spec: ChessboardSpec | ArucoSpec | CharucoS
         return find_chessboard(picture, spec)
     if isinstance(spec, SquareGridSpec):
         return find_squares(picture, spec)
-    return find_charuco(picture, spec) if isinstance(spec, CharucoSpec) else find_aruco(picture, spec)
+    return _find_markers(picture, spec)
+
+
+def _find_markers(picture: Bytes, spec: ArucoSpec | CharucoSpec) -> FoundBoard:
+    """A board of markers, as it is printed or mirrored, in which no marker of a board can be read."""
+
+    def find(shown: Bytes) -> FoundBoard:
+        return find_charuco(shown, spec) if isinstance(spec, CharucoSpec) else find_aruco(shown, spec)
+
+    upright = find(picture)
+    if len(upright.corners) >= _PLAIN_CORNERS:
+        return upright
+    mirrored = find(np.ascontiguousarray(picture[:, ::-1]))
+    is_mirrored = len(mirrored.corners) >= max(_PLAIN_CORNERS, len(upright.corners) + 1)
+    return mirrored.mirrored(picture.shape[1]) if is_mirrored else upright
 
 
 def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.boards.lattice import homography_steps
-from measure.boards.specs import ArucoSpec, CharucoSpec, FoundBoard, FoundCorner, aruco_dictionary, corners_of_square
+from measure.boards.specs import (
+    AprilGridSpec,
+    ArucoSpec,
+    CharucoSpec,
+    FoundBoard,
+    FoundCorner,
+    aruco_dictionary,
+    corners_of_square,
+)
 from measure.flags import NO_REASON, Code, Reason
 from measure.targets.sheets import SheetView, robust_view
 
@@ -26,12 +34,20 @@ _FEWEST_CORNERS = 4  # that a homography takes
 
 @dataclass(frozen=True, eq=False)
 class MarkerReadings:
-    """All markers of a dictionary that a picture shows: outlines_px (4, 2) by number; module: the share of their sides
-    that one of their cells has."""
+    """All markers of a dictionary that a picture shows: outlines_px (4, 2) by number; border: the share of their sides
+    that the border about their code has."""
 
     outlines_px: Mapping[int, list[Array]]
     size_px: tuple[int, int]
-    module: float
+    border: float
+
+    def quarter_turned(self, turns: int) -> "MarkerReadings":
+        """The same markers, printed turned: each begins at another of its corners."""
+        turned = {
+            number: [np.roll(outline, turns, axis=0) for outline in places]
+            for number, places in self.outlines_px.items()
+        }
+        return replace(self, outlines_px=turned)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,21 +60,26 @@ class ReadMarkers:
     agreeing: int
 
 
-def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary) -> MarkerReadings:
-    """Read all markers of a dictionary, of whatever board."""
-    outlines, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
+def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary, border_modules: int = 1) -> MarkerReadings:
+    """Read all markers of a dictionary, of whatever board. border_modules: about the code of each."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border_modules
+    if border_modules > 1:  # squares touch the corners, which an outline cuts off
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    outlines, numbers, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(picture)
     readings: dict[int, list[Array]] = {}
     for outline, number in zip(
         outlines, [] if numbers is None else np.asarray(numbers, int).ravel().tolist(), strict=True
     ):
         readings.setdefault(number, []).append(np.asarray(outline, float).reshape(4, 2))
-    return MarkerReadings(readings, (picture.shape[1], picture.shape[0]), 1 / (dictionary.markerSize + 2))
+    border = border_modules / (dictionary.markerSize + 2 * border_modules)
+    return MarkerReadings(readings, (picture.shape[1], picture.shape[0]), border)
 
 
 def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
     """The markers of a board, in the order in which they are read."""
     readings = {number: places for number, places in read.outlines_px.items() if number in board}
-    view = _view(readings, board, read.size_px, read.module / 2)
+    view = _view(readings, board, read.size_px, read.border / 2)
     corners: dict[int, Array] = {}
     refused: dict[int, Reason] = {}
     agreeing = 0
@@ -95,7 +116,7 @@ def other_first_numbers(read: MarkerReadings, first: int, count: int) -> list[in
 
 
 def _view(
-    readings: Mapping[int, list[Array]], board: Mapping[int, Array], size_px: tuple[int, int], half_module: float
+    readings: Mapping[int, list[Array]], board: Mapping[int, Array], size_px: tuple[int, int], half_border: float
 ) -> SheetView | None:
     """Where the board lies by the markers that were read once; None where not most of all that were read agree, or
     where they are not as large as they would be there: markers of two boards may lie as those of a squeezed one."""
@@ -110,7 +131,7 @@ def _view(
     agreeing = sum(
         min(_off(view, board[number], place) for place in places) < 1.0 for number, places in readings.items()
     )
-    return view if 2 * agreeing > len(readings) and np.median(misfits) < half_module else None
+    return view if 2 * agreeing > len(readings) and np.median(misfits) < half_border else None
 
 
 def _misfit(view: SheetView, corners: Array, image_px: Array) -> float:
@@ -173,8 +194,14 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
 def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
     """A board's markers; and the layout, the one that is described or a better one, under which most of those that were
     read lie where their board has them."""
-    readings = read_markers(picture, aruco_dictionary(spec.dictionary))
+    border_modules = spec.border_modules if isinstance(spec, ArucoSpec) else 1
+    readings = read_markers(picture, aruco_dictionary(spec.dictionary), border_modules)
     best, layout = placed_markers(readings, _markers(spec)), spec
+    if isinstance(spec, AprilGridSpec):  # programs that print them do not agree which corner of a tag is the first
+        turned = [readings.quarter_turned(turns) for turns in range(4)]
+        placed = [placed_markers(each, _markers(spec)) for each in turned]
+        best = max(placed, key=lambda each: each.agreeing)
+        readings = turned[placed.index(best)]
     for other in _other_layouts(spec, readings) if best.agreeing < len(readings.outlines_px) else ():
         placed = placed_markers(readings, _markers(other))
         if placed.agreeing > best.agreeing:
@@ -200,7 +227,8 @@ def _other_layout_board(spec: ArucoSpec | CharucoSpec, other: ArucoSpec | Charuc
     differing = [key for key in keys if getattr(spec, key, None) != getattr(other, key, None)]
     if not getattr(other, "legacy", None):
         differing = [key for key in differing if key != "legacy" or getattr(spec, key)]
-    fitting = ", ".join(f"{key} = {str(getattr(other, key)).lower()}" for key in differing)
+    words = {"first_marker": "first_id"} if isinstance(spec, AprilGridSpec) else {}  # as [targets] has them
+    fitting = ", ".join(f"{words.get(key, key)} = {str(getattr(other, key)).lower()}" for key in differing)
     message = f"the markers that were read do not lie as on the board that is described, but as with {fitting}"
     return FoundBoard({}, Reason(f"{message}. Set that, if it is the board's", Code.NO_BOARD))
 

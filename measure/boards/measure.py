@@ -12,6 +12,7 @@ from measure.boards.corners import Corner, CornerStart, fit_corners
 from measure.boards.find import find_board
 from measure.boards.lattice import Place, find_grid
 from measure.boards.specs import (
+    AprilGridSpec,
     ArucoSpec,
     BoardSpec,
     CharucoSpec,
@@ -19,7 +20,6 @@ from measure.boards.specs import (
     CircleGridSpec,
     FoundCorner,
     SquareGridSpec,
-    aruco_dictionary,
 )
 from measure.flags import NO_REASON, Code, Reason, Status
 from measure.matching.window import ScanWindow
@@ -39,7 +39,7 @@ _SHORTEST_REACH_PX = 5.0  # less shows too little of the edges...
 _FARTHEST_REACH = 0.6  # ...but beyond this share the neighbouring crossing begins to show
 _LONGEST_REACH_PX = 15.0  # enough for a few thousandths of a pixel, whatever the square
 _HALF_SIDE, _FREE_GAP = 0.5, 0.8  # of a square that stands alone, and of the gap beside it
-_MARKER_REACH = 0.8  # of a marker's module: its black border is one module wide
+_MARKER_REACH = 0.8  # of a marker's black border, or of the gap beside it
 _WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out it is weak
 
 
@@ -47,13 +47,15 @@ _WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out 
 class BoardMeasurement:
     """A board in a scan: one mark for each of its points, found or not; reason: why the board was not found; notes:
     what the user should know; refused: markers that were read and are not used, one sentence each; ambiguous: what else
-    in the scan may be the board as well, so that none of its points is an observation."""
+    in the scan may be the board as well, so that none of its points is an observation; is_mirrored: as `FoundBoard` has
+    it."""
 
     marks: tuple[MarkMeasurement, ...]
     reason: Reason = NO_REASON
     notes: tuple[str, ...] = ()
     refused: tuple[Reason, ...] = ()
     ambiguous: Reason = NO_REASON
+    is_mirrored: bool = False
 
 
 def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
@@ -135,7 +137,9 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
         if isinstance(spec, ArucoSpec):
             refusal = board.refused.get(int(name.split(".")[0]), NO_REASON)
         marks.append(_corner_mark(name, fitted.get(name), refusal or unseen))
-    measured = BoardMeasurement(tuple(marks), board.reason, notes, tuple(board.refused.values()))
+    measured = BoardMeasurement(
+        tuple(marks), board.reason, notes, tuple(board.refused.values()), is_mirrored=board.is_mirrored
+    )
     what = "squares" if isinstance(spec, SquareGridSpec) else "inner corners"
     return _unless_alone(measured, f"boards of {spec.columns} x {spec.rows} {what}", board.others_px)
 
@@ -167,16 +171,16 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
         place_px = col, row, side, side
         return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px))
 
-    surface: Surface = quarter if isinstance(spec, ArucoSpec | SquareGridSpec) else crossing
+    stands_alone = isinstance(spec, ArucoSpec | SquareGridSpec) and not isinstance(spec, AprilGridSpec)
+    surface: Surface = quarter if stands_alone else crossing
     return dict(zip(found, fit_corners(read, starts, surface), strict=True))
 
 
 def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:
     """(2,) how far along the sides (2,) of a square or marker grey values are used."""
     if isinstance(spec, ArucoSpec):
-        modules = aruco_dictionary(spec.dictionary).markerSize + 2
-        gap_modules = spec.gap_mm / spec.marker_mm * modules
-        return np.asarray(np.minimum(_MARKER_REACH * min(1.0, gap_modules) * sides_px / modules, _LONGEST_REACH_PX))
+        free = min(spec.border_modules / spec.modules, spec.gap_mm / spec.marker_mm)
+        return np.asarray(np.minimum(_MARKER_REACH * free * sides_px, _LONGEST_REACH_PX))
     if isinstance(spec, SquareGridSpec):  # to neither its next corner nor the next square
         free = min(_HALF_SIDE, _FREE_GAP * spec.gap_mm / spec.square_mm)
         return np.asarray(np.minimum(free * sides_px, _LONGEST_REACH_PX))

@@ -5,7 +5,7 @@ units are those of the specification.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import ClassVar
 
@@ -108,16 +108,40 @@ class ArucoSpec(_Spec):
     gap_mm: float
     first_marker: int = 0
     fewest = 1
+    border_modules: ClassVar[int] = 1  # of a marker, about its code
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_markers(self.dictionary, self.first_marker, self.columns * self.rows)
 
+    @property
+    def modules(self) -> int:
+        """Along the side of a marker."""
+        return int(aruco_dictionary(self.dictionary).markerSize) + 2 * self.border_modules
+
+    def marker(self, row: int, column: int) -> int:
+        """The number of the marker at a place."""
+        return self.first_marker + row * self.columns + column
+
     def object_points(self) -> dict[str, Point3]:
         """Id to (X, Y, 0) in mm."""
         corners = _corners(self.columns, self.rows, self.marker_mm, self.gap_mm)
-        first, across = self.first_marker, self.columns
-        return {f"{first + row * across + column}.{k}": point for (row, column, k), point in corners.items()}
+        return {f"{self.marker(row, column)}.{k}": point for (row, column, k), point in corners.items()}
+
+
+@dataclass(frozen=True)
+class AprilGridSpec(ArucoSpec):
+    """Kalibr's grid of AprilTags: two modules of border, a dark square in each gap that touches the markers' corners,
+    the first marker in the LOWER left corner, then row by row upwards.
+
+    Corners are named as those of `ArucoSpec`.
+    """
+
+    border_modules = 2
+
+    def marker(self, row: int, column: int) -> int:
+        """The number of the marker at a place."""
+        return super().marker(self.rows - 1 - row, column)
 
 
 @dataclass(frozen=True)
@@ -223,7 +247,8 @@ class FoundCorner:
 class FoundBoard:
     """The corners found, by id; none, and the reason why; refused: the markers that were read and are not used, by
     number, and why; off_corners: the corners that do not lie where the markers beside them put them, and why;
-    others_px: the middles of further boards that look the same; notes: what the user should know."""
+    others_px: the middles of further boards that look the same; notes: what the user should know; is_mirrored: whether
+    the picture shows the board as a mirror does."""
 
     corners: dict[str, FoundCorner]
     reason: Reason = NO_REASON
@@ -231,6 +256,16 @@ class FoundBoard:
     off_corners: Mapping[str, Reason] = field(default_factory=dict)
     others_px: tuple[Array, ...] = ()
     notes: tuple[str, ...] = ()
+    is_mirrored: bool = False
+
+    def mirrored(self, width_px: int) -> "FoundBoard":
+        """The board of a picture of which this is the mirror image, left to right."""
+        sign = np.array([-1.0, 1.0])
+        corners = {
+            name: FoundCorner(corner.center_px * sign + [width_px - 1, 0], corner.steps_px * sign[:, None])
+            for name, corner in self.corners.items()
+        }
+        return replace(self, corners=corners, is_mirrored=not self.is_mirrored)
 
 
 def corners_of_square(name: str, corners: Array) -> dict[str, FoundCorner]:

@@ -41,6 +41,10 @@ from pipeline.measuring.target_identification import (
 from pipeline.results.comparator_file import comparator_from_pixel
 from pipeline.results.measured_record import MeasuredScan
 
+_MIRRORED = (
+    "The board is seen mirrored: in a mirror, from its back, or the picture is flipped. Its points are named as on the "
+    "board. If that is meant, write transparent = true under [targets]; else flip the picture."
+)
 LEAST_PAIRS = 4  # of points and marks that name an image's targets
 Array = NDArray[np.float64]
 
@@ -130,7 +134,8 @@ def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) ->
             problems = (f"No point of the board is used: {board.ambiguous}. Cover all but one, or cut the scan.",)
         # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
         notes = tuple(f"{note}." for note in board.notes) if sought.surveyed else ()
-        return with_targets(measured, board.marks, (*problems, *notes), Code.NO_BOARD)
+        mirrored = (_MIRRORED,) if board.is_mirrored and not settings.transparent else ()
+        return with_targets(measured, board.marks, (*problems, *mirrored, *notes), Code.NO_BOARD)
     found, notes = _oriented_by_targets(options, sought, scan, measured)
     if isinstance(found, str):
         unnamed = Reason(found, Code.UNNAMED)

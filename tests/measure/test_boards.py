@@ -21,6 +21,7 @@ from measure.boards.markers import ReadMarkers, off_corners
 from measure.boards.measure import BoardMeasurement, measure_board
 from measure.boards.saddle_points import largest_lattice, saddle_strength
 from measure.boards.specs import (
+    AprilGridSpec,
     ArucoSpec,
     BoardSpec,
     CharucoSpec,
@@ -172,6 +173,11 @@ def test_circle_grids(spec: CircleGridSpec) -> None:
 def printed(board: Any, spec: BoardSpec, size_mm: tuple[float, float], corner_mm: Array) -> Any:
     """Darkness from OpenCV's own drawing of a board, 4 px a mm, whose upper left corner lies at corner_mm."""
     drawing = board.generateImage((round(size_mm[0] * 4), round(size_mm[1] * 4)), marginSize=0, borderBits=1)
+    return dark_of(drawing, corner_mm)
+
+
+def dark_of(drawing: Any, corner_mm: Array) -> Any:
+    """Darkness from a drawing, 4 px a mm, whose upper left corner lies at corner_mm."""
 
     def dark(x: Array, y: Array) -> Array:
         col, row = np.floor((x - corner_mm[0]) * 4).astype(int), np.floor((corner_mm[1] - y) * 4).astype(int)
@@ -317,6 +323,62 @@ def test_aruco_and_apriltag_corners(dictionary: str) -> None:
     board = measure_board(scan_of(picture), spec)
     errors = errors_px(board, truth_of(spec, homography))
     assert len(errors) == 24
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+
+
+def april_grid_dark(spec: AprilGridSpec, quarter_turns: int = 0) -> Any:
+    """Kalibr's board of OpenCV's markers, each turned so often: corner squares about all, the first at the lower left."""
+    side, gap = round(4 * spec.marker_mm), round(4 * spec.gap_mm)
+    drawing = np.full((spec.rows * (side + gap) + gap, spec.columns * (side + gap) + gap), 255, np.uint8)
+    for row, column in np.ndindex(spec.rows + 1, spec.columns + 1):
+        top, left = row * (side + gap), column * (side + gap)
+        drawing[top : top + gap, left : left + gap] = 0
+        if row < spec.rows and column < spec.columns:
+            number = spec.first_marker + (spec.rows - 1 - row) * spec.columns + column
+            marker = cv2.aruco.generateImageMarker(aruco_dictionary(spec.dictionary), number, side, borderBits=2)
+            where = np.s_[top + gap : top + gap + side, left + gap : left + gap + side]
+            drawing[where] = np.rot90(marker, quarter_turns)
+    corner = np.array([-spec.gap_mm, spec.rows * (spec.marker_mm + spec.gap_mm)])
+    return dark_of(drawing, corner)
+
+
+APRIL_GRID = AprilGridSpec("APRILTAG_36h11", 3, 2, 66.0, 20.0, first_marker=5)
+
+
+@parametrize_with_studies(("turn_deg", "quarter_turns"), [(4.0, 0), (184.0, 2)], quick=(1,))
+def test_a_grid_of_april_tags_has_its_corners_at_the_junctions(turn_deg: float, quarter_turns: int) -> None:
+    """Counted from the lower left, however each tag is turned; two modules of border, squares at all corners."""
+    homography = board_from_pixel(turn_deg, 1e-4)
+    picture = picture_of(APRIL_GRID, homography, april_grid_dark(APRIL_GRID, quarter_turns))
+    board = measure_board(scan_of(picture), APRIL_GRID)
+    errors = errors_px(board, truth_of(APRIL_GRID, homography))
+    assert len(errors) == 24
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+    assert np.abs(errors.mean(axis=0)).max() < 0.008
+    assert all("junction_col_px" in mark.quality for mark in board.marks)
+    other = measure_board(scan_of(picture), replace(APRIL_GRID, first_marker=0))
+    assert "but as with first_id = 5" in other.reason
+
+
+@parametrize_with_studies("kind", ["aprilgrid", "charuco", "aruco"], quick=(2,))
+def test_a_board_in_a_mirror_keeps_its_names(kind: str) -> None:
+    """As it is seen from its back; what was read in the picture as it is, of another board's number, is none of it."""
+    spec: ArucoSpec | CharucoSpec = APRIL_GRID
+    homography = board_from_pixel(5.0, 1e-4)
+    if kind == "charuco":
+        spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
+        picture = charuco_picture(spec, homography)
+    elif kind == "aruco":
+        spec = ArucoSpec("5X5_100", 3, 2, 63.0, 21.0)
+        drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary("5X5_100"))
+        picture = picture_of(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
+    else:
+        picture = picture_of(spec, homography, april_grid_dark(APRIL_GRID))
+    truth = truth_of(spec, homography)
+    board = measure_board(scan_of(picture[:, ::-1]), spec)
+    assert board.is_mirrored
+    errors = errors_px(board, {name: np.array([WIDTH - 1 - col, row]) for name, (col, row) in truth.items()})
+    assert len(errors) >= 16
     assert np.sqrt(np.mean(errors**2)) < 0.03
 
 
@@ -475,6 +537,7 @@ def test_markers_of_two_boards_are_not_those_of_one(gap: float) -> None:
         ChessboardSpec(9, 6, 25.0),
         CircleGridSpec(6, 5, 30.0, 14.0),
         ArucoSpec("4X4_50", 3, 2, 30.0, 10.0),
+        AprilGridSpec("APRILTAG_36h11", 3, 2, 30.0, 9.0),
         CharucoSpec("4X4_50", 6, 5, 32.0, 24.0),
         SquareGridSpec(6, 5, 25.0, 15.0),
     ],
