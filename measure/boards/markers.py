@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain, product
 from typing import Any, TypeVar
 
 import cv2
@@ -195,15 +196,15 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
     """A board's markers; and the layout, the one that is described or a better one, under which most of those that were
     read lie where their board has them."""
     border_modules = spec.border_modules if isinstance(spec, ArucoSpec) else 1
-    readings = read_markers(picture, aruco_dictionary(spec.dictionary), border_modules)
+    readings: MarkerReadings = read_markers(picture, aruco_dictionary(spec.dictionary), border_modules)
     best, layout = placed_markers(readings, _markers(spec)), spec
-    if isinstance(spec, AprilGridSpec):  # programs that print them do not agree which corner of a tag is the first
-        turned = [readings.quarter_turned(turns) for turns in range(4)]
-        placed = [placed_markers(each, _markers(spec)) for each in turned]
-        best = max(placed, key=lambda each: each.agreeing)
-        readings = turned[placed.index(best)]
-    for other in _other_layouts(spec, readings) if best.agreeing < len(readings.outlines_px) else ():
-        placed = placed_markers(readings, _markers(other))
+    # Programs that print AprilTags do not agree which of a tag's corners is the first.
+    turned = [readings.quarter_turned(turns) for turns in range(4 if isinstance(spec, AprilGridSpec) else 1)]
+    layouts: Iterator[Layout] = chain((spec,), _other_layouts(spec, readings))
+    for other, read in product(layouts, turned):
+        if best.agreeing == len(readings.outlines_px):
+            break
+        placed = placed_markers(read, _markers(other))
         if placed.agreeing > best.agreeing:
             best, layout = placed, other
     return best, layout

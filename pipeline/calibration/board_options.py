@@ -1,5 +1,6 @@
 """The board of `reseau calibrate`, as the command line describes it and as project.toml has it."""
 
+import math
 import re
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -7,16 +8,19 @@ from typing import Literal, get_args
 from pipeline.errors import InputError
 from pipeline.text.wording import did_you_mean, quoted
 
-BoardKind = Literal["chessboard", "charuco", "aruco", "circle-grid", "asymmetric-circle-grid"]
+BoardKind = Literal["chessboard", "charuco", "aprilgrid", "aruco", "circle-grid", "asymmetric-circle-grid"]
 MOST = 500  # columns or rows, as `[targets]` takes them
+KALIBR_SPACING = 0.3  # of an AprilGrid's tags, where nobody says it
 MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
 @dataclass(frozen=True)
 class BoardOptions:
-    """columns, rows: inner corners (chessboard), squares (charuco), markers (aruco) or circles.
+    """columns, rows: inner corners (chessboard), squares (charuco), markers (aprilgrid, aruco) or circles.
 
-    spacing_mm: side of a square, or from one marker or circle to the next. size_mm: of a marker or a circle.
+    spacing_mm: side of a square, or from one marker or circle to the next; of an asymmetric grid from row to row, half
+    of what lies between two circles of a row. size_mm: of a marker or a circle. first_id: of the markers. bend: whether
+    the board's bend is adjusted. transparent: whether it is seen from both sides, as in a mirror.
     """
 
     kind: BoardKind
@@ -26,6 +30,9 @@ class BoardOptions:
     size_mm: float | None = None
     dictionary: str | None = None
     legacy: bool = False
+    first_id: int = 0
+    bend: bool = False
+    transparent: bool = False
 
     def __post_init__(self) -> None:
         """Raises InputError where an option of its kind is missing: before anything is read."""
@@ -41,12 +48,19 @@ class BoardOptions:
             case "charuco":
                 keys |= {"square_mm": self.spacing_mm, "marker_mm": self._size, "dictionary": self._dictionary}
                 keys |= {"legacy": True} if self.legacy else {}
+                keys |= {"first_id": self.first_id}
             case "aruco":
                 gap_mm = self.spacing_mm - self._size
                 keys |= {"marker_mm": self._size, "gap_mm": gap_mm, "dictionary": self._dictionary}
+                keys |= {"first_marker": self.first_id}
+            case "aprilgrid":
+                marker_mm = self.spacing_mm / (1.0 + KALIBR_SPACING) if self.size_mm is None else self._size
+                keys |= {"marker_mm": marker_mm, "spacing": self.spacing_mm / marker_mm - 1.0}
+                keys |= {"dictionary": self.dictionary} if self.dictionary else {}
+                keys |= {"first_id": self.first_id}
             case "circle-grid" | "asymmetric-circle-grid":
-                keys |= {"kind": "circle-grid", "spacing_mm": self.spacing_mm, "diameter_mm": self._size}
-                keys |= {"asymmetric": True} if self.kind == "asymmetric-circle-grid" else {}
+                keys |= {"spacing_mm": self.spacing_mm, "diameter_mm": self._size}
+        keys |= {"transparent": True} if self.transparent else {}
         return "[targets]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in keys.items())
 
     @property
@@ -54,10 +68,11 @@ class BoardOptions:
         if self.size_mm is None:
             what = "the diameter of a circle" if "circle" in self.kind else "the side of a marker"
             raise InputError(f"--marker is missing: {what}, such as --marker 18mm, is needed for {self.kind}.")
-        if not self.size_mm < self.spacing_mm:
+        nearest_mm = self.spacing_mm * (math.sqrt(2.0) if self.kind == "asymmetric-circle-grid" else 1.0)
+        if not self.size_mm < nearest_mm:
             raise InputError(
-                f"--marker {self.size_mm:g} mm is not smaller than --square {self.spacing_mm:g} mm, the distance from "
-                "one to the next. Exchange the two, or measure them again."
+                f"--marker {self.size_mm:g} mm is not smaller than the distance from one to the next, {nearest_mm:.4g} "
+                f"mm by --square {self.spacing_mm:g} mm. Exchange the two, or measure them again."
             )
         return self.size_mm
 
@@ -69,7 +84,13 @@ class BoardOptions:
 
 
 def board_options(
-    kind: str, board: str, square: str, marker: str | None, dictionary: str | None, legacy: bool
+    kind: str,
+    board: str,
+    square: str,
+    marker: str | None = None,
+    dictionary: str | None = None,
+    legacy: bool = False,
+    first_id: int = 0,
 ) -> BoardOptions:
     """The board that the options of the command line describe. Raises InputError naming the option that is wrong."""
     kinds: dict[str, BoardKind] = {each: each for each in get_args(BoardKind)}
@@ -82,7 +103,8 @@ def board_options(
         raise InputError(f"--board {board}: must be two counts of 1 to {MOST}, COLUMNSxROWS, such as 9x6.")
     size_mm = None if marker is None else _length_mm("--marker", marker)
     columns, rows = map(int, counts.groups())
-    return BoardOptions(kinds[kind], columns, rows, _length_mm("--square", square), size_mm, dictionary, legacy)
+    spacing_mm = _length_mm("--square", square)
+    return BoardOptions(kinds[kind], columns, rows, spacing_mm, size_mm, dictionary, legacy, first_id)
 
 
 def _length_mm(option: str, text: str) -> float:

@@ -224,8 +224,8 @@ def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calib
     if len(left_out) == number:
         return (
             f"the board was found in none of {counted(number, 'picture')}; of most: {_most_common(left_out.values())}. "
-            "Check --board (inner corners of a chessboard, not squares), --kind, and that the whole board is in the "
-            "picture."
+            "Check --board (inner corners of a chessboard, not squares), --kind, --first-id, and that the board is in "
+            "the picture."
         )
     return "; ".join(f"{camera}: {why}" for camera, why in not_calibrated.items()) + (
         f" Left out: {listed([f'{name} ({why})' for name, why in left_out.items()])}." if left_out else ""

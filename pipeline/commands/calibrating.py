@@ -30,11 +30,12 @@ def calibrate(
     board: Annotated[str, typer.Option(metavar="9x6", help="Inner corners, squares (charuco), markers or circles.")],
     square: Annotated[str, typer.Option(metavar="25mm", help="Side of a square, or distance from one to the next.")],
     kind: Annotated[
-        str, typer.Option(help="chessboard, charuco, aruco, circle-grid or asymmetric-circle-grid.")
+        str, typer.Option(help="chessboard, charuco, aprilgrid, aruco, circle-grid or asymmetric-circle-grid.")
     ] = "chessboard",
     marker: Annotated[str | None, typer.Option(metavar="18mm", help="Side of a marker, diameter of a circle.")] = None,
     dictionary: Annotated[str | None, typer.Option(metavar="4X4_50", help="Of the markers.")] = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="The older ChArUco layout; else both are tried.")] = False,
+    first_id: Annotated[int, typer.Option(metavar="N", min=0, help="Number of the first marker.")] = 0,
     lens: Annotated[str, typer.Option(help=f"{', '.join(LENSES)}.")] = "auto",
     square_pixels: Annotated[bool, typer.Option("--square-pixels", help="One focal length for x and y.")] = False,
     pitch_um: Annotated[float | None, typer.Option(metavar="UM", min=0.01, help="Side of a pixel, for mm.")] = None,
@@ -53,7 +54,7 @@ def calibrate(
 
     if lens not in LENSES:
         raise InputError(f"--lens {lens}: possible are {', '.join(LENSES)}.{did_you_mean(lens, LENSES)}")
-    given = board_options(kind, board, square, marker, dictionary, legacy)
+    given = board_options(kind, board, square, marker, dictionary, legacy, first_id)
     options = CalibrationOptions(given, LENSES[lens], square_pixels, pitch_um, ros)
     found = calibrate(pictures, out, options, Reporter(), workers)
     show(as_json, found.as_json, found.print)

@@ -29,7 +29,18 @@ if TYPE_CHECKING:
     from measure.boards.specs import BoardSpec
     from measure.targets.ring_codes import RingCode
 
-KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco", "squares")
+KINDS = (
+    "disk",
+    "cross",
+    "coded-ring",
+    "chessboard",
+    "circle-grid",
+    "asymmetric-circle-grid",
+    "aruco",
+    "aprilgrid",
+    "charuco",
+    "squares",
+)
 
 _MOST_OF_A_BOARD = 500  # columns, and rows
 POLARITY = choice("auto", "light", "dark")
@@ -160,6 +171,16 @@ class ArucoTable(BoardTable):
     first_marker: Annotated[int, whole()] = Field(default=0, description="Number of the first marker.")
 
 
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class AprilGridTable(BoardTable):
+    """[targets] of Kalibr's grid of AprilTags."""
+
+    marker_mm: Annotated[float, POSITIVE] = Field(description="Side of a tag with its black border.")
+    spacing: Annotated[float, POSITIVE] = Field(default=0.3, description="Gap between tags, in their sides.")
+    first_id: Annotated[int, whole()] = Field(default=0, description="Number of the tag at the lower left.")
+    dictionary: Annotated[str, TEXT] = Field(default="APRILTAG_36h11", description="Of the tags.")
+
+
 TARGET_TABLES: Mapping[str, type[TargetTable]] = dict(
     zip(
         KINDS,
@@ -169,7 +190,9 @@ TARGET_TABLES: Mapping[str, type[TargetTable]] = dict(
             CodedRingTable,
             ChessboardTable,
             CircleGridTable,
+            CircleGridTable,
             ArucoTable,
+            AprilGridTable,
             CharucoTable,
             SquaresTable,
         ),
@@ -235,9 +258,10 @@ def _board(given: TargetTable) -> "BoardSpec":
 
     match given:
         case CircleGridTable():
-            staggered, row_spacing = given.asymmetric, given.row_spacing_mm
+            counts_dots = given.kind == "asymmetric-circle-grid"  # of a row, as OpenCV does; else places
+            columns, staggered = given.columns * (2 if counts_dots else 1), given.asymmetric or counts_dots
             return specs.CircleGridSpec(
-                given.columns, given.rows, given.spacing_mm, given.diameter_mm, staggered, row_spacing
+                columns, given.rows, given.spacing_mm, given.diameter_mm, staggered, given.row_spacing_mm
             )
         case SquaresTable():
             return specs.SquareGridSpec(given.columns, given.rows, given.square_mm, given.gap_mm)
@@ -247,6 +271,11 @@ def _board(given: TargetTable) -> "BoardSpec":
         case ArucoTable():
             marker, gap, first = given.marker_mm, given.gap_mm, given.first_marker
             return specs.ArucoSpec(given.dictionary, given.columns, given.rows, marker, gap, first)
+        case AprilGridTable():
+            marker, first = given.marker_mm, given.first_id
+            return specs.AprilGridSpec(
+                given.dictionary, given.columns, given.rows, marker, given.spacing * marker, first
+            )
     assert isinstance(given, ChessboardTable)
     return specs.ChessboardSpec(given.columns, given.rows, given.square_mm)
 

@@ -77,7 +77,9 @@ def find_points(picture: Bytes, board: BoardSpec) -> Array:
         case CharucoSpec():
             points = cv2.aruco.CharucoDetector(charuco_board(board)).detectBoard(picture)[0]
         case ArucoSpec():
-            markers = cv2.aruco.ArucoDetector(aruco_dictionary(board.dictionary)).detectMarkers(picture)[0]
+            parameters = cv2.aruco.DetectorParameters()
+            parameters.markerBorderBits = board.border_modules
+            markers = cv2.aruco.ArucoDetector(aruco_dictionary(board.dictionary), parameters).detectMarkers(picture)[0]
             points = np.concatenate(markers) if len(markers) else None
     return np.asarray(points, dtype=float).reshape(-1, 2) if found and points is not None else np.zeros((0, 2))
 

@@ -327,7 +327,7 @@ def test_aruco_and_apriltag_corners(dictionary: str) -> None:
 
 
 def april_grid_dark(spec: AprilGridSpec, quarter_turns: int = 0) -> Any:
-    """Kalibr's board of OpenCV's markers, each turned so often: corner squares about all, the first at the lower left."""
+    """Kalibr's board of OpenCV's markers, each turned so often: squares at all corners, the first at the lower left."""
     side, gap = round(4 * spec.marker_mm), round(4 * spec.gap_mm)
     drawing = np.full((spec.rows * (side + gap) + gap, spec.columns * (side + gap) + gap), 255, np.uint8)
     for row, column in np.ndindex(spec.rows + 1, spec.columns + 1):

@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import tomllib
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from pipeline.calibration.board_options import board_options
 from pipeline.calibration.pictures import find_pictures
 from pipeline.cli import run
 from pipeline.errors import InputError
+from pipeline.files.target_table import read_targets
+from pipeline.text.tables import Table
 
 TOO_FEW = (
     "the board is in 1 picture of 440 x 360 px, and 3 or more with different tilts are needed. Pictures that were "
@@ -112,13 +115,24 @@ def test_pictures_of_other_focal_lengths_are_of_other_cameras(tmp_path: Path) ->
 
 
 def test_boards_as_project_files_have_them() -> None:
-    circles = board_options("asymmetric-circle-grid", "4x11", "1in", "10mm", None, False)
-    assert (
-        'kind = "circle-grid"\ncolumns = 4\nrows = 11\nspacing_mm = 25.4\ndiameter_mm = 10.0\nasymmetric = true'
-        in circles.table
-    )
-    aruco = board_options("aruco", "3x2", "40mm", "30mm", "4X4_50", False)
-    assert "marker_mm = 30.0\ngap_mm = 10.0" in aruco.table
+    """OpenCV's asymmetric grid of 4 x 11; Kalibr's sizes, the gap three tenths of a tag where nobody says it."""
+
+    def board(*given: Any, **options: Any) -> Any:
+        table = tomllib.loads(board_options(*given, **options).table)["targets"]
+        assert table.get("transparent") is None
+        return read_targets(Table(table, Path("project.toml"), "targets")).board
+
+    circles = board("asymmetric-circle-grid", "4x11", "1in", "10mm")
+    steps = np.array(list(circles.object_points().values()))[:, :2] / 25.4
+    of_opencv = [(2 * column + row % 2, 10 - row) for row in range(11) for column in range(4)]
+    np.testing.assert_allclose(steps, of_opencv)
+    aruco = board("aruco", "3x2", "40mm", "30mm", "4X4_50", first_id=6)
+    assert (aruco.marker_mm, aruco.gap_mm, aruco.first_marker) == (30.0, 10.0, 6)
+    april = board("aprilgrid", "6x6", "114.4mm", first_id=3)
+    assert (april.marker_mm, april.gap_mm, april.first_marker) == pytest.approx((88.0, 26.4, 3))
+    assert april.object_points()["3.3"] == pytest.approx((0.0, 0.0, 0.0))  # lower left corner of the lower left tag
+    charuco = board("charuco", "5x7", "30mm", "22mm", "4X4_250", first_id=20)
+    assert (charuco.legacy, charuco.first_id) == (None, 20)
 
 
 def test_a_count_that_is_wrong_is_named_with_the_one_that_fits(
