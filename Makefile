@@ -36,7 +36,7 @@ types: $(TESTED)
 
 # What running needs: for a user, and in a second environment for the tests of what a user has, to which nothing is added.
 # The second lock file's package carries the networks that read writing; what it asks for itself would replace OpenCV.
-$(READY) $(PLAIN)/ready: %/ready: requirements.lock requirements-no-deps.lock pyproject.toml
+$(READY) $(PLAIN)/ready: %/ready: requirements.lock requirements-no-deps.lock pyproject.toml compiled/kernels.c
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "reseau needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Say which one to use: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $*
 	$*/bin/pip install --quiet --requirement requirements.lock

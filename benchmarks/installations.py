@@ -24,7 +24,7 @@ from tempfile import TemporaryDirectory
 from urllib.request import HTTPCookieProcessor, build_opener
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("reseau", "measure", "adjust", "pipeline", "synthetic_images")
+PACKAGES = ("reseau", "measure", "adjust", "compiled", "pipeline", "synthetic_images")
 NEWEST_MINOR = 30  # of the Pythons that are looked for
 WITHOUT_ANSWER = {"http", "s3"}  # extras whose calls have no server here
 LAST_LINES = 5  # of what failed

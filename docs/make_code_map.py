@@ -9,7 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "code.md"
-PACKAGES = ("measure", "adjust", "pipeline", "synthetic_images", "benchmarks")
+PACKAGES = ("measure", "adjust", "compiled", "pipeline", "synthetic_images", "benchmarks")
 
 
 def first_sentences() -> dict[str, str]:

@@ -108,7 +108,10 @@ def root(
     if show_version:
         from importlib.metadata import version
 
-        typer.echo(f"reseau {version('reseau')}")
+        import compiled
+
+        loops = "without" if compiled.kernels is None else "with"
+        typer.echo(f"reseau {version('reseau')}, {loops} compiled loops")
         raise typer.Exit
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())

@@ -17,6 +17,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for reason, need in (
         (REASON, f"real data in {DATA}"),
         (browser.REASON, "a browser: install chromium"),
+        (plain_environment.NO_COMPILER, "the compiled loops: install with a C compiler there"),
         (plain_environment.REASON, f"an environment without extras: make {plain_environment.READY}"),
     ):
         count = sum(reason in each for each in skipped)

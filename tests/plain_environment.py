@@ -5,6 +5,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 READY = Path(".venv-plain", "ready")  # made by make, below the root
+NO_COMPILER = "no compiler was there at the installation"
 REASON = "there is no plain environment"
 PYTHON = ROOT / READY.parent / "bin" / "python"
 

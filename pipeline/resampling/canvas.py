@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from math import ceil, floor
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import make_interp_spline
 
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
@@ -146,7 +147,7 @@ def scan_places(chain: FrameChain, canvas: Canvas, col0: int, row0: int, side: i
 
     The chain is smooth: between nodes 16 px apart cubic splines are within 1e-4 px of it.
     """
-    nodes = np.arange(-_BEYOND * _NODES_PX, side + _BEYOND * _NODES_PX + 1, _NODES_PX, dtype=float)
+    nodes = _nodes(side)
     places_mm = canvas.camera_mm(col0 + nodes, row0 + nodes)
     pixels, found = chain.scan_from_frame(places_mm.reshape(-1, 2))
     pixels = pixels.reshape(len(nodes), len(nodes), 2)
@@ -155,5 +156,16 @@ def scan_places(chain: FrameChain, canvas: Canvas, col0: int, row0: int, side: i
         exact, known = chain.scan_from_frame(canvas.camera_mm(col0 + at, row0 + at).reshape(-1, 2))
         exact[~known] = np.nan
         return exact[:, 0].reshape(side, side), exact[:, 1].reshape(side, side)
-    columns, rows = (RectBivariateSpline(nodes, nodes, pixels[..., axis])(at, at) for axis in (0, 1))
-    return columns, rows
+    from_nodes = _cubic_from_nodes(side)
+    return from_nodes @ pixels[..., 0] @ from_nodes.T, from_nodes @ pixels[..., 1] @ from_nodes.T
+
+
+def _nodes(side: int) -> Array:
+    return np.arange(-_BEYOND * _NODES_PX, side + _BEYOND * _NODES_PX + 1, _NODES_PX, dtype=float)
+
+
+@cache
+def _cubic_from_nodes(side: int) -> Array:
+    """(side, nodes) what cubic splines through values at the nodes are at the pixels of a tile."""
+    nodes = _nodes(side)
+    return np.asarray(make_interp_spline(nodes, np.eye(len(nodes)))(np.arange(side)))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, maximum_filter, spline_filter
 
+import compiled
 from measure.scans.scan import Scan
 from pipeline.types import Array, Mask, Samples
 
@@ -108,15 +109,31 @@ def interpolated(source: Source, columns: Array, rows: Array, degree: Degree) ->
     right, bottom = (int(np.ceil(places[inside].max())) + MARGIN_PX for places in (columns, rows))
     window = source.window(left, top, right - left + 1, bottom - top + 1)
     known = source.valid_mask(left, top, right - left + 1, bottom - top + 1)
-    at = np.array([rows[inside] - top, columns[inside] - left])
     if not known.all():  # what a spline touches of lost pixels is lost
         lost = maximum_filter(~known, size=degree + 2)
-        inside[inside] = ~lost[tuple(np.rint(at).astype(int))]
-        at = np.array([rows[inside] - top, columns[inside] - left])
-    highest, clamped = np.iinfo(source.dtype).max, 0
+        at = np.rint([rows[inside] - top, columns[inside] - left]).astype(int)
+        inside[inside] = ~lost[tuple(at)]
+    is_whole, clamped = bool(inside.all()), 0
+    at = np.stack([rows, columns]).reshape(2, -1) if is_whole else np.array([rows[inside], columns[inside]])
+    at -= [[top], [left]]
     for channel in range(source.channels):
-        coefficients = spline_filter(window[..., channel], degree, mode="mirror")
-        values = np.rint(map_coordinates(coefficients, at, order=degree, mode="mirror", prefilter=False))
-        clamped += int(((values < 0) | (values > highest)).sum())
-        samples[inside, channel] = np.clip(values, 0, highest).astype(source.dtype)
+        values, beyond = spline_samples(window[..., channel], at, degree, source.dtype)
+        samples[..., channel][... if is_whole else inside] = values.reshape(shape) if is_whole else values
+        clamped += beyond
     return Tile(samples, inside, clamped)
+
+
+def spline_samples(
+    picture: Samples, places: Array, degree: Degree, dtype: type[np.uint8] | type[np.uint16]
+) -> tuple[Samples, int]:
+    """Samples (n,) of a spline through a picture (rows, columns), mirrored at its edges, at places (2, n), row and
+    column; how many of them were clamped to what can be stored."""
+    coefficients = spline_filter(picture, degree, mode="mirror")
+    if compiled.kernels is not None:
+        samples: Samples = np.empty(places.shape[1], dtype)
+        width = coefficients.shape[1]
+        return samples, compiled.kernels.spline_samples(coefficients, width, places[0], places[1], degree, samples)
+    values = np.rint(map_coordinates(coefficients, places, order=degree, mode="mirror", prefilter=False))
+    highest = np.iinfo(dtype).max
+    clamped = int(((values < 0) | (values > highest)).sum())
+    return np.clip(values, 0, highest).astype(dtype), clamped
