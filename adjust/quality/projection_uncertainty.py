@@ -10,25 +10,26 @@ B and P are the derivatives of the camera point of a fixed ray by the calibratio
 The covariance is that of dq, and that of the common orientation beside it, sigma0² P (sum P' W P)^-1 P'. Both together
 are mrcal's cross-reprojection uncertainty (mrcal.secretsauce.net, "Projection uncertainty"). At infinity a shift shows
 nothing. On film the camera frame is that of the marks: what the interior orientation of a scan makes of a change of the
-marks' coordinates is taken out as well.
+marks' coordinates is taken out, and t and s fit what dl leaves beside the changes of the images' film transformations.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError
-from adjust.functional_model.film_kinds import FilmKind
 from adjust.functional_model.line_of_sight import sight_vectors
 from adjust.functional_model.projection import ImageModel, ray_by_orientation, rays
-from adjust.functional_model.transformation import film_kind
+from adjust.functional_model.transformation import film_kind, film_parameter_names
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates
 from adjust.problem.images import adjusted_image, adjusted_lens, adjusted_places
 from adjust.problem.parameter import Parameter
 
+MOST_IMAGES = 100  # evenly over all, over which an orientation is fitted
 GRID = 33  # places along the longer side of a picture
 RANK = 1e-9  # of the normal matrix of an orientation, in equal columns: below it a direction is left alone
 
@@ -87,7 +88,8 @@ def projection_uncertainty(
     if not distance > 0.0:
         raise AdjustmentError(f"The distance of projected points must be positive, in object units, not {distance}.")
     field = ProjectionField(estimates, only_camera(estimates, camera))
-    covariances = estimates.sigma0**2 * estimates.cofactor_of(field.parameters), clusters(field.parameters)
+    known = estimates.sigma0**2 * estimates.cofactor_of([*field.calibration, *field.films])
+    covariances = known, clusters(field.calibration)
     places = frame_grid(field.corners_mm, GRID) if places_mm is None else np.asarray(places_mm, dtype=float)
     flat, shape = places.reshape(-1, 2), (*places.shape[:-1], 2, 2)
     model, robust = (
@@ -113,57 +115,70 @@ def only_camera(estimates: Estimates, name: str = "") -> Camera:
 class ProjectionField:
     """The change of a camera's projection with all that its calibration knows, freed of the orientation.
 
-    parameters: of the calibration. corners_mm: of its picture, or of what was observed where the size is not known.
-    median_distance: of the observed targets, object units.
+    calibration: the keys of lens and marks. films: those of the film transformations of MOST_IMAGES, whose targets say
+    which orientation fits best. corners_mm: of the picture, or of what was observed where its size is not known.
+    median_distance: of the targets, object units.
     """
 
     def __init__(self, estimates: Estimates, camera: Camera) -> None:
         self.camera, self._sigma0 = camera, estimates.sigma0
         self._lens = adjusted_lens(estimates, camera.name)
-        self.parameters = [Parameter.interior(camera.name, name) for name in self._lens.quantities]
+        self.calibration = [Parameter.interior(camera.name, name) for name in self._lens.quantities]
+        self.films = list[Parameter]()
         self._marks = _MarkFrame.of(estimates, camera)
         if self._marks is not None:
-            marks = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
-            self.parameters += marks
+            self.calibration += [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
         self._align(estimates)
 
     def _align(self, estimates: Estimates) -> None:
-        """The orientation (6, 6) by its observations, and how it follows the calibration (6, k)."""
-        normal, right, distances, places = np.zeros((6, 6)), 0.0, list[Array](), list[Array]()
-        network = estimates.network
-        observations, of_image = network.observations, np.array(network.observations.image)
-        for image in network.images:
-            rows = np.flatnonzero((of_image == image.name) & ~observations.is_fiducial)
-            if image.camera != self.camera.name or not len(rows):
-                continue
+        """The orientation (6, 6) by its observations, and how it follows the calibration and the films (6, k)."""
+        observations = estimates.network.observations
+        of_image, is_target = np.array(observations.image), ~observations.is_fiducial
+        shown = [each for each in estimates.network.images if each.camera == self.camera.name]
+        shown = [each for each in shown if (is_target & (of_image == each.name)).any()]
+        normal, right, by_films, distances, places = np.zeros((6, 6)), 0.0, list[Array](), list[Array](), list[Array]()
+        for image in shown[:: -(-len(shown) // MOST_IMAGES)]:  # evenly over all
+            rows = np.flatnonzero(is_target & (of_image == image.name))
             model = adjusted_image(estimates, image.name)
             ray, depth = _targets(model, adjusted_places(estimates, [observations.point[row] for row in rows]))
             places.append(model.camera_from_comparator(observations.xy_mm[rows]))
+            distances.append(depth * np.sqrt(1.0 + (ray**2).sum(axis=1)))
             by, turn = self._derivatives(places[-1], ray, 1.0 / depth)
             weights = 2.0 / np.trace(observations.covariance_mm2[rows], axis1=1, axis2=2)
             weighted = (weights[:, None, None] * turn).reshape(-1, 6).T
             normal += weighted @ turn.reshape(-1, 6)
             right = right + weighted @ by.reshape(-1, by.shape[2])
-            distances.append(depth * np.sqrt(1.0 + (ray**2).sum(axis=1)))
+            film_names = film_parameter_names(image.transformation)
+            self.films += [Parameter.film(image.name, name) for name in film_names]
+            by_films.append(-weighted @ _by_film(model, places[-1]).reshape(2 * len(rows), len(film_names)))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
         self._orientation = np.linalg.pinv(normal * np.outer(scale, scale), rcond=RANK, hermitian=True)
         self._orientation *= np.outer(scale, scale)
-        self._following = -self._orientation @ right
+        self._by_calibration = -self._orientation @ right
+        self._by_films = -self._orientation @ np.concatenate(by_films, axis=1)
         self.median_distance = float(np.median(np.concatenate(distances)))
         observed = np.concatenate(places)
         self.corners_mm = self.camera.frame_corners() or np.array([observed.min(axis=0), observed.max(axis=0)])
 
     def covariance_mm2(self, covariance: Array, places_mm: Array, distance: float) -> Array:
-        """(n, 2, 2) of points at places (n, 2), from the covariance of `parameters`; nan where there is no image."""
+        """(n, 2, 2) of points at places (n, 2); nan where there is no image.
+
+        covariance: of calibration and films, or of the calibration alone: films then follow the marks.
+        """
         ray, found = self._lens.ray_from_observed(places_mm)
         found &= ~self._lens.folded_over(places_mm)
         result = np.full((len(places_mm), 2, 2), np.nan)
         ray = ray[found]
         by, turn = self._derivatives(places_mm[found], ray, np.sqrt(1.0 + (ray**2).sum(axis=1)) / distance)
-        free = by + turn @ self._following
-        calibration = covariance if self._marks is None else self._marks.reduced(covariance, len(self._lens.values))
+        lens = len(self._lens.values)
+        following = self._by_calibration
+        if len(covariance) > len(self.calibration):
+            following = np.concatenate([following[:, :lens], 0.0 * following[:, lens:], self._by_films], axis=1)
+        free = np.pad(by, ((0, 0), (0, 0), (0, following.shape[1] - by.shape[2]))) + turn @ following
+        if self._marks is not None:
+            covariance = self._marks.reduced(covariance, lens)
         common = self._sigma0**2 * turn @ self._orientation @ turn.swapaxes(1, 2)
-        result[found] = free @ calibration @ free.swapaxes(1, 2) + common
+        result[found] = free @ covariance @ free.swapaxes(1, 2) + common
         return result
 
     def _derivatives(self, xy_mm: Array, ray: Array, inverse_depth: Array) -> tuple[Array, Array]:
@@ -181,12 +196,10 @@ class ProjectionField:
 class _MarkFrame:
     """What the interior orientation of a scan makes of a change of the fiducial marks' coordinates.
 
-    by_marks (q, 2 f): the q centred parameters of the film transformation by the coordinates, by least squares.
+    by_marks (q, 2 f): the q parameters of the film transformation by the coordinates, by least squares.
     """
 
     model: ImageModel
-    kind: FilmKind
-    half_mm: float
     by_marks: Array
 
     @classmethod
@@ -197,25 +210,20 @@ class _MarkFrame:
         if image is None or not camera.fiducials:
             return None
         model = adjusted_image(estimates, image.name)
-        kind = film_kind(image.transformation, model.film.mirrored)
         keys = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
         marks = estimates.values_of(keys).reshape(-1, 2)
-        half = float(np.abs(marks - marks.mean(axis=0)).max()) or 1.0
-        frame = cls(model, kind, half, np.empty((0, 0)))
-        by_marks = np.linalg.pinv(frame.design(marks).reshape(2 * len(marks), -1)).astype(np.float64)
-        return cls(model, kind, half, by_marks)
+        design = _by_film(model, marks).reshape(2 * len(marks), -1)
+        sizes = np.linalg.norm(design, axis=0)
+        return cls(model, np.linalg.pinv(design / sizes).astype(np.float64) / sizes[:, None])
 
     def design(self, xy_mm: Array) -> Array:
         """(n, 2, q) how camera points move with the parameters."""
-        film = self.model.film
-        comparator_mm, _ = film.comparator_from_camera(xy_mm)
-        return self.kind.design(film.parameters, comparator_mm, film.center_mm, np.array(self.half_mm))
+        return _by_film(self.model, xy_mm)
 
     def reduced(self, covariance: Array, lens: int) -> Array:
-        """(lens + q, lens + q) from the covariance of the lens and of all marks."""
-        reduction = np.zeros((lens + len(self.by_marks), len(covariance)))
-        reduction[:lens, :lens] = np.eye(lens)
-        reduction[lens:, lens:] = self.by_marks
+        """With q parameters of the film transformation in place of the marks, which stand behind those of the lens."""
+        others = len(covariance) - lens - self.by_marks.shape[1]
+        reduction = block_diag(np.eye(lens), self.by_marks, np.eye(others))
         return np.asarray(reduction @ covariance @ reduction.T)
 
 
@@ -225,6 +233,16 @@ def frame_grid(corners_mm: Sequence[Sequence[float]] | Array, longer: int) -> Ar
     counts = np.maximum(np.rint(longer * (high - low) / (high - low).max()), 3).astype(int)
     x, y = np.linspace(low[0], high[0], counts[0]), np.linspace(high[1], low[1], counts[1])
     return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def _by_film(model: ImageModel, xy_mm: Array) -> Array:
+    """(n, 2, q) how camera points move with the parameters of an image's film transformation."""
+    film = model.film
+    kind = film_kind(film.transformation, film.mirrored)
+    comparator_mm, _ = film.comparator_from_camera(xy_mm)
+    half = np.array(max(float(np.ptp(comparator_mm, axis=0).max()), 1.0))
+    centred = kind.design(film.parameters, comparator_mm, film.center_mm, half)
+    return np.asarray(centred @ np.linalg.inv(kind.centred_jacobian(film.parameters, film.center_mm, half)))
 
 
 def _targets(model: ImageModel, xyz: Array) -> tuple[Array, Array]:
