@@ -15,7 +15,6 @@ from adjust.problem.estimates import Estimates
 from adjust.problem.images import adjusted_image, adjusted_lens
 from adjust.problem.parameter import Parameter
 from adjust.quality.distortion_curves import distortion_curves, is_defined_over_frame
-from adjust.quality.projection_uncertainty import ProjectionUncertainty
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,7 +45,7 @@ class CameraPlots:
     corners_mm : Array (2, 2)
         The lower left and the upper right corner of the picture.
     uncertainty : Callable
-        The uncertainty of points at a distance, over the picture.
+        By the distance of points: places (r, c, 2) over the picture and standard deviations (r, c), mm.
     pixel_mm : float or None
         Side of a pixel; with it plots are in px, y down.
     """
@@ -58,7 +57,7 @@ class CameraPlots:
     is_fiducial: Mask
     images: int
     corners_mm: Array
-    uncertainty: Callable[[float], ProjectionUncertainty]
+    uncertainty: Callable[[float], tuple[Array, Array]]
     pixel_mm: float | None = None
 
     def plot_residuals(self, axes: "Axes | None" = None) -> "Axes":
@@ -128,9 +127,9 @@ class CameraPlots:
         distance : of the points from the camera in object units; by default they are infinitely far
         axes : of Matplotlib; a new figure without
         """
-        found = self.uncertainty(distance)
+        places_mm, sigma_mm = self.uncertainty(distance)
         axes = self._frame(axes)
-        places, sigma = self._places(found.places_mm), found.sigma_mm * self._lengths_per_mm
+        places, sigma = self._places(places_mm), sigma_mm * self._lengths_per_mm
         levels = contour_levels(sigma)
         filled = axes.contourf(
             places[..., 0],
@@ -223,7 +222,7 @@ def adjusted_camera_plots(
     estimates: Estimates,
     camera: Camera,
     v_mm: Array,
-    uncertainty: Callable[[float], ProjectionUncertainty],
+    uncertainty: Callable[[float], tuple[Array, Array]],
     pixel_mm: float | None = None,
 ) -> CameraPlots:
     """The plots of a camera from its adjustment; v_mm (n, 2): the residuals in the comparator."""

@@ -177,8 +177,9 @@ class Adjustment(Estimates, PlottedResult):
         """
         shown = only_camera(self, camera)
 
-        def uncertainty(distance: float) -> ProjectionUncertainty:
-            return self.projection_uncertainty(shown.name, distance)
+        def uncertainty(distance: float) -> tuple[Array, Array]:
+            found = self.projection_uncertainty(shown.name, distance)
+            return found.places_mm, found.sigma_mm
 
         return adjusted_camera_plots(self, shown, self.residuals.v_mm, uncertainty, pixel_mm)
 

@@ -4,12 +4,15 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
+from adjust.display.camera_plots import CameraPlots, PlottedResult
+from adjust.display.tables import data_frame
 from adjust.errors import AdjustmentError
 from adjust.problem.network import Network
 from adjust.solution.adjustment import adjust
@@ -38,11 +41,12 @@ FEWEST_CORNERS = 4  # of a picture whose space resection is over-determined
 FEWEST_PICTURES = 3  # of a flat board that determine a principal distance and point
 
 
-@dataclass(frozen=True)
-class Calibration:
+@dataclass(frozen=True, repr=False)
+class Calibration(PlottedResult):
     """Calibrated cameras, and what is not calibrated.
 
     unreadable: by picture, why. not_calibrated: by camera, why. files: what was written, report and project last.
+    adjustments: by camera; in them a pixel is pixel_mm wide.
     """
 
     cameras: tuple[CameraIntrinsics, ...]
@@ -50,6 +54,38 @@ class Calibration:
     not_calibrated: Mapping[str, str]
     files: tuple[Path, ...]
     summary: Summary
+    adjustments: Mapping[str, Adjustment]
+    pixel_mm: float
+
+    def plots(self, camera: str = "") -> CameraPlots:
+        """What the plots of a camera show, in px. Raises InputError for a camera that there is not."""
+        if not camera and len(self.adjustments) == 1:
+            camera = next(iter(self.adjustments))
+        if camera not in self.adjustments:
+            raise InputError(f"There is no calibrated camera {camera!r}. Name one of: {', '.join(self.adjustments)}.")
+        return self.adjustments[camera].plots(camera, self.pixel_mm)
+
+    def to_pandas(self) -> Any:
+        """One row a parameter of a camera, as pandas.DataFrame. Raises ImportError where pandas is not installed."""
+        rows = [
+            {"camera": camera.pictures.name, "parameter": name, **each.as_json()}
+            for camera in self.cameras
+            for name, each in camera.values.items()
+        ]
+        return data_frame({name: [row[name] for row in rows] for name in rows[0]})
+
+    def __repr__(self) -> str:
+        return f"Calibration({'; '.join(map(repr, self.cameras))})"
+
+    def _repr_html_(self) -> str:
+        """The cameras' parameters, as a notebook shows them."""
+        rows = "".join(
+            f"<tr><td>{escape(camera.pictures.name)}</td><td>{name}</td><td>{each.value:.7g}</td><td>{each.sigma:.2g}</td></tr>"
+            for camera in self.cameras
+            for name, each in camera.values.items()
+        )
+        head = "".join(f"<th>{name}</th>" for name in ("camera", "parameter", "value", "standard deviation"))
+        return f"<p>{escape(repr(self))}</p><table><tr>{head}</tr>{rows}</table>"
 
     @property
     def needs_look(self) -> bool:
@@ -90,7 +126,7 @@ class Calibration:
         ]
 
 
-def calibrate(
+def calibrate_pictures(
     given: Sequence[Path], out: Path, options: CalibrationOptions, reporter: Reporter, workers: int | None = None
 ) -> Calibration:
     """Calibrate the cameras that took some pictures of a board.
@@ -154,7 +190,7 @@ def calibrate(
     for path, text in files.items():
         write_atomically(path, text)
     written = (*files, project.report_path, project.path)
-    return Calibration(cameras, pictures.unreadable, not_calibrated, written, summary)
+    return Calibration(cameras, pictures.unreadable, not_calibrated, written, summary, adjustments, options.pixel_mm)
 
 
 def _left_out(pictures: BoardPictureFiles, marks: Sequence[ComparatorPoint]) -> dict[str, str]:

@@ -43,7 +43,7 @@ class Intrinsic:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class CameraIntrinsics:
     """Intrinsics in px from the centre of the top left pixel, x right, y down, as OpenCV has them.
 
@@ -70,6 +70,12 @@ class CameraIntrinsics:
     @property
     def is_fisheye(self) -> bool:
         return self.family == "opencv_fisheye"
+
+    def __repr__(self) -> str:
+        centre = ", ".join(
+            f"{name} {each.value:.2f} ± {each.sigma:.2f}" for name, each in self.values.items() if name in CENTRE
+        )
+        return f"{self.pictures.name}: {centre} px, {counted(self.used, 'picture')}, rms {self.rms_px:.3f} px a point"
 
     def as_json(self) -> dict[str, Any]:
         values = {name: each.as_json() for name, each in self.values.items()}

@@ -11,15 +11,7 @@ from pipeline.commands.shared import DONE, LOOK, AsJson, show
 
 if TYPE_CHECKING:
     from pipeline.calibration.calibrate_stage import Calibration
-    from pipeline.calibration.lens_choice import LensSetting
 
-LENSES: "dict[str, LensSetting]" = {
-    "auto": "auto",
-    "opencv4": "opencv4",
-    "opencv5": "opencv5",
-    "opencv8": "opencv8",
-    "fisheye": "fisheye",
-}
 OUT = Path("calibration")
 
 
@@ -36,7 +28,7 @@ def calibrate(
     dictionary: Annotated[str | None, typer.Option(metavar="4X4_50", help="Of the markers.")] = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="The older ChArUco layout; else both are tried.")] = False,
     first_id: Annotated[int, typer.Option(metavar="N", min=0, help="Number of the first marker.")] = 0,
-    lens: Annotated[str, typer.Option(help=f"{', '.join(LENSES)}.")] = "auto",
+    lens: Annotated[str, typer.Option(help="auto, opencv4, opencv5, opencv8, fisheye.")] = "auto",
     square_pixels: Annotated[bool, typer.Option("--square-pixels", help="One focal length for x and y.")] = False,
     pitch_um: Annotated[float | None, typer.Option(metavar="UM", min=0.01, help="Side of a pixel, for mm.")] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the results go.")] = OUT,
@@ -45,18 +37,23 @@ def calibrate(
     as_json: AsJson = False,
 ) -> int:
     """Calibrate a digital camera from pictures of a board."""
-    from pipeline.calibration.board_options import board_options
-    from pipeline.calibration.calibrate_stage import calibrate
-    from pipeline.calibration.project_files import CalibrationOptions
-    from pipeline.errors import InputError
-    from pipeline.progress import Reporter
-    from pipeline.text.wording import did_you_mean
+    from pipeline.calibration.board_calibration import calibrate
 
-    if lens not in LENSES:
-        raise InputError(f"--lens {lens}: possible are {', '.join(LENSES)}.{did_you_mean(lens, LENSES)}")
-    given = board_options(kind, board, square, marker, dictionary, legacy, first_id)
-    options = CalibrationOptions(given, LENSES[lens], square_pixels, pitch_um, ros)
-    found = calibrate(pictures, out, options, Reporter(), workers)
+    found = calibrate(
+        pictures,
+        board,
+        square,
+        kind=kind,
+        marker=marker,
+        dictionary=dictionary,
+        legacy=legacy,
+        lens=lens,
+        square_pixels=square_pixels,
+        pitch_um=pitch_um,
+        out=out,
+        ros=ros,
+        workers=workers,
+    )
     show(as_json, found.as_json, found.print)
     print_next(as_json, *_steps(found))
     return LOOK if found.needs_look else DONE

@@ -3,18 +3,23 @@
 import io
 import json
 import re
+import sys
 import tomllib
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import cv2
+import matplotlib as mpl
 import numpy as np
 import pytest
 from PIL import Image
 from test_check_corners import CENTER_PX, FOCAL_PX, SIZE_PX, TURNS, picture
 
+import reseau
+from pipeline.calibration import board_calibration
 from pipeline.calibration.board_options import board_options
+from pipeline.calibration.calibrate_stage import Calibration
 from pipeline.calibration.pictures import find_pictures
 from pipeline.cli import run
 from pipeline.errors import InputError
@@ -40,10 +45,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def result(folder: Path) -> dict[str, Any]:
+def calibrations() -> list[Calibration]:
+    """What `result` was made of, behind it."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path, calibrations: list[Calibration]) -> dict[str, Any]:
     """What the command prints; its files stand in the folder `calibration`."""
-    out, printed = folder / "calibration", io.StringIO()
-    with redirect_stdout(printed):
+    out, printed, calibrate = folder / "calibration", io.StringIO(), board_calibration.calibrate
+
+    def kept(*arguments: Any, **options: Any) -> Calibration:
+        calibrations.append(calibrate(*arguments, **options))
+        return calibrations[-1]
+
+    with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(board_calibration, "calibrate", kept)
         code = run(["calibrate", str(folder), *BOARD, "--lens", "opencv4", "--out", str(out), "--ros", "--json"])
     assert code == 1  # two pictures are left out
     return dict(json.loads(printed.getvalue()))
@@ -72,6 +89,31 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     assert storage.getNode("distortion_coefficients").mat().shape == (1, 4)
     assert "distortion_model: plumb_bob" in (out / "camera-ros.yaml").read_text(encoding="utf-8")
     assert re.search(r"c = 520\.\d+ ± 0\.\d+ px", (out / "out" / "report.html").read_text(encoding="utf-8"))
+
+
+def test_in_python_it_can_be_plotted_in_pixels_and_shown_in_a_notebook(
+    result: dict[str, Any], calibrations: list[Calibration], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (calibration,) = calibrations
+    mpl.use("Agg")
+    axes = calibration.plot_residuals()
+    assert axes.get_xlabel() == "column (px)"
+    assert (
+        axes.get_title(loc="left") == f"camera-400x320: residuals, rms {result['cameras'][0]['rms_px']:.3g} px a point"
+    )
+    assert max(axes.dataLim.intervalx) < SIZE_PX[0] + 30
+    assert calibration._repr_html_().count("<tr>") == 9  # fx, fy, cx, cy, k1, k2, p1, p2
+    assert repr(calibration).startswith("Calibration(camera-400x320: fx 520.")
+    with pytest.raises(InputError, match="Name one of: camera-400x320"):
+        calibration.plots("x")
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pip install pandas"):
+        calibration.to_pandas()
+
+
+def test_a_folder_is_given_by_its_name_in_python(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no picture"):
+        reseau.calibrate(str(tmp_path), "9x6", "25mm")
 
 
 @pytest.mark.parametrize(
