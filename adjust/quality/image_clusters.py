@@ -1,8 +1,10 @@
 """A covariance of the cameras that does not trust residuals of one image to be independent: images are its clusters."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from adjust.array_types import Array, Indices, Mask
+from adjust.array_types import Array, Indices
 from adjust.least_squares.iteration import Linearised
 from adjust.least_squares.numbering import Numbering
 
@@ -35,37 +37,78 @@ def cluster_covariance(numbering: Numbering, end: Linearised, cofactor: Array) -
     -------
     None with fewer than FEWEST_IMAGES images, or where something rests on one image alone.
     """
-    problem = numbering.problem
-    images = problem.network.frame_numbers[problem.image_numbers]
-    clusters = np.unique(images)
-    if len(clusters) < FEWEST_IMAGES:
+    shares = _shares(numbering, end, cofactor)
+    if len(shares) < FEWEST_IMAGES:
         return None
-    root = np.asarray(np.linalg.cholesky(cofactor), dtype=np.float64)
-    moves = [_move(problem.columns, end, images == each, numbering, root) for each in clusters]
+    moves = [_move(share.by_shared, share.right) for share in shares]
     if any(move is None for move in moves):
         return None
-    spread = np.array(moves) @ root.T
+    spread = np.array(moves) @ np.linalg.cholesky(cofactor).T
     spread -= spread.mean(axis=0)
-    return np.asarray((len(clusters) - 1) / len(clusters) * spread.T @ spread)
+    return np.asarray((len(shares) - 1) / len(shares) * spread.T @ spread)
 
 
-def _move(columns: Indices, end: Linearised, rows: Mask, numbering: Numbering, root: Array) -> Array | None:
-    """By how much the shared unknowns move without the observations of one image, in units of `root`.
+def prediction_errors(numbering: Numbering, end: Linearised, cofactor: Array, folds: int) -> Array | None:
+    """How well images are predicted by others: the mean square (m,) of the lengths of each image's residuals.
 
-    root: the triangle L of their cofactor matrix L L', by which N becomes the unit matrix.
+    Every so many images are left out together, and oriented by the camera of the others. Without them the shared
+    unknowns move by d, as `cluster_covariance` has it, and their residuals r become r - B d (Allen 1974, with images in
+    place of observations). Lengths are over the standard deviations of coordinates.
+
+    Parameters
+    ----------
+    numbering, end, cofactor : as for `cluster_covariance`
+    folds : how often images are left out
+
+    Returns
+    -------
+    None where something rests on images that are left out together.
     """
-    shared = shared_positions(numbering)
-    columns, matrix, right = columns[rows], end.rows.matrix[rows], end.rows.right[rows].ravel()
+    shares = _shares(numbering, end, cofactor)
+    errors = np.zeros(len(shares))
+    for fold in (range(first, len(shares), folds) for first in range(min(folds, len(shares)))):
+        equations = (shares[image].by_shared for image in fold), (shares[image].right for image in fold)
+        move = _move(*map(np.concatenate, map(list, equations)))
+        if move is None:
+            return None
+        for image in fold:
+            errors[image] = 2.0 * float(np.mean((shares[image].right - shares[image].by_shared @ move) ** 2))
+    return errors
+
+
+@dataclass(frozen=True, eq=False)
+class _Share:
+    """The equations of an image after elimination of their own unknowns: derivatives (n, k) by the shared ones, in
+    units of the root of their cofactor matrix, by which N becomes the unit matrix; and right sides (n,)."""
+
+    by_shared: Array
+    right: Array
+
+
+def _shares(numbering: Numbering, end: Linearised, cofactor: Array) -> list[_Share]:
+    """Those of each image that has marks, in the network's order."""
+    problem = numbering.problem
+    images, shared = problem.network.frame_numbers[problem.image_numbers], shared_positions(numbering)
+    root = np.asarray(np.linalg.cholesky(cofactor), dtype=np.float64)
     free = np.append(numbering.problem.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
-    own = np.setdiff1d(np.unique(columns[free[columns]]), shared)
-    by_shared, by_own = (_by_unknowns(columns, matrix, each, len(free)) for each in (shared, own))
-    basis = np.linalg.qr(by_own)[0]
-    by_shared, right = by_shared - basis @ (basis.T @ by_shared), right - basis @ (basis.T @ right)
-    by_shared = by_shared @ root
-    shares, axes = np.linalg.eigh(by_shared.T @ by_shared)
-    if shares.max(initial=0.0) > LARGEST_SHARE:
+    shares = []
+    for image in np.unique(images):
+        rows = images == image
+        columns, matrix, right = problem.columns[rows], end.rows.matrix[rows], end.rows.right[rows].ravel()
+        own = np.setdiff1d(np.unique(columns[free[columns]]), shared)
+        by_shared, by_own = (_by_unknowns(columns, matrix, each, len(free)) for each in (shared, own))
+        basis = np.linalg.qr(by_own)[0]
+        by_shared, right = by_shared - basis @ (basis.T @ by_shared), right - basis @ (basis.T @ right)
+        shares.append(_Share(by_shared @ root, right))
+    return shares
+
+
+def _move(by_shared: Array, right: Array) -> Array | None:
+    """By how much the shared unknowns move without the equations of some images, in units of the root."""
+    parts, axes = np.linalg.eigh(by_shared.T @ by_shared)
+    if parts.max(initial=0.0) > LARGEST_SHARE:
         return None
-    return np.asarray(-axes @ (axes.T @ (by_shared.T @ right) / (1.0 - shares)))
+    return np.asarray(-axes @ (axes.T @ (by_shared.T @ right) / (1.0 - parts)))
 
 
 def _by_unknowns(columns: Indices, matrix: Array, positions: Indices, count: int) -> Array:

@@ -21,7 +21,7 @@ from adjust.problem.problem import Problem
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.quality.contradiction import CalibrationTest, calibration_tests
 from adjust.quality.correlation import Correlation, correlations
-from adjust.quality.image_clusters import MOST_SHARED, cluster_covariance, shared_positions
+from adjust.quality.image_clusters import MOST_SHARED, cluster_covariance, prediction_errors, shared_positions
 from adjust.quality.lens_reach import LensReach, lens_reach
 from adjust.quality.projection_uncertainty import ProjectionUncertainty, only_camera, projection_uncertainty
 from adjust.quality.reliability import Reliability, reliability
@@ -127,6 +127,14 @@ class Adjustment(Estimates, PlottedResult):
         place = {int(position): number for number, position in enumerate(at)}
         numbers = [place.get(self.index(each), len(at)) for each in parameters]
         return np.pad(found, (0, 1))[np.ix_(numbers, numbers)]
+
+    def prediction_errors(self, folds: int) -> Array | None:
+        """The mean square (m,) of the lengths of each image's residuals, over their standard deviations, where every so
+        many images are left out in turn (`adjust.quality.image_clusters`); None without a solution."""
+        run, at = self.scaled, shared_positions(self.scaled.numbering)
+        if not self.converged or len(at) > MOST_SHARED:
+            return None
+        return prediction_errors(run.numbering, run.end, self.cofactor.part(at), folds)
 
     def lens_reach(self, camera: Camera, frame_mm: tuple[float, float] | None = None) -> LensReach | None:
         """How far out the lens of a camera is known; None without a solution or without targets.

@@ -34,10 +34,11 @@ _SMOOTHED_PX = 10.0  # squares from this side on are looked at over 3 x 3 pixels
 _MOST_LINES = 500  # of a board, along a side
 _THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _DRAWINGS = 3  # of the chessboard detector's random numbers for a second board: one in twenty missed one at the edge
-_CROSSINGS_SEEN = 0.8  # of a second board, but its four corners, before it is searched
+_CROSSINGS_SEEN = 0.8  # of a second board's, before it is searched
 _PLAIN_CORNERS = 8  # of a board of markers: two of them, which nothing else is read as
 _LEAST = 3  # lines that a chessboard has in either direction
 _FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
+_ENOUGH_PIXELS = 100_000  # for the range of grey values
 _LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
 
 
@@ -55,10 +56,15 @@ def is_even(grid: Array, size_px: tuple[int, int], farthest: float = np.inf) -> 
     wherever the detector put single corners; none may be farther off than so many steps."""
     rows, columns = grid.shape[:2]
     places = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
+    steps, plane = _shorter_steps(grid), cv2.findHomography(places, grid.reshape(-1, 2))[0]
+    if plane is not None:  # most lenses bend little of a square
+        off = cv2.perspectiveTransform(places[:, None], plane).reshape(grid.shape) - grid
+        if (np.linalg.norm(off, axis=2) < _TRUSTED * steps).all():
+            return True
     view = robust_view(places, grid.reshape(-1, 2), size_px)
     if view is None:
         return False
-    off = np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / _shorter_steps(grid)
+    off = np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / steps
     return off.max() < farthest and all(np.median(line) < _UNEVEN for line in (*off, *off.T))
 
 
@@ -190,16 +196,18 @@ def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, dra
 
 def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tuple[Array, ...]:
     """The middles of the chessboards beside those that were found, each painted over before the next is sought."""
+    strength = saddle_strength(picture)
     columns, rows = np.clip(np.round(grid).astype(int), 0, np.array(picture.shape)[::-1] - 1).reshape(-1, 2).T
-    strength = float(np.median(saddle_strength(picture)[rows, columns]))
-    picture, background = picture.copy(), int(np.median(picture))
+    known_strength = float(np.median(strength[rows, columns]))
+    crossings = spec.columns * spec.rows - 4  # of a board that hang together: all but its corners
+    picture, background = picture.copy(), int(np.median(picture[::4, ::4]))
     others: list[Array] = []
     while True:
-        cv2.fillConvexPoly(picture, np.round(_outline(grid)).astype(np.int32), background)
-        if largest_lattice(picture, strength) < _CROSSINGS_SEEN * (
-            spec.columns * spec.rows - 4
-        ):  # searching takes long
+        outline = np.round(_outline(grid)).astype(np.int32)
+        cv2.fillConvexPoly(strength, outline, 0.0)
+        if largest_lattice(picture, strength, known_strength) < _CROSSINGS_SEEN * crossings:  # searching takes long
             return tuple(others)
+        cv2.fillConvexPoly(picture, outline, background)
         other = _drawn_chessboard_grid(picture, spec, _THOROUGHLY, _DRAWINGS)
         if other is None:
             return tuple(others)
@@ -265,7 +273,8 @@ def _find_markers(picture: Bytes, spec: ArucoSpec | CharucoSpec) -> FoundBoard:
 def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
     """The reduced scan stretched to 8 bits, and why there is nothing to search in it, if so."""
     grey = scan.reduced(factor)
-    low, high = np.percentile(grey, (1, 99))
+    every = max(round(np.sqrt(grey.size / _ENOUGH_PIXELS)), 1)
+    low, high = np.percentile(grey[::every, ::every], (1, 99))
     if high - low < _LEAST_CONTRAST * scan.full_scale_dn:
         share = 100 * (high - low) / scan.full_scale_dn
         message = f"the scan has no contrast: its grey values span {share:.1f} % of the scale"

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from measure.array_types import Array, Mask
 
 Bytes = NDArray[np.uint8]
+Strength = NDArray[np.float32]
 
 _SMOOTHING_PX = 1.5
 _APART_PX = 3  # a saddle point is the strongest within it
@@ -32,20 +33,22 @@ class SaddlePoints:
     waves: NDArray[np.complexfloating]
 
 
-def saddle_strength(picture: Bytes) -> NDArray[np.float32]:
+def saddle_strength(picture: Bytes) -> Strength:
     """(height, width) the negative determinant of the second derivatives of the smoothed grey values."""
-    smooth = cv2.GaussianBlur(picture, (0, 0), _SMOOTHING_PX).astype(np.float32)
-    across, down, both = (cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((2, 0), (0, 2), (1, 1)))
-    return np.asarray(both * both - across * down, np.float32)
+    smooth = cv2.GaussianBlur(picture, (0, 0), _SMOOTHING_PX)
+    across, down, both = (cv2.Sobel(smooth, cv2.CV_16S, *order) for order in ((2, 0), (0, 2), (1, 1)))
+    squares = cv2.multiply(both, both, dtype=cv2.CV_32F)
+    return np.asarray(cv2.subtract(squares, cv2.multiply(across, down, dtype=cv2.CV_32F)), np.float32)
 
 
-def largest_lattice(picture: Bytes, known_strength: float) -> int:
+def largest_lattice(picture: Bytes, strength: Strength, known_strength: float) -> int:
     """How many saddle points at most hang together as a chessboard's crossings do.
 
     A crossing belongs together with its neighbours along both lines: they are dark where it is light, and it lies in
-    their middle. known_strength: that of crossings that are known (`saddle_strength`); much fainter ones do not count.
+    their middle. strength: of the picture (`saddle_strength`), 0 where nothing is sought; known_strength: that of
+    crossings that are known; much fainter ones do not count.
     """
-    points = _saddle_points(picture, known_strength)
+    points = _saddle_points(picture, strength, known_strength)
     number = len(points.places_px)
     if number <= _NEIGHBOURS:
         return number
@@ -69,8 +72,7 @@ def _line_neighbours(points: SaddlePoints, near: NDArray[np.intp]) -> Mask:
     return np.asarray((crossing & paired[:, :, None] & paired[:, None]).any(axis=2))
 
 
-def _saddle_points(picture: Bytes, known_strength: float) -> SaddlePoints:
-    strength = saddle_strength(picture)
+def _saddle_points(picture: Bytes, strength: Strength, known_strength: float) -> SaddlePoints:
     highest = cv2.dilate(strength, np.ones((2 * _APART_PX + 1, 2 * _APART_PX + 1)))
     rows, columns = np.nonzero((strength == highest) & (strength > _STRENGTH * known_strength))
     angles = np.arange(_RING_PLACES) * 2 * np.pi / _RING_PLACES

@@ -99,17 +99,21 @@ def influence_covariances(influences: Array, residuals: Array, used: Mask, unkno
     squares = (kept**2).sum(axis=(1, 2))
     variances = squares / np.maximum(count - unknowns, 1)
     correlation = _covariance_along(kept, used, 1) / np.maximum(squares / count, 1e-300)
-    shape = padded(residuals.shape[1:], REACH_PX)
     index = np.arange(-REACH_PX, REACH_PX + 1)
     is_white = np.abs(correlation) < 3 / np.sqrt(2 * count)
     lags = _faded(autocovariance(kept, used, REACH_PX))
     lags *= (variances / np.maximum(lags[:, REACH_PX, REACH_PX], 1e-300))[:, None, None]
     lags[is_white] = np.where(np.add.outer(abs(index), abs(index)) == 0, variances[is_white, None, None], 0.0)
-    kernels = np.zeros((len(residuals), *shape))
+    shape = padded(residuals.shape[1:], REACH_PX)
+    kernels = np.zeros((len(residuals), *shape), np.float32)
     kernels[:, index[:, None], index] = lags
-    filtered = fft.irfft2(fft.rfft2(influences, s=shape) * fft.rfft2(kernels).real[:, None], s=shape)
-    height, width = residuals.shape[1:]
-    return np.einsum("nkhw,nlhw->nkl", influences, filtered[..., :height, :width]), variances
+    weights = np.full(shape[1] // 2 + 1, 2.0)  # of a real transform's columns, which stand for their opposites, too
+    weights[[0, *([-1] if shape[1] % 2 == 0 else [])]] = 1.0
+    weights = fft.rfft2(kernels).real * (weights / np.prod(shape)).astype(np.float32)
+    waves = fft.rfft2(influences.astype(np.float32), s=shape)
+    parts = [waves.real.reshape(*waves.shape[:2], -1), waves.imag.reshape(*waves.shape[:2], -1)]
+    flat = weights.reshape(len(weights), 1, -1)
+    return sum((part * flat) @ part.swapaxes(1, 2) for part in parts).astype(float), variances
 
 
 def _faded(lags: Array) -> Array:

@@ -1,6 +1,6 @@
 """The lens model of a digital camera: the simplest that predicts pictures it was not fitted to as well as any."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
-from adjust.problem.camera import Camera
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
@@ -54,29 +53,33 @@ def choose_lens(network: Network, square_pixels: bool, pixel_mm: float, adjusted
     """Select the lens model of a camera by cross-validation over its pictures.
 
     Fifths of the pictures are left out in turn; their points are predicted with the camera of the others, after a space
-    resection each. A richer model is taken where its predictions are better by more than the standard error of the
-    difference over the pictures.
+    resection each, by the normal equations of all pictures. A richer model is taken where its predictions are better by
+    more than the standard error of the difference over the pictures.
 
     Parameters
     ----------
-    network : of one camera and its pictures
+    network : of one camera and its pictures, its marks alike in standard deviation
     square_pixels : whether fx and fy are one
     pixel_mm : side of a pixel
     adjusted : adjusts a network
     """
-    images = [image.name for image in network.images]
-    if len(images) < FEWEST_PICTURES:
+    if len(network.images) < FEWEST_PICTURES:
         return LensChoice("opencv4", ())
     squares: dict[LensModel, Array | None] = {}
     best: LensModel = "opencv4"
+    is_wide = False
     for model in PARAMETERS:
-        if model == "fisheye" and not _is_wide(_with_lens(network, lens_of("opencv4", square_pixels)), adjusted):
+        if model == "fisheye" and not is_wide:
             continue
-        squares[model] = _prediction_errors(_with_lens(network, lens_of(model, square_pixels)), images, adjusted)
-        if model != best and _is_better(squares[model], squares[best]):
+        fitted = _fitted(_with_lens(network, lens_of(model, square_pixels)), adjusted)
+        squares[model] = None if fitted is None else fitted.prediction_errors(FOLDS)
+        if model == "opencv4":
+            is_wide = fitted is None or _is_wide(fitted)
+        elif _is_better(squares[model], squares[best]):
             best = model
+    sigma_px = np.sqrt(network.observations.covariance_mm2[0, 0, 0]) / pixel_mm
     rms_px = {
-        model: None if each is None else float(np.sqrt(each.mean())) / pixel_mm for model, each in squares.items()
+        model: None if each is None else float(np.sqrt(each.mean()) * sigma_px) for model, each in squares.items()
     }
     return LensChoice(best, tuple(LensScore(model, rms) for model, rms in rms_px.items()))
 
@@ -88,54 +91,22 @@ def _is_better(squares: Array | None, than: Array | None) -> bool:
     return bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
-def _is_wide(network: Network, adjusted: Adjust) -> bool:
-    """Whether the field is so wide that a fisheye is likely; so it is where the usual model has no solution."""
+def _fitted(network: Network, adjusted: Adjust) -> Adjustment | None:
+    """The adjustment; None without a solution."""
     try:
         result = adjusted(network)
     except AdjustmentError:
-        return True
-    (camera,) = network.cameras
-    c_mm = result.value(Parameter.interior(camera.name, "c"))
-    return not result.converged or float(np.hypot(*camera.frame_mm)) / 2.0 > WIDE * c_mm
+        return None
+    return result if result.converged else None
+
+
+def _is_wide(fitted: Adjustment) -> bool:
+    """Whether the field is so wide that a fisheye is likely."""
+    (camera,) = fitted.network.cameras
+    c_mm = fitted.value(Parameter.interior(camera.name, "c"))
+    return float(np.hypot(*camera.frame_mm)) / 2.0 > WIDE * c_mm
 
 
 def _with_lens(network: Network, lens: Distortion) -> Network:
     (camera,) = network.cameras
     return replace(network, cameras=(replace(camera, distortion=lens),))
-
-
-def _prediction_errors(network: Network, images: Sequence[str], adjusted: Adjust) -> Array | None:
-    """Mean squared length (m,) of the residuals of each picture, predicted by others; None without a solution."""
-    squares = []
-    for fold in (images[first::FOLDS] for first in range(FOLDS)):
-        try:
-            fitted = adjusted(_of_images(network, set(images) - set(fold)))
-            if not fitted.converged:
-                return None
-            (camera,) = network.cameras
-            known = replace(network, cameras=(_held(camera, fitted),))
-            for image in fold:
-                predicted = adjusted(_of_images(known, {image}))
-                squares.append(float((predicted.residuals.v_mm**2).sum(axis=1).mean()))
-        except AdjustmentError:
-            return None
-    return np.array(squares)
-
-
-def _of_images(network: Network, names: set[str]) -> Network:
-    rows = np.flatnonzero([image in names for image in network.observations.image])
-    images = tuple(image for image in network.images if image.name in names)
-    return replace(network, images=images, observations=network.observations.only(rows))
-
-
-def _held(camera: Camera, fitted: Adjustment) -> Camera:
-    """The camera as it was found, held fixed."""
-
-    def prior(name: str) -> Prior:
-        return Prior(fitted.value(Parameter.interior(camera.name, name)), 0.0)
-
-    parameters = {name: prior(name) for name in camera.distortion.parameters}
-    distortion = replace(camera.distortion, parameters=parameters)
-    return replace(
-        camera, principal_distance_mm=prior("c"), x0_mm=prior("x0"), y0_mm=prior("y0"), distortion=distortion
-    )

@@ -114,8 +114,8 @@ def test_crossings_side_by_side_are_told_from_a_texture() -> None:
     both = np.hstack([100.0 + 0.3 * grey, texture])
     board, noise = (np.clip(each, 0, 255).astype(np.uint8) for each in (both, texture))
     strength = float(np.percentile(saddle_strength(np.clip(grey, 0, 255).astype(np.uint8)), 99.9))
-    assert 26 <= largest_lattice(board, strength) <= 30
-    assert largest_lattice(noise, strength) < 0.5 * 26
+    assert 26 <= largest_lattice(board, saddle_strength(board), strength) <= 30
+    assert largest_lattice(noise, saddle_strength(noise), strength) < 0.5 * 26
 
 
 @pytest.mark.study
