@@ -113,7 +113,8 @@ def influence_covariances(influences: Array, residuals: Array, used: Mask, unkno
     waves = fft.rfft2(influences.astype(np.float32), s=shape)
     parts = [waves.real.reshape(*waves.shape[:2], -1), waves.imag.reshape(*waves.shape[:2], -1)]
     flat = weights.reshape(len(weights), 1, -1)
-    return sum((part * flat) @ part.swapaxes(1, 2) for part in parts).astype(float), variances
+    real, imaginary = ((part * flat) @ part.swapaxes(1, 2) for part in parts)
+    return np.asarray(real + imaginary, float), variances
 
 
 def _faded(lags: Array) -> Array:
