@@ -49,7 +49,7 @@ BOARDS: dict[str, tuple[Grid, tuple[str, str, str, str | None, None, bool]]] = {
     "chessboard": (ChessboardSpec(9, 6, 25.0), ("chessboard", "9x6", "25mm", None, None, False)),
     "circles": (
         CircleGridSpec(8, 11, 18.0, 20.0, asymmetric=True),
-        ("asymmetric-circle-grid", "8x11", "18mm", "20mm", None, False),
+        ("asymmetric-circle-grid", "4x11", "18mm", "20mm", None, False),
     ),
 }
 DOT_PX = 4  # of the painted board, a mm
