@@ -106,7 +106,7 @@ def _board_faults(network: Network) -> Faults:
                 yield f"point {id_} is on the boards {board_by_point[id_]} and {board.name}; it can be on one."
             if id_ in network.point_by_id and id_ not in network.known_places:
                 yield (
-                    f"point {id_} of board {board.name} is not known: a bend is told from flat coordinates. Give X, Y "
+                    f"point {id_} of board {board.name} is not known: a bend counts from flat coordinates. Give X, Y "
                     "and Z with standard deviations (0 fixes them), or leave the bend out."
                 )
 
@@ -197,7 +197,7 @@ def _calibration_faults(network: Network) -> Faults:
         if not np.linalg.eigvalsh(each.covariance / np.outer(scale, scale)).min(initial=1.0) > DEFINITE:
             yield (
                 f"the covariance of an earlier calibration of {description(each.parameters[:3])} and more is not "
-                f"positive definite: some of these quantities were fixed, or no observation told them apart. Fix them "
+                f"positive definite: some of these quantities were fixed, or are not separately estimable. Fix them "
                 f"here too."
             )
 

@@ -78,7 +78,7 @@ def draw_case(camera: Path, index: int, turn: int) -> Case:
     centers = {side: FLIP @ up @ FLIP @ (places[side] + origins[side] - MIDDLE_PX) + MIDDLE_PX for side in SIDES}
     return Case(
         kind=camera.name,
-        symmetry="unlike marks",
+        symmetry="different marks",
         picture=f"{learned_dn}, seen beside {seen_dn}",
         layout=learned_layout(camera, learned_dn, round_),
         pose=pose,

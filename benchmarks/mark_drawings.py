@@ -18,7 +18,7 @@ _AS_DRAWN = " " * 24 + "# as on the right side, x outwards"
 
 GALLERY = (
     "from a picture of such marks (sPyMicMac's gallery of fiducial patterns), which has no scale: to 4 %, by the "
-    "frame's edge beside K-17 marks, RMK A notches and Wild crosses in other such pictures"
+    "frame's edge with K-17 marks, RMK A notches and Wild crosses in other such pictures"
 )
 
 

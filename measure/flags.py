@@ -24,7 +24,7 @@ class Status(StrEnum):
 STATUS_MEANING = {
     Status.MEASURED: "Found, fitted and consistent with all checks.",
     Status.WEAK: "Fitted, but damaged, faint, partly covered or not well known; its standard deviation says how well.",
-    Status.PREDICTED: "Not seen; the coordinates are where the other marks say it should be.",
+    Status.PREDICTED: "Not found; the coordinates are predicted from the other marks.",
     Status.REJECTED: "Something was found and measured, but a check says that it is not this mark.",
     Status.ABSENT: "Not found, outside the scan or unreadable.",
 }
@@ -81,16 +81,16 @@ CODE_MEANING = {
     Code.OUTSIDE: "Its place lies outside of the scan, or behind the camera.",
     Code.DAMAGED_FILE: "The scan's file does not give the pixels there.",
     Code.FAILED_SCAN: "The scan could not be measured at all: its failure says why.",
-    Code.UNREACHABLE: "It could not be looked at once more: the scan is gone, or the process that did it was ended.",
+    Code.UNREACHABLE: "The second pass could not reach it: the scan is gone, or the process that did it was ended.",
     Code.NO_FRAME: "No frame of the camera was found in the scan.",
-    Code.NOT_FOUND: "Nothing near its place looks like it.",
-    Code.GROUND: "The ground is as light or as dark as the mark: it cannot stand out there.",
+    Code.NOT_FOUND: "No candidate near its place.",
+    Code.GROUND: "The background is as light or as dark as the mark: there is no contrast.",
     Code.COVERED: "A part of it is damaged, covered or touched by something.",
     Code.CONTRAST: "It hardly stands out of the noise, or of the texture about it.",
-    Code.LIKENESS: "Its picture is unlike its drawing.",
+    Code.LIKENESS: "Its picture does not match its drawing.",
     Code.POLARITY: "It is light where the marks are dark, or the reverse.",
     Code.SIZE: "It is larger, smaller or otherwise turned than it should be.",
-    Code.SMALL: "It is so small that its size, its blur and dust look alike.",
+    Code.SMALL: "It is so small that size, blur and dust cannot be separated.",
     Code.BLUR: "Its blur is another than that of the other marks.",
     Code.NO_FIT: "The fit did not converge, or went to something else.",
     Code.IMPRECISE: "Its standard deviation is large.",
@@ -104,8 +104,8 @@ CODE_MEANING = {
     Code.OWN_PICTURE: "It was learned from this scan alone: nothing checks its place.",
     Code.OTHER_SCANS: "The picture about the point, or its place, contradicts the other scans.",
     Code.FEW_SCANS: "Too few scans agree on the point.",
-    Code.POSE: "How the frame lies in the scan is not certain.",
-    Code.CHANCE: "Chance may have made what was taken for the frame.",
+    Code.POSE: "The scan orientation is ambiguous.",
+    Code.CHANCE: "The frame may be a false alarm.",
     Code.FAINT_FRAME: "The frame was found only where less about each mark was compared.",
     Code.OTHER_FRAME: "The scan shows another frame as well.",
     Code.BENT_FRAME: "No affine transformation takes the given coordinates to the marks of this frame.",
@@ -188,10 +188,10 @@ CAUSE_MEANING = {
     Cause.UNLIKE_DRAWING: "At its edges the picture differs by more than noise: it is not quite as drawn.",
     Cause.TONE: "The curve through which light was stored as grey values is not known well enough.",
     Cause.CHANGED_TONES: "A learned mark's half tones may be others than where it was learned.",
-    Cause.LANDSCAPE: "The ground that shows within a notch is not even.",
+    Cause.LANDSCAPE: "The background within a notch has texture.",
     Cause.COMPRESSION: "JPEG rounded the mark's edges away.",
     Cause.TOUCHED: "Something may touch the mark, as its size or shape says.",
-    Cause.OWN_TURN: "It was only seen, as turned and as large as the frame says: it may be drawn a little otherwise.",
+    Cause.OWN_TURN: "Its rotation and scale were taken from the frame, not fitted.",
     Cause.FILM: "The film was bent or stretched, as the camera's frames show.",
     Cause.SECOND_METHOD: "Its edges put it elsewhere.",
     Cause.GIVEN_PLACES: "It contradicts the given places.",
@@ -218,41 +218,41 @@ def _limit(value: float, of: str, decides: str) -> float:
 # The search for a frame.
 FRAMES_BY_CHANCE = _limit(
     0.01,
-    "frames that chance is expected to find in a scan without any, over all attempts so far, or those at its pitch",
-    "a frame under another pitch, or seen at a closer look only, is not taken",
+    "expected false alarms, as frames in a scan without any, over all attempts so far, or those at its pitch",
+    "a frame found under another pitch, or by the search for faint marks, is rejected",
 )
 PLACEMENTS_BY_CHANCE = _limit(
     30.0,
-    "placements as good that chance is expected to make, before the marks are matched",
+    "expected false alarms: placements as good, before the marks are matched",
     "no frame is measured there",
 )
 FRAME_BY_CHANCE = _limit(
-    0.05, "chance having made the frame, where only some of its marks are seen", "its marks are weak, its pose assumed"
+    0.05, "p-value of the frame, where only some of its marks are found", "its marks are weak, its pose assumed"
 )
 NO_FRAME = _limit(  # likelier than not
     0.5,
-    "chance having made the frame, where only some of its marks are seen",
+    "p-value of the frame, where only some of its marks are found",
     "none of its marks is an observation: they are predicted",
 )
 CAMERA_BY_CHANCE = _limit(
     0.01,
-    "constellations that chance is expected to make as good",
-    "a camera is not named unless its marks in wrong places look half as much like themselves",
+    "expected false alarms: constellations as good",
+    "a camera is not named unless its marks correlate half as well at wrong places",
 )
 CAMERA_BY_NOISE = _limit(
     1e-8,
     "triples of marks that noise is expected to make look as much like themselves",
-    "the marks of a camera that chance may have found are not matched there",
+    "a camera whose marks may be false alarms is not matched there",
 )
 NOISE_LIKE_A_MARK = _limit(
     0.05, "noise as coarse as the window's answering as strongly as the best place", "nothing is matched there"
 )
 TEXTURE_LIKE_A_FAINT_MARK = _limit(  # one in some five hundred places
-    1e-4, "texture feigning a faint mark so strongly so near to its place", "a faint mark is not taken for seen"
+    1e-4, "texture feigning a faint mark so strongly so near to its place", "the faint mark is rejected"
 )
 FAINT_MARK_BY_NOISE = _limit(  # counted: in some four hundred places
     1e-3,
-    "noise looking like a faint mark so strongly so near to its place, at a closer look",
+    "noise as strong as a faint mark, as near to its place, in the search for faint marks",
     "it has no part in the frame, which all its marks together decide",
 )
 
@@ -281,7 +281,7 @@ JPEG_STEP = _limit(0.01, "a coefficient without a step being given one, where th
 
 # Targets and natural points.
 DISK_UNLIKE_THE_OTHERS = _limit(
-    0.01, "a right disk looking so unlike the others of its scan", "the disk is weak: dust may hide in it"
+    0.01, "a right disk differing so much from the others of its scan", "the disk is weak: dust may hide in it"
 )
 TARGET_OFF_PLACE = _limit(1e-3, "a right target lying farther off its place", "the target is weak")
 TARGET_ELSEWHERE = _limit(  # in a thousand fields of a thousand targets one is
@@ -293,7 +293,9 @@ SHEET_POINT_OFF_PLACE = _limit(
 SHEET_POINT_ELSEWHERE = _limit(
     1e-4, "any right point of a sheet lying still farther off", "the point is rejected, if other pictures show it"
 )
-POINT_OFF_ITS_NEIGHBOURS = _limit(1e-4, "a right natural point moving so unlike those about it", "it is left out")
+POINT_OFF_ITS_NEIGHBOURS = _limit(
+    1e-4, "a right natural point moving so differently from those about it", "it is left out"
+)
 POINT_OFF_ITS_RAY = _limit(1e-4, "a right natural point lying so far off the epipolar line", "it is left out")
 POINT_REFUSED = _limit(1e-4, "a test of its pictures refusing a right natural point", "it is left out of that scan")
 

@@ -92,7 +92,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _message(f"{place}{error.strerror or error}. {what_to_do(error)}", WRONG_INPUT)
     except Exception as error:
         if next_step := what_to_do_about_store(error):
-            return _message(f"the store of what is measured cannot be written ({error}). {next_step}", WRONG_INPUT)
+            return _message(f"the results database cannot be written ({error}). {next_step}", WRONG_INPUT)
         import traceback
 
         traceback.print_exc()

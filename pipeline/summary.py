@@ -147,8 +147,8 @@ def _film_table(adjustment: AdjustmentRecord) -> Table:
     title = f"Film transformations ({_sigma0(adjustment)})"
     datum = adjustment.groups.get("datum")
     if datum:
-        title += f"; given fiducials: rms {datum.rms_x_um:.2f}, {datum.rms_y_um:.2f} um"
-    columns = ("image", "transformation", "fiducials", "rms x, um", "rms y, um")
+        title += f"; given fiducials: rms {datum.rms_x_um:.2f}, {datum.rms_y_um:.2f} µm"
+    columns = ("image", "transformation", "fiducials", "rms x, µm", "rms y, µm")
     squares: dict[str, list[tuple[float, float]]] = {}
     for row in adjustment.residuals:
         squares.setdefault(row.image, []).append((row.vx_um**2, row.vy_um**2))
@@ -168,7 +168,7 @@ def _form_table(name: str, form: Figure) -> Table:
     """Where marks stand otherwise than they are given, free of the datum, and the distances that films keep."""
     after = "" if form.transformation == "none" else f", after a transformation to these ({form.transformation})"
     title = f"Corrections to the given fiducials of {name}{after}"
-    table = Table("mark", "x, um", "sigma", "y, um", "sigma", title=title, title_justify="left")
+    table = Table("mark", "x, µm", "sigma", "y, µm", "sigma", title=title, title_justify="left")
     for id, change, sigma in zip(form.ids, form.change_um, form.sigmas_um, strict=True):
         table.add_row(Text(id), *(f"{value:.3f}" for pair in zip(change, sigma, strict=True) for value in pair))
     for each in form.distances:

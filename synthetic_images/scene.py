@@ -294,7 +294,7 @@ class Scanner:
 
     margin_mm: how far the scan reaches beyond the frame; blur_px: Gaussian sigma of the MTF beside the pixel's own
     area; noise: rms as a share of full scale, white; tile_px: edge of the file's tiles, 0 for strips.
-    white_is_zero: only how the file stores the same picture; negative: the picture is a negative. tone: the gamma by
+    white_is_zero: only how the file keeps the same picture; negative: the picture is a negative. tone: the gamma by
     which light is coded, or one of TONES. bend_um: what the scanner bends in all scans alike, by the names of
     `bend.Bend`.
     """

@@ -118,7 +118,7 @@ def _all_points(block: Block) -> dict[str, Array]:
 def _why_not_intersected(point: str, images: Sequence[str]) -> str:
     if len(images) == 1:
         return (
-            f"point {point} is unknown and seen in image {images[0]} only; two images are needed to find it. "
+            f"point {point} is unknown and measured in image {images[0]} only; two images are needed to find it. "
             "Measure it in another image, give its coordinates, or leave it out."
         )
     return (

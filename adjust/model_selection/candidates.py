@@ -167,4 +167,4 @@ def _prediction(other: Candidate, chosen: Candidate) -> str:
     a, b = other.cross_validation, chosen.cross_validation
     if a is None or b is None:
         return "it was not cross-validated" if a is None else "the chosen one was not cross-validated"
-    return f"it predicts points left out to {a.rms_um:.2f} um, the chosen one to {b.rms_um:.2f} um"
+    return f"it predicts points left out to {a.rms_um:.2f} µm, the chosen one to {b.rms_um:.2f} µm"

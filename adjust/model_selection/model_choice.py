@@ -137,7 +137,7 @@ class _Fits:
         try:
             choice = choose_bends(network, lambda bent: adjust(bent, adjusted_values(near), self.options))
         except AdjustmentError as error:
-            return (), (f"A bend of the scanner was not looked for: {error}",)
+            return (), (f"No bend of the scanner was estimated: {error}",)
         return given_model(choice.network).bends, choice.remarks
 
     def _candidate(self, model: Model) -> Candidate:

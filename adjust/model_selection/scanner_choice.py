@@ -73,7 +73,7 @@ def choose_bends(
     if not trial.converged:
         causes = "".join(f" {each.cause}" for each in trial.singular)
         remark = (
-            "A bend of the scanner was not looked for: the adjustment with all of its terms ended with "
+            "No bend of the scanner was estimated: the adjustment with all of its terms ended with "
             f"{trial.termination}.{causes}"
         )
         return ScannerChoice(network_with_terms(network, {}), (remark,))

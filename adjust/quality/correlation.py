@@ -36,17 +36,20 @@ WIDER = "Targets out to the corners of the frame would tell them apart, in a wid
 OUTWARD = "Targets from the centre to the corners of the frame would tell them apart."
 APART, TILTED = "apart", "tilted"  # remedies that depend on whether the field is known
 CAUSES = {  # of correlations between two kinds of parameters, and what would tell these apart
-    frozenset(("c", "along")): ("flying height and principal distance trade off", TILTED),
-    frozenset(("point", "across")): ("the principal point and a shift of the camera trade off", APART),
+    frozenset(("c", "along")): ("flying height and principal distance are correlated", TILTED),
+    frozenset(("point", "across")): ("the principal point and a shift of the camera are correlated", APART),
     frozenset(("point", "tilt")): (
-        "the principal point and a tilt of the camera trade off in a narrow field of view",
+        "the principal point and a tilt of the camera are correlated in a narrow field of view",
         WIDER,
     ),
     frozenset(("point", "decentering")): (
-        "decentering distortion with a tilt looks like a shift of the principal point",
+        "decentering distortion with a tilt is correlated with a shift of the principal point",
         f"{WIDER} Else use the two together, or fix the decentering where it is not significant.",
     ),
-    frozenset(("decentering", "tilt")): ("decentering distortion looks like a tilt with a shift of the camera", WIDER),
+    frozenset(("decentering", "tilt")): (
+        "decentering distortion is correlated with a tilt and a shift of the camera",
+        WIDER,
+    ),
     frozenset(("radial",)): (
         "neighbouring powers of the radius are alike within the frame",
         "Compare the curve and not its coefficients; leave out the highest one that is not significant.",

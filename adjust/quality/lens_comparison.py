@@ -103,7 +103,7 @@ def compare(
     if len(calibrations) < 2:
         raise AdjustmentError("a comparison needs two calibrations or more.")
     if use not in get_args(Use):
-        raise AdjustmentError(f"what the use of a camera takes up is one of {', '.join(get_args(Use))}, not {use!r}.")
+        raise AdjustmentError(f"the use of a camera is one of {', '.join(get_args(Use))}, not {use!r}.")
     when = np.arange(len(calibrations), dtype=float) if times is None else np.asarray(times, float)
     if len(when) != len(calibrations) or not (np.diff(when) > 0).all():
         raise AdjustmentError(f"{len(calibrations)} calibrations need as many times, in rising order, not {when}.")

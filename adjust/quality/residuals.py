@@ -30,7 +30,7 @@ class Residuals:
 
     def __repr__(self) -> str:
         rms_um = 1000.0 * np.sqrt(np.mean(np.square(self.v_mm), axis=0)) if len(self.v_mm) else np.zeros(2)
-        return f"Residuals({len(self.v_mm)} of rms {rms_um[0]:.3g}, {rms_um[1]:.3g} um)"
+        return f"Residuals({len(self.v_mm)} of rms {rms_um[0]:.3g}, {rms_um[1]:.3g} µm)"
 
 
 @dataclass(frozen=True)

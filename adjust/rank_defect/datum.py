@@ -215,9 +215,9 @@ def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
         others = "the other datum coordinates and" if chosen else ""
         raise DatumError(
             f"The datum is over-constrained: {others} what is given hold {', '.join(strained)} already, and "
-            f"a minimal datum takes {datum.free.shape[1]} values here. To hold more would strain the network. "
-            f"Leave {'it' if len(strained) == 1 else 'them'} out of the datum coordinates, or say by a standard "
-            f"deviation in the points how well each is known."
+            f"a minimal datum takes {datum.free.shape[1]} values here. More would deform the network. Leave "
+            f"{'it' if len(strained) == 1 else 'them'} out of the datum coordinates, or say by a standard deviation "
+            "in the points how well each is known."
         )
     _check_complete(datum, basis, f"The datum coordinates {', '.join(coordinates)}")
     return positions
@@ -269,6 +269,6 @@ def _check_complete(datum: ObjectDatum, motions: Array, what: str) -> None:
     named, _ = _independent(open_directions[order], FLAT, np.zeros((0, open_directions.shape[1])))
     moving, remedies = zip(*(DATUM_DIRECTIONS[i] for i in sorted(order[k] for k in named)), strict=True)
     raise DatumError(
-        f"{what} do not hold the object space: it {'; it '.join(moving)}. Name "
+        f"{what} leave datum defects of the object space: it {'; it '.join(moving)}. Name "
         f"{'; '.join(dict.fromkeys(remedies))}, or leave the choice to the program."
     )

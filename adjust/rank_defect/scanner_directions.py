@@ -114,7 +114,7 @@ def undetermined_term_sentences(
         by_reason.setdefault(term_reason(term, poses, "lens" if term in by_lens else "marks"), []).append(term)
     for (cause, given, otherwise), alike in by_reason.items():
         yield (
-            f"The bend of scanner {scanner} is hardly told from the other unknowns in its "
+            f"The bend of scanner {scanner} is correlated with the other unknowns in its "
             f"term{'s' * (len(alike) > 1)} {', '.join(alike)}: {cause}. Give a standard deviation to {given}, "
             f"or {otherwise}."
         )

@@ -266,8 +266,8 @@ class _Solver:
             result = self.solve(network, own)
             if result.converged:
                 warning = (
-                    f"From the given approximations the iteration did not come to rest ({stopped.termination} after "
-                    f"{stopped.iterations} steps); it was begun anew from approximations found from the network itself."
+                    f"From the given approximations the iteration did not converge ({stopped.termination} after "
+                    f"{stopped.iterations} steps); it was repeated with approximations found from the network itself."
                     " Check those given."
                 )
                 return replace(result, remarks=(warning, *result.remarks))

@@ -57,7 +57,7 @@ def _sentence(slips: Sequence[NetworkHypothesis], found: Adjustment, given: Adju
     elif not given.converged:
         stands = "the iteration does not come to rest"
     else:
-        stands = f"σ₀ is {given.sigma0:.3g}, which chance makes it with a probability below {100.0 * family:g} %"
+        stands = f"σ₀ is {given.sigma0:.3g} (p < {family:g})"
     return (
         f"{what[0].upper()}{what[1:]}. Without this all {len(found.network.observations)} observations agree "
         f"(σ₀ = {found.sigma0:.2f}); as it stands, {stands}. {slips[0].remedy}"

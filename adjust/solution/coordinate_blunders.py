@@ -142,7 +142,7 @@ class Slip:
         digits = max(0, 1 - int(np.floor(np.log10(self.sigma))))
         at = ", ".join(f"{axis} = {value:.{digits}f}" for axis, value in zip("XYZ", self.place, strict=True))
         by = ", ".join(f"{axis} by {value:+.{digits}f}" for axis, value in zip("XYZ", self.off, strict=True))
-        missed = f"{far.miss_mm:.3g} mm beside its marks" if np.isfinite(far.miss_mm) else "behind the camera"
+        missed = f"{far.miss_mm:.3g} mm from its marks" if np.isfinite(far.miss_mm) else "behind the camera"
         guess = f" {self.explained}" if self.explained else ""
         return (
             f"Control point {far.name} is not where it is given: its rays from {far.images} images meet at {at}, "

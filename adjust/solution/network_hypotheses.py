@@ -92,7 +92,7 @@ def unit_words(factor: float) -> str:
     """Of points in another unit, which a factor takes back."""
     how = "large" if factor < 1.0 else "small"
     times = max(factor, 1.0 / factor)
-    return f"the coordinates of the points are {times:.4g} times too {how} beside stations or distances: another unit"
+    return f"the coordinates of the points are {times:.4g} times too {how} for the stations or distances: another unit"
 
 
 def _move_points(network: Network, by: Array) -> Network:

@@ -113,7 +113,7 @@ def name_coded(
     search, best = min(grown, key=lambda one: one[1].log10_chance)
     if best.log10_chance + np.log10(len(searches)) > MOST_LOG10_CHANCE_OF_CODES:
         right = _right_codes(best, codes)
-        return f"{right} of the {len(codes)} coded targets recognised lie as their points would, which may be chance"
+        return f"{right} of the {len(codes)} coded targets recognised fit their points, which may be a false alarm"
     numbers = set(codes.values())
     named = {
         point: mark

@@ -144,7 +144,7 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
 
 def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
     """Why there is no board of the count that is asked for, with the count that fits, if there is one."""
-    message = f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen"
+    message = f"no chessboard of {spec.columns} x {spec.rows} inner corners is whole in the scan"
     if pattern is None:
         return message
     rows, columns = pattern.grid.shape[:2]

@@ -175,9 +175,9 @@ def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | Squar
     size, places = f"{spec.columns} x {spec.rows} {what}", spec.places()
     assignments = grid_places(points_px, appearances, places)
     if not is_whole(assignments):
-        message = f"no grid of {size} is wholly seen; {len(points_px)} spots look like {what}"
+        message = f"no grid of {size} is whole in the scan; {len(points_px)} spots are candidates for {what}"
         if assignments:
-            message = f"a grid of more than {size} is seen, or one with a line of it hidden"
+            message = f"the grid is larger than {size}, or one of its lines is hidden"
         return FoundGrid({}, reason=Reason(message, Code.NO_BOARD))
 
     def uprightness(assignment: dict[Place, int]) -> float:

@@ -282,6 +282,6 @@ def off_corners(found: Mapping[str, FoundCorner], spec: CharucoSpec, read: ReadM
         x, y, w = homography @ (*place, 1.0)
         squares_off = np.linalg.solve(homography_steps(homography, place), corner.center_px - (x / w, y / w))
         if np.hypot(*squares_off) > _OFF_SQUARES:
-            message = f"it lies {np.hypot(*squares_off):.1f} squares off where the markers beside it put it"
+            message = f"it lies {np.hypot(*squares_off):.1f} squares from the place that the adjacent markers give"
             off[name] = Reason(message, Code.OFF_PLACE)
     return off

@@ -129,7 +129,7 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     notes = board.notes
     if isinstance(spec, ChessboardSpec) and fitted:
         fitted, notes = _named_by_colour(fitted, board.corners, spec)
-    hidden = "its square was not seen" if isinstance(spec, SquareGridSpec) else "not seen: its markers were not read"
+    hidden = "its square was not found" if isinstance(spec, SquareGridSpec) else "not found: its markers were not read"
     unseen = board.reason or Reason(hidden, Code.UNNAMED)
     marks = []
     for name in spec.object_points():

@@ -167,7 +167,7 @@ def _problem(own: FrameMisfit, shared: Explanation, names: Sequence[str], known_
         )
     if own.hypothesis is Hypothesis.PERSPECTIVE:
         return Reason(
-            f"its marks show a perspective against {than}, {off} beside an affine transformation; {p_value}. The film "
+            f"its marks show a perspective against {than}, {off} after an affine transformation; {p_value}. The film "
             f'was photographed obliquely: set transformation = "projective" under [adjust]. {widened}',
             Code.BENT_FRAME,
         )
@@ -192,7 +192,7 @@ def _problem(own: FrameMisfit, shared: Explanation, names: Sequence[str], known_
 def _wrong_places(shared: Explanation, layout: FiducialLayout, rest: str) -> Reason:
     off = _distances([mark.id for mark in layout.marks], np.hypot(*shared.pattern.mm.T))
     return Reason(
-        f"in all frames of the camera the marks lie beside the given coordinates in the same way, {off}, under an "
+        f"in all frames of the camera the marks differ from the given coordinates in the same way, {off}, after an "
         f"affine transformation: p = {shared.pattern.p_value:.1g} for their standard deviations. Check whether these "
         f"are the coordinates of this camera.{rest}",
         Code.OFF_GIVEN,
@@ -202,7 +202,7 @@ def _wrong_places(shared: Explanation, layout: FiducialLayout, rest: str) -> Rea
 def _bent_scans(shared: Explanation) -> Reason:
     most = float(np.hypot(*shared.pattern.mm.T).max())
     return Reason(
-        f"all scans are bent in the same way in the scanner's axes, by up to {most:.3f} mm beside an affine "
+        f"all scans are bent in the same way in the scanner's axes, by up to {most:.3f} mm after an affine "
         f"transformation (p = {shared.pattern.p_value:.1g} without): the scanner does it.",
         Code.BENT_SCANS,
     )

@@ -122,7 +122,7 @@ def _decide(frame: Frame, index: int, mark: FaintMark | None, why_not: Reason) -
         return before, bool(frame.certain[index]) or not frame.inliers[index]
     reason = NO_REASON
     if is_clear:
-        reason = Reason(f"{away_px:.0f} px from it something looks like it, too", Code.AMBIGUOUS)
+        reason = Reason(f"{away_px:.0f} px from it is a second candidate", Code.AMBIGUOUS)
     return Detection(before.predicted_px, True, mark.fit, reason), True
 
 
@@ -144,8 +144,8 @@ def reason_not_found(
     if ground.room_dn < _SHOWS * usual_dn:
         shade = "light" if ground.is_light else "dark"
         return Reason(
-            f"the ground at its place is so {shade} that the mark could change it by {_grey(ground.room_dn)} only, the "
-            f"others by {usual_dn:.0f}",
+            f"the background at its place is so {shade} that the mark could change it by "
+            f"{_grey(ground.room_dn)} only, the others by {usual_dn:.0f}",
             Code.GROUND,
         )
     if mark is not None and is_certain:
@@ -158,12 +158,12 @@ def reason_not_found(
     could = min(ground.room_dn, usual_dn)
     if mark is not None and abs(mark.fit.stored_contrast_dn) < _SHOWS * could:
         return Reason(
-            f"nothing {within} looks like it: what does so most changes the ground by "
+            f"no candidate {within}: the best one changes the background by "
             f"{_grey(abs(mark.fit.stored_contrast_dn))}, where the mark could by {could:.0f}",
             Code.NOT_FOUND,
         )
     return Reason(
-        f"nothing {within} stands out of the texture like it: the ground there varies by {_grey(ground.sigma_dn)}, and "
+        f"nothing {within} stands out of the texture: the background there varies by {_grey(ground.sigma_dn)}, and "
         f"a mark could change it by {could:.0f}",
         Code.CONTRAST,
     )

@@ -285,8 +285,8 @@ class Frame:
         found = f"{int(self.inliers.sum())} of {len(self.detections)} marks were found where the others put them"
         if self.agrees:
             return Reason(
-                f"{found}, but only {self._clear} of them look plainly like their drawings, where {self._least} have "
-                "to: compare the drawings with the scan, or say by which curve it stores light (tone)"
+                f"{found}, but only {self._clear} of them match their drawings, where {self._least} have "
+                "to: compare the drawings with the scan, or set its tone curve (tone under [measure])"
             )
         if self._unsettled and self.may_settle:
             names = ", ".join(ids[index] for index in self._unsettled)

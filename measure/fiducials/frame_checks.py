@@ -41,10 +41,10 @@ def pitch_problem(
     if np.abs(excess).max() <= limit:
         return None
     return Reason(
-        f"{source} gives a pitch of {pitch_um[0]:.2f} x {pitch_um[1]:.2f} um, but the marks' separations suggest "
-        f"{seen_um[0]:.2f} x {seen_um[1]:.2f} um ({100 * excess[0]:+.1f} and {100 * excess[1]:+.1f} %, where they and "
+        f"{source} gives a pitch of {pitch_um[0]:.2f} x {pitch_um[1]:.2f} µm, but the marks' separations suggest "
+        f"{seen_um[0]:.2f} x {seen_um[1]:.2f} µm ({100 * excess[0]:+.1f} and {100 * excess[1]:+.1f} %, where they and "
         f"the film allow {100 * limit:.1f} %): set pitch_um = [{seen_um[0]:.2f}, {seen_um[1]:.2f}] in the project, or "
-        "look whether the camera is the right one.",
+        "check whether the camera is the right one.",
         Code.PITCH,
     )
 
@@ -59,7 +59,7 @@ def with_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:
     if not scan.damage:
         return frame
     marks = without_lost(scan, frame.marks)
-    sentence = f"{scan.damage[0].upper()}{scan.damage[1:]}. No mark is measured there: copy the file anew, or rescan."
+    sentence = f"{scan.damage[0].upper()}{scan.damage[1:]}. No mark is measured there: copy the file again, or rescan."
     problem = Reason(sentence, Code.DAMAGED_FILE)
     return replace(frame, marks=marks, problems=(problem, *(each for each in frame.problems if each != problem)))
 

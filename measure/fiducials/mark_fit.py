@@ -81,7 +81,7 @@ def detect_mark(
 
 def not_found(search_px: float) -> Reason:
     """Why a mark was not found."""
-    return Reason(f"nothing within {search_px:.0f} px of its place looks like it", Code.NOT_FOUND)
+    return Reason(f"nothing within {search_px:.0f} px of its place matches its drawing", Code.NOT_FOUND)
 
 
 def _lost(scan: Scan, expected: MarkPrediction) -> Reason:

@@ -147,7 +147,7 @@ def _against_the_set_pose(search: FrameSearch, frame: Frame, lines: Sequence[Lin
         return NO_REASON
     evidence = " ".join(pose.evidence).rstrip(".")
     return Reason(
-        f"pose {frame.placement.pose} is set in the project, but what is seen of this frame decides for {pose.name}, "
+        f"pose {frame.placement.pose} is set in the project, but the marks of this frame show {pose.name}, "
         f'and then the marks have other names (pose = "auto" takes each scan as it lies): {evidence}',
         Code.POSE,
     )
@@ -166,13 +166,13 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
             )
             shift_mm = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
             another = Reason(
-                f"the scan shows another frame {shift_mm} beside this one, with {other.supported} marks where this one "
+                f"the scan shows another frame {shift_mm} from this one, with {other.supported} marks where this one "
                 f"has {best.supported}: give a scan of one frame, or name both in images.csv by the column window",
                 Code.OTHER_FRAME,
             )
             shifted = Reason(
                 f"the constellation fits nearly as well shifted by {shift_mm}, on {other.supported} marks against "
-                f"{best.supported}: the marks' names are not certain",
+                f"{best.supported}: the marks' names are ambiguous",
                 Code.AMBIGUOUS,
             )
             is_outside = (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any()
@@ -206,7 +206,7 @@ def second_frame(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, op
             second = _outline(found, layout) + np.array(rest[:2] * 2)
             windows = f"{_words(scan, first)} and {_words(scan, second)}"
             return Reason(
-                f"The scan shows a second frame, {measured} marks of it clear, and only one was measured. Name both in "
+                f"The scan shows a second frame, {measured} marks of it found, and only one was measured. Name both in "
                 f"images.csv, each called as the scan with something behind, by the column window: {windows}.",
                 Code.SECOND_PICTURE,
             )

@@ -212,7 +212,7 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape) -> 
     if shape.differs:
         frame = frame.add_reason(index, Reason(f"{other}: something may cover or touch it", *codes))
     elif touch is not None and is_round(mark) and is_damaged and touch.exceedance(WRONG_PX) > LARGE_ERROR:
-        reason = f"{other} and damaged beside it: something may touch it and have moved it by more than {WRONG_PX} px"
+        reason = f"{other}, and the picture next to it is damaged: something may touch it; error over {WRONG_PX} px"
         frame = frame.add_reason(index, Reason(reason, *codes))
     if touch is not None:
         frame = frame.add_covariance(index, Cause.TOUCHED, touch.variance_px2 * np.eye(2))

@@ -14,9 +14,7 @@ from measure.matching.covariance import honest_covariance
 from measure.results import FrameMeasurement, MarkMeasurement, Pose, SecondPlace
 from measure.scans.scan import Scan
 
-_FAINT = Reason(
-    "the frame was found at a closer look only, its marks being faint beside what surrounds them", Code.FAINT_FRAME
-)
+_FAINT = Reason("the frame was found only by the search for faint marks", Code.FAINT_FRAME)
 _ASSUMED = Reason(
     "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
 )
@@ -38,7 +36,7 @@ def absent_frame(scan: Scan, layout: FiducialLayout, reason: Reason, rotation_de
     why = Reason(f"not found: {reason}{also}", *codes)
     marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, why) for mark in layout.marks)
     remedy = (
-        "look whether the camera is that of the scan, the pitch right, and the film laid within "
+        "check whether the camera is that of the scan, the pitch right, and the film laid within "
         f"{rotation_deg:g} degrees of upright or of a quarter turn"
     )
     if Code.NO_FIT in reason.codes:

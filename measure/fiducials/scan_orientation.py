@@ -199,14 +199,14 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
         equal = [verdict.pose for verdict in near if verdict.pose != assumed]
         as_likely = f"as likely as {', '.join(equal)} and " if equal else ""
         sentence = (
-            f"the {found} marks found do not tell the poses {names} apart with certainty: {assumed} is assumed"
+            f"the {found} marks found do not separate the poses {names} significantly: {assumed} is assumed"
             f"{like_writing}, {as_likely}likelier than {alike[0].pose} by log-odds of only {lead:.1f}."
         )
     else:
         assumed = upright or alike[0].pose
         sentence = (
-            f"nothing in the {found} marks found tells the poses {names} apart: their pictures and given coordinates "
-            f"are alike; {assumed} is assumed{like_writing}."
+            f"nothing in the {found} marks found separates the poses {names}: their pictures and given coordinates are "
+            f"alike; {assumed} is assumed{like_writing}."
         )
     rivals = tuple(pose_in_camera(verdict.pose, assumed) for verdict in alike if verdict.pose != assumed)
     return Pose(assumed, False, (sentence, *against), written, main, rivals=rivals)
@@ -220,15 +220,15 @@ def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Seq
         telling = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > TOLD]
         kinds = sorted({_difference(best.names[site], rival.names[site], layout) for site in telling})
         sentences.append(
-            f"{' and '.join(kinds)} at {len(telling)} of {len(by_site)} marks speak against the next best pose "
+            f"{' and '.join(kinds)} at {len(telling)} of {len(by_site)} marks are evidence against the next best pose "
             f"{rival.pose} with log-odds {lead:.1f}."
         )
     asymmetry = float(np.sqrt(max(rival.chi_square - best.chi_square, 0.0)))
     if abs(best.coordinates - rival.coordinates) > TOLD:
         word = "against" if best.coordinates > rival.coordinates else "for"
         sentences.append(
-            f"the asymmetry of the marks' given coordinates, {asymmetry:.1f} sigmas, speaks {word} pose {rival.pose} "
-            f"with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
+            f"the asymmetry of the marks' given coordinates, {asymmetry:.1f} sigmas, is evidence {word} pose "
+            f"{rival.pose} with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
         )
     if abs(best.writing - rival.writing) > TOLD:
         sentences.append(_writing_sentence(best, rival, layout, lines))
@@ -245,7 +245,7 @@ def _writing_sentence(best: _Verdict, rival: _Verdict, layout: FiducialLayout, l
     telling = [index for index in np.argsort(-np.array(by_line), kind="stable").tolist() if by_line[index] > 0]
     quoted = ", ".join(f'"{lines[index].text}"' for index in telling[:_QUOTED])
     word = "against" if lead > 0 else "for"
-    return f"of {len(lines)} lines of writing {quoted} speak most {word} pose {rival.pose}: log-odds {abs(lead):.1f}."
+    return f"of {len(lines)} lines of writing {quoted} are evidence {word} pose {rival.pose}: log-odds {abs(lead):.1f}."
 
 
 def _difference(one: int, other: int, layout: FiducialLayout) -> str:
@@ -254,7 +254,7 @@ def _difference(one: int, other: int, layout: FiducialLayout) -> str:
         return "marks where the other pose has none"
     (core, dots), (other_core, other_dots) = (_figure(layout.marks[index].mark) for index in (one, other))
     if core != other_core:
-        return "unlike marks"
+        return "different marks"
     return "identification dots" if dots != other_dots else "the marks' directions"
 
 

@@ -79,7 +79,7 @@ def _edge_doubt(mark: MarkMeasurement, is_alone: bool) -> Doubt:
     is_weak = is_alone or (may_be_wrong(before + off_px**2 / 2 * np.eye(2)) and not may_be_wrong(before))
     reason = Reason(
         f"its edges put it {off_px:#.2g} px elsewhere, {mark.quality['second_method_sigmas']:.1f} standard "
-        "deviations of the difference: it is damaged or unlike its drawing",
+        "deviations of the difference: it is damaged, or not as drawn",
         Code.EDGES,
     )
     return Doubt(off_px**2 / 2, Cause.SECOND_METHOD, reason if is_weak else NO_REASON)

@@ -67,8 +67,8 @@ def _doubt_by_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -
     if expected <= FRAME_BY_CHANCE:
         return NO_REASON
     return Reason(
-        f"so much of the scan looks like the {len(clear)} marks found that chance would make {expected:.2g} such "
-        "frames in it, and the frame may lie elsewhere",
+        f"so many places of the scan match the {len(clear)} marks found that {expected:.2g} such false alarms are "
+        "expected in it; the frame may lie elsewhere",
         Code.CHANCE,
     )
 
@@ -100,8 +100,8 @@ def _doubt_by_neighbourhood(
     if chance <= FRAME_BY_CHANCE:
         return NO_REASON
     return Reason(
-        f"only {found} of {len(inside)} marks were clearly found, and {hits} of {len(places)} places beside them look "
-        f"as much like marks: chance finds as many with a probability of {chance:.2f}, and the frame may lie elsewhere",
+        f"only {found} of {len(inside)} marks were found, and {hits} of {len(places)} random places match "
+        f"as well (p = {chance:.2f}): the frame may lie elsewhere",
         *((Code.CHANCE, Code.NO_FRAME) if chance > NO_FRAME else (Code.CHANCE,)),
     )
 

@@ -31,7 +31,7 @@ from measure.scans.scan import Scan
 Result = tuple[list[Placement], list[tuple[float, Frame]]]
 
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
-_NOTHING = Reason("nothing in the scan looks like two or more of the camera's marks")
+_NOTHING = Reason("no two of the camera's marks were found in the scan")
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 
 
@@ -288,7 +288,7 @@ def _pitch_to_try(unsure: Sequence[Frame]) -> str:
         return ""
     best = max(unsure, key=lambda frame: (frame.measured_count, int(frame.inliers.sum())))
     pair = ", ".join(f"{um:.2f}" for um in 1000 / np.hypot(*best.pixel_from_camera[:, :2].T))
-    agreeing = f"under another pitch {int(best.inliers.sum())} of them lie as they should, which may be chance"
+    agreeing = f"under another pitch {int(best.inliers.sum())} of them fit, which may be a false alarm"
     return f"; {agreeing}: try pitch_um = [{pair}]"
 
 
@@ -298,8 +298,10 @@ def _too_faint(likeliest: tuple[float, Frame] | None) -> str:
         return ""
     expected, frame = likeliest
     agreeing = f"{int(frame.inliers.sum())} marks that are hardly there lie as they should"
-    by_chance = f"where chance makes {expected:.1g} such frames"
-    return f"; {agreeing}, {by_chance}: no other pitch tells them from it, click those that you see in reseau review"
+    by_chance = f"where {expected:.1g} such false alarms are expected"
+    return (
+        f"; {agreeing}, {by_chance}: another pitch does not separate them; click the visible marks in `reseau review`"
+    )
 
 
 def likeliest_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line] = ()) -> Pose:

@@ -313,7 +313,7 @@ def fit_frame_corner(
         course = Course(scan, pixel_from_mark[:, 2], unit[:, side], unit[:, 1 - side], weights)
         edge = edge_along(course, (first, reach), search_px, polarity)
         if edge is None:
-            unseen = Reason("an edge of the frame is not to be seen there as one line", Code.NOT_FOUND)
+            unseen = Reason("an edge of the frame is not visible there as one line", Code.NOT_FOUND)
             nothing = Covariance.from_noise(np.full((2, 2), np.inf))
             return MarkFit(False, unseen, pixel_from_mark[:, 2], nothing, pixel_from_mark)
         edges.append(edge)

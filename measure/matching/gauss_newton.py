@@ -175,7 +175,7 @@ class PictureFit:
             if self.telling.sum() < 3 * len(self.model.design):
                 self.reason = Reason("too little of the mark is undamaged", Code.COVERED)
             elif round_ == 0 and not self._is_plain():
-                self.reason = Reason("the ground about the mark is not plain", Code.NO_FIT)
+                self.reason = Reason("the background of the mark is not uniform", Code.NO_FIT)
             self._adjust(0.002)
 
     def choose_area(self) -> None:

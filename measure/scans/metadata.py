@@ -45,7 +45,7 @@ Samples = NDArray[np.uint8 | np.uint16]
 def damage_error(path: Path, what: str) -> MeasurementError:
     """what: a part of a sentence."""
     return MeasurementError(
-        f"{path} is damaged or truncated ({what.rstrip('.')}): copy it anew from the original, or rescan"
+        f"{path} is damaged or truncated ({what.rstrip('.')}): copy it again from the original, or rescan"
     )
 
 
@@ -79,7 +79,7 @@ def check_size(
         bound = f"--max-pixels allows {max_pixels}"
     raise TooLargeError(
         f"{path} claims {what} of {width} x {height} pixels ({decoded_bytes} bytes), stored in {stored_bytes} bytes: "
-        f"{bound}. If it is truly so large, give --max-pixels {pixels}; else the file is damaged: copy it anew"
+        f"{bound}. If it is truly so large, give --max-pixels {pixels}; else the file is damaged: copy it again"
     )
 
 
@@ -99,14 +99,14 @@ def first_bytes(path: Path) -> bytes:
             start = file.read(16)
     except FileNotFoundError:
         raise MissingError(
-            f"there is no scan {path} (looked for {path.absolute()}): check its name and its folder"
+            f"there is no scan {path} (searched at {path.absolute()}): check its name and its folder"
         ) from None
     except OSError as error:
         raise MeasurementError(
             f"{path} cannot be read: {error.strerror}; check that it is a file you may read"
         ) from error
     if not start:
-        raise MeasurementError(f"{path} is empty (0 bytes): copy or scan it anew")
+        raise MeasurementError(f"{path} is empty (0 bytes): copy or scan it again")
     return start
 
 

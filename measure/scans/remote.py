@@ -376,7 +376,7 @@ def _retry(address: Address, ask: Callable[[], Made]) -> Made:
                 # cause.
                 error = error.__cause__ or error
                 if isinstance(error, FileNotFoundError) or _status(error) == 404:
-                    message = f"there is no {address}: check its name, and that its store or server has it"
+                    message = f"there is no {address}: check its name, and that its server has it"
                     raise MissingError(message) from None
             if wait_s is None:
                 raise UnreachableError(f"{address}: {_explanation(error)}. Tried {len(_WAITS_S) + 1} times.") from error
@@ -386,9 +386,9 @@ def _retry(address: Address, ask: Callable[[], Made]) -> Made:
 
 def _explanation(error: BaseException) -> str:
     if isinstance(error, PermissionError) or _status(error) in (401, 403):
-        return "its store or server forbids to read it (403): check your credentials and its permissions"
+        return "its server forbids to read it (403): check your credentials and its permissions"
     if isinstance(error, TimeoutError):
-        return f"its store or server did not answer within {_TIMEOUT_S:g} s"
+        return f"its server did not answer within {_TIMEOUT_S:g} s"
     return f"it cannot be reached ({type(error).__name__}: {public_text(str(error))})"
 
 

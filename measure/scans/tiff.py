@@ -341,7 +341,7 @@ def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
         file.seek(last)
         if any(file.read(_LOOKED_AT_BYTES)):
             raise damage_error(
-                path, f"its last {size - last} bytes belong to nothing, as if some had been put in before"
+                path, f"its last {size - last} bytes are not part of any page: bytes may have been inserted before"
             )
 
 

@@ -259,7 +259,7 @@ def _doubt(disk: FittedDisk, off: Array, squares: float, count: int) -> Reason:
     if fdtrc(figures, _SPREADS * MEDIAN_EFFICIENCY * count, (squares + slopes) / figures) < DISK_UNLIKE_THE_OTHERS:
         size, *form, contrast, variance = off
         return Reason(
-            f"unlike the other targets: {np.exp(size):.2f} times their size, {np.exp(contrast):.2f} times their "
+            f"not like the other targets: {np.exp(size):.2f} times their size, {np.exp(contrast):.2f} times their "
             f"contrast, its form {100 * np.hypot(*form):.0f} % off, its blur by {variance:.1f} px²; dust may hide in "
             "it",
             Code.DUST,

@@ -43,17 +43,15 @@ _NONE_HERE = "No natural points are sought here"
 _LEAST_BATCH = 4  # part of the points wanted: every batch goes through all scans
 _FINE_PX = 1.0  # how far measured points may lie off their epipolar lines for the lens
 _CHUNK = 16  # points that a worker gets at a time
-_OFF_LINES = Reason("the point lies off the epipolar lines of the other scans, unlike its neighbours", Code.OTHER_SCANS)
+_OFF_LINES = Reason(
+    "the point lies off the epipolar lines of the other scans, and its neighbours do not", Code.OTHER_SCANS
+)
 _UNLIKE_NEIGHBOURS = Reason(
     "the points about it map elsewhere from scan to scan: ground that repeats itself may have been mistaken",
     Code.OTHER_SCANS,
 )
-_UNEVEN = Reason(
-    "parts of the picture about the point move unlike each other: it is no plane piece of ground", Code.OTHER_SCANS
-)
-_OTHER_PICTURE = Reason(
-    "the picture about the point is unlike that in the other scans: something else", Code.OTHER_SCANS
-)
+_UNEVEN = Reason("parts of the picture about the point move differently: its surface is not plane", Code.OTHER_SCANS)
+_OTHER_PICTURE = Reason("the picture about the point differs from that in the other scans", Code.OTHER_SCANS)
 _PRECISE_PX = 0.125  # rms length of the error of the weakest measured point: half a pixel is four times as much
 Progress = Callable[[str, int, int], None]
 

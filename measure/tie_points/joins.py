@@ -43,9 +43,11 @@ _APART_PX = 2 * RADIUS_PX + 2  # of joins: patches that overlap have correlated 
 _SHARP_PX = 0.5  # rms length of an error: with less texture a join is weak
 _INTERPOLATION_PX = 0.01  # that sharp pictures without noise are off by, between pixels; aerial ones at most
 _CHUNK = 16  # places that a worker gets at a time
-_UNEVEN = Reason("parts of the picture about the place move unlike each other", Code.OTHER_SCANS)
+_UNEVEN = Reason("parts of the picture about the place move differently", Code.OTHER_SCANS)
 _LOST = Reason("the process that matched it was ended", Code.UNREACHABLE)
-_UNLIKE = Reason("the places about it map elsewhere from scan to scan: dust on the glass, or chance", Code.OTHER_SCANS)
+_UNLIKE = Reason(
+    "the places about it map elsewhere from scan to scan: dust on the glass, or a false match", Code.OTHER_SCANS
+)
 _UNJOINED = "It is not joined to the other scans of its frame"
 
 _MatchedPair = tuple[Matched, ...]

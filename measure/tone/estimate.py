@@ -76,7 +76,7 @@ class FrameTone:
         """A sentence: which curve, and whence."""
         value, sigma = self.tone.equivalent_power(self.least, self.greatest)
         exact = f"{value:.2f}" if self.tone.is_known else f"{value:.2f} (σ {sigma:.2f})"
-        return f"Light was taken to grow as the grey value to the power of {exact}: {self.tone.source}."
+        return f"Scanner gamma: {exact}: {self.tone.source}."
 
     def shift_px(self, mark: MarkTone, before: Tone) -> float:
         """The distance of a mark's place by this curve from that by another one."""

@@ -241,6 +241,6 @@ def _not_corrected(network: Network, possible_mm: Array) -> tuple[str, ...]:
         return ()
     return (
         f"The disks' eccentricity is not corrected, for their normals are not known; it can reach {worst:.1f} sigma "
-        f"({1000.0 * float(np.abs(possible_mm).max()):.2f} um). Add the columns nX, nY, nZ to the points, or use "
+        f"({1000.0 * float(np.abs(possible_mm).max()):.2f} µm). Add the columns nX, nY, nZ to the points, or use "
         "smaller disks.",
     )

@@ -44,7 +44,7 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceReco
 
 def print_choice(choice: Choice, console: Console, path: Path) -> None:
     """The candidates as a table, then the verdict and a reason a line."""
-    columns = ("model", "unknowns", "redundancy", "sigma0", "v'Pv", "AIC", "AICc", "left out, um", "correlated")
+    columns = ("model", "unknowns", "redundancy", "sigma0", "v'Pv", "AIC", "AICc", "left out, µm", "correlated")
     table = Table(*columns, title="Candidates", title_justify="left")
     for each in choice.candidates:
         style = "bold green" if each is choice.chosen else ""

@@ -137,16 +137,16 @@ def _why(comparison: Comparison, level: float) -> str:
     }[comparison.use]
     of_what = _counted(comparison.same) if comparison.trend is None else "twice the smaller one of two tests"
     sentence = (
-        f"Calibrations of an unchanged camera would differ as much with a probability of {comparison.probability:.2g} "
-        f"({of_what}; drift is said below {level:g}), after {taken} have taken up what they can."
+        f"p = {comparison.probability:.2g} for an unchanged camera "
+        f"({of_what}; drift: p < {level:g}), after adjustment of {taken}."
     )
     if comparison.trend is None:
         return sentence
     first, last = comparison.calibrations[0].name, comparison.calibrations[-1].name
     return (
-        f"{sentence} That all are one: {comparison.same.probability:.2g} ({_counted(comparison.same)}). That there is "
-        f"no steady change with time: {comparison.trend.probability:.2g} ({_counted(comparison.trend)}); from {first} "
-        f"to {last} it is {_rms(comparison.trend_um):.2f} um rms over the frame, "
+        f"{sentence} All equal: p = {comparison.same.probability:.2g} ({_counted(comparison.same)}). No "
+        f"linear change with time: p = {comparison.trend.probability:.2g} ({_counted(comparison.trend)}); from {first} "
+        f"to {last} it is {_rms(comparison.trend_um):.2f} µm rms over the frame, "
         f"{_largest(comparison.trend_um, comparison.trend_covariance_um2)}."
     )
 
@@ -170,7 +170,7 @@ def _print_difference(
     field = comparison.field_um[k]
     x, y = comparison.places_mm[np.hypot(*field.T).argmax()]
     largest = _largest(field, comparison.field_covariance_um2[k])
-    console.print(Text(f"Over the frame {_rms(field):.2f} um rms, {largest} at ({x:.0f}, {y:.0f}) mm."))
+    console.print(Text(f"Over the frame {_rms(field):.2f} µm rms, {largest} at ({x:.0f}, {y:.0f}) mm."))
     if comparison.fiducials:
         marks = comparison.fiducials_um[k]
         which = comparison.fiducials[np.hypot(*marks.T).argmax()]
@@ -185,7 +185,7 @@ def _rms(differences_um: Array) -> float:
 def _largest(differences_um: Array, covariance_um2: Array) -> str:
     size = np.hypot(*differences_um.T)
     sx, sy = sigmas(covariance_um2[size.argmax()])
-    return f"at most {size.max():.2f} um (sigmas {sx:.2f} and {sy:.2f} um)"
+    return f"at most {size.max():.2f} µm (sigmas {sx:.2f} and {sy:.2f} µm)"
 
 
 def draw_comparison(comparison: Comparison, path: Path) -> None:

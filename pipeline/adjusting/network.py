@@ -63,7 +63,7 @@ def _check_fiducial_unit(project: Project, image: str, marks: Sequence[Comparato
     if measured_mm and given_mm and not 1 / OTHER_UNIT < measured_mm / given_mm < OTHER_UNIT:
         raise InputError(
             f"{project.comparator}, line {marks[0].line}: the fiducials of image {image!r} stand "
-            f"{measured_mm / given_mm:.3g} times as far apart as those of {camera.path}. Give both in mm: not in um, "
+            f"{measured_mm / given_mm:.3g} times as far apart as those of {camera.path}. Give both in mm: not in µm, "
             "inches or pixels."
         )
 
@@ -210,7 +210,7 @@ def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[
         lost |= {part: frame for part in parts if part not in kept}
     sentences = tuple(
         f"Image {image!r} has no part in the adjustment: it has fewer than {FEWEST_COMMON} points in common with the "
-        f"other scans of frame {frame!r}, so that nothing joins it to them. See what is said of its measurement."
+        f"other scans of frame {frame!r}, so that nothing joins it to them. See the reasons of its marks."
         for image, frame in sorted(lost.items())
     )
     bare = {frame: _few_fiducials(project, frame, parts, lost) for frame, parts in shown_points.items()}

@@ -62,7 +62,7 @@ def measure_again(
     if not visits:
         return None
     found = dict[str, tuple[MarkMeasurement, ...] | str]()
-    with executor() as workers, reporter.stage("looking again at") as count:
+    with executor() as workers, reporter.stage("second pass of") as count:
         for done, (visit, result) in enumerate(results_of(looked_again, visits, workers), 1):
             found[visit.image] = str(result) if isinstance(result, Exception) else result
             count(visit.image, done, len(visits))
@@ -110,7 +110,7 @@ def _visited(
     """The scan with what was seen of it, the same object where that is nothing. What the first visit gave stays where a
     second one was not possible any more, and the frame says so."""
     if isinstance(seen, str):
-        problem = Reason(f"It could not be looked at again: {seen}", Code.UNREACHABLE)
+        problem = Reason(f"The second pass failed: {seen}", Code.UNREACHABLE)
         return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))
     targets = {mark.point: mark for mark in scan.frame.marks if mark.kind not in ON_FILM}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]

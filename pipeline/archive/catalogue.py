@@ -60,7 +60,7 @@ def find_scan_files(given: Sequence[Path]) -> tuple[list[Path], Counter[str]]:
         where, others = ", ".join(map(str, given)), ", ".join(sorted(ending or "nothing" for ending in endings))
         held = f" There are files that end in {others}." if others else ""
         raise InputError(
-            f"{where}: no scan there, nor below. Files that end in {', '.join(SCAN_ENDINGS)} are looked for.{held}"
+            f"{where}: no scan there, nor below. Files that end in {', '.join(SCAN_ENDINGS)} are scans.{held}"
         )
     return sorted(files), endings
 

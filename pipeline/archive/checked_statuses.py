@@ -193,7 +193,7 @@ def rejudge(store: Store, before: Judging, scans: Sequence[MeasuredScan]) -> str
         for scan in sorted(scans, key=lambda scan: scan.frame.image)
         for result, decisions in [rows[scan.frame.image]]
     )
-    return judge(store, before.made_from, f"looked again {before.input}", frames)
+    return judge(store, before.made_from, f"second pass {before.input}", frames)
 
 
 def latest(store: Store) -> Judging | None:

@@ -110,7 +110,7 @@ def _check_workers(client: "Client", address: str, scans: Sequence[str]) -> None
     complaints = []
     for worker, answer in sorted(answers.items()):
         if isinstance(answer, BaseException):
-            complaints.append(f"{worker}: cannot be asked ({answer}): is reseau installed there?")
+            complaints.append(f"{worker}: does not answer ({answer}): is reseau installed there?")
             continue
         there, missing = answer
         other = [
@@ -122,7 +122,7 @@ def _check_workers(client: "Client", address: str, scans: Sequence[str]) -> None
             what = "; ".join(f"{scan} ({why})" for scan, why in missing[:_NAMED])
             remedy = "the same path to the scans"
             if any(is_address(scan) for scan, _ in missing):
-                remedy = "the extra, the credentials and the network that reach the store, as they are here"
+                remedy = "the extra, the credentials and the network that reach the scans, as they are here"
             complaints.append(f"{worker}: cannot read {what}. Give it {remedy}.")
     if complaints:
         more = f"\n... and {len(complaints) - _NAMED} more workers" if len(complaints) > _NAMED else ""

@@ -75,7 +75,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
     unknown = {name: state for name, state in states.items() if state != getattr(known.get(state.uri), "state", None)}
     taken = {state.uri for name, state in states.items() if name not in unknown}
     found, keys = 0, dict[str, str]()
-    with reporter.stage("looked for in the store") as count:
+    with reporter.stage("searched in the results database") as count:
         for done, (name, state) in enumerate(unknown.items(), 1):
             count(name, done, len(unknown))
             if not by_size.get(state.bytes):

@@ -124,7 +124,9 @@ def measured_scans(path: Path, digest: str = "", images: Collection[str] | None 
     with Store(path) as store:
         judging = find_judging(store, digest) if digest else latest(store)
         if judging is None:
-            raise InputError(f"{path}: its scans are not judged yet. Run `reseau measure`, which goes on with them.")
+            raise InputError(
+                f"{path}: its scans have not passed the cross-scan checks. Run `reseau measure`, which continues."
+            )
         folder = path.parent / (store.recall(_PLACE) or {"path": ".."})["path"]
         yield from checked_scans(store, judging, folder, images)
 

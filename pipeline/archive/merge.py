@@ -32,9 +32,11 @@ def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
     to bring it to this version. Raises InputError for a file that is no store, before anything is taken."""
     for path in others:
         if not path.is_file():
-            raise InputError(f"{path}: there is no such store. Name the out/measurement.db of each shard.")
+            raise InputError(
+                f"{path}: there is no such results database. Name the out/measurement.K-of-N.db of each part."
+            )
         if path.resolve() == store.path.resolve():
-            raise InputError(f"{path}: is the store that the others are to be joined in. Name the others only.")
+            raise InputError(f"{path}: is the results database that the others are joined into. Name the others only.")
         Store(path).close()
     return [_taken(store, path) for path in others]
 

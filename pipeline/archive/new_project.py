@@ -30,7 +30,7 @@ _SHOWN = 12  # of each kind of remark on the terminal
 _BROKEN = "cannot be read"
 _COPIES = "the same bytes as another scan"
 _NAMESAKES = "another picture of the same name is taken"
-_UNKNOWN = "no camera is told: give them one in images.csv, and take them out of here"
+_UNKNOWN = "their camera is unknown: give them one in images.csv, and remove them from `exclude`"
 _FORMATS = ("JPEG", "PNG", "TIFF")  # the later the better, of one name and size
 
 
@@ -58,7 +58,7 @@ class NewProject:
         """What needs a look, and the single cases of it."""
         yield "cannot be read, and are left out", list(self.found.broken.values())
         yield (
-            "are of no camera that could be told"
+            "show no known camera"
             + ("" if self.named else ": draw it in camera.toml (`reseau template camera`), or have its marks learned"),
             [
                 f"{group.folder}, {len(group.paths)} scans, {_form(group.head)}: {group.why_not()}"
@@ -92,7 +92,7 @@ class NewProject:
         if mute:
             scans = sum(len(group.paths) for group in mute)
             pixels = [um for group in mute if (um := group.pixel_um)]
-            spacing_text = f", {np.median(pixels):.1f} um in the samples" if pixels else ""
+            spacing_text = f", {np.median(pixels):.1f} µm in the samples" if pixels else ""
             are_all = len(mute) == len(self.named)
             sets = "sets it" if are_all else "is that of all scans: to set it, give these a project of their own"
             yield (
@@ -104,7 +104,7 @@ class NewProject:
             yield f"Cameras' numbers on plates in the samples: {', '.join(plates)}."
         if self.found.endings:
             others = sorted(self.found.endings.items(), key=lambda item: -item[1])[:_SHOWN]
-            yield f"Not looked at: {', '.join(f'{count} files {_ending(ending)}' for ending, count in others)}."
+            yield f"Not examined: {', '.join(f'{count} files {_ending(ending)}' for ending, count in others)}."
 
     def as_json(self) -> Mapping[str, object]:
         return {
@@ -138,8 +138,8 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
     given = [path for one in given for path in _given_paths(one)]
     for path in given:
         if not isinstance(path, Address) and not path.exists():
-            raise InputError(f"there is no {path} (looked for {path.absolute()}). Give folders with scans, or scans.")
-    with reporter.stage("looked at") as count:
+            raise InputError(f"there is no {path} (searched at {path.absolute()}). Give folders with scans, or scans.")
+    with reporter.stage("examined") as count:
         try:
             found = catalogue(given, count, max_pixels)
         except MeasurementError as error:
@@ -206,9 +206,9 @@ def print_new_project(new: NewProject, console: Console) -> None:
     def say(text: str, style: str = "") -> None:
         console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)
 
-    say(f"{new.found.files} files looked at.")
+    say(f"{new.found.files} files examined.")
     for (camera, form), (scans, folders) in sorted(_totals(new).items()):
-        say(f"{camera or 'camera not told'}: {scans} scans in {folders} folder{'s' * (folders > 1)}, {form}", "bold")
+        say(f"{camera or 'camera unknown'}: {scans} scans in {folders} folder{'s' * (folders > 1)}, {form}", "bold")
     for what, cases in new.remarks():
         if cases:
             say(f"Needs a look: {what}:", "yellow")
@@ -308,7 +308,7 @@ def _form(head: ScanHead) -> str:
     pitch = (
         "no resolution"
         if head.pitch.um is None
-        else f"{' x '.join(f'{um:.3g}' for um in sorted(set(head.pitch.um)))} um"
+        else f"{' x '.join(f'{um:.3g}' for um in sorted(set(head.pitch.um)))} µm"
     )
     colours = "colour" if head.channels > 1 else "grey"
     return f"{head.file_format} {head.bits} bit {colours}, about {head.width_px} x {head.height_px} px, {pitch}"

@@ -117,8 +117,8 @@ def check_judgings(db: sqlite3.Connection, path: object) -> None:
 
 def damaged_judging(path: object) -> DamagedError:
     return DamagedError(
-        f"{path}: the list of judged images is not as it was written: the file was changed or is damaged. "
-        "Run `reseau measure --retry`, which judges all images again."
+        f"{path}: the list of checked images is not as it was written: the file was changed or is damaged. "
+        "Run `reseau measure --retry`, which checks all images again."
     )
 
 

@@ -88,7 +88,7 @@ class ScanGroup:
             firsts = [trial for sample in self.samples for trial in sample.best[:1]]
             found, drawn = sum(trial.found for trial in firsts), sum(trial.drawn for trial in firsts)
             return (
-                f"perhaps {' or '.join(self.cameras)}, {found} of {drawn} marks seen, but that rests on the form of "
+                f"perhaps {' or '.join(self.cameras)}, {found} of {drawn} marks found, but that rests on the form of "
                 f"its marks alone, and {' or '.join(self.much_alike)} has marks much like them: compare the drawings "
                 "with a scan"
             )
@@ -97,7 +97,7 @@ class ScanGroup:
             return f"no camera stands out in {len(self.samples)} of them"
         counts_text = ", ".join(f"{name} in {count}" for name, count in counts.most_common())
         if 2 * sum(map(bool, self._named)) > len(self.samples) and frozenset.intersection(*filter(None, self._named)):
-            return f"what is seen are marks of {counts_text}, and the camera's plate in the picture says another one"
+            return f"the marks are those of {counts_text}, but the camera's plate in the picture names another camera"
         return f"of {len(self.samples)} samples not all show the same camera ({counts_text})"
 
     @property

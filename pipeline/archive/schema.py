@@ -231,7 +231,7 @@ def _measurements() -> Schema:
 def store_error(path: Path, what: str, error: Exception) -> InputError:
     """What is said of a file that cannot be read or written as a store."""
     next_step = what_to_do_about_store(error) or _MOVE
-    return InputError(f"{path}: cannot be used as a store of {what} ({error}). {next_step}")
+    return InputError(f"{path}: cannot be used as a database of {what} ({error}). {next_step}")
 
 
 _MOVE = "Move it away, and run `reseau measure` again."

@@ -24,10 +24,10 @@ class Verdict(StrEnum):
 
 
 MEANING = {
-    Verdict.GOOD: "Every mark that was sought is measured, and nothing speaks against any of them.",
+    Verdict.GOOD: "Every mark is measured, and no check contradicts any of them.",
     Verdict.DECIDED: "Good but for what a person has decided: nothing is open.",
     Verdict.LOOK: "Usable, but a mark is weak, missing or refused, or the frame has a problem: an assumed pose, say.",
-    Verdict.POOR: "Hardly usable: too few marks were found to tell where the frame is, or to check one by another.",
+    Verdict.POOR: "Hardly usable: too few marks were found for an interior orientation, or for a check of it.",
     Verdict.FAILED: "Nothing was measured: the file is missing, damaged or no scan, or its process was ended.",
     Verdict.WAITING: "Not measured yet.",
     Verdict.OLD: "Stale: the file, the options or the decisions about it are others than when it was measured.",
@@ -40,7 +40,7 @@ NEXT_STEP = {
     Verdict.POOR: "Look at the scan: is it of this camera, whole, sharp? Scan it again, or name it in `exclude`.",
     Verdict.FAILED: "Mend or replace the file, which is noticed; `--retry` after an outage; or name it in `exclude`.",
     Verdict.WAITING: "Run `reseau measure`.",
-    Verdict.OLD: "Run `reseau measure`: it measures or judges these anew, and no others.",
+    Verdict.OLD: "Run `reseau measure`: it measures or checks these again, and no others.",
 }
 
 _MARK_VERDICTS = {status: Verdict.GOOD if status is Status.MEASURED else Verdict.LOOK for status in Status}

@@ -51,7 +51,7 @@ def write_project(
 def _project_text(out: Path, pictures: BoardPictureFiles, options: CalibrationOptions, several: bool) -> str:
     files = (pictures.files[name] for camera in pictures.cameras for name in camera.images)
     scans = ", ".join(quoted(os.path.relpath(path, out)) for path in files)
-    unknown = "" if options.pitch_um else "# Nobody said how large a pixel is: of all in mm only ratios count.\n"
+    unknown = "" if options.pitch_um else "# The pixel size is not given: of all in mm only ratios count.\n"
     images = 'images = "images.csv"\n' if several else ""
     bend = 'board_bend = "free"\n' if options.board.bend else ""
     return f"""# Written by `reseau calibrate`; `reseau run` goes on with it.

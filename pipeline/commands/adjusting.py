@@ -83,10 +83,13 @@ def compare(
     camera: OfCamera = None,
     times: Annotated[str | None, typer.Option(metavar="T,T,...", help="When they were made: 1952,1958.5.")] = None,
     flat: Annotated[
-        bool, typer.Option("--flat", help="For use over flat ground, where height and place take up c and the point.")
+        bool,
+        typer.Option(
+            "--flat", help="For flat ground, where height and position are correlated with c and the principal point."
+        ),
     ] = False,
     level: Annotated[
-        float, typer.Option(min=1e-12, max=0.5, help="Drift is said where chance makes as much more rarely than this.")
+        float, typer.Option(min=1e-12, max=0.5, help="Significance level of the test: drift below this p-value.")
     ] = 0.01,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write compare.json and compare.svg there.")] = None,
     as_json: AsJson = False,

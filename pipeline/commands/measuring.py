@@ -75,7 +75,8 @@ def measuring(stage: str, help_text: str) -> Callable[..., int]:
     def command(
         project: ProjectFile,
         shard: Annotated[
-            str | None, typer.Option(metavar="K/N", help="The K-th of N parts of the scans, into a store of its own.")
+            str | None,
+            typer.Option(metavar="K/N", help="The K-th of N parts of the scans, with a results database of its own."),
         ] = None,
         cluster: Annotated[
             str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786, or `local`.")
@@ -215,7 +216,9 @@ def cameras(
         Path | None,
         typer.Option("--project", metavar="PROJECT.toml", help="Try its camera files, too; its scans without --scan."),
     ] = None,
-    pitch_um: Annotated[float | None, pitch_option("The scan's pixel in um, if its file is mute.", "--pitch")] = None,
+    pitch_um: Annotated[
+        float | None, pitch_option("The scan's pixel in µm, if its file does not say.", "--pitch")
+    ] = None,
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
@@ -258,7 +261,7 @@ def _name_cameras(
         else:
             print_next(as_json, LIBRARY_STEP)
         return DONE if identification.best else LOOK
-    with reporter.stage("looked at") as count:
+    with reporter.stage("examined") as count:
         found = group_scans(find_scan_files(given)[0], count, max_pixels, by_folder=False)
     grouped = name_cameras(found, trial_of_cameras(tried, pitch_um, max_pixels), reporter, None)
     if not grouped.groups:

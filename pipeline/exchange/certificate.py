@@ -38,7 +38,7 @@ from pipeline.types import Array
 
 CONVENTION = Convention(
     (float("nan"), float("nan")),
-    "radial distortion in um, positive away from the centre, at angles from the axis or at radii in mm",
+    "radial distortion in µm, positive away from the centre, at angles from the axis or at radii in mm",
     "U.S. Geological Survey, Report of Calibration of Aerial Mapping Camera (OSL): Lens Distortion by field angle",
 )
 POWERS = (3, 5, 7)
@@ -240,8 +240,8 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
         f"{certificate.name}: equivalent principal distance {fitted.equivalent_mm:.4f} mm, its standard deviation "
         f"{fitted.sigmas[0]:.4f}; calibrated {fitted.calibrated_mm:.4f} mm, by the balance of the fitted curve; the "
         f"table refers to {certificate.principal_distance_mm:.4f} mm. The camera file has the equivalent one.",
-        f"{certificate.name}: k3 {k3:.4g}, k5 {k5:.4g}, k7 {k7:.4g}; residuals of the table {rms:.2f} um rms, "
-        f"{largest:.2f} um at most, {over} values more than unknowns.",
+        f"{certificate.name}: k3 {k3:.4g}, k5 {k5:.4g}, k7 {k7:.4g}; residuals of the table {rms:.2f} µm rms, "
+        f"{largest:.2f} µm at most, {over} values more than unknowns.",
         f"{certificate.name}: the certificate {point}.",
         *([apart] if off.any() else []),
     ]

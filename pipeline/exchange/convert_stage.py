@@ -127,7 +127,7 @@ def _convert(
         f"{lens.distortion.family} and {options.family} mean the same here: what is left over {size} is rounding."
         if found.is_same
         else f"{options.family} does not take this lens quite: over {size} it is off by up to "
-        f"{1e3 * found.largest_mm:.3g} um, rms {1e3 * found.rms_mm:.3g} um a point. "
+        f"{1e3 * found.largest_mm:.3g} µm, rms {1e3 * found.rms_mm:.3g} µm a point. "
         "The standard deviations do not count that."
     )
     return found, (sentence, f"Fitted: c, x0', y0' and {listed(found.estimated) or 'no parameter'}.")

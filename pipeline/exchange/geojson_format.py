@@ -37,7 +37,7 @@ def write(block: Block, options: ExportOptions) -> Written:
             continue
         features.append(_feature(frame, lon_lat(outline[:, :2] * block.project.unit_mm / 1000.0, crs), outline[0, 2]))
     content = {"type": "FeatureCollection", "features": features}
-    notes = ("The ground is taken as level, at the mean height of the points that an image shows.",)
+    notes = ("The terrain is taken as level, at the mean height of the points that an image shows.",)
     lost = ("relief", "all standard deviations")
     return Written({"footprints.geojson": json.dumps(content, ensure_ascii=False) + "\n"}, lost, notes, tuple(left_out))
 
@@ -48,7 +48,7 @@ def footprint(block: Block, frame: WholeFrame) -> Array | str:
     assert model is not None
     heights = [block.points[mark.point][2] for mark in frame.observed(False) if mark.point in block.points]
     if not heights:
-        return "none of its points is adjusted, so the height of its ground is not known."
+        return "none of its points is adjusted, so the height of the terrain is not known."
     outline_mm = _outline(frame_corners_mm(block, frame))
     ideal, found = model.lens.ideal_from_observed(outline_mm)
     c, point = model.lens.interior[0], model.lens.interior[1:]

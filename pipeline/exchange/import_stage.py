@@ -63,7 +63,7 @@ def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:
 
 def _comparator(marks: Sequence[ForeignMark], options: ImportOptions) -> str:
     if options.pitch_um is None:
-        raise InputError("marks in pixels become mm: say with --pitch-um how many um a pixel has.")
+        raise InputError("marks in pixels become mm: give the pixel size in µm with --pitch-um.")
     pitch = (options.pitch_um, options.pitch_um)
     times = Counter((mark.image, mark.kind, mark.point) for mark in marks)
     (image, kind, point), most = times.most_common(1)[0]

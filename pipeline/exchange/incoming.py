@@ -75,7 +75,7 @@ def opencv_camera(
     where the pitch, or the size that the middle needs, is not known.
     """
     if options.pitch_um is None:
-        raise InputError(f"{path}: counts in pixels: say with --pitch-um how many um one has.")
+        raise InputError(f"{path}: counts in pixels: give the pixel size in µm with --pitch-um.")
     fx, fy, cx, cy = interior_px
     pitch = options.pitch_um / 1000.0
     first = np.array(convention.first_pixel_px)

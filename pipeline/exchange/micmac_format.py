@@ -105,7 +105,7 @@ def _picture_box(block: Block, frame: OutFrame) -> Canvas:
     x_um, y_um = frame.known_pitch_um
     if x_um != y_um:
         raise InputError(
-            f"micmac: a pixel of {frame.image!r} is {x_um:g} x {y_um:g} um. Resample it, and export colmap."
+            f"micmac: a pixel of {frame.image!r} is {x_um:g} x {y_um:g} µm. Resample it, and export colmap."
         )
     return Canvas(0.0, 0.0, x_um / 1000.0, *block.size_px(frame))
 
@@ -198,7 +198,7 @@ def _affine_note(frames: Sequence[OutFrame], fiducials: Mapping[str, Array], box
     worst = max(misfits, key=lambda image: misfits[image])
     return (
         f"MicMac fits its affine transformation without weights: in image {worst} it lies up to "
-        f"{misfits[worst]:.2g} px beside the adjusted one."
+        f"{misfits[worst]:.2g} px from the adjusted one."
     )
 
 

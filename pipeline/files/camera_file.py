@@ -225,7 +225,7 @@ class CameraTable:
         default=None, description="scan and px, columns and rows by fiducial, of marks to be learned."
     )
     learned_from: Annotated[LearnedFrom | None, subtable(LearnedFrom)] = Field(
-        default=None, description="As the program writes it beside learned marks."
+        default=None, description="As the program writes it with learned marks."
     )
 
 

@@ -96,7 +96,7 @@ def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
     _check_family(sigma, path, distortion, camera.distortion)
     earlier = _taken(path, distortion, covariance, name, camera, fiducials)
     if not np.isfinite(earlier.values).all():
-        raise sigma.error("calibration", f"{path} holds no interior orientation: no object point told it.")
+        raise sigma.error("calibration", f"{path} holds no interior orientation: it was made without object points.")
     _check_agreement(sigma, path, name, content.cameras[name], covariance)
     _check_held(sigma, earlier, camera)
     return earlier

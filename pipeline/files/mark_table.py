@@ -206,7 +206,7 @@ class PaintedTable(MarkTable):
     """A mark that is lighter or darker than its ground."""
 
     polarity: Annotated[shapes.Polarity, choice("auto", "light", "dark")] = Field(
-        default="auto", description="Whether the mark is lighter than its ground."
+        default="auto", description="Whether the mark is lighter than its background."
     )
 
 
@@ -292,7 +292,7 @@ class TemplateTable(PaintedTable):
         if np.ptp(self.image) == 0.0:
             path = table.path_value("image")
             raise table.error(
-                "image", f"{path} shows nothing: all its pixels are alike. Cut out the mark with its ground."
+                "image", f"{path} shows nothing: all its pixels are alike. Cut out the mark with its background."
             )
         template = MarkTemplate(
             self.image,

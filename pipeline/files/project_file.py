@@ -247,7 +247,7 @@ def read_project(path: Path) -> Project:
     if not project.scans and not project.comparator.exists():
         raise InputError(
             f"{path}: there are no scans and no comparator coordinates. Give scans = [...] to measure, or comparator = "
-            f'"..." with the coordinates; looked for {project.comparator.resolve()}.'
+            f'"..." with the coordinates; searched {project.comparator.resolve()}.'
         )
     _check_written(table, project, named)
     return project

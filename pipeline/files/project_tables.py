@@ -54,7 +54,7 @@ class ObjectTable:
         default=0.0, description="Of the board's middle off its plane, object units."
     )
     transparent: Annotated[bool, FLAG] = Field(
-        default=False, description="Whether a flat field can be seen from both sides."
+        default=False, description="Whether a flat field is visible from both sides."
     )
     antenna_offset: Annotated[tuple[float, float, float], TRIPLE] = Field(
         default=(0.0, 0.0, 0.0), description="Of the observed stations from the projection centres; goes with images."
@@ -95,9 +95,9 @@ def _pitch(table: Table) -> tuple[float, float]:
     if not all(0.0 < value < math.inf for value in pitch):
         raise table.error("pitch_um", f"must be positive, not {list(pitch)}.")
     if min(pitch) < FINEST_PITCH_UM:
-        raise table.error("pitch_um", f"{min(pitch):g} um is finer than any scanner. Give um: 20.0, not 0.02.")
+        raise table.error("pitch_um", f"{min(pitch):g} µm is finer than any scanner. Give µm: 20.0, not 0.02.")
     if max(pitch) > _COARSEST_PITCH_UM:
-        raise table.error("pitch_um", f"{max(pitch):g} um is coarser than any scan. Give um: 20.0, not 20000.")
+        raise table.error("pitch_um", f"{max(pitch):g} µm is coarser than any scan. Give µm: 20.0, not 20000.")
     return pitch
 
 

@@ -75,7 +75,7 @@ class TargetTable:
 
     kind: Annotated[str, choice(*KINDS)] = Field(description="What the targets are.")
     transparent: Annotated[bool, FLAG] = Field(
-        default=False, description="Whether a flat field can be seen from both sides."
+        default=False, description="Whether a flat field is visible from both sides."
     )
 
 
@@ -84,7 +84,7 @@ class SingleTargetTable(TargetTable):
     """What targets have that stand by themselves."""
 
     polarity: Annotated[Polarity, POLARITY] = Field(
-        default="auto", description="Whether marks are lighter than their ground."
+        default="auto", description="Whether marks are lighter than their background."
     )
 
 
@@ -288,7 +288,7 @@ class TieTable:
     images: Annotated[int | None, whole()] = Field(
         default=None, description="Images that a point is to be in; absent: 2."
     )
-    height: Annotated[float | None, NUMBER] = Field(default=None, description="Of the ground, object units.")
+    height: Annotated[float | None, NUMBER] = Field(default=None, description="Of flat ground, object units.")
     height_sigma: Annotated[float | None, NOT_NEGATIVE] = Field(
         default=None, description="Its standard deviation, object units; goes with height."
     )

@@ -167,7 +167,7 @@ class Trial:
     @property
     def against_chance(self) -> str:
         if self.chance is None:
-            return f"chance makes {self.expected:.1g} constellations that answer as well in such a scan"
+            return f"{self.expected:.1g} false alarms expected in such a scan"
         return f"the same marks in wrong places score {self.chance:.2f}"
 
     @property
@@ -254,7 +254,7 @@ class Identification:
         if abs(trial.pixel_um / pitch_um - 1) < _SHRUNK:
             return ""
         return (
-            f"Its marks lie as far apart as they should only if a pixel measures {trial.pixel_um:.1f} um, not "
+            f"Its marks lie as far apart as they should only if a pixel measures {trial.pixel_um:.1f} µm, not "
             f"{pitch_um:.1f}: if the scan is of this camera, the pitch that --pitch or its file gives is wrong."
         )
 
@@ -280,7 +280,7 @@ def _figures(trial: Trial) -> str:
     if trial.residual_mm is not None:
         words.append(f"affine residual {trial.residual_mm:.3f} mm ({trial.residual_sigmas:.0f} sigma)")
     if math.isfinite(trial.expected):
-        words.append(f"by chance {trial.expected:.1g}")
+        words.append(f"expected false alarms {trial.expected:.1g}")
     if trial.chance is not None:
         words.append(f"in wrong places {trial.chance:.2f}")
     return f"{', '.join(words)}; {trial.seconds:.0f} s"

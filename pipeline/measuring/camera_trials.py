@@ -294,9 +294,9 @@ def _expected_at_most(seen: Trial, marks: int) -> float:
 def _not_looked_at(names: Names, each: Tried) -> Trial:
     expected = each.answer.expected
     if np.isfinite(expected):
-        reason = f"not measured: chance makes {expected:.1g} constellations in such a scan that answer as well"
+        reason = f"not measured: {expected:.1g} false alarms expected in such a scan"
     else:
-        reason = "not measured: nowhere in the scan do its marks answer together"
+        reason = "not measured: no constellation of its marks correlates anywhere in the scan"
     return Trial(names, 0, len(each.layout.marks), 0.0, 0.0, 0.0, None, None, None, reason, 0.0, expected)
 
 
@@ -329,7 +329,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         chance=_score_by_chance(search, each) if score > close and expected > CAMERA_BY_CHANCE else None,
         residual_sigmas=None if residual is None else residual[0],
         residual_mm=None if residual is None else residual[1],
-        reason="" if frame else "no three of its marks are seen where its constellation answers best",
+        reason="" if frame else "fewer than three of its marks at the best constellation",
         seconds=time.perf_counter() - start,
         expected=expected,
         pixel_um=1000 / _px_per_mm(frame) if frame else None,

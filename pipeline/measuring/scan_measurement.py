@@ -218,11 +218,11 @@ def _pitch(
         return scan.pitch_um, (), ()
     if frame.px_per_mm is not None:
         pitch = 1000.0 / frame.px_per_mm
-        note = f"The pitch of {pitch:.2f} um is from the marks' separations, for {scan.pitch_note}."
+        note = f"The pitch of {pitch:.2f} µm is from the marks' separations, for {scan.pitch_note}."
         return (pitch, pitch), (), (note,)
     if options.camera.frame_mm is not None:
         pitch = 1000.0 * max(options.camera.frame_mm) / max(scan.width_px, scan.height_px)
-        note = f"The pitch is not known ({scan.pitch_note}); {pitch:.1f} um is taken, as if the frame filled the scan."
+        note = f"The pitch is not known ({scan.pitch_note}); {pitch:.1f} µm is taken, as if the frame filled the scan."
         return (pitch, pitch), (Reason(note, Code.PITCH),), ()
     raise InputError(
         f"{scan.path}: pitch_um is missing in the project, and {scan.pitch_note}. Give the size of a "

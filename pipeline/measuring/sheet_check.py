@@ -124,5 +124,5 @@ def _judged_mark(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
             mark, status=Status.REJECTED, reason=Reason(f"another mark, or one disturbed: {how}", Code.OFF_PLACE)
         )
     alone = "" if verdict.others else ", and no other picture tells whether it does so on the sheet"
-    reason = Reason(f"{how}{alone}; the chance that any right one does is {verdict.chance:.1g}", Code.OFF_PLACE)
+    reason = Reason(f"{how}{alone}; p = {verdict.chance:.1g}", Code.OFF_PLACE)
     return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, reason)))

@@ -233,7 +233,7 @@ def _oriented(
         places = np.array([p.center_px for p in predictions])
     shown = ((places >= 0.0) & (places <= (measured.width_px - 1, measured.height_px - 1))).all(axis=1)
     if log10_of_chance(places[shown], found, gate_px, placement.tried) > _MOST_LOG10_CHANCE:
-        return f"{unlike}, but for what chance explains"
+        return f"{unlike}, except for possible false alarms"
     named = {
         predictions[i].point: replace(strongest[j], pixel_from_disk=predictions[i].pixel_from_disk)
         for i, j in assign(places, found, gate_px)

@@ -45,7 +45,7 @@ def said_of_tones(
     samples = {kind: few_of(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
     said = {name: read_tone_information(one) for kept in before.values() for name, one in (kept or {}).items()}
-    with reporter.stage("tone curve looked for in") as tell:
+    with reporter.stage("tone curve estimated from") as tell:
         for done, scan in enumerate(measure(tasks), 1):
             tell(scan.frame.image, done, len(tasks))
             if scan.frame.tone is not None and scan.frame.tone.information is not None:

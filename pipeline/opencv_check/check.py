@@ -143,8 +143,8 @@ def _compare(
     known["refit_residual_um"] = refit_um
     if refit_um > LARGEST_REFIT * sigma_um:
         raise _NotPossible(
-            f"OpenCV's model cannot take this lens: the nearest one is off by {refit_um:.2f} um, rms over the image, "
-            f"where a coordinate's standard deviation is {sigma_um:.2f} um."
+            f"OpenCV's model cannot take this lens: the nearest one is off by {refit_um:.2f} µm, rms over the image, "
+            f"where a coordinate's standard deviation is {sigma_um:.2f} µm."
         )
     is_fisheye = problem.network.cameras[0].distortion.family == FISHEYE
     calibrated = partial(
@@ -162,7 +162,7 @@ def _compare(
         known["corners_px"] = compare_corners(problem.images, pictures, calibrated)
     if opencv.rms_um > WORSE_RMS * rms_um + ROUNDINGS * opencv.rounding_um:
         raise _NotPossible(
-            f"OpenCV ends in a worse solution, {opencv.rms_um:.2f} um a point against {rms_um:.2f} um: it begins every "
+            f"OpenCV ends in a worse solution, {opencv.rms_um:.2f} µm a point against {rms_um:.2f} µm: it begins every "
             "image by itself and did not come to the minimum."
         )
     verdict, reason = _agreement(rows, sigmas_tell)
@@ -170,11 +170,11 @@ def _compare(
         verdict = "agrees"
         reason = (
             "Given the very same model both programs agree. OpenCV's own model is not quite this lens: the refit "
-            f"leaves {refit_um:.3f} um, which {known['points']} points notice. {reason}"
+            f"leaves {refit_um:.3f} µm, which {known['points']} points notice. {reason}"
         )
     if verdict == "agrees" and sigmas_tell:
         verdict, reason = _judge_departure(reason, _departures(adjustment, solved, problem.network.cameras[0]))
-    rms = f"The residuals are {opencv.rms_um:.2f} um rms a point in OpenCV, {rms_um:.2f} um here."
+    rms = f"The residuals are {opencv.rms_um:.2f} µm rms a point in OpenCV, {rms_um:.2f} µm here."
     return verdict, f"{reason} {rms} {_notes(problem, opencv, sigmas_tell)}"
 
 
@@ -272,7 +272,7 @@ def _notes(problem: BareProblem, opencv: OpenCvCalibration, sigmas_tell: bool) -
         )
     if problem.uncertain_points:
         notes.append(
-            f"{problem.uncertain_points} points are in truth uncertain and enter at their adjusted coordinates"
+            f"{problem.uncertain_points} points have standard deviations and enter at their adjusted coordinates"
         )
     if problem.sigma_spread > NOTABLE_SPREAD:
         notes.append(
@@ -284,5 +284,5 @@ def _notes(problem: BareProblem, opencv: OpenCvCalibration, sigmas_tell: bool) -
     if problem.left_out:
         notes.append(f"left out, for too few points: {', '.join(problem.left_out)}")
     if opencv.rounding_um > NOTABLE_ROUNDING * 1e3 * problem.sigma_mm:
-        notes.append(f"OpenCV's single precision rounds by {opencv.rounding_um:.3f} um")
+        notes.append(f"OpenCV's single precision rounds by {opencv.rounding_um:.3f} µm")
     return "; ".join(notes) + "."

@@ -32,7 +32,7 @@ def find_inner_edges(parts: Sequence[Part]) -> list[Part]:
         kinds_text = " and ".join(
             f"{channels} channel{'s' * (channels > 1)} of {dtype}" for channels, dtype in sorted(kinds)
         )
-        raise MeasurementError(f"its scans store their pixels unlike each other: {kinds_text}. Scan both alike.")
+        raise MeasurementError(f"its scans have different pixel types: {kinds_text}. Scan both alike.")
     return [replace(part, inner=_inner_edges(part, [each for each in parts if each is not part])) for part in parts]
 
 

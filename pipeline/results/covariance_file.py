@@ -127,7 +127,7 @@ def read_covariance(path: Path) -> Covariance:
     try:
         data = read_bytes(file)
     except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{file}: there is no such file; it belongs to {path.name}. {AGAIN}") from None
+        raise InputError(f"{file}: there is no such file; it goes with {path.name}. {AGAIN}") from None
     names, values, matrix = (_array(data, name, file) for name in ("names", "values", "matrix"))
     if names.dtype.kind != "U" or values.dtype.kind != "f" or matrix.dtype.kind != "f":
         kinds = ", ".join(f"{array.dtype}" for array in (names, values, matrix))
@@ -151,7 +151,7 @@ def read_own_covariance(path: Path) -> Covariance:
     covariance = read_covariance(path)
     if covariance.adjustment not in ("", of_file(path)):
         raise InputError(
-            f"{covariance_path(path)}: belongs to another adjustment than {path}. Bring both files of one adjustment "
+            f"{covariance_path(path)}: is of another adjustment than {path}. Bring both files of one adjustment "
             "together, or run `reseau adjust` again."
         )
     return covariance

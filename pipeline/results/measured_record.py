@@ -42,7 +42,7 @@ class FailureCode(StrEnum):
 
 MEANING = {
     FailureCode.MISSING: "There is no such file.",
-    FailureCode.UNREACHABLE: "A store or a server did not give it, after some tries. It may be whole: `--retry`.",
+    FailureCode.UNREACHABLE: "A server did not deliver it, after some tries. It may be whole: `--retry`.",
     FailureCode.UNREADABLE: "The file is damaged, or no picture that is read, or the system refused it.",
     FailureCode.TOO_LARGE: "The file claims more pixels than are read without `--max-pixels`.",
     FailureCode.PITCH: "Neither the project nor the file says what a pixel measures, and no marks tell it.",

@@ -30,7 +30,7 @@ class Question(StrEnum):
 
 _UNKNOWN = "how its marks look is not known: click each of them in one scan that shows them well."
 _COMMON = (
-    "its marks were learned from what its scans have in common. Click them in one scan to learn them anew from there."
+    "its marks were learned from what its scans have in common. Click them in one scan to learn them again from it."
 )
 _WORST = (Status.REJECTED, Status.WEAK, Status.PREDICTED, Status.ABSENT)
 

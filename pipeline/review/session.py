@@ -157,7 +157,9 @@ class Session:
         self._shown: _Shown | None = None
         self.refresh()
         if self._judging == _NONE and not self._queue:
-            raise InputError(f"{project.measurement_path}: nothing in it is judged. Run `reseau measure` first.")
+            raise InputError(
+                f"{project.measurement_path}: no scan in it passed the cross-scan checks. Run `reseau measure` first."
+            )
 
     def refresh(self) -> None:
         """Know what another process measured, or another window decided."""

@@ -191,7 +191,7 @@ def test_a_point_seen_once_and_too_few_marks_are_named() -> None:
     network = with_unknown(truth.network, {"t0"})
     rows = [i for i, point in enumerate(network.observations.point) if point != "t0"]
     once = network.observations.point.index("t0")
-    with pytest.raises(AdjustmentError, match=r"point t0 is unknown and seen in image f. only"):
+    with pytest.raises(AdjustmentError, match=r"point t0 is unknown and measured in image f. only"):
         approximate(replace(network, observations=subset(network.observations, [*rows, once])))
     rows = [
         i

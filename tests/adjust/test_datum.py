@@ -183,7 +183,7 @@ def test_a_flat_field_of_heights_needs_a_fourth_chosen_coordinate() -> None:
         sigma[2] = 0.02
     network, start = network_of(case), approximations_of(case, case["state"])
     first, last = network.points[0].id, network.points[-1].id
-    with pytest.raises(AdjustmentError, match="do not hold the object space"):
+    with pytest.raises(AdjustmentError, match="leave datum defects of the object space"):
         adjust(network, start, Options("minimal", (f"{first}.X", f"{first}.Y", f"{last}.X")))
     four = Options("minimal", (f"{first}.X", f"{first}.Y", f"{last}.X", f"{last}.Y"))
     assert adjust(network, start, four).unknowns == adjust(network, start, Options("minimal")).unknowns

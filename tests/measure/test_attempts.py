@@ -83,7 +83,7 @@ def test_attempts_under_the_given_pitch_are_judged_by_themselves(monkeypatch: py
     found, _ = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 3, at_given=2)
     assert (name(found), found.unsure) == ("", ())
     assert "3 marks that are hardly there lie as they should, where chance makes 0.01 such frames" in found.misfit
-    assert "no other pitch tells them from it, click those that you see in reseau review" in found.misfit
+    assert "another pitch does not separate them; click the visible marks in `reseau review`" in found.misfit
     found, _ = found_by(monkeypatch, np.inf, 1.0, 0.3, at_given=2)
     assert found.misfit == "not 0"  # chance makes more than one
 
@@ -97,7 +97,7 @@ def test_what_is_settled_is_not_looked_for_again(monkeypatch: pytest.MonkeyPatch
 def test_where_nothing_was_seen_the_reason_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     found, _ = found_by(monkeypatch, None, None)
     assert name(found) == ""
-    assert found.misfit == "nothing in the scan looks like two or more of the camera's marks"
+    assert found.misfit == "no two of the camera's marks were found in the scan"
 
 
 @pytest.mark.parametrize(("times", "looks"), [(1.0, 7), (2.0, 8), (0.5, 8), (None, 4)])

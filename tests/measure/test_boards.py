@@ -258,7 +258,7 @@ def test_a_charuco_corner_is_held_against_the_markers_beside_it() -> None:
     found = {name: FoundCorner(truth[name], 32 * np.eye(2)) for name in ("c2", "c3", "c19")}
     assert off_corners(found, spec, read) == {}
     found["c2"] = FoundCorner(truth["c7"], 32 * np.eye(2))
-    assert "1.0 squares off where the markers beside it put it" in off_corners(found, spec, read)["c2"]
+    assert "1.0 squares from the place that the adjacent markers give" in off_corners(found, spec, read)["c2"]
 
 
 @parametrize_with_studies(
@@ -420,7 +420,7 @@ def test_a_grid_of_squares_with_some_hidden_keeps_its_names() -> None:
     board = measure_board(scan_of(picture), spec)
     hidden = [mark for mark in board.marks if not mark.status.is_observation]
     assert {mark.point for mark in hidden} == {f"r1c2.{i}" for i in range(4)}
-    assert {str(mark.reason) for mark in hidden} == {"its square was not seen"}
+    assert {str(mark.reason) for mark in hidden} == {"its square was not found"}
     assert np.abs(errors_px(board, truth)).max() < 0.15
 
 

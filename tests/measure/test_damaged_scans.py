@@ -66,7 +66,7 @@ def test_a_truncated_tiff_is_found_when_it_is_opened(tmp_path: Path, kept: float
     tifffile.imwrite(tmp_path / "s.tif", picture(), **options)
     data = (tmp_path / "s.tif").read_bytes()
     (tmp_path / "s.tif").write_bytes(data[: int(kept * len(data))])
-    with pytest.raises(MeasurementError, match=r"damaged or truncated.*copy it anew"):
+    with pytest.raises(MeasurementError, match=r"damaged or truncated.*copy it again"):
         open_scan(tmp_path / "s.tif")
 
 

@@ -29,7 +29,7 @@ def test_a_speck_that_passes_for_the_disk_is_told_by_the_other_disks() -> None:
         predictions.append(TargetPrediction(str(number), place + 0.3, 1.05 * shape, 4.0))
     marks = measure_disks(scan_of(picture), predictions)
     assert [mark.point for mark in marks if mark.status is Status.WEAK] == ["7"]
-    assert "unlike the other targets" in marks[7].reason
+    assert "not like the other targets" in marks[7].reason
     assert all(mark.status is Status.MEASURED for mark in marks if mark.point != "7")
 
 

@@ -33,7 +33,7 @@ def test_a_pitch_that_film_and_separations_allow_is_no_problem() -> None:
 def test_a_wrong_pitch_is_named() -> None:
     problem = pitch_problem(frame(21.17, 20.0), layout(0.01), (20.0, 20.0), "the project")
     assert problem is not None
-    assert "the project gives a pitch of 20.00 x 20.00 um" in problem
+    assert "the project gives a pitch of 20.00 x 20.00 µm" in problem
     assert "set pitch_um = [21.17, 20.00]" in problem
 
 

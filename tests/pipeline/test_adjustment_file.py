@@ -134,7 +134,7 @@ def test_what_trades_off_stands_in_words(tmp_path: Path) -> None:
     first = file_content(tmp_path / "adjustment.json")["correlations"][0]
     assert first["parameters"] == ["IO.K.c", "EO.*.Z0"]
     assert 0.95 < first["rho"] <= 1.0
-    assert "flying height and principal distance trade off" in first["cause"]
+    assert "flying height and principal distance are correlated" in first["cause"]
     assert first["remedy"]
 
 

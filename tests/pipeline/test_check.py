@@ -217,7 +217,7 @@ def test_unknown_points_are_told() -> None:
     unknown = sum(point.X is None for point in points)
     assert unknown > 5
     assert check.verdict == "agrees", check.reason
-    assert f"{unknown} points are in truth uncertain" in check.reason
+    assert f"{unknown} points have standard deviations" in check.reason
     assert max(row.difference_sigmas for row in check.rows) < 0.1
 
 

@@ -86,7 +86,7 @@ def test_the_covariance_of_another_adjustment_is_refused(project: Path, capsys: 
     other = moved(project, "other", 0.1)
     other.with_suffix(".npz").write_bytes((project / "out" / "adjustment.npz").read_bytes())
     assert run(["compare", str(project / "out" / "adjustment.json"), str(other)]) == 2
-    assert "belongs to another adjustment than" in capsys.readouterr().err.replace("\n", " ")
+    assert "is of another adjustment than" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_a_file_named_twice_is_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -117,7 +117,7 @@ def test_marks_without_a_sigma_need_one_that_is_said(tmp_path: Path, capsys: pyt
     assert run(["import", "micmac", str(file), str(tmp_path / "o"), *PITCH]) == WRONG_INPUT
     assert "say with --sigma-px" in capsys.readouterr().err
     assert run(["import", "micmac", str(file), str(tmp_path / "o")]) == WRONG_INPUT
-    assert "say with --pitch-um" in capsys.readouterr().err
+    assert "with --pitch-um" in capsys.readouterr().err
     folder = imported("micmac", [file], tmp_path, *PITCH, "--sigma-px", "0.2")
     (mark,) = read_comparator(folder / "comparator.csv")
     assert (mark.image, mark.kind) == ("a", "fiducial")

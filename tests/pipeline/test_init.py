@@ -105,7 +105,7 @@ def test_a_camera_is_told_by_most_samples_and_by_what_its_plate_does_not_contrad
         ((alike, of_camera(path), of_camera(path)), "not all show the same camera"),
         (
             (of_camera(path, "wild-rc5-153", against=["wild-rc5-153"]),),
-            "the camera's plate in the picture says",
+            "the camera's plate in the picture names",
         ),
     ]:
         told = kind(group, *samples)

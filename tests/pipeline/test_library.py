@@ -300,7 +300,7 @@ def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     trials = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["trials"]
     assert trials[0]["expected"] < 1e-4
     assert trials[1]["expected"] is None
-    assert trials[1]["reason"] == "not measured: nowhere in the scan do its marks answer together"
+    assert trials[1]["reason"] == "not measured: no constellation of its marks correlates anywhere in the scan"
 
 
 @pytest.mark.study
@@ -327,7 +327,7 @@ def test_a_pitch_that_the_marks_contradict_is_told() -> None:
     right = Identification(Path("a.tif"), (seen,), pitch_um=(126.0, 128.0))
     assert "um" not in right.sentence()
     wrong = replace(right, pitch_um=(63.5, 63.5))
-    assert "only if a pixel measures 127.3 um, not 63.5" in wrong.sentence()
+    assert "only if a pixel measures 127.3 µm, not 63.5" in wrong.sentence()
 
 
 def test_cameras_that_come_close_are_all_named() -> None:

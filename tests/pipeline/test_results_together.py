@@ -268,7 +268,7 @@ def test_a_scan_that_vanishes_before_the_second_visit_keeps_what_the_first_gave(
     code, told = summary(project, capsys, "run")
     assert code == 1
     assert told["adjustment"] is not None
-    assert "It could not be looked at again: frame2.tif: there is no scan any more." in said(told)
+    assert "It second pass failed: frame2.tif: there is no scan any more." in said(told)
 
 
 @pytest.mark.study
@@ -288,7 +288,7 @@ def test_a_process_that_is_ended_on_the_second_visit_costs_nothing_that_the_firs
     code, told = summary(project, capsys, "run")
     assert code == 1
     assert told["adjustment"] is not None
-    problems = [one for one in told["problems"] if "could not be looked at again" in one["what"]]
+    problems = [one for one in told["problems"] if "second pass failed" in one["what"]]
     assert [one["what"].split(":")[0] for one in problems] == ["frame2"]
     assert "its process was ended" in problems[0]["what"]
     assert {visit.image for visit in asked if isinstance(visit, second_visit.Visit)} > {"frame1", "frame2"}

@@ -310,9 +310,9 @@ def test_stores_of_shards_become_one(tmp_path: Path) -> None:
 
 def test_merging_names_what_is_no_store(tmp_path: Path) -> None:
     with Store(tmp_path / "a.db") as store:
-        with pytest.raises(InputError, match="there is no such store"):
+        with pytest.raises(InputError, match="there is no such results database"):
             merge(store, [tmp_path / "b.db"])
-        with pytest.raises(InputError, match="to be joined in"):
+        with pytest.raises(InputError, match="joined into"):
             merge(store, [tmp_path / "a.db"])
 
 

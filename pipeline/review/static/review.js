@@ -500,7 +500,7 @@ function showPoses(entry, frame) {
       const [button, picture, told, key] = ["button", "img", "span", "kbd"].map((tag) => document.createElement(tag));
       button.type = "button";
       picture.src = `/api/pose.png?${new URLSearchParams({ image: entry.image, pose })}`;
-      picture.alt = `as it is seen if its pose is ${pose}`;
+      picture.alt = `as it appears with scan orientation ${pose}`;
       told.textContent = `${pose}${pose === frame.pose?.name && !frame.pose.decided ? " (assumed)" : ""} `;
       key.textContent = index + 1;
       button.append(picture, told, key);
@@ -549,7 +549,7 @@ async function openFrame(entry, generation) {
     if (decision === "place") state.clicks.set(point, [col, row]);
   }
   state.click = { points: Object.keys(frame.fiducials), places: frame.fiducials, least: 3, half: CLICK_HALF_PX, tries: tryFrame, kept: keptFrame };
-  by("click-told").textContent = "Choose a mark, click near it in the scan, then exactly in the window beside it. Three marks find the frame.";
+  by("click-told").textContent = "Choose a mark, click near it in the scan, then exactly in the window next to it. Three marks find the frame.";
   by("scan-label").hidden = true;
   await clickIn(frame, generation);
 }
@@ -561,7 +561,7 @@ async function openCamera(entry, generation) {
   state.clicks = new Map(Object.entries(entry.answer?.px ?? {}));
   const points = Object.keys(camera.fiducials);
   state.click = { points, places: camera.fiducials, least: points.length, tried: camera.tried, half: CLICK_HALF_PX, tries: tryCamera, kept: keptCamera };
-  by("click-told").textContent = "Choose a scan that shows the marks well, and click every one of them: near it in the scan, then exactly in the window beside it.";
+  by("click-told").textContent = "Choose a scan that shows the marks well, and click every one of them: near it in the scan, then exactly in the window next to it.";
   by("scan-label").hidden = false;
   options("scan", [...new Set([shown, ...camera.images])], false);
   await clickInScan(shown, generation);
