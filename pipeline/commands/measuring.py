@@ -192,7 +192,7 @@ def review(
         raise missing_extra("reseau review", "Starlette and Uvicorn", "review") from None
 
     def say_address(address: str) -> None:
-        say(address)
+        typer.echo(address)  # with its token, which `say` would hide
         print_next(
             False, "decide in the browser; end with Ctrl-C", command_step("run", project, why="applies the decisions")
         )

@@ -368,8 +368,8 @@ def test_status_says_why_a_scan_needs_a_look(folder: Path) -> None:
     assert whys == {"a": "pose 0 is assumed", "b": "pose 90 is assumed", "c": ""}
 
 
-def test_the_page_of_archives_has_the_table_of_verdicts() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "how-to" / "archives.md").read_text(encoding="utf-8")
+def test_the_page_of_results_has_the_table_of_verdicts() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "results.md").read_text(encoding="utf-8")
     assert all(f"| `{verdict}` | {MEANING[verdict]} | {NEXT_STEP[verdict]} |" in text for verdict in Verdict)
 
 

@@ -44,7 +44,7 @@ def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.Cap
     assert run(["compare", str(first), str(moved(project, "later", 0.5)), "--out", str(out)]) == 1
     told = capsys.readouterr().out
     assert told.startswith("drift\n")
-    (largest,) = re.findall(r"Fiducial marks after a similarity: at most ([\d.]+) um", told)
+    (largest,) = re.findall(r"Fiducial marks after a similarity: at most ([\d.]+) µm", told)
     assert float(largest) < 0.2  # of their 0.3 um: c and the marks are hardly tied
     drawn = ElementTree.parse(out / "compare.svg").getroot()
     assert len(drawn.findall(f".//{SVG}ellipse")) == 49  # one a place of the field

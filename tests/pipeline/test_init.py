@@ -149,7 +149,7 @@ def test_the_project_that_is_written_is_read_and_has_each_scans_camera(box: Path
     looks = told["needs_a_look"]
     assert len(looks) == 3
     (forms,) = [case for cases in looks.values() for case in cases if str(box / "1952" / "sub") in case]
-    assert "perhaps wild-rc10-153, 4 of 4 marks seen, but that rests on the form of its marks alone" in forms
+    assert "perhaps wild-rc10-153, 4 of 4 marks found, but that rests on the form of its marks alone" in forms
     assert "and arrow-153 has marks much like them" in forms
     assert any("broken.tif" in case for cases in looks.values() for case in cases)
     assert any("1958" in case and "no camera stands out" in case for cases in looks.values() for case in cases)

@@ -159,7 +159,7 @@ def test_a_pose_assumed_is_a_note_where_fiducials_are_all_there_is(adjusted: Rep
 
 
 def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "how-to" / "read-the-report.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "results.md").read_text(encoding="utf-8")
     table = page.split("| test | passed when | false alarms |\n|---|---|---|\n")[1].split("\n\n")[0]
     assert [line.split(" | ")[0].removeprefix("| ") for line in table.splitlines()] == list(NEEDS_A_LOOK)
 

@@ -237,7 +237,7 @@ def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monke
 def test_a_file_of_another_kind_or_of_a_later_version_is_refused(path: Path) -> None:
     path.parent.mkdir()
     path.write_text("measured: nothing", encoding="utf-8")
-    with pytest.raises(InputError, match="cannot be used as a store of measurements"):
+    with pytest.raises(InputError, match="cannot be used as a database of measurements"):
         Store(path)
     path.unlink()
     with sqlite3.connect(path) as db:
@@ -404,7 +404,7 @@ def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -
     with sqlite3.connect(path) as db:
         db.execute(change)
     with Store(path) as store:
-        with pytest.raises(InputError, match=r"list of judged images is not as it was written.*measure --retry"):
+        with pytest.raises(InputError, match=r"list of checked images is not as it was written.*measure --retry"):
             latest(store)
         store.forget_damaged()
         assert latest(store) is None
