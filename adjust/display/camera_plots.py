@@ -101,7 +101,7 @@ class CameraPlots:
         radius, um = curves.radius_mm * self._per_mm, 1e-3 * self._lengths_per_mm
         drawn = [(curves.radial_um, curves.radial_sigma_um, TARGET, "radial")]
         if (curves.asymmetric_um > 1e-6).any():
-            label = "asymmetric, largest of all directions"
+            label = "without the radial part, largest of all directions"
             drawn.append((curves.asymmetric_um, curves.asymmetric_sigma_um, FIDUCIAL, label))
         for value, sigma, color, label in drawn:
             axes.plot(radius, um * value, color=color, label=label)

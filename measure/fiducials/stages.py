@@ -297,7 +297,7 @@ def _too_faint(likeliest: tuple[float, Frame] | None) -> str:
     if likeliest is None or likeliest[0] >= 1:
         return ""
     expected, frame = likeliest
-    agreeing = f"{int(frame.inliers.sum())} marks that are hardly there lie as they should"
+    agreeing = f"{int(frame.inliers.sum())} faint marks fit"
     by_chance = f"where {expected:.1g} such false alarms are expected"
     return (
         f"; {agreeing}, {by_chance}: another pitch does not separate them; click the visible marks in `reseau review`"

@@ -71,7 +71,7 @@ def test_each_attempt_is_judged_by_all_hypotheses_so_far(monkeypatch: pytest.Mon
     assert judged == [2, 4, 6]
     assert name(found) == ""
     assert [cast(Stand, frame).name for frame in found.unsure] == ["2"]
-    assert found.misfit.startswith("not 0; under another pitch 3 of them lie as they should")
+    assert found.misfit.startswith("not 0; under another pitch 3 of them fit")
     found, _ = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 7)
     assert (name(found), found.is_taken) == ("2", True)
 
@@ -82,7 +82,7 @@ def test_attempts_under_the_given_pitch_are_judged_by_themselves(monkeypatch: py
     assert name(found) == "2"
     found, _ = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 3, at_given=2)
     assert (name(found), found.unsure) == ("", ())
-    assert "3 marks that are hardly there lie as they should, where chance makes 0.01 such frames" in found.misfit
+    assert "3 faint marks fit, where 0.01 such false alarms are expected" in found.misfit
     assert "another pitch does not separate them; click the visible marks in `reseau review`" in found.misfit
     found, _ = found_by(monkeypatch, np.inf, 1.0, 0.3, at_given=2)
     assert found.misfit == "not 0"  # chance makes more than one

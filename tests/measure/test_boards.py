@@ -498,7 +498,7 @@ def test_of_boards_that_look_the_same_none_is_observed(kind: str) -> None:
 def test_a_circle_grid_is_no_part_of_a_larger_one() -> None:
     spec, larger = CircleGridSpec(6, 5, 28.0, 13.0), CircleGridSpec(7, 5, 28.0, 13.0)
     board = measure_board(scan_of(beside_each_other(larger, circles_dark(larger), (1.0,))), spec)
-    assert "a grid of more than 6 x 5 dots" in board.reason
+    assert "the grid is larger than 6 x 5 dots" in board.reason
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
 
@@ -511,7 +511,7 @@ def test_a_few_spots_are_no_circle_grid() -> None:
         return np.asarray(np.min([np.hypot(col - x, row - y) for x, y in places], axis=0) > 8.0, float)
 
     board = measure_board(scan_of(8000 + 30000 * drawn(light, 340, 250, 0.8, fineness=4)), spec)
-    assert "no grid of 6 x 5 dots is wholly seen; 5 spots look like dots" in board.reason
+    assert "no grid of 6 x 5 dots is whole in the scan; 5 spots are candidates for dots" in board.reason
 
 
 @pytest.mark.parametrize("gap", [60.0, 130.0])

@@ -39,7 +39,7 @@ def zeros_png(side: int) -> bytes:
 
 
 def test_a_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(MeasurementError, match=r"no scan .*nowhere\.tif.*looked for.*check its name"):
+    with pytest.raises(MeasurementError, match=r"no scan .*nowhere\.tif.*searched at.*check its name"):
         open_scan(tmp_path / "nowhere.tif")
 
 

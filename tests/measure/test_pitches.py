@@ -109,7 +109,7 @@ def test_three_of_many_marks_that_lie_as_the_cameras_are_no_frame(tmp_path: Path
     result = measured(alone, layout, tmp_path, STIFF)
     assert not any(mark.status.is_observation for mark in result.marks)
     (problem,) = result.problems
-    assert "under another pitch 3 of them lie as they should, which may be chance: try pitch_um = [" in problem
+    assert "under another pitch 3 of them fit, which may be a false alarm: try pitch_um = [" in problem
 
 
 def test_the_pitch_to_try_is_what_the_marks_say(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_the_pitch_to_try_is_what_the_marks_say(tmp_path: Path) -> None:
     with written_scan(frame_picture(ALIKE, matrix), tmp_path) as scan:
         frame = measure_frame(scan, ALIKE, Placement("0", matrix, 1.0, 4, 1, 1, pair_mm), STIFF)
     told = _pitch_to_try([frame])
-    assert told.startswith("; under another pitch 4 of them lie as they should, which may be chance: try pitch_um = [")
+    assert told.startswith("; under another pitch 4 of them fit, which may be a false alarm: try pitch_um = [")
     pair = [float(number) for number in told.split("[")[1].rstrip("]").split(", ")]
     assert pair == pytest.approx([1000 * mm for mm in pair_mm], rel=1e-3)
     assert _pitch_to_try([]) == ""
