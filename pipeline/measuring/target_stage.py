@@ -42,7 +42,7 @@ from pipeline.results.comparator_file import comparator_from_pixel
 from pipeline.results.measured_record import MeasuredScan
 
 _MIRRORED = (
-    "The board is mirrored in the picture: in a mirror, from its back, or the picture is flipped. Its points are named as on the "
+    "The board is mirrored: in a mirror, from its back, or the picture is flipped. Its points are named as on the "
     "board. If that is meant, write transparent = true under [targets]; else flip the picture."
 )
 LEAST_PAIRS = 4  # of points and marks that name an image's targets
