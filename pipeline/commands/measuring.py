@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -179,25 +180,35 @@ def report(
 
 
 def review(
-    project: ProjectFile,
+    project: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PROJECT.toml", help="The project file, or a folder of scans to draw a camera.", show_default=False
+        ),
+    ],
     port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Of this machine; 0 takes any.")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open no browser.")] = False,
     who: Annotated[str | None, typer.Option(metavar="NAME", help="Who decides; by default who is logged in.")] = None,
     max_pixels: MaxPixels = None,
 ) -> int:
-    """Settle doubtful marks in the browser."""
+    """Settle doubtful marks, or draw a camera, in the browser."""
     try:
         from pipeline.review.server import serve
     except ModuleNotFoundError:
         raise missing_extra("reseau review", "Starlette and Uvicorn", "review") from None
+    from pipeline.archive.catalogue import find_scan_files
+    from pipeline.files.project_file import read_undrawn
+
+    file = project / "project.toml" if project.is_dir() else project
+    scans = find_scan_files([project])[0] if project.is_dir() and not file.exists() else ()
+    given = replace(read_undrawn(file, scans), max_pixels=max_pixels)
+    step = command_step("run", file, why="applies the decisions")
 
     def say_address(address: str) -> None:
         typer.echo(address)  # with its token, which `say` would hide
-        print_next(
-            False, "decide in the browser; end with Ctrl-C", command_step("run", project, why="applies the decisions")
-        )
+        print_next(False, "decide in the browser; end with Ctrl-C", *([] if scans else [step]))
 
-    serve(read(project, max_pixels), port, who, not no_browser, say_address)
+    serve(given, port, who, not no_browser, say_address)
     return DONE
 
 

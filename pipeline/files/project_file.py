@@ -1,8 +1,9 @@
 """project.toml: which camera, which scans, what to measure, how to adjust, where to write."""
 
 import dataclasses
+import glob
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +18,7 @@ from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.decisions_file import FILE as DECISIONS
 from pipeline.files.decisions_file import Decision, cut_short_line, decisions_bytes, learned_from, parse_decisions
 from pipeline.files.images_file import GivenImages, read_images
-from pipeline.files.library import camera_path
+from pipeline.files.library import PREFIX, camera_path
 from pipeline.files.mark_table import Clicks
 from pipeline.files.points_file import GivenDistance, GivenPoints, read_distances, read_points
 from pipeline.files.project_tables import UNITS_MM, ProjectTable
@@ -51,6 +52,7 @@ class Project:
     transparent: whether a flat field of object points can be seen from both sides.
     crs: what the object coordinates are, as "EPSG:25832"; empty where nobody says it.
     writing: in which scans is read what is written about the frame, as in `FiducialOptions`.
+    missing_camera: the default camera's file where it is still to be drawn; then there are no cameras.
     """
 
     path: Path
@@ -78,6 +80,7 @@ class Project:
     decisions: tuple[Decision, ...] = ()
     decisions_hash: str = ""
     decisions_cut_short: int = 0
+    missing_camera: str = ""
 
     def open_scan(self, name: str) -> "Scan":
         """The scan of an image. Raises MeasurementError where it cannot be read."""
@@ -207,7 +210,20 @@ def read_project(path: Path) -> Project:
 
     Raises InputError with file, line and key: for what is wrong in the project file itself before any other file.
     """
-    table = read_toml(path)
+    return _read_tables(read_toml(path))
+
+
+def read_undrawn(path: Path, scans: Sequence[Path] = ()) -> Project:
+    """A project whose default camera may still have to be drawn. scans: instead of a project file, which path then only
+    names. Raises InputError as `read_project` does."""
+    if not scans:
+        return _read_tables(read_toml(path), needs_camera=False)
+    names = [glob.escape(os.path.relpath(scan, path.parent)) for scan in scans]
+    return _read_tables(Table({"camera": "camera.toml", "scans": names}, path, ""), needs_camera=False)
+
+
+def _read_tables(table: Table, needs_camera: bool = True) -> Project:
+    path = table.file
     given, objects = read_model(table, ProjectTable), table.table("object")
     folder = path.parent
     files = {key: getattr(given.object, key) for key in ("points", "images", "distances")}
@@ -215,14 +231,16 @@ def read_project(path: Path) -> Project:
     antenna = given.object.antenna_offset
     if any(antenna) and "images" not in named:
         raise objects.error("antenna_offset", 'goes with images = "...", the file of the observed stations. Give both.')
-    _check_named(table, objects, given.camera, named)
+    lacks_camera = not needs_camera and _lacks_camera(given.camera, folder)
+    _check_named(table, objects, "" if lacks_camera else given.camera, named)
     images = read_images(named["images"], antenna) if "images" in named else None
     found = FoundScans({}, frozenset())
     if given.scans is not None:
         found = find_scans(table, given.scans, given.exclude)
     project = Project(
         path=path,
-        cameras=_cameras(table, given.camera, images),
+        cameras={} if lacks_camera else _cameras(table, given.camera, images),
+        missing_camera=given.camera if lacks_camera else "",
         scans=with_cuts(found.files, images, named.get("images")),
         left_out=found.left_out,
         comparator=folder / given.comparator,
@@ -285,10 +303,14 @@ def _shown(project: Project, camera: CameraFile, shown: Decision | None) -> Clic
     return Clicks(shown.image, px, shown.fingerprint, shown.who or "somebody")
 
 
+def _lacks_camera(camera: str, folder: Path) -> bool:
+    return not camera.startswith(PREFIX) and not (folder / camera).exists()
+
+
 def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, Path]) -> None:
     """Name every file that is not there, not just the first."""
     try:
-        keys = {"camera": (table, camera_path(camera, table.file.parent))}
+        keys = {"camera": (table, camera_path(camera, table.file.parent))} if camera else {}
     except InputError as error:
         raise table.error("camera", str(error)) from None
     keys |= {key: (objects, path) for key, path in named.items()}

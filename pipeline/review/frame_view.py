@@ -263,10 +263,16 @@ def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float
     missing = [one.id for one in camera.learned if one.id not in px]
     if missing:
         raise InputError(f"{shown}: click {', '.join(missing)}, too.")
-    (task,) = scan_tasks(project, [shown])
-    start = first_pictures(replace(camera, clicks=Clicks(shown, px)), [task.fiducials_alone("linear")], None)
+    start = camera_as_shown(project, camera, Clicks(shown, px))
     own = {name: start if one.path == camera.path else one for name, one in project.cameras.items()}
     return _tried(scan_tasks(replace(project, cameras=own), [image])[0])
+
+
+def camera_as_shown(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile:
+    """A camera, of the project or not, with the pictures of its marks at clicked places of one scan."""
+    alone = replace(project, cameras=dict.fromkeys(project.cameras or ("",), camera))
+    (task,) = scan_tasks(alone, [clicks.scan])
+    return first_pictures(replace(camera, clicks=clicks), [task.fiducials_alone("linear")], None)
 
 
 def _tried(task: ScanTask) -> MeasuredScan:

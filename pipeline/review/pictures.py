@@ -3,6 +3,7 @@
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from measure.scans.opening import open_scan
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
+Result = TypeVar("Result")
 
 _OPEN = 4  # scans that are kept open
 _KEPT_MB = 64  # of pictures, so that one that was shown is there at once
@@ -23,6 +25,7 @@ _FRAME_PX = 1400  # of the longer side of a whole scan
 _POSE_PX = 180
 _NOTHING = 128  # grey: beyond the scan
 _ROUNDS, _OUTLYING = 6, 5.0  # of a fit, and times the median residual: three and a half standard deviations
+_DRAWN_BGR, _COVERED = (61, 163, 22), 0.55  # a drawing over the scan: its colour, and how much of the scan it hides
 _SHARE = 0.1  # per cent of pixels that may be too dark or too light to be told apart
 
 
@@ -42,9 +45,12 @@ class Pictures:
 
     def size(self, scan: str) -> tuple[tuple[int, int], tuple[float, float] | None]:
         """Width and height in px, and the pitch in um as far as its file tells it."""
+        return self.compute(scan, lambda file: ((file.width_px, file.height_px), file.pitch_um))
+
+    def compute(self, scan: str, work: Callable[[Scan], Result]) -> Result:
+        """What some work on an open scan gives."""
         with self._reading:
-            file = self._scan(scan)
-            return (file.width_px, file.height_px), file.pitch_um
+            return work(self._scan(scan))
 
     def window(self, scan: str, col0: int, row0: int, size: int) -> bytes:
         """A square window; one of many pixels is reduced. Raises MeasurementError where the file cannot be read."""
@@ -55,6 +61,11 @@ class Pictures:
         out."""
         key = ("residual", scan, hash(mark), *pixel_from_mark.ravel(), blur_px, half)
         return self._png(key, lambda: _residual(self._scan(scan), mark, pixel_from_mark, blur_px, half))
+
+    def drawing(self, mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> bytes:
+        """The mark as it is rendered for the fit, transparent where nothing is drawn, in the window of `residual`."""
+        key = ("drawing", hash(mark), *pixel_from_mark.ravel(), blur_px, half)
+        return self._png(key, lambda: _drawing(mark, pixel_from_mark, blur_px, half))
 
     def frame(self, scan: str) -> bytes:
         """The whole scan, reduced."""
@@ -144,13 +155,30 @@ def _means(scan: Scan, col0: int, row0: int, count: int, step: int) -> Array:
     return np.asarray(grey.reshape(step, count, step).mean(axis=(0, 2), dtype=np.float64))
 
 
+def window_start(pixel_from_mark: Array, half: int) -> tuple[int, int]:
+    """First column and row of the window, 2 half + 1 pixels wide, about a mark."""
+    col, row = np.rint(pixel_from_mark[:, 2]).astype(int).tolist()
+    return col - half, row - half
+
+
+def _model(mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> Array:
+    """The mark's rendered picture in the window about it."""
+    local = np.column_stack([pixel_from_mark[:, :2], pixel_from_mark[:, 2] - window_start(pixel_from_mark, half)])
+    return picture(mark, local, 2 * half + 1, 2 * half + 1, blur_px)
+
+
+def _drawing(mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> NDArray[np.uint8]:
+    """(rows, columns, 4), blue, green, red and how much of the scan is covered."""
+    shown = np.empty((2 * half + 1, 2 * half + 1, 4), np.uint8)
+    shown[..., :3] = _DRAWN_BGR
+    shown[..., 3] = np.rint(_COVERED * 255 * np.clip(_model(mark, pixel_from_mark, blur_px, half), 0.0, 1.0))
+    return shown
+
+
 def _residual(scan: Scan, mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> NDArray[np.uint8]:
-    center = pixel_from_mark[:, 2]
-    col0, row0 = (round(float(value)) - half for value in center)
-    width = 2 * half + 1
-    grey = np.asarray(scan.window(col0, row0, width, width), dtype=np.float64)
-    local = np.column_stack([pixel_from_mark[:, :2], center - (col0, row0)])
-    model = np.asarray(picture(mark, local, width, width, blur_px), dtype=np.float64)
+    model = _model(mark, pixel_from_mark, blur_px, half)
+    width = len(model)
+    grey = np.asarray(scan.window(*window_start(pixel_from_mark, half), width, width), dtype=np.float64)
     rows, cols = np.mgrid[-1 : 1 : width * 1j, -1 : 1 : width * 1j]
     design = np.stack([model, np.ones_like(model), rows, cols], axis=-1).reshape(-1, 4)
     left, is_fitted = grey.ravel(), np.ones(grey.size, dtype=bool)

@@ -1,7 +1,6 @@
 """The page on this machine: what it asks for, and what it is answered."""
 
 import getpass
-import json
 import secrets
 import socket
 import sys
@@ -23,15 +22,25 @@ from measure.fiducials.options import Click
 from measure.geometry import POSES
 from pipeline.errors import InputError
 from pipeline.files.decisions_file import KINDS, LEARNED, MEANING, OF_SCANS, Choice, Decision
+from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import few_of
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.review.drawing_answers import DrawingAnswers
 from pipeline.review.frame_view import mark_json, measured_as_shown, measured_from_clicks
 from pipeline.review.pictures import Pictures
+from pipeline.review.query import Query, parse_json
 from pipeline.review.safety import Guard
 from pipeline.review.session import Filters, Session
 
-_FILES = {"review.js": "text/javascript", "review.css": "text/css", "index.html": "text/html"}
+_SCRIPT = "text/javascript"
+_FILES = {
+    "review.js": _SCRIPT,
+    "view.js": _SCRIPT,
+    "draw.js": _SCRIPT,
+    "review.css": "text/css",
+    "index.html": "text/html",
+}
 _LARGEST_BODY = 200_000  # bytes
 _WIDEST_PX = 60_000
 _OFFERED, _TRIED = 100, 4  # scans: to click a camera's marks in, and to try what was learned
@@ -90,7 +99,7 @@ def _bound(port: int) -> socket.socket:
 
 
 def _application(session: Session, pictures: Pictures) -> Starlette:
-    answers = _Answers(session, pictures)
+    answers, drawing = _Answers(session, pictures), DrawingAnswers(session, pictures)
     routes = [
         Route("/", _static("index.html")),
         *(Route(f"/static/{name}", _static(name)) for name in _FILES if name != "index.html"),
@@ -108,6 +117,10 @@ def _application(session: Session, pictures: Pictures) -> Starlette:
         Route("/api/decide", _json(answers.decide), methods=["POST"]),
         Route("/api/measure", _json(answers.measure), methods=["POST"]),
         Route("/api/learn", _json(answers.learn), methods=["POST"]),
+        Route("/api/draw", _json(drawing.draw), methods=["POST"]),
+        Route("/api/drawing.png", _png(drawing.picture)),
+        Route("/api/save-camera", _json(drawing.save), methods=["POST"]),
+        Route("/api/save-learned", _json(drawing.save_learned), methods=["POST"]),
     ]
     return Starlette(routes=routes)
 
@@ -118,21 +131,26 @@ class _Answers:
     def __init__(self, session: Session, pictures: Pictures) -> None:
         self._session, self._pictures = session, pictures
 
-    def start(self, query: "_Query", body: Any) -> Any:
+    def start(self, query: Query, body: Any) -> Any:
         session = self._session
         return {
             "project": session.project.title,
             "who": session.who,
             "poses": list(POSES),
+            "scans": few_of(list(session.project.scans), _OFFERED),
+            "kinds": list(MARK_TABLES),
+            "pose": session.project.pose,
+            "file": session.camera_name,
+            "cameras": len(session.project.cameras),
             "choices": session.choices(),
             "meaning": {str(choice): meaning for choice, meaning in MEANING.items()},
         }
 
-    def queue(self, query: "_Query", body: Any) -> Any:
+    def queue(self, query: Query, body: Any) -> Any:
         filters = Filters(**{one.name: query.text(one.name) for one in fields(Filters)})
         return self._session.page(filters, query.whole("start", 0, 10**9))
 
-    def mark(self, query: "_Query", body: Any) -> Any:
+    def mark(self, query: Query, body: Any) -> Any:
         image, point, kind = query.text("image"), query.text("point"), query.text("kind")
         view, session = self._session.looking.at(image), self._session
         others = [session.looking.at(name) for name in session.looking.others(image, point, kind)]
@@ -149,11 +167,11 @@ class _Answers:
             ],
         }
 
-    def frame(self, query: "_Query", body: Any) -> Any:
+    def frame(self, query: Query, body: Any) -> Any:
         image = query.text("image")
         return {**self._session.looking.at(image).frame_json(), "decided": self._session.decided_in(image)}
 
-    def camera(self, query: "_Query", body: Any) -> Any:
+    def camera(self, query: Query, body: Any) -> Any:
         """Whose marks are to be learned: which they are, and scans to click them in."""
         entry = self._session.entry(query.text("key"))
         camera = self._session.project.camera_of(entry.images[0])
@@ -164,21 +182,21 @@ class _Answers:
             "tried": few_of(entry.images, _TRIED),
         }
 
-    def scan(self, query: "_Query", body: Any) -> Any:
+    def scan(self, query: Query, body: Any) -> Any:
         """A scan that need not be measured yet."""
         image = query.text("image")
-        camera = self._session.project.camera_of(image)
+        learned = self._session.project.camera_of(image).learned if self._session.project.cameras else ()
         size_px, pitch_um = self._pictures.size(self._session.scan_of(image))
         pitch_um = self._session.project.pitch_um or pitch_um
-        most_mm = max((one.learned_mm for one in camera.learned), default=0.0)
+        most_mm = max((one.learned_mm for one in learned), default=0.0)
         half_px = 500.0 * most_mm / min(pitch_um) if pitch_um else _HALF_PX
         return {"image": image, "size": size_px, "half": max(_HALF_PX, round(half_px))}
 
-    def window(self, query: "_Query") -> bytes:
+    def window(self, query: Query) -> bytes:
         place = (query.whole("col", -_WIDEST_PX, 10**6), query.whole("row", -_WIDEST_PX, 10**6))
         return self._pictures.window(self._scan(query), *place, query.whole("size", 8, _WIDEST_PX))
 
-    def residual(self, query: "_Query") -> bytes:
+    def residual(self, query: Query) -> bytes:
         view = self._session.looking.at(query.text("image"))
         point, kind = query.text("point"), query.text("kind")
         matrix, blur_px = view.pixel_from_mark(point, kind), view.mark(point, kind).quality.get("blur_px", 0.0)
@@ -187,23 +205,23 @@ class _Answers:
         drawn = view.drawn[point].mark
         return self._pictures.residual(view.scan.scan, drawn, matrix, blur_px, view.window_px(point, kind))
 
-    def whole(self, query: "_Query") -> bytes:
+    def whole(self, query: Query) -> bytes:
         return self._pictures.frame(self._scan(query))
 
-    def posed(self, query: "_Query") -> bytes:
+    def posed(self, query: Query) -> bytes:
         pose = query.text("pose")
         if pose not in POSES:
             raise KeyError(pose)
         return self._pictures.posed(self._scan(query), pose)
 
-    def decide(self, query: "_Query", body: Any) -> Any:
+    def decide(self, query: Query, body: Any) -> Any:
         given = body.get("decisions") if isinstance(body, dict) else None
         if not isinstance(given, list) or not given:
             raise InputError("decisions are missing.")
         self._session.decide([_decision(one) for one in given], str(body.get("key", "")))
         return self.queue(query, None)
 
-    def measure(self, query: "_Query", body: Any) -> Any:
+    def measure(self, query: Query, body: Any) -> Any:
         if not isinstance(body, dict):
             raise InputError("clicks are missing.")
         image, clicks = str(body.get("image", "")), body.get("clicks")
@@ -213,7 +231,7 @@ class _Answers:
         given = [Click(str(one["point"]), float(one["col_px"]), float(one["row_px"])) for one in clicks]
         return _trial_json(measured_from_clicks(self._session.learned, image, given))
 
-    def learn(self, query: "_Query", body: Any) -> Any:
+    def learn(self, query: Query, body: Any) -> Any:
         """One scan measured with the marks as another one, or itself, shows them."""
         if not isinstance(body, dict) or not isinstance(body.get("px"), dict):
             raise InputError("clicks are missing.")
@@ -222,28 +240,8 @@ class _Answers:
             self._session.scan_of(name)  # raises for one that is none
         return _trial_json(measured_as_shown(self._session.project, shown, _places(body["px"]), image))
 
-    def _scan(self, query: "_Query") -> str:
+    def _scan(self, query: Query) -> str:
         return self._session.scan_of(query.text("image"))
-
-
-class _Query:
-    """The values of a request's query."""
-
-    def __init__(self, request: Request) -> None:
-        self._values = request.query_params
-
-    def text(self, name: str) -> str:
-        return self._values.get(name, "")
-
-    def whole(self, name: str, least: int, most: int) -> int:
-        """Raises InputError for what is no such number."""
-        try:
-            value = round(float(self._values.get(name, "0")))
-        except (ValueError, OverflowError):
-            value = least - 1
-        if not least <= value <= most:
-            raise InputError(f"{name} must be a whole number from {least} to {most}.")
-        return value
 
 
 def _decision(given: Any) -> Decision:
@@ -300,21 +298,23 @@ def _static(name: str) -> Callable[[Request], Response]:
     return lambda request: Response(content, media_type=f"{_FILES[name]}; charset=utf-8")
 
 
-def _json(answer: Callable[[_Query, Any], Any]) -> Callable[[Request], Any]:
+def _json(answer: Callable[[Query, Any], Any]) -> Callable[[Request], Any]:
     async def answering(request: Request) -> Response:
         try:
             body = await _body(request) if request.method == "POST" else None
-            return JSONResponse(await anyio.to_thread.run_sync(answer, _Query(request), body))
+            return JSONResponse(await anyio.to_thread.run_sync(answer, Query(request.query_params), body))
         except Exception as error:
             return _refusal(error)
 
     return answering
 
 
-def _png(picture: Callable[[_Query], bytes]) -> Callable[[Request], Any]:
+def _png(picture: Callable[[Query], bytes]) -> Callable[[Request], Any]:
     async def answering(request: Request) -> Response:
         try:
-            return Response(await anyio.to_thread.run_sync(picture, _Query(request)), media_type="image/png")
+            return Response(
+                await anyio.to_thread.run_sync(picture, Query(request.query_params)), media_type="image/png"
+            )
         except Exception as error:
             return _refusal(error)
 
@@ -327,14 +327,7 @@ async def _body(request: Request) -> Any:
         data += part
         if len(data) > _LARGEST_BODY:
             raise InputError("that is too much for one request.")
-    try:
-        return json.loads(data, parse_constant=_no_number)
-    except (ValueError, RecursionError):
-        raise InputError("that is no JSON.") from None
-
-
-def _no_number(text: str) -> float:
-    raise ValueError(f"{text} is no number of JSON")
+    return parse_json(data)
 
 
 def _refusal(error: Exception) -> Response:

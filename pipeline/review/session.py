@@ -148,15 +148,15 @@ class Session:
     def __init__(self, project: Project, who: str) -> None:
         """Raises InputError where there is nothing to ask yet."""
         self.project, self.who = project, who
-        folder = project.path.resolve().parent
-        self.looking = Looking(project.measurement_path, folder, lambda image: self.learned.camera_of(image))
+        self.folder = project.path.resolve().parent
+        self.looking = Looking(project.measurement_path, self.folder, lambda image: self.learned.camera_of(image))
         self._lock = threading.RLock()
         self._judging: int | None = None
         self._ledger = Ledger(project.decisions_path)
         self._answers: dict[str, Decision] = {}
         self._shown: _Shown | None = None
         self.refresh()
-        if self._judging == _NONE and not self._queue:
+        if self._judging == _NONE and not self._queue and not project.scans:
             raise InputError(
                 f"{project.measurement_path}: no scan in it passed the cross-scan checks. Run `reseau measure` first."
             )
@@ -228,6 +228,11 @@ class Session:
             "cameras": sorted({entry.camera for entry in self._queue}),
             "folders": sorted({entry.folder for entry in self._queue if entry.folder}),
         }
+
+    @property
+    def camera_name(self) -> str:
+        """The file that a camera drawn here is to be written to: that which the project still lacks, or another one."""
+        return self.project.missing_camera or "drawn-camera.toml"
 
     def entry(self, key: str) -> Entry:
         """Raises KeyError for a question that is none, or none any more."""

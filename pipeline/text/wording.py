@@ -1,10 +1,14 @@
 """Lists, counts and suggestions as the program words them, and values as the text of a TOML file."""
 
 import difflib
+import json
 import math
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
+from typing import Any
 
+_BARE_KEY = re.compile("[A-Za-z0-9_-]+")
 LISTED = 8  # so many names are listed; the rest are counted
 
 
@@ -53,6 +57,33 @@ def gathered(told: Iterable[tuple[str, str, str]]) -> list[str]:
 def quoted(text: str) -> str:
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
+
+
+def table_lines(values: Mapping[str, Any], name: str = "") -> list[str]:
+    """The lines of a TOML table of that name below its head; tables inside of it stand at its end."""
+    inside = {key: value for key, value in values.items() if isinstance(value, Mapping) or _is_tables(value)}
+    lines = [f"{_key(key)} = {_value(value)}" for key, value in values.items() if key not in inside]
+    for key, value in inside.items():
+        path = f"{name}.{_key(key)}" if name else _key(key)
+        for one in [value] if isinstance(value, Mapping) else value:
+            head = f"[{path}]" if isinstance(value, Mapping) else f"[[{path}]]"
+            lines += ["", head, *table_lines(one, path)]
+    return lines
+
+
+def _is_tables(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(one, Mapping) for one in value)
+
+
+def _key(key: str) -> str:
+    return key if _BARE_KEY.fullmatch(key) else _value(key)
+
+
+def _value(value: Any) -> str:
+    """TOML has JSON's text, whole numbers, lists and flags; other numbers keep their point."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_value, value))}]"
+    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
 
 
 def numbers(values: Iterable[float]) -> str:

@@ -19,6 +19,10 @@ from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.decisions_file import Choice, Decision, append_decisions
 from pipeline.files.project_file import read_project
+from pipeline.review.drawing_answers import DrawingAnswers
+from pipeline.review.pictures import Pictures
+from pipeline.review.query import Query
+from pipeline.review.session import Session
 
 pytestmark = pytest.mark.xdist_group("review")
 
@@ -99,6 +103,24 @@ def show_marks(page: Page) -> str:
         steer(page, "near", place)
         page.keyboard.press("Enter")
     return shown
+
+
+def test_marks_of_one_scan_are_saved_as_a_camera_file(project: Path) -> None:
+    """It measures the other scans at once: their marks lie as much off as the clicks."""
+    pictures, off = Pictures(), np.array([1.0, -1.0])
+    answers = DrawingAnswers(Session(read_project(project), "ann"), pictures)
+    px = {point: (place + off).tolist() for point, place in zip("1234", true_px("a"), strict=True)}
+    with pytest.raises(InputError, match="click 4, too"):
+        answers.save_learned(Query({}), {"image": "a", "px": {p: px[p] for p in "123"}, "file": "own"})
+    told = answers.save_learned(Query({}), {"image": "a", "px": px, "file": "own"})
+    pictures.close()
+    assert "own.toml with 4 marks" in told["text"]
+    assert 'name it in the project, camera = "own.toml"' in told["text"]
+    project.write_text(PROJECT.replace("camera.toml", "own.toml").replace("*.tif", "b.tif"), encoding="utf-8")
+    assert run(["measure", str(project)]) == 0
+    rows = comparator(project.parent)
+    found = np.array([[float(rows["b", p][f"{axis}_px"]) for axis in ("col", "row")] for p in "1234"])
+    np.testing.assert_allclose(found - true_px("b"), np.broadcast_to(off, (4, 2)), atol=0.1)
 
 
 def learn(image: str, points: str = "1234", **rest: Any) -> Decision:

@@ -1,164 +1,20 @@
 // The page of `reseau review`. It shows what the server says and sends decisions back; nothing is kept here.
 
-const by = (id) => document.getElementById(id);
+import { fitDrawing, openDrawing, zoomDrawing } from "./draw.js";
+import { COARSE_STEP, View, ask, bitmap, by, colour, guarded, json, tell } from "./view.js";
+
 const FILTERS = ["question", "verdict", "status", "code", "camera", "folder"];
-const VIEWS = ["mark-view", "pose-view", "frame-view", "whole-view", "near-view", "facts-view", "tries-view"];
+const VIEWS = ["mark-view", "pose-view", "frame-view", "whole-view", "near-view", "facts-view", "tries-view", "draw-view"];
 const CLICK_HALF_PX = 40; // of the window about a coarse click
-const COARSE_STEP = 8; // pixels of the page that an arrow key moves by in a whole scan; the window beside it shows as much about a click
 const PAGE = 100; // questions that the server gives at a time
 const POLL_MS = 3000; // after which another window's decisions are known here
-const COLOURS = { measured: "--measured", second: "--second", predicted: "--predicted", outline: "--outline" };
 
 const state = {
   entries: [], start: 0, at: -1, page: null, mark: null, frame: null, poses: [], clicks: new Map(), named: "", trial: null,
   overlay: true, generation: 0, ahead: new Map(), // ahead: what is fetched of the next marks, by key
+  opened: null, // what the server said first
   click: null, // what clicks in a whole scan are for: its camera's marks, or a frame that was not found
 };
-
-// --- asking the server
-
-async function ask(path, values = {}, body = null) {
-  const query = new URLSearchParams(values).toString();
-  const options = body === null ? {} : { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
-  const answer = await fetch(query ? `${path}?${query}` : path, { ...options, credentials: "same-origin" });
-  if (!answer.ok) throw new Error(await answer.text());
-  return answer;
-}
-
-const json = async (path, values, body) => (await ask(path, values, body)).json();
-const bitmap = async (path, values) => createImageBitmap(await (await ask(path, values)).blob());
-
-function tell(message) {
-  by("told").textContent = message;
-}
-
-async function guarded(work) {
-  tell("");
-  try {
-    await work();
-  } catch (error) {
-    tell(error instanceof TypeError ? `The server does not answer: ${error.message}` : error.message);
-  }
-}
-
-// --- a picture of a part of a scan, in the scan's own pixels
-
-class View {
-  constructor(canvas, place, coarse = false) {
-    this.canvas = canvas;
-    this.place = place; // (col, row) => what a click does
-    this.coarse = coarse; // whether arrow keys move by parts of the picture, and not by pixels of the scan
-    this.zoom = 4;
-    this.center = [0, 0];
-    this.picture = null;
-    this.cursor = null;
-    this.marks = () => {};
-    this.wanted = "";
-    if (place) {
-      canvas.addEventListener("click", (event) => {
-        const box = canvas.getBoundingClientRect();
-        const x = ((event.clientX - box.left - canvas.clientLeft) * canvas.width) / canvas.clientWidth;
-        const y = ((event.clientY - box.top - canvas.clientTop) * canvas.height) / canvas.clientHeight;
-        this.place(...this.scan(x, y));
-      });
-      canvas.addEventListener("keydown", (event) => this.key(event));
-      canvas.addEventListener("blur", () => this.draw());
-    }
-  }
-
-  canvasXY(col, row) {
-    const { width, height } = this.canvas;
-    return [(col - this.center[0]) * this.zoom + width / 2, (row - this.center[1]) * this.zoom + height / 2];
-  }
-
-  scan(x, y) {
-    const { width, height } = this.canvas;
-    return [(x - width / 2) / this.zoom + this.center[0], (y - height / 2) / this.zoom + this.center[1]].map((px) => Math.round(px * 100) / 100);
-  }
-
-  async load(image) {
-    const needed = this.canvas.width / this.zoom + 2;
-    let size = 64;
-    while (size < needed) size *= 2;
-    const step = Math.max(1, Math.floor(size / 480));
-    const [col, row] = this.center.map((value) => Math.round(value - size / 2));
-    const wanted = JSON.stringify([image, col, row, size]);
-    if (wanted === this.wanted) return this.draw();
-    this.wanted = wanted;
-    const picture = await bitmap("/api/window.png", { image, col, row, size });
-    if (this.wanted !== wanted) return; // another one was asked for meanwhile
-    this.picture = { bitmap: picture, col, row, step };
-    this.draw();
-  }
-
-  draw() {
-    const pen = this.canvas.getContext("2d");
-    pen.setTransform(1, 0, 0, 1, 0, 0);
-    pen.filter = "none";
-    pen.clearRect(0, 0, this.canvas.width, this.canvas.height);
-    if (this.picture) {
-      const { bitmap: shown, col, row, step } = this.picture;
-      pen.imageSmoothingEnabled = step * this.zoom < 1;
-      pen.filter = `brightness(${by("brightness").value}%) contrast(${by("contrast").value}%)`;
-      pen.drawImage(shown, ...this.canvasXY(col - 0.5, row - 0.5), shown.width * step * this.zoom, shown.height * step * this.zoom);
-      pen.filter = "none";
-    }
-    this.marks(pen);
-    this.canvas.dataset.cursor = this.cursor ? JSON.stringify(this.cursor) : "";
-    if (this.cursor && document.activeElement === this.canvas) this.cross(pen, this.cursor, "#facc15", 5, 16);
-  }
-
-  cross(pen, [col, row], colour, from, to) {
-    const [x, y] = this.canvasXY(col, row);
-    for (const [width, stroke] of [[4, "#0009"], [2, colour]]) {
-      pen.lineWidth = width;
-      pen.strokeStyle = stroke;
-      pen.beginPath();
-      for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-        pen.moveTo(x + from * dx, y + from * dy);
-        pen.lineTo(x + to * dx, y + to * dy);
-      }
-      pen.stroke();
-    }
-  }
-
-  line(pen, points, colour, width = 1.5) {
-    pen.lineWidth = width;
-    pen.strokeStyle = colour;
-    pen.beginPath();
-    for (const point of points) pen.lineTo(...this.canvasXY(...point));
-    pen.closePath();
-    pen.stroke();
-  }
-
-  name(pen, [col, row], text, colour) {
-    const [x, y] = this.canvasXY(col, row);
-    pen.font = "14px system-ui, sans-serif";
-    pen.lineWidth = 4;
-    pen.strokeStyle = "#000c";
-    pen.strokeText(text, x + 9, y - 9);
-    pen.fillStyle = colour;
-    pen.fillText(text, x + 9, y - 9);
-  }
-
-  key(event) {
-    const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.key in steps) {
-      const px = (this.coarse ? COARSE_STEP / this.zoom : 1) * (event.shiftKey ? 0.1 : 1);
-      this.cursor = (this.cursor ?? this.center).map((value, axis) => value + px * steps[event.key][axis]);
-    } else if (event.key === "Enter" && this.cursor) {
-      this.place(...this.cursor);
-    } else {
-      return;
-    }
-    event.preventDefault();
-    event.stopPropagation();
-    this.draw();
-  }
-}
-
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(COLOURS[name]).trim();
 
 const views = {
   mark: new View(by("mark"), (col, row) => decideMark("place", { col_px: col, row_px: row })),
@@ -515,13 +371,8 @@ async function showWhole(frame, generation) {
   by("whole-view").hidden = false;
   by("words").textContent = frame.writing?.length ? `Read on the film: ${frame.writing.map(({ text }) => text).join(" · ")}` : "";
   const view = views.whole;
-  view.zoom = Math.min(by("whole").width / frame.size[0], by("whole").height / frame.size[1]);
-  view.center = [frame.size[0] / 2 - 0.5, frame.size[1] / 2 - 0.5];
   view.marks = (pen) => drawFrame(view, pen, frame);
-  const shown = await bitmap("/api/frame.png", { image: frame.image });
-  if (generation !== state.generation) return;
-  view.picture = { bitmap: shown, col: 0, row: 0, step: frame.size[0] / shown.width };
-  view.draw();
+  await view.showWhole(frame.image, frame.size, () => generation === state.generation);
 }
 
 function drawFrame(view, pen, frame) {
@@ -550,7 +401,7 @@ async function openFrame(entry, generation) {
   }
   state.click = { points: Object.keys(frame.fiducials), places: frame.fiducials, least: 3, half: CLICK_HALF_PX, tries: tryFrame, kept: keptFrame };
   by("click-told").textContent = "Choose a mark, click near it in the scan, then exactly in the window next to it. Three marks find the frame.";
-  by("scan-label").hidden = true;
+  by("scan-label").hidden = by("learned-row").hidden = true;
   await clickIn(frame, generation);
 }
 
@@ -562,7 +413,7 @@ async function openCamera(entry, generation) {
   const points = Object.keys(camera.fiducials);
   state.click = { points, places: camera.fiducials, least: points.length, tried: camera.tried, half: CLICK_HALF_PX, tries: tryCamera, kept: keptCamera };
   by("click-told").textContent = "Choose a scan that shows the marks well, and click every one of them: near it in the scan, then exactly in the window next to it.";
-  by("scan-label").hidden = false;
+  by("scan-label").hidden = by("learned-row").hidden = false;
   options("scan", [...new Set([shown, ...camera.images])], false);
   await clickInScan(shown, generation);
 }
@@ -611,7 +462,7 @@ function showNames() {
       return button;
     }),
   );
-  by("measure").disabled = by("keep").disabled = state.clicks.size < least;
+  by("measure").disabled = by("keep").disabled = by("save-learned").disabled = state.clicks.size < least;
   by("forget").disabled = state.clicks.size === 0;
   drawSketch();
 }
@@ -740,6 +591,28 @@ function keptFrame({ image, fingerprint }) {
 
 const keptCamera = ({ image }) => [{ image, kind: "learned", decision: "learn", px: Object.fromEntries(state.clicks) }];
 
+function saveLearned() {
+  return guarded(async () => {
+    const body = { image: state.frame.image, px: Object.fromEntries(state.clicks), file: by("learned-file").value };
+    by("trial").textContent = (await json("/api/save-learned", {}, body)).text;
+  });
+}
+
+// No question is open while a camera is drawn.
+function drawCamera() {
+  return guarded(async () => {
+    state.generation += 1;
+    Object.assign(state, { at: -1, mark: null, frame: null, trial: null, click: null, clicks: new Map() });
+    showQueue();
+    for (const id of VIEWS) by(id).hidden = true;
+    by("title").textContent = "Draw a camera";
+    by("reason").textContent = by("decided").textContent = "";
+    await openDrawing(state.opened);
+  });
+}
+
+const isDrawing = () => !by("draw-view").hidden;
+
 function forgetClicks() {
   state.clicks = new Map();
   state.trial = null;
@@ -751,6 +624,7 @@ function forgetClicks() {
 // --- keys and buttons
 
 function zoom(factor) {
+  if (isDrawing()) return zoomDrawing(factor);
   const view = by("near-view").hidden ? views.mark : views.near;
   const image = state.mark?.image ?? state.frame?.image;
   if (!image || !view.picture) return;
@@ -771,7 +645,7 @@ const KEYS = {
   j: () => step(1),
   k: () => step(-1),
   u: () => undo(),
-  m: () => measureClicks(),
+  m: () => (isDrawing() ? fitDrawing() : measureClicks()),
   o: () => toggleOverlay(),
   f: () => showFrame(),
   "+": () => zoom(2),
@@ -807,6 +681,10 @@ for (const [id, key] of [["accept", "a"], ["reject", "r"], ["absent", "n"], ["me
 for (const [name, work] of [["undo", undo], ["previous", () => step(-1)], ["next", () => step(1)]]) {
   for (const button of document.getElementsByClassName(name)) button.addEventListener("click", () => work());
 }
+by("draw").addEventListener("click", drawCamera);
+by("draw-closer").addEventListener("click", () => zoom(2));
+by("draw-farther").addEventListener("click", () => zoom(0.5));
+by("save-learned").addEventListener("click", saveLearned);
 by("forget").addEventListener("click", forgetClicks);
 by("scan").addEventListener("change", chooseScan);
 by("overlay").addEventListener("change", toggleOverlay);
@@ -847,6 +725,8 @@ await guarded(async () => {
   by("project").textContent = start.project;
   document.title = `review: ${start.project}`;
   state.poses = start.poses;
+  state.opened = start;
+  by("learned-file").value = start.file;
   const { choices } = start;
   options("question", choices.questions);
   options("verdict", choices.verdicts);
@@ -855,5 +735,6 @@ await guarded(async () => {
   options("camera", choices.cameras);
   options("folder", choices.folders);
   await filtered();
+  if (!start.cameras) await drawCamera();
 });
 setInterval(() => refresh().catch(() => {}), POLL_MS);

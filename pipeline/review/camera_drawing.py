@@ -1,0 +1,299 @@
+"""A camera that a person draws in one scan: what the page sends of it, where its frame lies, and its file."""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass as checked_dataclass
+
+from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
+from measure.fiducials.interior_orientation import fit_frame
+from measure.geometry import POSES, Affine, linear_scale, up_from_camera
+from measure.marks.shapes import MarkTemplate, Point
+from measure.marks.templates import cut, learn_template
+from measure.scans.scan import Scan
+from pipeline.errors import InputError
+from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile, parse_camera, read_camera
+from pipeline.files.camera_text import camera_text
+from pipeline.files.mark_table import SavePicture, saved_in, template_lines
+from pipeline.text.atomic import write_atomically
+from pipeline.text.tables import Table
+from pipeline.text.wording import listed, table_lines
+
+Array = NDArray[np.float64]
+
+MARK = "drawn"  # the name of the table [mark.NAME]
+_DRAWN_BY = f"# Drawn on the review page by reseau {version('reseau')}"
+_FILE_NAME = re.compile(r"\w[\w .-]{0,99}")
+_CLICK_MM = 0.3  # how well a mark is clicked
+_ONE_SIDE = 0.5  # of half the marks' extent: what lies farther out is on one side of the frame
+_FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
+_NO_PITCH = (
+    "what a pixel of the scan measures is not known. Give its size in µm, or the coordinates of two marks, or the "
+    "frame's size and two of its opposite corners."
+)
+
+
+@checked_dataclass(frozen=True)
+class ClickedMark:
+    """A mark that was clicked. xy_mm: its coordinates, None where they are not known. turn_deg, blur_px: of its picture
+    against the drawing, clockwise in the scan, as far as it was fitted."""
+
+    id: str
+    px: tuple[float, float]
+    xy_mm: tuple[float | None, float | None] = (None, None)
+    turn_deg: float = 0.0
+    blur_px: float = 0.8
+
+    @property
+    def given_mm(self) -> Point | None:
+        x, y = self.xy_mm
+        return None if x is None or y is None else (x, y)
+
+
+@checked_dataclass(frozen=True)
+class CameraDrawing:
+    """What the page sends. mark: a table [mark.NAME]; point: the mark that is looked at; corners_px: two opposite
+    corners of the exposed frame; sigma_mm: of the coordinates that are given. None: not known."""
+
+    image: str
+    mark: dict[str, Any]
+    marks: tuple[ClickedMark, ...] = ()
+    point: str = ""
+    name: str = ""
+    pose: str = "0"
+    pitch_um: float | None = None
+    principal_distance_mm: float | None = None
+    frame_mm: tuple[float | None, float | None] = (None, None)
+    corners_px: tuple[tuple[float, float], ...] = ()
+    sigma_mm: float | None = None
+
+    @property
+    def given_frame_mm(self) -> Point | None:
+        width, height = self.frame_mm
+        return None if width is None or height is None else (width, height)
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether the mark is a square of the scan, and no drawing."""
+        return self.mark.get("kind") in ("template", "learned")
+
+
+@dataclass(frozen=True, eq=False)
+class FramePlacement:
+    """Where a frame lies in a scan: pixel_from_camera (2, 3), the size of a pixel, and what says that."""
+
+    pixel_from_camera: Array
+    pitch_um: Point
+    pitch_source: str
+
+    def camera_mm(self, px: Point) -> Point:
+        """A place of the scan in the camera's coordinates, to a micrometre."""
+        x, y = Affine(self.pixel_from_camera).inverse.apply(np.array(px)).round(3).tolist()
+        return x, y
+
+
+def parse_drawing(given: Any) -> CameraDrawing:
+    """The drawing of a request. Raises InputError for what is none."""
+    try:
+        drawing: CameraDrawing = TypeAdapter(CameraDrawing).validate_python(given)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        raise InputError(f"the drawing's {'.'.join(map(str, first['loc']))}: {first['msg']}.") from None
+    ids = [one.id for one in drawing.marks]
+    if drawing.pose not in POSES:
+        raise InputError(f"{drawing.pose!r} is no pose; {', '.join(POSES)} are.")
+    if repeated := next((id for id in ids if ids.count(id) > 1), None):
+        raise InputError(f"two marks are called {repeated!r}. Every mark has a name of its own.")
+    return drawing
+
+
+def place_frame(
+    drawing: CameraDrawing, size_px: tuple[int, int], known_um: Point | None, source: str
+) -> FramePlacement:
+    """Where the frame lies: through the marks whose coordinates are given; else upright in the pose that is set, its
+    axes through the middles of marks on opposite sides. known_um: the pitch that the project or the file gives, and
+    source which of them. Raises InputError where nothing says what a pixel measures."""
+    known = [(one.px, one.given_mm) for one in drawing.marks if one.given_mm is not None]
+    pitch_um, source = _pitch(drawing, known_um, source)
+    if len(known) >= 2:
+        places, given = (np.array(values, dtype=float) for values in zip(*known, strict=True))
+        pixel_mm = np.array(pitch_um or (1000.0, 1000.0)) / 1000.0
+        up = _through_coordinates(places * pixel_mm * (1.0, -1.0), given, drawing.pose)
+        if pitch_um is None:
+            pixel_mm = pixel_mm / linear_scale(up)
+            up, source = up / linear_scale(up), "the coordinates of the marks"
+        return FramePlacement(_FLIP @ up / pixel_mm[:, None], _pair(1000.0 * pixel_mm), source)
+    if pitch_um is None:
+        raise InputError(_NO_PITCH)
+    linear = _FLIP @ up_from_camera(drawing.pose) / (np.array(pitch_um)[:, None] / 1000.0)
+    places = np.array([one.px for one in drawing.marks], dtype=float).reshape(-1, 2)
+    linear = linear @ _turn(_skew_rad(places @ np.linalg.inv(linear).T))
+    camera = places @ np.linalg.inv(linear).T
+    middle = np.array(drawing.corners_px or [(-0.5, -0.5), np.subtract(size_px, 0.5)]).mean(axis=0)
+    if len(known) == 1:
+        px, xy = known[0]
+        origin = np.array(px) - linear @ xy
+    else:
+        origin = linear @ (camera.min(axis=0) + camera.max(axis=0)) / 2 if len(places) >= LEAST_CLICKS else middle
+    return FramePlacement(np.column_stack([linear, origin]), pitch_um, source)
+
+
+def _pitch(drawing: CameraDrawing, known_um: Point | None, source: str) -> tuple[Point | None, str]:
+    frame_mm, corners = drawing.given_frame_mm, np.array(drawing.corners_px, dtype=float)
+    if drawing.pitch_um is not None:
+        if not 0.0 < drawing.pitch_um < math.inf:
+            raise InputError(f"a pixel measures more than 0 µm, not {drawing.pitch_um:g}.")
+        return (drawing.pitch_um, drawing.pitch_um), "as given"
+    if frame_mm and len(corners) == 2:
+        pitch = 1000.0 * math.hypot(*frame_mm) / float(np.hypot(*(corners[1] - corners[0])))
+        return (pitch, pitch), "the frame's size and corners"
+    return known_um, source
+
+
+def _through_coordinates(up_mm: Array, given_mm: Array, pose: str) -> Array:
+    """(2, 3), camera to the scan's (right, up) in mm; mirrored where that fits better, or the pose says it."""
+    tells_mirror = len(given_mm) >= LEAST_CLICKS and not are_collinear(given_mm)
+    mirrors = ("0", "0m") if tells_mirror else ("0m" if "m" in pose else "0",)
+    fits = [fit_frame(given_mm, up_mm, np.full(len(up_mm), _CLICK_MM), up_from_camera(one)) for one in mirrors]
+    return min(fits, key=lambda fit: round(fit.chi_square, 6)).up_from_camera
+
+
+def _skew_rad(places_mm: Array) -> float:
+    """By which turn the line through the middles of the left and the right marks becomes x', and that of the lower and
+    upper ones y': the mean of both."""
+    if len(places_mm) < 2:
+        return 0.0
+    middle, half = (places_mm.max(axis=0) + places_mm.min(axis=0)) / 2, np.ptp(places_mm, axis=0) / 2
+    skews = []
+    for axis in (0, 1):
+        if half[axis] < _ONE_SIDE * half.max():
+            continue
+        off = places_mm[:, axis] - middle[axis]
+        ends = [places_mm[side * off > _ONE_SIDE * half[axis]].mean(axis=0) for side in (1, -1)]
+        x, y = ends[0] - ends[1]
+        skews.append(math.atan2(y, x) if axis == 0 else math.atan2(-x, y))
+    return float(np.mean(skews))
+
+
+def _turn(angle_rad: float) -> Array:
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[c, -s], [s, c]])
+
+
+def _pair(values: Array) -> Point:
+    return float(values[0]), float(values[1])
+
+
+def frame_size_mm(drawing: CameraDrawing, placement: FramePlacement) -> Point | None:
+    """As given, or between the corners that were clicked, to a tenth of a millimetre."""
+    if drawing.given_frame_mm or len(drawing.corners_px) != 2:
+        return drawing.given_frame_mm
+    first, second = (np.array(placement.camera_mm(px)) for px in drawing.corners_px)
+    return _pair(np.abs(second - first).round(1))
+
+
+def camera_content(drawing: CameraDrawing, placement: FramePlacement) -> dict[str, Any]:
+    """The camera in the words of a camera file, but for the table of its mark."""
+    frame_mm, content = frame_size_mm(drawing, placement), dict[str, Any]()
+    if drawing.name:
+        content["name"] = drawing.name
+    if frame_mm:
+        content["frame_mm"] = list(frame_mm)
+    if drawing.principal_distance_mm is not None:
+        content["principal_distance_mm"] = drawing.principal_distance_mm
+    content["fiducial"] = [_fiducial(drawing, placement, one) for one in drawing.marks]
+    return content
+
+
+def _fiducial(drawing: CameraDrawing, placement: FramePlacement, one: ClickedMark) -> dict[str, Any]:
+    given = one.given_mm
+    sigma = DEFAULT_SIGMA_MM if given is None or drawing.sigma_mm is None else drawing.sigma_mm
+    return {"id": one.id, "xy_mm": list(given or placement.camera_mm(one.px)), "sigma_mm": sigma, "mark": MARK}
+
+
+def drawn_camera(drawing: CameraDrawing, placement: FramePlacement, path: Path) -> CameraFile:
+    """The camera as its file would be read; a mark that is a square of the scan is to be learned. Raises InputError."""
+    content = camera_content(drawing, placement)
+    content["mark"] = {MARK: {**drawing.mark, "kind": "learned"} if drawing.is_picture else drawing.mark}
+    if drawing.is_picture and drawing.marks:
+        content["clicks"] = {"scan": drawing.image, "px": {one.id: list(one.px) for one in drawing.marks}}
+    return parse_camera(Table(content, path, ""))
+
+
+def camera_path(folder: Path, name: str) -> Path:
+    """Where a camera file of that name is to stand. Raises InputError for a name of a folder, and for a file that was
+    not drawn here."""
+    name = name.strip().removesuffix(".toml")
+    if not _FILE_NAME.fullmatch(name):
+        raise InputError(f"{name!r} can be no file's name here. Give one such as camera.toml, without a folder.")
+    path = folder / f"{name}.toml"
+    if path.exists() and not path.read_bytes().startswith(_DRAWN_BY.rpartition(" ")[0].encode()):
+        raise InputError(f"{path.name} is there already, and was not drawn here. Give another name.")
+    return path
+
+
+def save_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, path: Path) -> CameraFile:
+    """Write a camera that is drawn, or whose mark is one chip of the scan, and read it again. Raises InputError for
+    what would be no camera file."""
+    if not drawing.marks:
+        raise InputError("click the marks first.")
+    if not frame_size_mm(drawing, placement):
+        raise InputError("the frame's size is not known. Give it in mm, or click two of its opposite corners.")
+    drawn_camera(drawing, placement, path).layout()
+    if drawing.is_picture:
+        mark = _chip_lines(drawing, placement, scan, saved_in(path.parent, f"{path.stem}-"))
+    else:
+        mark = table_lines(drawing.mark, f"mark.{MARK}")
+    body = [*table_lines(camera_content(drawing, placement)), "", f"[mark.{MARK}]", *mark]
+    write_atomically(path, "\n".join([*_remarks(drawing, placement), "", *body]) + "\n")
+    return read_camera(path)
+
+
+def save_learned(camera: CameraFile, remarks: Sequence[str], path: Path) -> CameraFile:
+    """Write a camera whose marks one scan's pictures show, and read it again."""
+    text = camera_text(replace(camera, path=path, clicks=None), saved_in(path.parent, f"{path.stem}-"))
+    write_atomically(path, "\n".join([*remarks, "", text]))
+    return read_camera(path)
+
+
+def learned_remarks(image: str) -> list[str]:
+    """What a camera file says of marks that were learned from one scan."""
+    return [f"{_DRAWN_BY}: its marks were learned from their places in {_on_one_line(image)}."]
+
+
+def _chip_lines(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, save: SavePicture) -> list[str]:
+    """The table of a mark that is a chip: cut about the mark that is looked at, or the first one."""
+    size_mm = float(drawing.mark["size_mm"])
+    one = next((mark for mark in drawing.marks if mark.id == drawing.point), drawing.marks[0])
+    place = np.column_stack([placement.pixel_from_camera[:, :2], one.px])
+    learned = learn_template([cut(scan, place, size_mm)], size_mm)
+    chip = MarkTemplate(learned.image, learned.pitch_um, learned.origin_px, 0.0, "light", learned.detail_mm)
+    return template_lines(chip, MARK, save)
+
+
+def _remarks(drawing: CameraDrawing, placement: FramePlacement) -> list[str]:
+    """Where the numbers of the file come from."""
+    pixel = " x ".join(f"{um:.4g}" for um in dict.fromkeys(np.round(placement.pitch_um, 6).tolist()))
+    found = [one.id for one in drawing.marks if one.given_mm is None]
+    lines = [f"{_DRAWN_BY} in {drawing.image}, a pixel of {pixel} µm ({placement.pitch_source})."]
+    if found:
+        lines.append(f"xy_mm of {listed(found)}: from their places in the scan and its pixel, not from a certificate.")
+    if len(found) < len(drawing.marks):
+        lines.append(f"xy_mm of {listed([one.id for one in drawing.marks if one.given_mm])}: as given.")
+    if not drawing.given_frame_mm:
+        lines.append("frame_mm: between two corners clicked in the scan.")
+    if drawing.principal_distance_mm is None:
+        lines.append("principal_distance_mm is not known: the adjustment finds it from the points.")
+    return [_on_one_line(f"# {line.removeprefix('# ')}") for line in lines]
+
+
+def _on_one_line(text: str) -> str:
+    return "".join(one if one.isprintable() else "?" for one in text)

@@ -1,0 +1,105 @@
+"""What the page is answered about a camera that a person draws."""
+
+from dataclasses import replace
+from typing import Any
+
+from measure.errors import MeasurementError
+from measure.marks.shapes import MarkShape, Point
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.mark_table import Clicks
+from pipeline.review.camera_drawing import (
+    CameraDrawing,
+    FramePlacement,
+    camera_path,
+    drawn_camera,
+    learned_remarks,
+    parse_drawing,
+    place_frame,
+    save_drawing,
+    save_learned,
+)
+from pipeline.review.drawing_view import drawing_json, drawn_mark, take_step
+from pipeline.review.frame_view import camera_as_shown
+from pipeline.review.pictures import Pictures
+from pipeline.review.query import Query
+from pipeline.review.session import Session
+
+_WIDEST_PX = 2000  # half the window about a mark
+
+
+class DrawingAnswers:
+    """Requests about drawings: the page holds the drawing, and sends it whole."""
+
+    def __init__(self, session: Session, pictures: Pictures) -> None:
+        self._session, self._pictures = session, pictures
+
+    def draw(self, query: Query, body: Any) -> Any:
+        """The drawing after a step, and all that is shown of it."""
+        drawing, placement = self._placed(_part(body, "drawing"))
+        if step := body.get("step"):
+            scan = self._session.scan_of(drawing.image)
+            drawing = self._pictures.compute(scan, lambda file: take_step(drawing, placement, step, file))
+            placement = self._placement(drawing)
+        return drawing_json(drawing, placement)
+
+    def picture(self, query: Query) -> bytes:
+        """The rendered drawing, or what it leaves of the scan, about the mark that is looked at."""
+        drawing, placement = self._placed(query.table("drawing"))
+        half, shown = query.whole("half", 8, _WIDEST_PX), drawn_mark(drawing, placement)
+        if shown is None or not isinstance(shown.mark, MarkShape):
+            raise MeasurementError("nothing is drawn there")
+        matrix, blur_px = shown.pixel_from_mark, shown.clicked.blur_px
+        if query.text("of") == "drawing":
+            return self._pictures.drawing(shown.mark, matrix, blur_px, half)
+        return self._pictures.residual(self._session.scan_of(drawing.image), shown.mark, matrix, blur_px, half)
+
+    def save(self, query: Query, body: Any) -> Any:
+        """The camera file written, and what to do next."""
+        drawing, placement = self._placed(_part(body, "drawing"))
+        project, path = self._session.project, camera_path(self._session.folder, str(body.get("file", "")))
+        if drawing.mark.get("kind") == "learned" and drawing.marks:
+            camera = drawn_camera(drawing, placement, path)
+            camera.layout()
+            known = replace(project, pitch_um=placement.pitch_um, pose="auto")
+            clicks = Clicks(drawing.image, {one.id: one.px for one in drawing.marks}, who=self._session.who)
+            learned = camera_as_shown(known, camera, clicks)
+            return self._saved(save_learned(learned, learned_remarks(drawing.image), path))
+        scan = self._session.scan_of(drawing.image)
+        return self._saved(self._pictures.compute(scan, lambda file: save_drawing(drawing, placement, file, path)))
+
+    def save_learned(self, query: Query, body: Any) -> Any:
+        """A camera of the project written with its marks as one scan shows them at clicked places."""
+        image, path = str(_part(body, "image")), camera_path(self._session.folder, str(body.get("file", "")))
+        self._session.scan_of(image)  # raises for one that is none
+        px = {str(point): (float(col), float(row)) for point, (col, row) in _part(body, "px").items()}
+        project = self._session.project
+        camera = project.camera_of(image)
+        if missing := [one.id for one in camera.learned if one.id not in px]:
+            raise InputError(f"{image}: click {', '.join(missing)}, too.")
+        learned = camera_as_shown(project, camera, Clicks(image, px, who=self._session.who))
+        return self._saved(save_learned(learned, learned_remarks(image), path))
+
+    def _saved(self, camera: CameraFile) -> Any:
+        file, project = camera.path.name, self._session.project
+        names = {project.missing_camera, *(one.path.name for one in project.cameras.values())}
+        first = "" if file in names else f'name it in the project, camera = "{file}", then '
+        return {"text": f"Saved {camera.path} with {len(camera.fiducials)} marks. Next: {first}reseau measure."}
+
+    def _placed(self, given: Any) -> tuple[CameraDrawing, FramePlacement]:
+        drawing = parse_drawing(given)
+        return drawing, self._placement(drawing)
+
+    def _placement(self, drawing: CameraDrawing) -> FramePlacement:
+        project = self._session.project
+        size_px, file_um = self._pictures.size(self._session.scan_of(drawing.image))
+        known_um: Point | None = project.pitch_um or file_um
+        return place_frame(
+            drawing, size_px, known_um, "as the project says" if project.pitch_um else "as the file says"
+        )
+
+
+def _part(body: Any, name: str) -> Any:
+    if not isinstance(body, dict) or name not in body:
+        raise InputError(f"{name} is missing.")
+    return body[name]

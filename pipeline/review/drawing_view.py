@@ -1,0 +1,232 @@
+"""A camera drawing as the page shows it, what a drag, a click or a fit makes of it, and its pictures."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.detection.localisation import MarkPrediction
+from measure.fiducials.mark_fit import Detection, detect_mark
+from measure.geometry import Affine, linear_scale
+from measure.marks.rendering import reach_px
+from measure.marks.shapes import FrameCorner, Mark, MarkShape, Point
+from measure.matching.options import MatchOptions
+from measure.scans.scan import Scan
+from pipeline.errors import InputError
+from pipeline.files.mark_table import MARK_TABLES
+from pipeline.review.camera_drawing import MARK, CameraDrawing, ClickedMark, FramePlacement, drawn_camera, frame_size_mm
+from pipeline.review.frame_view import outlines_px
+from pipeline.review.mark_handles import (
+    Handle,
+    MarkJson,
+    first_drawing,
+    first_part,
+    handles,
+    scaled_mark,
+    with_vertex,
+    without,
+)
+from pipeline.review.pictures import window_start
+from pipeline.text.table_models import key_rows
+
+Array = NDArray[np.float64]
+Json = dict[str, Any]
+
+_START_PX = 20.0  # of a new drawing, to every side of its point
+_LEAST_PX, _SIZES = 30, 1.8  # of half the window about a mark: at least, and in the mark's own size
+_SEARCH_PX, _SEARCH_MM = 6.0, 0.3  # about a click, whichever is more
+_NO_FILE = Path("camera.toml")  # of a drawing that is not saved yet
+_CHOICES = {"polarity": ("auto", "light", "dark"), "rotate": ("none", "radial")}
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMark:
+    """The mark that is looked at. mark: None where its drawing is not complete, and problem says why; pixel_from_mark
+    (2, 3): through its place, the frame's rotation and scale, and its own turn as far as that was fitted."""
+
+    clicked: ClickedMark
+    xy_mm: Point
+    mark: Mark | None
+    pixel_from_mark: Array
+    problem: str = ""
+
+    @property
+    def toward(self) -> Point:
+        """In which quadrant about it the frame lies."""
+        return -1.0 if self.xy_mm[0] > 0 else 1.0, -1.0 if self.xy_mm[1] > 0 else 1.0
+
+
+def drawn_mark(drawing: CameraDrawing, placement: FramePlacement) -> DrawnMark | None:
+    """None where no mark is looked at."""
+    clicked = next((one for one in drawing.marks if one.id == drawing.point), None)
+    if clicked is None:
+        return None
+    xy = clicked.given_mm or placement.camera_mm(clicked.px)
+    matrix = _pixel_from_mark(placement, clicked)
+    try:
+        camera = drawn_camera(drawing, placement, _NO_FILE)
+    except InputError as error:
+        sentence = str(error).removeprefix(f"{_NO_FILE}: ").replace(f"[mark.{MARK}] ", "")
+        return DrawnMark(clicked, xy, None, matrix, sentence)
+    mark = next(one.mark for one in camera.fiducials if one.id == clicked.id)
+    return DrawnMark(clicked, xy, mark if isinstance(mark, Mark) else None, matrix)
+
+
+def _pixel_from_mark(placement: FramePlacement, clicked: ClickedMark) -> Array:
+    turn = math.radians(clicked.turn_deg)
+    c, s = math.cos(turn), math.sin(turn)
+    return np.column_stack([np.array([[c, -s], [s, c]]) @ placement.pixel_from_camera[:, :2], clicked.px])
+
+
+def drawing_json(drawing: CameraDrawing, placement: FramePlacement) -> Json:
+    """All that the page shows of a drawing beside its pictures."""
+    shown = drawn_mark(drawing, placement)
+    frame_mm = frame_size_mm(drawing, placement)
+    return {
+        "mark": drawing.mark,
+        "marks": [
+            {
+                "id": one.id,
+                "px": list(one.px),
+                "xy_mm": list(one.xy_mm),
+                "found_mm": list(placement.camera_mm(one.px)),
+                "turn_deg": one.turn_deg,
+                "blur_px": one.blur_px,
+            }
+            for one in drawing.marks
+        ],
+        "pitch_um": list(placement.pitch_um),
+        "pitch_source": placement.pitch_source,
+        "frame_mm": None if frame_mm is None else list(frame_mm),
+        "form": _form(drawing.mark),
+        "problem": shown.problem if shown else "",
+        "shown": None if shown is None else _shown_json(drawing, shown),
+    }
+
+
+def _form(mark: MarkJson) -> list[Json]:
+    """The keys of a mark that are one number or one word, as its table in a camera file has them."""
+    kind = mark["kind"]
+    rows = list(key_rows(MARK_TABLES["learned" if kind == "template" else kind]))
+    form = []
+    for row in rows:
+        choices = _CHOICES.get(row.name, ())
+        if choices or row.type.startswith("number"):
+            absent = choices[0] if choices else 0.0
+            value = mark.get(row.name, absent)
+            form.append({"key": row.name, "unit": row.unit, "meaning": row.meaning, "choices": choices, "value": value})
+    return form
+
+
+def _shown_json(drawing: CameraDrawing, shown: DrawnMark) -> Json:
+    own = handles(drawing.mark, shown.toward)
+    place = _handle_affine(drawing, shown)
+    lines = [] if shown.mark is None else outlines_px(shown.mark, shown.pixel_from_mark)
+    if drawing.is_picture:
+        half = drawing.mark["size_mm"] / 2
+        square = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
+        lines = [place.apply(square).round(3).tolist()]
+    half_px = _half_px(shown, lines, place, own)
+    return {
+        "center": list(shown.clicked.px),
+        "half": half_px,
+        "start": list(window_start(shown.pixel_from_mark, half_px)),
+        "outlines": lines,
+        "handles": [{"key": one.key, "px": place.apply(np.array(one.place_mm)).round(3).tolist()} for one in own],
+        "has_picture": isinstance(shown.mark, MarkShape),
+    }
+
+
+def _half_px(shown: DrawnMark, lines: Sequence[Any], place: Affine, own: Sequence[Handle]) -> int:
+    points = [point for line in lines for point in line] + [place.apply(np.array(one.place_mm)) for one in own]
+    off = float(np.abs(np.array(points or [shown.clicked.px]) - shown.clicked.px).max())
+    if isinstance(shown.mark, MarkShape):
+        off = max(off, reach_px(shown.mark, shown.pixel_from_mark[:, :2]))
+    return max(_LEAST_PX, math.ceil(_SIZES * off))
+
+
+def _handle_affine(drawing: CameraDrawing, shown: DrawnMark) -> Affine:
+    """From the axes that a mark is drawn in, which a radial one has turned with its place, to the scan."""
+    linear = shown.pixel_from_mark[:, :2]
+    if drawing.mark.get("rotate") == "radial":
+        x, y = np.array(shown.xy_mm) / (math.hypot(*shown.xy_mm) or 1.0)
+        linear = linear @ np.array([[x, -y], [y, x]])
+    return Affine.from_linear(linear, shown.clicked.px)
+
+
+def take_step(drawing: CameraDrawing, placement: FramePlacement, step: Mapping[str, Any], scan: Scan) -> CameraDrawing:
+    """The drawing after what a person did with it: {"kind": of mark}, {"part": shape}, {"click": px} in the picture of
+    the mark, {"drag": key of a handle, "px": to}, {"remove": key of a handle} or {"fit": True}."""
+    mark, shown = drawing.mark, drawn_mark(drawing, placement)
+    size_mm = _START_PX / linear_scale(placement.pixel_from_camera)
+    match step:
+        case {"kind": str(kind)}:
+            return replace(drawing, mark=dict(first_drawing(kind, size_mm)))
+        case {"part": str(shape)}:
+            return replace(drawing, mark={**mark, "part": [*mark.get("part", ()), first_part(shape, size_mm / 2)]})
+        case {"fit": True}:
+            return fit_drawing(drawing, placement, scan)
+    if shown is None:
+        raise InputError("choose a mark first.")
+    match step:
+        case {"click": [float() | int() as col, float() | int() as row]}:
+            if mark["kind"] != "polygon":
+                return _moved(drawing, (float(col), float(row)))
+            place = _handle_affine(drawing, shown).inverse.apply(np.array([col, row], float))
+            return replace(drawing, mark=dict(with_vertex(mark, place)))
+        case {"drag": "place", "px": [float() | int() as col, float() | int() as row]}:
+            return _moved(drawing, (float(col), float(row)))
+        case {"drag": str(key), "px": [float() | int() as col, float() | int() as row]}:
+            handle = next((one for one in handles(mark, shown.toward) if one.key == key), None)
+            if handle is None:
+                raise InputError(f"the drawing has no {key!r} to drag.")
+            place = _handle_affine(drawing, shown).inverse.apply(np.array([col, row], float))
+            return replace(drawing, mark=dict(handle.dragged(place)))
+        case {"remove": str(key)}:
+            return replace(drawing, mark=dict(without(mark, key)))
+    raise InputError("that is no step of a drawing.")
+
+
+def _moved(drawing: CameraDrawing, px: Point) -> CameraDrawing:
+    marks = tuple(replace(one, px=px) if one.id == drawing.point else one for one in drawing.marks)
+    return replace(drawing, marks=marks)
+
+
+def fit_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan) -> CameraDrawing:
+    """Every mark matched as `measure` matches it: its place and blur; and all of them turned, and the drawing larger,
+    by the median over the marks. Raises InputError where none looks like the drawing."""
+    if drawing.is_picture:
+        raise InputError("a square of the scan is its own picture: there is nothing to fit.")
+    camera = drawn_camera(drawing, placement, _NO_FILE)
+    marks, scales, turns_deg, reasons = list[ClickedMark](), list[float](), list[float](), list[str]()
+    for one, fiducial in zip(drawing.marks, camera.fiducials, strict=True):
+        start = _pixel_from_mark(placement, replace(one, turn_deg=0.0))
+        found = _match(scan, fiducial.mark, start)
+        if found.fit is None:
+            reasons.append(f"{one.id}: {found.reason}")
+            marks.append(one)
+            continue
+        change = found.fit.pixel_from_mark[:, :2] @ np.linalg.inv(start[:, :2])
+        col, row = found.fit.center_px.round(3).tolist()
+        turns_deg.append(math.degrees(math.atan2(change[1, 0] - change[0, 1], change[0, 0] + change[1, 1])))
+        marks.append(replace(one, px=(col, row), blur_px=max(float(found.fit.blur_px), 0.1)))
+        if not isinstance(fiducial.mark, FrameCorner):
+            scales.append(linear_scale(change))
+    if len(reasons) == len(marks):
+        raise InputError(f"nothing was fitted. {'; '.join(reasons) or 'Click a mark first.'}")
+    mark = scaled_mark(drawing.mark, median(scales)) if scales else drawing.mark
+    turned = tuple(replace(one, turn_deg=median(turns_deg)) for one in marks)
+    return replace(drawing, marks=turned, mark=dict(mark))
+
+
+def _match(scan: Scan, mark: Any, start: Array) -> Detection:
+    """The better one of both polarities, where the drawing leaves it open."""
+    search_px = max(_SEARCH_PX, _SEARCH_MM * linear_scale(start))
+    polarities = {"light": (1,), "dark": (-1,)}.get(mark.polarity, (1, -1))
+    found = [detect_mark(scan, MarkPrediction(mark, start, search_px, one), MatchOptions()) for one in polarities]
+    return max(found, key=lambda one: -1.0 if one.fit is None else one.fit.likeness)

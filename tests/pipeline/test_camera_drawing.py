@@ -1,0 +1,314 @@
+"""A camera drawn on the review page: handles, where the frame lies, the saved file, and a person's session."""
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from browser import browser_page, needs_browser
+from brute_marks import Array
+from drawn_frames import ALIKE, CORNERS, PITCH_UM, frame_picture, pixel_from_camera
+from playwright.sync_api import Browser, Page, expect
+from review_pages import comparator
+from review_server import Served, served
+
+from measure.scans.opening import open_scan
+from pipeline.cli import run
+from pipeline.errors import InputError
+from pipeline.files.camera_file import read_camera
+from pipeline.files.mark_table import MARK_TABLES
+from pipeline.files.project_file import read_undrawn
+from pipeline.review.camera_drawing import (
+    CameraDrawing,
+    ClickedMark,
+    FramePlacement,
+    camera_path,
+    parse_drawing,
+    place_frame,
+    save_drawing,
+)
+from pipeline.review.drawing_view import drawing_json, take_step
+from pipeline.review.mark_handles import first_drawing, handles, with_vertex, without
+from pipeline.review.session import Session
+
+pytestmark = pytest.mark.xdist_group("review")
+
+SIZES = {"ring_mm": 0.5, "ring_line_mm": 0.1, "arm_mm": 0.8, "line_mm": 0.1}  # of the marks in the scan
+TURN_RAD = 0.004
+PROJECT = f'camera = "camera.toml"\nscans = ["*.tif"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n'
+
+
+def true_px(pose: str = "0") -> Array:
+    matrix = pixel_from_camera(pose, TURN_RAD)
+    return np.array([matrix @ (*place, 1.0) for place in CORNERS])
+
+
+def marks_at(places: Array, given: bool = False) -> tuple[ClickedMark, ...]:
+    xy = CORNERS if given else [(None, None)] * len(CORNERS)
+    return tuple(ClickedMark(str(k), (float(c), float(r)), xy[k - 1]) for k, (c, r) in enumerate(places, 1))
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("drawing") / "a.tif"
+    grey = frame_picture(ALIKE, pixel_from_camera("0", TURN_RAD), 1)
+    tifffile.imwrite(path, np.clip(np.rint(grey), 0, 65535).astype(np.uint16))
+    return path
+
+
+# --- handles
+
+
+@pytest.mark.parametrize("kind", [kind for kind in MARK_TABLES if kind != "polygon"])
+def test_a_handle_that_is_dragged_lies_where_it_was_dragged_to(kind: str) -> None:
+    """As far as its size allows: a length follows the part of the drag along it; nothing else moves in size."""
+    mark = first_drawing(kind, 2.0)
+    for handle in handles(mark):
+        start = np.array(handle.place_mm)
+        along = start / (np.hypot(*start) or 1.0)
+        after = handle.dragged(start + 0.3 * along)
+        (moved,) = [one for one in handles(after) if one.key == handle.key]
+        assert {key for key in after if after[key] != mark.get(key)} <= {handle.key.split(".")[0]}
+        again = moved.dragged(np.array(moved.place_mm))
+        assert json.dumps(again) == json.dumps(after), handle.key
+
+
+def test_a_dragged_size_is_what_the_camera_file_means_by_it() -> None:
+    mark = {"kind": "ring-cross", **SIZES, "gap_mm": 0.0, "angle_deg": 30.0}
+    c, s = math.cos(math.radians(30.0)), math.sin(math.radians(30.0))
+    by_key = {one.key: one for one in handles(mark)}
+    assert by_key["arm_mm"].dragged(np.array([1.2 * c - 0.5 * s, 1.2 * s + 0.5 * c]))["arm_mm"] == pytest.approx(1.2)
+    side = 0.56 * np.array([c, s]) + 0.15 * np.array([-s, c])
+    assert by_key["line_mm"].dragged(side)["line_mm"] == pytest.approx(0.3)
+    ring = 0.65 * np.array([math.cos(math.radians(-22.5)), math.sin(math.radians(-22.5))])
+    assert by_key["ring_line_mm"].dragged(ring)["ring_line_mm"] == pytest.approx(0.3)
+    turned = by_key["angle_deg"].dragged(-np.array([math.cos(math.radians(45)), math.sin(math.radians(45))]))
+    assert turned["angle_deg"] == pytest.approx(45.0)
+
+
+def test_corners_of_a_polygon_come_where_they_are_clicked_and_go() -> None:
+    mark = {"kind": "polygon", "vertices_mm": [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0]]}
+    more = with_vertex(mark, np.array([1.0, -0.2]))
+    assert more["vertices_mm"] == [[0.0, 0.0], [1.0, -0.2], [2.0, 0.0], [2.0, 2.0]]
+    assert without(more, "vertices_mm.1") == mark
+    parts = {"kind": "parts", "part": [{"shape": "disk", "center_mm": [0, 0], "radius_mm": 1.0}] * 2}
+    assert len(without(parts, "part.0.radius_mm")["part"]) == 1
+
+
+# --- where the frame lies
+
+
+@pytest.mark.parametrize("pose", ["0", "90", "180", "270m"])
+def test_the_axes_go_through_the_middles_of_opposite_marks(pose: str) -> None:
+    drawing = CameraDrawing("a", {"kind": "dot"}, marks_at(true_px(pose)), pose=pose)
+    placement = place_frame(drawing, (400, 400), (PITCH_UM, PITCH_UM), "")
+    np.testing.assert_allclose([placement.camera_mm(one.px) for one in drawing.marks], CORNERS, atol=2e-3)
+
+
+def test_given_coordinates_tell_pitch_and_mirror() -> None:
+    drawing = CameraDrawing("a", {"kind": "dot"}, marks_at(true_px("90m"), given=True))
+    placement = place_frame(drawing, (400, 400), None, "")
+    assert placement.pitch_um == pytest.approx((PITCH_UM, PITCH_UM), rel=1e-3)
+    np.testing.assert_allclose(placement.pixel_from_camera, pixel_from_camera("90m", TURN_RAD), atol=0.05)
+
+
+def test_the_size_of_the_frame_and_two_corners_tell_the_pitch() -> None:
+    corners = ((10.0, 20.0), (10.0 + 3400.0, 20.0 + 3400.0))
+    drawing = CameraDrawing("a", {"kind": "dot"}, frame_mm=(17.0, 17.0), corners_px=corners)
+    assert place_frame(drawing, (4000, 4000), None, "").pitch_um == pytest.approx((5.0, 5.0))
+    with pytest.raises(InputError, match="what a pixel of the scan measures is not known"):
+        place_frame(CameraDrawing("a", {"kind": "dot"}), (4000, 4000), None, "")
+
+
+# --- fitting and saving
+
+
+def placed(drawing: CameraDrawing) -> FramePlacement:
+    return place_frame(drawing, (400, 400), (PITCH_UM, PITCH_UM), "as the project says")
+
+
+def test_a_fit_finds_places_and_the_size(scan: Path) -> None:
+    """Drawn 10 % too small, and clicked 3 px off."""
+    sizes = {key: 0.9 * value for key, value in SIZES.items()}
+    drawing = CameraDrawing("a", {"kind": "ring-cross", **sizes}, marks_at(true_px() + np.array([3.0, -2.0])), "1")
+    with open_scan(scan) as opened:
+        fitted = take_step(drawing, placed(drawing), {"fit": True}, opened)
+    np.testing.assert_allclose([one.px for one in fitted.marks], true_px(), atol=0.05)
+    assert fitted.mark["ring_mm"] == pytest.approx(0.5, rel=0.01)
+    assert fitted.marks[0].blur_px == pytest.approx(0.8, abs=0.15)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in MARK_TABLES if kind != "polygon"])
+def test_every_kind_has_a_form_and_handles_to_start_from(kind: str, scan: Path) -> None:
+    start = CameraDrawing("a", {"kind": "dot", "radius_mm": 1.0}, marks_at(true_px()), "1", frame_mm=(17.0, 17.0))
+    with open_scan(scan) as opened:
+        drawing = take_step(start, placed(start), {"kind": kind}, opened)
+    shown = drawing_json(drawing, placed(drawing))
+    numbers = {one["key"] for one in shown["form"] if not one["choices"]}
+    assert shown["problem"] == ""
+    assert {one["key"] for one in shown["shown"]["handles"]} >= numbers
+    assert shown["shown"]["outlines"]
+    assert shown["shown"]["has_picture"] == (kind not in ("template", "learned"))
+
+
+def test_what_is_not_complete_is_said_and_not_refused() -> None:
+    drawing = CameraDrawing("a", {"kind": "polygon", "vertices_mm": [[0.0, 0.0]]}, marks_at(true_px()), "1")
+    shown = drawing_json(drawing, placed(drawing))
+    assert "at least three vertices" in shown["problem"]
+    assert not shown["shown"]["has_picture"]
+
+
+@pytest.mark.parametrize(
+    ("mark", "statuses"),
+    [
+        ({"kind": "ring-cross", **SIZES}, {"measured"}),
+        ({"kind": "template", "size_mm": 2.4}, {"measured", "weak"}),
+    ],
+)
+def test_a_saved_camera_measures_the_scan(
+    mark: dict[str, float | str], statuses: set[str], scan: Path, tmp_path: Path
+) -> None:
+    drawing = CameraDrawing("a", mark, marks_at(true_px()), "1", name="K", frame_mm=(17.0, 17.0))
+    with open_scan(scan) as opened:
+        camera = save_drawing(drawing, placed(drawing), opened, tmp_path / "camera.toml")
+    text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
+    assert "xy_mm of 1, 2, 3, 4: from their places in the scan and its pixel, not from a certificate" in text
+    assert {one.sigma_mm for one in camera.fiducials} == {(1.0, 1.0)}
+    (tmp_path / "project.toml").write_text(PROJECT.replace("*.tif", str(scan)), encoding="utf-8")
+    run(["measure", str(tmp_path / "project.toml")])
+    rows = comparator(tmp_path)
+    assert {row["status"] for row in rows.values()} <= statuses
+    found = np.array([[float(rows["a", p][f"{axis}_px"]) for axis in ("col", "row")] for p in "1234"])
+    np.testing.assert_allclose(found, true_px(), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"marks": []}, "click the marks first"),
+        ({"frame_mm": [None, None]}, "the frame's size is not known"),
+        ({"mark": {"kind": "dot", "radius_mm": -1.0}}, "radius_mm: must be greater than 0"),
+        ({"pose": "45"}, "no pose"),
+        ({"pitch_um": 0.0}, "more than 0"),
+        ({"marks": [{"id": "1", "px": [1.0, 2.0]}] * 2}, "two marks are called '1'"),
+        ({"corners_px": "x"}, "the drawing's corners_px"),
+    ],
+)
+def test_what_would_be_no_camera_is_refused_and_not_written(
+    change: dict[str, object], words: str, scan: Path, tmp_path: Path
+) -> None:
+    marks = [{"id": one.id, "px": list(one.px)} for one in marks_at(true_px())]
+    given = {"image": "a", "mark": {"kind": "dot", "radius_mm": 0.5}, "marks": marks, "frame_mm": [17.0, 17.0]}
+
+    def save() -> None:
+        drawing = parse_drawing(given | change)
+        with open_scan(scan) as opened:
+            save_drawing(drawing, placed(drawing), opened, tmp_path / "camera.toml")
+
+    with pytest.raises(InputError, match=words):
+        save()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_camera_file_is_not_written_over_unless_it_was_drawn(scan: Path, tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text('name = "own"\n')
+    with pytest.raises(InputError, match=r"own.toml is there already, and was not drawn here"):
+        camera_path(tmp_path, "own")
+    for name in ("../a", "", ".hidden", "a/b.toml"):
+        with pytest.raises(InputError, match="can be no file's name"):
+            camera_path(tmp_path, name)
+    drawing = CameraDrawing("a", {"kind": "dot", "radius_mm": 0.5}, marks_at(true_px()), frame_mm=(17.0, 17.0))
+    with open_scan(scan) as opened:
+        for _ in range(2):
+            save_drawing(drawing, placed(drawing), opened, camera_path(tmp_path, "new"))
+
+
+def test_a_project_whose_camera_is_missing_can_be_opened_to_draw_it(scan: Path, tmp_path: Path) -> None:
+    project = tmp_path / "project.toml"
+    project.write_text(PROJECT.replace("*.tif", str(scan)).replace("camera.toml", "mine.toml"), encoding="utf-8")
+    session = Session(read_undrawn(project), "ann")
+    assert (session.camera_name, dict(session.project.cameras)) == ("mine.toml", {})
+    alone = read_undrawn(tmp_path / "none.toml", [scan])
+    assert list(alone.scans) == ["a"]
+
+
+# --- a person's session
+
+
+@pytest.fixture
+def folder(scan: Path, tmp_path: Path) -> Path:
+    (tmp_path / "project.toml").write_text(PROJECT.replace("*.tif", str(scan)), encoding="utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def server(folder: Path) -> Iterator[Served]:
+    with served(folder / "project.toml") as one:
+        yield one
+
+
+@needs_browser
+def test_a_person_draws_a_camera_and_its_file_measures_the_scan(browser: Browser, server: Served, folder: Path) -> None:
+    with browser_page(browser) as page:
+        page.goto(server.address)
+        expect(page.locator("#draw-view")).to_be_visible()  # the project has no camera yet
+        expect(page.locator("#draw-pitch-told")).to_contain_text("50.00 × 50.00 µm as the project says")
+        click_marks(page)
+        page.locator("#draw-kind").select_option("ring-cross")
+        for key in ("ring_mm", "arm_mm"):
+            drag_size(page, key, SIZES[key])
+        for key in ("line_mm", "ring_line_mm"):
+            page.locator(f"#size-{key}").fill(str(SIZES[key]))
+            page.locator(f"#size-{key}").press("Enter")
+            expect(page.locator(f"#size-{key}")).not_to_be_focused()
+        page.locator("#draw-fit").click()
+        expect(page.locator("#draw-told")).to_contain_text("Fitted: turned by")
+        for key, value in SIZES.items():
+            assert float(page.locator(f"#size-{key}").input_value()) == pytest.approx(value, rel=0.05)
+        assert page.locator("#draw-left").get_attribute("data-shown")
+        for field, text in (("width", "17"), ("height", "17"), ("distance", "30"), ("name", "K")):
+            page.locator(f"#draw-{field}").fill(text)
+        page.locator("#draw-save").click()
+        expect(page.locator("#draw-told")).to_contain_text("camera.toml with 4 marks. Next: reseau measure.")
+    camera = read_camera(folder / "camera.toml")
+    assert (camera.principal_distance_mm, camera.frame_mm, camera.name) == (30.0, (17.0, 17.0), "K")
+    assert run(["measure", str(folder / "project.toml")]) == 0
+    rows = comparator(folder)
+    assert {row["status"] for row in rows.values()} == {"measured"}
+    found = np.array([[float(rows["a", p][f"{axis}_px"]) for axis in ("col", "row")] for p in "1234"])
+    np.testing.assert_allclose(found, true_px(), atol=0.1)
+
+
+def click_marks(page: Page) -> None:
+    box = page.locator("#draw-whole").bounding_box()
+    assert box is not None
+    for col, row in true_px():
+        page.locator("#draw-whole").click(position={"x": box["width"] * col / 400, "y": box["height"] * row / 400})
+    expect(page.locator("#draw-marks tr")).to_have_count(4)
+
+
+def drag_size(page: Page, key: str, value: float) -> None:
+    """Its handle, as far as the size is to grow, away from the mark's middle."""
+    canvas = page.locator("#draw-mark")
+    expect(page.locator(f"#size-{key}")).to_be_visible()
+    expect(canvas).to_have_attribute("data-handles", re.compile(f'"{key}"'))
+    box = canvas.bounding_box()
+    assert box is not None
+    places = json.loads(canvas.get_attribute("data-handles") or "{}")
+    before, scale = float(page.locator(f"#size-{key}").input_value()), box["width"] / 480
+    start = np.array(places[key])
+    arm = np.hypot(*(np.array(places["arm_mm"]) - 240)) / float(page.locator("#size-arm_mm").input_value())
+    end = start + (start - 240) / np.hypot(*(start - 240)) * arm * (value - before)
+    page.mouse.move(box["x"] + 1 + scale * start[0], box["y"] + 1 + scale * start[1])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 1 + scale * end[0], box["y"] + 1 + scale * end[1], steps=3)
+    page.mouse.up()
+    for _ in range(100):
+        if abs(float(page.locator(f"#size-{key}").input_value()) - value) < 0.04:
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError(f"{key} is {page.locator(f'#size-{key}').input_value()}, not {value}")
