@@ -9,7 +9,7 @@ const CAMERA = ["name", "distance", "width", "height", "pitch", "sigma"];
 const COLOUR = { line: "#22c55e", handle: "#facc15", mark: "#fff", corner: "#38bdf8" };
 
 const drawing = { image: "", mark: null, marks: [], point: "", corners: [], placesCorners: false };
-let told = null; // what the server says of it
+let reply = null; // what the server says of it
 let overlay = null; // the rendered drawing
 let drag = null;
 let generation = 0;
@@ -99,18 +99,18 @@ async function take(step, edit = () => {}) {
 async function answered({ step, edit }) {
   edit();
   if (!drawing.mark && !step?.kind) await answered({ step: { kind: by("draw-kind").value }, edit() {} });
-  const before = told?.shown?.center;
-  told = await json("/api/draw", {}, { drawing: sent(), step: step?.select === undefined ? step : null });
-  Object.assign(drawing, { mark: told.mark, marks: told.marks });
-  const { shown } = told;
+  const before = reply?.shown?.center;
+  reply = await json("/api/draw", {}, { drawing: sent(), step: step?.select === undefined ? step : null });
+  Object.assign(drawing, { mark: reply.mark, marks: reply.marks });
+  const { shown } = reply;
   if (shown && (!before || step?.kind || step?.select || step?.fit)) look(shown);
   if (step?.fit) by("draw-told").textContent = fitted();
   show();
 }
 
 function fitted() {
-  const blurs = told.marks.map(({ id, blur_px: blur }) => `${id}: ${blur.toFixed(2)} px`);
-  return `Fitted: turned by ${told.marks[0].turn_deg.toFixed(2)}°; blur of mark ${blurs.join(", ")}.`;
+  const blurs = reply.marks.map(({ id, blur_px: blur }) => `${id}: ${blur.toFixed(2)} px`);
+  return `Fitted: turned by ${reply.marks[0].turn_deg.toFixed(2)}°; blur of mark ${blurs.join(", ")}.`;
 }
 
 function look(shown) {
@@ -121,7 +121,7 @@ function look(shown) {
 }
 
 async function showPictures() {
-  const shown = told?.shown;
+  const shown = reply?.shown;
   const mine = (generation += 1);
   if (!shown) return;
   await view.load(drawing.image);
@@ -145,11 +145,11 @@ async function showPictures() {
 function show() {
   by("draw-parts").hidden = drawing.mark?.kind !== "parts";
   by("draw-corner-row").hidden = !["parts", "polygon"].includes(drawing.mark?.kind);
-  by("draw-problem").textContent = told?.problem ?? "";
-  if (told) {
-    const pitch = told.pitch_um.map((um) => um.toFixed(2)).join(" × ");
-    by("draw-pitch-told").textContent = `${pitch} µm ${told.pitch_source}`;
-    by("draw-frame-told").textContent = told.frame_mm ? `${told.frame_mm.join(" × ")} mm` : "not known yet";
+  by("draw-problem").textContent = reply?.problem ?? "";
+  if (reply) {
+    const pitch = reply.pitch_um.map((um) => um.toFixed(2)).join(" × ");
+    by("draw-pitch-told").textContent = `${pitch} µm ${reply.pitch_source}`;
+    by("draw-frame-told").textContent = reply.frame_mm ? `${reply.frame_mm.join(" × ")} mm` : "not known yet";
     showForm();
   }
   showMarks();
@@ -161,7 +161,7 @@ function show() {
 function showForm() {
   if (by("draw-form").contains(document.activeElement)) return; // somebody writes there
   by("draw-form").replaceChildren(
-    ...told.form.map(({ key, unit, meaning, choices, value }) => {
+    ...reply.form.map(({ key, unit, meaning, choices, value }) => {
       const label = document.createElement("label");
       const input = document.createElement(choices.length ? "select" : "input");
       if (choices.length) fill(input, choices);
@@ -255,8 +255,8 @@ function drawWhole(pen) {
 }
 
 function drawMark(pen) {
-  if (!told?.shown) return;
-  const { outlines, handles, center } = told.shown;
+  if (!reply?.shown) return;
+  const { outlines, handles, center } = reply.shown;
   if (by("draw-overlay").checked) {
     if (overlay) {
       const { drawn, start } = overlay;
@@ -307,7 +307,7 @@ function setPlacesCorners(on) {
 
 // The handle under the pointer; the mark's own place counts as one, after the others.
 function handleAt(x, y) {
-  const places = [...(told?.shown?.handles ?? []), { key: "place", px: told?.shown?.center ?? [NaN, NaN] }];
+  const places = [...(reply?.shown?.handles ?? []), { key: "place", px: reply?.shown?.center ?? [NaN, NaN] }];
   const apart = ({ px }) => Math.hypot(...view.canvasXY(...px).map((value, axis) => value - [x, y][axis]));
   const nearest = places.reduce((best, one) => (apart(one) < apart(best) ? one : best));
   return apart(nearest) < NEAR_PX ? nearest.key : null;
@@ -315,7 +315,7 @@ function handleAt(x, y) {
 
 const canvas = by("draw-mark");
 canvas.addEventListener("pointerdown", (event) => {
-  if (!told?.shown) return;
+  if (!reply?.shown) return;
   canvas.setPointerCapture(event.pointerId);
   drag = { key: handleAt(...view.eventXY(event)), moved: false };
   if (drag.key && drag.key !== "place") drawing.handle = drag.key;
