@@ -1,7 +1,7 @@
 """The words of the program: no text that a user reads has an avoided phrase.
 
 Texts are found, not listed: string literals of the packages with a blank in them, descriptions of keys, templates, the
-review page and the files that `reseau template` prints.
+review page, the files that `reseau template` prints and the documentation.
 """
 
 import ast
@@ -15,7 +15,7 @@ import pytest
 from pipeline.cli import GROUPS
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ("measure", "adjust", "pipeline", "synthetic_images", "help", "files")
+SOURCES = ("measure", "adjust", "pipeline", "synthetic_images", "help", "files", "docs")
 KINDS = (ast.JoinedStr, ast.Constant, ast.Expr)
 AVOIDED = {  # a pattern, and what to write
     r"(?<![-\w.])um(?![-\w.])": "µm",
@@ -29,7 +29,7 @@ AVOIDED = {  # a pattern, and what to write
     r"\bbelongs?\b|\bastray\b|\bslips?\b|\bfar points?\b": "outlier, gross error",
     r"\bunlike\b|\bown turn\b|\blandscape\b|\bborders? of the ground\b": "model misfit, background texture",
     r"\b(?:the|its|their|The|Its|Their) ground\b": "background (of a mark), terrain (of an image)",
-    r"\bpower of\b|\bunround\b": "gamma, quantisation",
+    r"\bpower of\b(?! the test)|\bunround\b": "gamma, quantisation",
     r"\b(?:takes?|taken|took) up\b": "film deformation model, correlated with",
     r"\bjudg\w+|\bwitness\w*\b|\basked\b": "cross-scan checks",
     r"\bstores?\b": "results database, server",
@@ -55,7 +55,7 @@ CODE = re.compile(r"\\[bdws]|\(\?")
 @cache
 def texts(source: str) -> tuple[tuple[str, str], ...]:
     """Where each text of a package, of its help or of its files stands, and the text on one line."""
-    found = {"help": command_help, "files": other_files}.get(source, partial(literals, source))()
+    found = {"help": command_help, "files": other_files, "docs": pages}.get(source, partial(literals, source))()
     return tuple((where, " ".join(text.split())) for where, text in found if is_text(text))
 
 
@@ -101,6 +101,16 @@ def other_files() -> Iterator[tuple[str, str]]:
         elif suffix == ".toml":
             lines = file.read_text(encoding="utf-8").splitlines()
             yield from ((where, line.partition("#")[2]) for line in lines if "#" in line)
+
+
+def pages() -> Iterator[tuple[str, str]]:
+    """Paragraphs of the documentation, without code. What the program says in generated pages stands in its own."""
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        text = page.read_text(encoding="utf-8")
+        if "generated" in text[:300].lower() or page.name == "code.md":
+            continue
+        text = re.sub(r"^```.*?^```|`[^`]*`|^    .*$", "", text, flags=re.DOTALL | re.MULTILINE)
+        yield from ((str(page.relative_to(ROOT)), paragraph) for paragraph in text.split("\n\n"))
 
 
 @pytest.mark.parametrize("source", SOURCES)
