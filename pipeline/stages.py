@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
+from pipeline.adjusting.turned_pictures import sensor_size_mm
 from pipeline.archive.checked_statuses import (
     checked_marks,
     drop_all_but,
@@ -331,7 +332,9 @@ def _board_pictures(project: Project, new: Unpublished) -> "BoardPictures | None
     pitch_um = pitches_of(new.at(project.comparator))
     if project.pitch_um:
         pitch_um = dict.fromkeys(project.scans, project.pitch_um) | pitch_um
-    return BoardPictures(board, project.open_scan, pitch_um)
+    images = project.given_images.turned_deg if project.given_images else {}
+    turned = {image: (turned_deg, sensor_size_mm(project, image)) for image, turned_deg in images.items()}
+    return BoardPictures(board, project.open_scan, pitch_um, turned)
 
 
 def _reported(project: Project, new: Unpublished) -> Summary:

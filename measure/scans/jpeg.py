@@ -266,6 +266,5 @@ def jpeg_colour_tags(path: Path) -> ColourTags:
     profiles = (body for marker, body in jpeg_headers(data) if marker == 0xE2 and body.startswith(b"ICC_PROFILE\0"))
     pieces = {body[12]: body[14:] for body in profiles}
     exif = _exif_page(data)
-    return ColourTags(
-        b"".join(pieces[number] for number in sorted(pieces)), exif={} if exif is None else exif_tags(exif)
-    )
+    tags = {} if exif is None else {**exif_tags(exif), "Orientation": orientation_tag(exif)}
+    return ColourTags(b"".join(pieces[number] for number in sorted(pieces)), exif=tags)

@@ -15,6 +15,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.network import Board, Image, LineOfSight, Network, ObjectPoint, Transformation
 from adjust.problem.observations import Calibration, Distance, Observations
 from measure.results import ON_FILM
+from pipeline.adjusting.turned_pictures import in_sensor_frame
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile
@@ -78,7 +79,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
 
     Raises InputError where a mark names a point, a fiducial or an image that the project does not have.
     """
-    used = [mark for mark in marks if mark.status.is_observation]
+    used = in_sensor_frame(project, [mark for mark in marks if mark.status.is_observation])
     if not used:
         raise InputError(
             f"{project.comparator}: holds no observation: no mark has the status measured or weak. "

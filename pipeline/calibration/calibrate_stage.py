@@ -23,6 +23,7 @@ from pipeline.adjusting.network import build_network
 from pipeline.calibration.camera_yaml import camera_files
 from pipeline.calibration.intrinsics import CameraIntrinsics, camera_intrinsics
 from pipeline.calibration.lens_choice import LensChoice, LensModel, choose_lens
+from pipeline.calibration.picture_turns import find_turns
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
 from pipeline.calibration.project_files import CalibrationOptions, write_project
 from pipeline.errors import InputError
@@ -118,7 +119,9 @@ class Calibration(PlottedResult):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def _lines(self) -> list[str]:
+        several = len(self.cameras) + len(self.not_calibrated) > 1
         return [
+            *(["Pictures of other sizes or focal lengths are taken for other cameras'."] if several else []),
             *(f"- {name} cannot be read: {why}" for name, why in self.unreadable.items()),
             *(f"- {camera} is not calibrated: {why}" for camera, why in self.not_calibrated.items()),
             *(" ".join((f"- {each.what}", each.next_step)) for each in self.summary.verdict.problems),
@@ -159,6 +162,10 @@ def calibrate_pictures(
             count(camera.name, done, len(pictures.cameras))
             own = [mark for mark in marks if mark.image in camera.images and mark.image not in left_out]
             try:
+                if any(turned is None for turned in camera.turned_deg.values()):
+                    camera = find_turns(project, own, camera)
+                    pictures = pictures.replace_camera(camera)
+                    project = write_project(out, pictures, options, lenses)
                 choices[camera.name] = choice = _chosen_lens(project, own, camera, options, left_out)
                 lenses[camera.name] = choice.model if choice else first
                 adjustments[camera.name] = _adjusted(write_project(out, pictures, options, lenses), own)
@@ -222,7 +229,7 @@ def _chosen_lens(
         raise InputError(
             f"the board is in {counted(len(used), 'picture')} of {camera.width_px} x {camera.height_px} px, and "
             f"{FEWEST_PICTURES} or more with different tilts are needed{others and f' (others: {others})'}. Pictures "
-            "that were turned or cut are taken for another camera's: give them as they were taken."
+            "that were cut are taken for another camera's: give them as they were taken."
         )
     if options.lens != "auto":
         return None

@@ -85,6 +85,8 @@ class CameraIntrinsics:
             "image_size_px": [self.pictures.width_px, self.pictures.height_px],
             "images_used": self.used,
             "images_left_out": dict(self.left_out),
+            "images_turned_deg": dict(self.pictures.turned_deg),
+            "unsure_turns": list(self.pictures.unsure_turns),
             **{f"{name}_px": values.pop(name) for name in CENTRE},
             "distortion": {"family": self.family, **values},
             "correlations": [{"of": [a, b], "value": value} for a, b, value in self.correlations],
@@ -147,6 +149,14 @@ class CameraIntrinsics:
             yield (
                 f"OpenCV, same points: fx {same.fx:.2f}, fy {same.fy:.2f}, cx {same.cx:.2f}, cy {same.cy:.2f} px, rms "
                 f"{same.rms:.3f} px ({self.check.verdict})."
+            )
+        if turned := self.pictures.turned_deg:
+            shown = listed([f"{name} ({degrees}°)" for name, degrees in turned.items()])
+            yield f"Turned counter-clockwise, and turned back into the frame of the others: {shown}."
+        if unsure := self.pictures.unsure_turns:
+            yield (
+                f"Which way {listed(unsure)} {'was' if len(unsure) == 1 else 'were'} turned cannot be told: both ways "
+                "fit alike, for the principal point lies in the middle and the distortion is symmetric."
             )
         if self.left_out:
             yield f"Left out: {listed([f'{name} ({why})' for name, why in self.left_out.items()])}."

@@ -4,8 +4,9 @@ import math
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from measure.errors import MeasurementError
 from measure.scans.jpeg import jpeg_colour_tags
@@ -15,16 +16,26 @@ from pipeline.errors import InputError
 from pipeline.files.scan_files import folders_below
 from pipeline.text.names import SCAN_ENDINGS, names_below
 
+_Kind = tuple[int, int, float | None]  # width, height, focal length
+QUARTERS_DEG = (90, 270)
+TURNS_BY_TAG = {6: 90, 8: 270}  # of Exif's Orientation: viewers turn these back
+
 
 @dataclass(frozen=True)
 class CameraPictures:
-    """Pictures of one size and one focal length (of their Exif tags, None without)."""
+    """Pictures of one size and one focal length (of their Exif tags, None without), some of them turned by a quarter.
+
+    turned_deg: by how much those were turned counter-clockwise against the others, None where only their contents tell.
+    unsure_turns: those whose contents do not tell it either.
+    """
 
     name: str
     width_px: int
     height_px: int
     focal_mm: float | None
     images: tuple[str, ...]
+    turned_deg: Mapping[str, int | None] = field(default_factory=dict)
+    unsure_turns: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -34,6 +45,10 @@ class BoardPictureFiles:
     files: Mapping[str, Path]
     cameras: tuple[CameraPictures, ...]
     unreadable: Mapping[str, str]
+
+    def replace_camera(self, camera: CameraPictures) -> "BoardPictureFiles":
+        """With this camera in the place of the one of its name."""
+        return replace(self, cameras=tuple(camera if each.name == camera.name else each for each in self.cameras))
 
 
 def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
@@ -49,20 +64,27 @@ def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f"two pictures are called {twice[0]!r} without their endings. Move one of them away.")
-    groups, unreadable = defaultdict[tuple[int, int, float | None], list[str]](list), dict[str, str]()
+    groups, unreadable = defaultdict[_Kind, list[str]](list), dict[str, str]()
+    turns = dict[str, int | None]()
     for name, path in zip(names, paths, strict=True):
         try:
             head = read_head(path)
         except MeasurementError as error:
             unreadable[name] = str(error)
             continue
-        groups[head.width_px, head.height_px, _focal_mm(path)].append(name)
+        exif = _exif(path)
+        groups[head.width_px, head.height_px, _focal_mm(exif)].append(name)
+        turns[name] = TURNS_BY_TAG.get(exif.get("Orientation", 1))
     if not groups:
         raise InputError(f"{next(iter(unreadable.values()))} No picture can be read.")
     by_count = sorted(groups.items(), key=lambda group: -len(group[1]))
+    kinds = dict[_Kind, list[str]]()
+    for (width, height, focal), images in by_count:  # of a size and the size turned by a quarter the more frequent
+        turned = (height, width, focal)
+        kinds.setdefault(turned if turned in kinds else (width, height, focal), []).extend(images)
     cameras = [
-        CameraPictures(name, *camera, tuple(images))
-        for name, (camera, images) in zip(_names([camera for camera, _ in by_count]), by_count, strict=True)
+        CameraPictures(name, *kind, tuple(images), {each: turns[each] for each in images if each not in groups[kind]})
+        for name, (kind, images) in zip(_names(list(kinds)), kinds.items(), strict=True)
     ]
     return BoardPictureFiles(dict(zip(names, paths, strict=True)), tuple(cameras), unreadable)
 
@@ -83,18 +105,22 @@ def _files(given: Iterable[Path], out: Path) -> Iterator[Path]:
                     yield folder / name
 
 
-def _focal_mm(path: Path) -> float | None:
-    """The focal length of a picture's Exif tags; None where it has none."""
+def _exif(path: Path) -> Mapping[str, Any]:
+    """The Exif tags of a picture; none where it has none."""
     try:
-        focal = jpeg_colour_tags(path).exif.get("FocalLength")
+        return jpeg_colour_tags(path).exif
     except (*DECODING_ERRORS, OSError):
-        return None
+        return {}
+
+
+def _focal_mm(exif: Mapping[str, Any]) -> float | None:
+    focal = exif.get("FocalLength")
     if isinstance(focal, tuple) and len(focal) == 2:  # a fraction, as the tag has it
         focal = focal[0] / focal[1] if focal[1] else 0.0
     return (round(focal, 3) or None) if isinstance(focal, float | int) and math.isfinite(focal) else None
 
 
-def _names(cameras: Sequence[tuple[int, int, float | None]]) -> list[str]:
+def _names(cameras: Sequence[_Kind]) -> list[str]:
     """ "camera" where there is one; else what tells them apart."""
     if len(cameras) == 1:
         return ["camera"]

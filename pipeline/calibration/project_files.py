@@ -35,24 +35,26 @@ class CalibrationOptions:
 def write_project(
     out: Path, pictures: BoardPictureFiles, options: CalibrationOptions, lenses: Mapping[str, LensModel]
 ) -> Project:
-    """Write project.toml, a camera file for each camera, and images.csv where there are several; read the project."""
+    """Write project.toml, a camera file for each camera, and images.csv where pictures differ; read the project."""
     out.mkdir(parents=True, exist_ok=True)
     for camera in pictures.cameras:
         write_atomically(out / f"{camera.name}.toml", _camera_text(camera, options, lenses[camera.name]))
-    several = len(pictures.cameras) > 1
-    if several:
-        lines = ["image,camera"]
-        lines += [csv_line([name, f"{each.name}.toml"]) for each in pictures.cameras for name in each.images]
+    has_lines = len(pictures.cameras) > 1 or any(camera.turned_deg for camera in pictures.cameras)
+    if has_lines:
+        lines = ["image,camera,turned_deg"]
+        for each in pictures.cameras:
+            cells = ((name, f"{each.name}.toml", each.turned_deg.get(name) or "") for name in each.images)
+            lines += [csv_line([name, file, str(turned)]) for name, file, turned in cells]
         write_atomically(out / "images.csv", "\n".join([*lines, ""]))
-    write_atomically(out / "project.toml", _project_text(out, pictures, options, several))
+    write_atomically(out / "project.toml", _project_text(out, pictures, options, has_lines))
     return read_project(out / "project.toml")
 
 
-def _project_text(out: Path, pictures: BoardPictureFiles, options: CalibrationOptions, several: bool) -> str:
+def _project_text(out: Path, pictures: BoardPictureFiles, options: CalibrationOptions, has_lines: bool) -> str:
     files = (pictures.files[name] for camera in pictures.cameras for name in camera.images)
     scans = ", ".join(quoted(os.path.relpath(path, out)) for path in files)
     unknown = "" if options.pitch_um else "# The pixel size is not given: of all in mm only ratios count.\n"
-    images = 'images = "images.csv"\n' if several else ""
+    images = 'images = "images.csv"\n' if has_lines else ""
     bend = 'board_bend = "free"\n' if options.board.bend else ""
     return f"""# Written by `reseau calibrate`; `reseau run` goes on with it.
 camera = "{pictures.cameras[0].name}.toml"

@@ -11,6 +11,7 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import LineOfSight
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
+from pipeline.adjusting.turned_pictures import in_sensor_frame
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -220,7 +221,7 @@ def read_block(project: Project) -> Block:
     adjustment = _adjustment(project, marks)
     pitches = pitches_of(project.comparator)
     by_image: dict[str, list[ComparatorPoint]] = {mark.image: [] for mark in marks}
-    for mark in marks:
+    for mark in in_sensor_frame(project, marks):
         if mark.status.is_observation:
             by_image[mark.image].append(mark)
     frames = [

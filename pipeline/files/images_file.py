@@ -19,7 +19,7 @@ from pipeline.text.text_file import read_bytes
 
 ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = tuple(f"s{element}" for element in ELEMENTS)
-_FURTHER = ("camera", "scanner", "part_of", "page", "window")
+_FURTHER = ("camera", "scanner", "part_of", "page", "window", "turned_deg")
 WRITTEN = ("run", "frame", "date", "time", "height", "scale", "camera_number")  # what may be read on the film
 
 
@@ -28,13 +28,15 @@ class GivenImages:
     """By image name: exterior orientation (None where the line gives none), the camera file's name and the scanner's
     ("" where none), and the frame of which it is one of several overlapping scans ("" where it is the only one): such
     parts have the orientation that one of their lines gives. cuts: the page and the window of a scan's file that the
-    image is, where a line says either. asks_writing: whether there is a column for what may be
+    image is, where a line says either. turned_deg: by how much a digital picture was turned counter-clockwise, where it
+    was. asks_writing: whether there is a column for what may be
     read on the film."""
 
     exterior: Mapping[str, Exterior | None]
     camera: Mapping[str, str]
     scanner: Mapping[str, str] = field(default_factory=dict)
     asks_writing: bool = False
+    turned_deg: Mapping[str, int] = field(default_factory=dict)
     part_of: Mapping[str, str] = field(default_factory=dict)
     cuts: Mapping[str, tuple[int | None, Window | None]] = field(default_factory=dict)
 
@@ -50,9 +52,8 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
     """
     exterior: dict[str, Exterior | None] = {}
     camera, scanner, part_of, cuts, asks_writing = {}, {}, {}, dict[str, tuple[int | None, Window | None]](), False
-    for row in read_csv(
-        path, ("image",), (*ELEMENTS, *SIGMAS, "camera", "scanner", "part_of", "page", "window", *WRITTEN)
-    ):
+    turned_deg = dict[str, int]()
+    for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, *_FURTHER, *WRITTEN)):
         name = image_name(row.name("image"))
         if name in exterior:
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
@@ -61,9 +62,20 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
         page, window = _page(row), _window(row)
         if page or window:
             cuts[name] = page, window
+        if turned := _turned(row):
+            turned_deg[name] = turned
         asks_writing = any(column in row.cells for column in WRITTEN)
     _join(path, exterior, camera, part_of)
-    return GivenImages(exterior, camera, scanner, asks_writing, part_of, cuts)
+    return GivenImages(exterior, camera, scanner, asks_writing, turned_deg, part_of, cuts)
+
+
+def _turned(row: Row) -> int:
+    text = row.text("turned_deg")
+    if text not in ("", "0", "90", "180", "270"):
+        raise row.error(
+            "turned_deg", f"is {text!r}: 0, 90, 180 or 270 is right, the counter-clockwise turn of a picture."
+        )
+    return int(text or 0)
 
 
 def _page(row: Row) -> int | None:

@@ -195,6 +195,10 @@ class Project:
         """The frame of which an image is one of several scans, "" where it is the only one."""
         return self.given_images.part_of.get(image, "") if self.given_images else ""
 
+    def turned_deg(self, image: str) -> int:
+        """By how much a digital picture was turned counter-clockwise against the sensor."""
+        return self.given_images.turned_deg.get(image, 0) if self.given_images else 0
+
     @property
     def has_parts(self) -> bool:
         """Whether a frame was scanned in several parts."""

@@ -1,7 +1,7 @@
 """A board's points as OpenCV itself finds them in a digital picture, beside those that were measured here."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from measure.boards.markers import charuco_board
 from measure.boards.specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec, aruco_dictionary
 from measure.errors import MeasurementError
 from measure.scans.scan import Scan
+from pipeline.adjusting.turned_pictures import turned_back
 from pipeline.opencv_check.opencv_calibration import ImagePoints, OpenCvCalibration, can_begin
 from pipeline.results.check_file import CornersCheck, PixelCalibration
 from pipeline.results.comparator_file import comparator_from_pixel
@@ -30,14 +31,16 @@ FEWEST_PICTURES = 3
 @dataclass(frozen=True)
 class BoardPictures:
     """The pictures of a board. open_scan: of an image, raises MeasurementError or KeyError where its scan is not at
-    hand; pitch_um: across and down, by image."""
+    hand; pitch_um: across and down, by image; turned: (quarters counter-clockwise in degrees, size of the sensor), of
+    the images that were turned."""
 
     board: BoardSpec
     open_scan: Callable[[str], Scan]
     pitch_um: Mapping[str, tuple[float, float]]
+    turned: Mapping[str, tuple[int, tuple[float, float]]] = field(default_factory=dict)
 
     def points_mm(self, image: str) -> Array:
-        """(n, 2) the points that OpenCV finds, in comparator coordinates; none where the scan is not at hand."""
+        """(n, 2) the points that OpenCV finds, in the frame of the sensor, mm; none where the scan is not at hand."""
         try:
             with self.open_scan(image) as scan:
                 grey = scan.window(0, 0, scan.width_px, scan.height_px) * (255.0 / scan.full_scale_dn)
@@ -45,7 +48,8 @@ class BoardPictures:
         except (MeasurementError, KeyError):
             return np.zeros((0, 2))
         picture = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
-        return comparator_from_pixel(find_points(picture, self.board), pitch_um)
+        points_mm = comparator_from_pixel(find_points(picture, self.board), pitch_um)
+        return turned_back(points_mm, *self.turned[image]) if image in self.turned else points_mm
 
 
 def detector_name(board: BoardSpec) -> str:

@@ -17,6 +17,7 @@ from PIL import Image
 from test_check_corners import CENTER_PX, FOCAL_PX, SIZE_PX, TURNS, picture
 
 import reseau
+from pipeline.adjusting.turned_pictures import turned_back
 from pipeline.calibration import board_calibration
 from pipeline.calibration.board_options import board_options
 from pipeline.calibration.calibrate_stage import Calibration
@@ -28,7 +29,7 @@ from pipeline.text.tables import Table
 
 TOO_FEW = (
     "the board is in 1 picture of 440 x 360 px, and 3 or more with different tilts are needed. Pictures that were "
-    "turned or cut are taken for another camera's: give them as they were taken."
+    "cut are taken for another camera's: give them as they were taken."
 )
 BOARD = ("--board", "7x5", "--square", "2cm")
 
@@ -37,7 +38,8 @@ BOARD = ("--board", "7x5", "--square", "2cm")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("pictures")
     for number in range(len(TURNS)):
-        Image.fromarray(picture(number)).save(made / f"p{number}.png")
+        shown = np.rot90(picture(number)) if number == 4 else picture(number)  # of the same camera, held upright
+        Image.fromarray(shown).save(made / f"p{number}.png")
     Image.fromarray(np.full((SIZE_PX[1], SIZE_PX[0]), 128, np.uint8)).save(made / "grey.png")
     Image.fromarray(np.pad(picture(1), 20, constant_values=210)).save(made / "wider.png")
     (made / "torn.png").write_bytes((made / "p0.png").read_bytes()[:100])
@@ -71,6 +73,7 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     assert list(result["unreadable"]) == ["torn"]
     assert result["not_calibrated"] == {"camera-440x360": TOO_FEW}  # and costs the other camera nothing
     assert (camera["name"], camera["image_size_px"], camera["images_used"]) == ("camera-400x320", list(SIZE_PX), 5)
+    assert (camera["images_turned_deg"], camera["unsure_turns"]) == ({"p4": 90}, [])
     assert camera["images_left_out"] == {"grey": "the scan has no contrast: its grey values span 0.0 % of the scale"}
     for name, truth in (("fx", FOCAL_PX), ("fy", FOCAL_PX), ("cx", CENTER_PX[0]), ("cy", CENTER_PX[1])):
         each = camera[f"{name}_px"]
@@ -143,6 +146,29 @@ def test_pictures_are_sorted_by_size_and_results_are_no_pictures(tmp_path: Path)
     ]
     with pytest.raises(InputError, match="there is no picture"):
         find_pictures([tmp_path / "out"], tmp_path / "out")
+
+
+def test_a_picture_turned_by_a_quarter_is_of_the_same_camera(tmp_path: Path) -> None:
+    """By the tag where it has one; else it is left to what the pictures show."""
+    for name, size, tag in (("a", (40, 30), 6), ("b", (40, 30), 1), ("c", (30, 40), 8), ("d", (30, 40), 1)):
+        exif = Image.Exif()
+        exif[0x0112] = tag
+        Image.new("L", size).save(tmp_path / f"{name}.jpg", exif=exif)
+    Image.new("L", (40, 30)).save(tmp_path / "e.png")
+    (camera,) = find_pictures([tmp_path], tmp_path / "out").cameras
+    assert (camera.name, camera.images) == ("camera", ("a", "b", "e", "c", "d"))
+    assert (camera.width_px, camera.height_px) == (40, 30)
+    assert camera.turned_deg == {"c": 270, "d": None}
+
+
+@pytest.mark.parametrize("turned_deg", [0, 90, 180, 270])
+def test_marks_of_a_turned_picture_are_turned_back(turned_deg: int) -> None:
+    """A pixel of a drawn picture, whose middle is where it was."""
+    drawn = np.zeros((3, 5))
+    drawn[1, 3] = 1.0
+    (row,), (column,) = np.nonzero(np.rot90(drawn, turned_deg // 90))
+    place = turned_back(np.array([0.01 * column, -0.01 * row]), turned_deg, (0.04, 0.02))
+    np.testing.assert_allclose(place, [0.03, -0.01])
 
 
 def test_pictures_of_other_focal_lengths_are_of_other_cameras(tmp_path: Path) -> None:

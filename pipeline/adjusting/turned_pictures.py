@@ -1,0 +1,53 @@
+"""Digital pictures that were turned by quarters: their marks in the frame of the sensor, which is one for all."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.files.project_file import Project
+from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.types import Array
+
+
+def in_sensor_frame(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
+    """The marks as they would be in pictures that nobody turned, by the column turned_deg of images.csv.
+
+    Raises InputError where the size of the picture, which this needs, is not known.
+    """
+    return [_turned_back(project, mark) if project.turned_deg(mark.image) else mark for mark in marks]
+
+
+def turned_back(xy_mm: Array, turned_deg: int, last_mm: tuple[float, float]) -> Array:
+    """(..., 2) comparator coordinates of a picture that was turned counter-clockwise, in the picture as it was before.
+
+    last_mm: from the first pixel to the last one of a row and of a column of the picture before, mm.
+    """
+    x, y = np.moveaxis(np.asarray(xy_mm, float), -1, 0)
+    width, height = last_mm
+    places = {0: (x, y), 90: (y + width, -x), 180: (width - x, -height - y), 270: (-y, x - height)}
+    return np.stack(places[turned_deg], axis=-1)
+
+
+def sensor_size_mm(project: Project, image: str) -> tuple[float, float]:
+    """From the first pixel to the last one of a row and of a column of the sensor. Raises InputError."""
+    camera, pitch_um = project.camera_of(image), project.pitch_um
+    if camera.frame_mm is None or pitch_um is None:
+        raise InputError(
+            f"{project.images_path}: image {image!r} is turned (column turned_deg), which needs the size of the "
+            f"picture: give frame_mm in {camera.path} and pitch_um in {project.path}."
+        )
+    (width, height), (across, down) = camera.frame_mm, pitch_um
+    return width - across / 1000.0, height - down / 1000.0
+
+
+def _turned_back(project: Project, mark: ComparatorPoint) -> ComparatorPoint:
+    if mark.xy_mm is None:
+        return mark
+    turned_deg = project.turned_deg(mark.image)
+    xy_mm = turned_back(mark.xy_mm, turned_deg, sensor_size_mm(project, mark.image))
+    if turned_deg == 180:
+        return replace(mark, xy_mm=xy_mm)
+    sigma_mm = None if mark.sigma_mm is None else mark.sigma_mm[::-1].copy()
+    return replace(mark, xy_mm=xy_mm, sigma_mm=sigma_mm, rho=-mark.rho)

@@ -1,0 +1,104 @@
+"""By which quarter turn a picture of a board was turned: by the one that fits the lens of the other pictures."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+from adjust.errors import AdjustmentError
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera
+from adjust.problem.network import Network
+from adjust.problem.parameter import Parameter
+from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
+from pipeline.adjusting.adjust_stage import adjustment_options
+from pipeline.adjusting.network import build_network
+from pipeline.calibration.pictures import QUARTERS_DEG, CameraPictures
+from pipeline.files.images_file import GivenImages
+from pipeline.files.project_file import Project
+from pipeline.results.comparator_file import ComparatorPoint
+
+PLAIN = 20.0  # twice the log of the odds, e to the 10
+FEWEST_PICTURES = 3  # that determine the lens by which the others are judged
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Weighted squares of residuals, and how many redundant observations they come of."""
+
+    vpv: float
+    redundancy: int
+
+
+def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: CameraPictures) -> CameraPictures:
+    """The camera's pictures with the turn of each; `unsure_turns`: those which both turns fit alike.
+
+    The principal point and decentering distortion, which turn with the picture, tell one turn from the other: each
+    picture is resected with the lens of those whose turn is known, or, where these are too few, all are adjusted with
+    either turn. Raises AdjustmentError or InputError where the pictures of known turns have no solution.
+
+    Parameters
+    ----------
+    marks : of the camera's pictures
+    """
+    open_turns = [name for name in camera.images if camera.turned_deg.get(name, 0) is None]
+    known = {name: turn for name, turn in camera.turned_deg.items() if turn is not None}
+    shown = {mark.image for mark in marks}
+    sought = [name for name in open_turns if name in shown]
+    if not sought:
+        return replace(camera, turned_deg=known | dict.fromkeys(open_turns, QUARTERS_DEG[0]))
+    fixed = sorted(shown - set(sought))
+    adjusted = partial(adjust, options=adjustment_options(project))
+
+    def network_of(images: Collection[str], turns: Mapping[str, int]) -> Network:
+        given = project.given_images or GivenImages({}, {})
+        turned = replace(project, given_images=replace(given, turned_deg=turns))
+        return build_network(turned, [mark for mark in marks if mark.image in images])[0]
+
+    groups = [[name] for name in sought]
+    lens: Adjustment | None = None
+    if len(fixed) >= FEWEST_PICTURES:
+        lens = adjusted(network_of(fixed, known))
+    else:
+        groups = [sought]  # all alike
+    turns, unsure = dict[str, int](), list[str]()
+    for group in groups:
+        fits = dict[int, _Fit]()
+        for turn in QUARTERS_DEG:
+            images = group if lens else [*fixed, *group]
+            network = network_of(images, known | dict.fromkeys(group, turn))
+            if lens is not None:
+                network = replace(network, cameras=(_held_camera(network.cameras[0], lens),))
+            try:
+                found = adjusted(network)
+            except AdjustmentError:
+                continue
+            fits[turn] = _Fit(found.vpv, found.redundancy)
+        best = min(fits, key=lambda turn: fits[turn].vpv, default=QUARTERS_DEG[0])
+        turns |= dict.fromkeys(group, best)
+        if not _is_plain(fits, best):
+            unsure += group
+    sure = [turns[name] for name in sought if name not in unsure]
+    usual = max(QUARTERS_DEG, key=sure.count) if sure else QUARTERS_DEG[0]
+    turns |= dict.fromkeys([*unsure, *(name for name in open_turns if name not in shown)], usual)
+    return replace(camera, turned_deg=known | turns, unsure_turns=tuple(unsure))
+
+
+def _is_plain(fits: Mapping[int, _Fit], best: int) -> bool:
+    """Whether one turn fits so much better than the other that chance does not explain it."""
+    if len(fits) < len(QUARTERS_DEG):
+        return bool(fits)
+    variance = max(fits[best].vpv / max(fits[best].redundancy, 1), 1.0)
+    return all((fit.vpv - fits[best].vpv) / variance > PLAIN for turn, fit in fits.items() if turn != best)
+
+
+def _held_camera(camera: Camera, fitted: Adjustment) -> Camera:
+    """The camera as it was adjusted, held fixed."""
+
+    def prior(name: str) -> Prior:
+        return Prior(fitted.value(Parameter.interior(camera.name, name)), 0.0)
+
+    distortion = replace(camera.distortion, parameters={name: prior(name) for name in camera.distortion.parameters})
+    return replace(
+        camera, principal_distance_mm=prior("c"), x0_mm=prior("x0"), y0_mm=prior("y0"), distortion=distortion
+    )
