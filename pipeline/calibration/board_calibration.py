@@ -26,6 +26,7 @@ def calibrate(
     marker: str | None = None,
     dictionary: str | None = None,
     legacy: bool = False,
+    first_id: int = 0,
     lens: str = "auto",
     square_pixels: bool = False,
     pitch_um: float | None = None,
@@ -41,10 +42,11 @@ def calibrate(
     pictures : a folder or a picture, or several of these
     board : columns x rows, such as "9x6": inner corners of a chessboard, squares, markers or circles
     square : side of a square, or distance from one marker or circle to the next, with its unit, such as "25mm"
-    kind : chessboard, charuco, aruco, circle-grid or asymmetric-circle-grid
+    kind : chessboard, charuco, aprilgrid, aruco, circle-grid or asymmetric-circle-grid
     marker : side of a marker or diameter of a circle, with its unit
     dictionary : of the markers, such as "4X4_50"
     legacy : whether a ChArUco board has the older layout; both are tried without
+    first_id : number of the first marker
     lens : opencv4, opencv5, opencv8, fisheye, or auto, by cross-validation
     square_pixels : whether x and y have one focal length
     pitch_um : side of a pixel, for results in mm
@@ -70,7 +72,7 @@ def calibrate(
     """
     if lens not in LENSES:
         raise InputError(f"--lens {lens}: possible are {', '.join(LENSES)}.{did_you_mean(lens, LENSES)}")
-    given = board_options(kind, board, square, marker, dictionary, legacy)
+    given = board_options(kind, board, square, marker, dictionary, legacy, first_id)
     options = CalibrationOptions(given, LENSES[lens], square_pixels, pitch_um, ros)
     paths = [pictures] if isinstance(pictures, str | os.PathLike) else pictures
     return calibrate_pictures([Path(path) for path in paths], Path(out), options, reporter or Reporter(), workers)

@@ -47,6 +47,7 @@ def calibrate(
         marker=marker,
         dictionary=dictionary,
         legacy=legacy,
+        first_id=first_id,
         lens=lens,
         square_pixels=square_pixels,
         pitch_um=pitch_um,
