@@ -24,7 +24,7 @@ from measure.boards.measure import measure_board
 from measure.boards.specs import ChessboardSpec, CircleGridSpec
 from measure.scans.opening import open_scan
 from pipeline.calibration.board_options import board_options
-from pipeline.calibration.calibrate_stage import calibrate
+from pipeline.calibration.calibrate_stage import calibrate_pictures
 from pipeline.calibration.project_files import CalibrationOptions
 from pipeline.progress import Count, Reporter
 
@@ -79,7 +79,9 @@ def case(board: str, width: int, pictures: int, opencv: str, seed: int) -> dict[
                 measure_board(scan, spec)
         measuring_s = time.process_time() - begun
         begun = sum(os.times()[:4])  # the process that measures, too
-        calibrate([Path(folder)], Path(folder) / "out", CalibrationOptions(board_options(*options)), reporter, 1)
+        calibrate_pictures(
+            [Path(folder)], Path(folder) / "out", CalibrationOptions(board_options(*options)), reporter, 1
+        )
         command_s = sum(os.times()[:4]) - begun
     spent_s = measuring_s + reporter.cpu_s["calibrating"]
     return found | {
