@@ -1,5 +1,6 @@
 """What the site of the documentation has beside docs/: formulas as MathML, and pages from elsewhere in the project."""
 
+import json
 import re
 from pathlib import Path
 
@@ -24,8 +25,31 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, source in PAGES.items():
         text = (ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, name, content=re.sub(r"\]\((?:\.\./)?docs/", "](", text)))
+    for path in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=_notebook(path)))
     files.append(File.generated(config, "reference/python.md", content=_names_of_faces()))
     return files
+
+
+def _notebook(path: Path) -> str:
+    """The page of a notebook: its cells, and what these show."""
+    lines = []
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            lines.append(text)
+            continue
+        lines.append(f"```python\n{text}\n```")
+        for output in cell["outputs"]:
+            data = output.get("data", {})
+            if "image/png" in data:
+                lines.append(f'<img alt="figure" src="data:image/png;base64,{data["image/png"].strip()}">')
+            elif "text/html" in data:
+                lines.append("".join(data["text/html"]))
+            elif "text" in output:
+                lines.append(f"```text\n{''.join(output['text'])}```")
+    lines.append(f"[This page as a notebook]({path.name})")
+    return "\n\n".join(lines)
 
 
 def _names_of_faces() -> str:
@@ -44,6 +68,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     root = "../" * page.file.src_uri.count("/")
     for name, source in PAGES.items():
         markdown = re.sub(rf"\]\((?:\.\./)+{re.escape(source)}", f"]({root}{name}", markdown)
+    markdown = re.sub(r"\]\(((?:\.\./)?notebooks/[\w-]+)\.ipynb\)", r"](\1.md)", markdown)
     parts = _CODE.split(markdown)  # every second one is code
     parts[::2] = [_FORMULA.sub(_mathml, part) for part in parts[::2]]
     return "".join(parts)

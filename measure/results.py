@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import chdtrc
@@ -161,6 +161,25 @@ class FrameMeasurement:
     def marks_because(self, code: Code) -> tuple[MarkMeasurement, ...]:
         """Those of whose reason this is a code."""
         return tuple(mark for mark in self.marks if code in mark.reason.codes)
+
+    def to_pandas(self) -> Any:
+        """One row a mark, as pandas.DataFrame, in px. Raises ImportError where pandas is not installed."""
+        try:
+            import pandas as pd
+        except ImportError:
+            message = "Tables need pandas, which this installation lacks. Install: pip install pandas."
+            raise ImportError(message) from None
+        nothing = np.full(2, np.nan)
+        places = np.array([nothing if mark.center_px is None else mark.center_px for mark in self.marks]).reshape(-1, 2)
+        covariances = (mark.covariance_px2 for mark in self.marks)
+        sigmas = [nothing if each is None else np.sqrt(np.diag(each)) for each in covariances]
+        columns: dict[str, Any] = {
+            name: [str(getattr(mark, name)) for mark in self.marks] for name in ("point", "kind")
+        }
+        columns |= {"status": [str(mark.status) for mark in self.marks]}
+        columns |= dict(zip(("column_px", "row_px"), places.T, strict=True))
+        columns |= dict(zip(("sigma_column_px", "sigma_row_px"), np.reshape(sigmas, (-1, 2)).T, strict=True))
+        return pd.DataFrame(columns | {"reason": [str(mark.reason) for mark in self.marks]})
 
     def __repr__(self) -> str:
         counts = Counter(str(mark.status) for mark in self.marks)

@@ -24,7 +24,8 @@ BAND = 1.959964  # standard deviations to a probability of 95 %
 LONGEST = 0.08  # of the picture's longer side, drawn for the longest residuals
 CELLS = 8  # of the coverage along the longer side
 FEWEST_LEVELS = 5
-ROUND = (1.0, 2.0, 5.0)
+ROUND = (1.0, 2.0, 5.0)  # times powers of ten
+FINER = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 TARGET, FIDUCIAL, OUTLINE = "#1f5fa8", "#c2571a", "#777777"
 
 
@@ -80,7 +81,7 @@ class CameraPlots:
         key = _round_below(longest)
         axes.quiverkey(quiver, 0.95, -0.1, key, f"{key:g} {self._short_unit}", labelpos="W")
         if self.is_fiducial.any():
-            axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.06), ncols=2, frameon=False, fontsize="small")
+            axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.11), ncols=2, frameon=False, fontsize="small")
         rms = np.sqrt((sizes**2).mean())
         axes.set_title(f"{self.name}: residuals, rms {rms:.3g} {self._short_unit} a point", loc="left", fontsize=10)
         return axes
@@ -275,15 +276,16 @@ class PlottedResult(ABC):
 
 
 def contour_levels(values: Array) -> list[float]:
-    """Round levels over values: 1, 2 and 5 times powers of ten, or where these are few, round steps."""
+    """Round levels over values: by ratios, finer ones where these are few, or steps where values are close."""
     finite = values[np.isfinite(values)]
     if not finite.size or not finite.max() > 0.0:
         raise AdjustmentError("No point of the picture has a standard deviation: nothing was estimated of the camera.")
     low, high = max(float(finite.min()), 1e-3 * float(finite.max())), float(finite.max())
     powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
-    levels = sorted(float(f"{m * power:.3g}") for power in powers for m in ROUND if low <= m * power <= high)
-    if len(levels) >= FEWEST_LEVELS:
-        return levels
+    for series in (ROUND, FINER):
+        levels = sorted(float(f"{m * power:.3g}") for power in powers for m in series if low <= m * power <= high)
+        if len(levels) >= FEWEST_LEVELS:
+            return levels
     step = _round_below(max(high - low, 1e-3 * high) / FEWEST_LEVELS)
     return [float(f"{k * step:.6g}") for k in range(int(np.ceil(low / step)), int(high / step) + 1)] or [high]
 
@@ -313,7 +315,7 @@ def _axes(axes: "Axes | None", size_in: tuple[float, float]) -> "Axes":
 
 
 def _log_norm(levels: list[float]) -> "LogNorm | None":
-    """Colours by ratios where the levels span more than one power of ten."""
+    """Colours by ratios where the levels are."""
     from matplotlib.colors import LogNorm
 
-    return LogNorm(levels[0], levels[-1]) if len(levels) > 1 and levels[-1] > 10.0 * levels[0] else None
+    return LogNorm(levels[0], levels[-1]) if len(levels) > 1 and levels[-1] > 3.0 * levels[0] else None

@@ -20,7 +20,7 @@ def names(project: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     mpl.use("Agg")
     project.rename(project.with_name("demo"))
     monkeypatch.chdir(project.parent)
-    (code,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    _, code = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     made: dict[str, Any] = {}
     exec(compile(code, PAGE.name, "exec"), made)
     return made
