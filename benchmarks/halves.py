@@ -1,0 +1,250 @@
+"""Do standard deviations of board calibrations hold? Differences between two random halves of the pictures.
+
+Each set is split 40 times into two halves that are calibrated by themselves: this program with an unmodelled error and
+the larger of the model's standard deviation and that over pictures, and `cv2.calibrateCameraExtended` with the same
+corners. A difference over the root of the sum of both claimed variances should scatter by 1: the figures are 1.48 times
+the median of its size. All splits of a set share its pictures: `range` holds 90 % of the figures that a true claim
+gives, by simulation with as many pictures. --corners FOLDER keeps what was measured.
+"""
+
+import pickle
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.lens import Prior
+from adjust.problem.camera import Camera
+from adjust.problem.network import Image, Network, ObjectPoint
+from adjust.problem.observations import Observations
+from adjust.solution.adjustment import adjust
+from adjust.solution.unmodelled_error import adjust_unmodelled
+from benchmarks.harness import DATA, Row
+from measure.boards.corners import one_definition
+from measure.boards.measure import measure_board
+from measure.boards.specs import ChessboardSpec
+from measure.scans.opening import open_scan
+from pipeline.calibration.intrinsics import camera_intrinsics
+from pipeline.calibration.lens_choice import LensModel, lens_of
+from pipeline.calibration.pictures import CameraPictures
+from pipeline.results.comparator_file import read_comparator
+
+Array = NDArray[np.float64]
+QUANTITIES = ("fx", "fy", "cx", "cy", "k1")
+COLUMNS = {"set": "s", "pictures": "d", "lens": "s", "range": "s", "all": ".2f"} | dict.fromkeys(QUANTITIES, ".2f")
+COLUMNS |= {"model": ".2f", "opencv": ".2f"}
+SPLITS, SIMULATIONS = 40, 2000
+PIXEL_MM = 0.005
+SEED = 1
+GIVEN_PX = 0.02  # of published corners, whose standard deviations nobody tells
+ROBUST = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """Of a picture: points (n, 3) of the board and places (n, 2) in px, y down, with covariances (n, 2, 2)."""
+
+    points: Array
+    places_px: Array
+    covariance_px2: Array
+
+
+@dataclass(frozen=True)
+class BoardSet:
+    """Pictures of one camera; corners: by picture."""
+
+    size_px: tuple[int, int]
+    lens: LensModel
+    corners: Callable[[], Sequence[Corners]]
+
+
+def measured(pattern: str, spec: ChessboardSpec) -> list[Corners]:
+    """Corners of pictures, measured by this program."""
+    marks, points = [], spec.object_points()
+    for path in sorted(DATA.glob(pattern)):
+        with open_scan(path) as scan:
+            marks.append(measure_board(scan, spec).marks)
+    found = []
+    for each in one_definition(marks):
+        seen = [mark for mark in each if mark.status.is_observation]
+        if len(seen) >= 4:
+            places = np.array([mark.center_px for mark in seen])
+            covariances = np.array([mark.covariance.px2 for mark in seen if mark.covariance is not None])
+            found.append(Corners(np.array([points[mark.point] for mark in seen]), places, covariances))
+    return found
+
+
+def published(name: str) -> list[Corners]:
+    """Corners that Bouguet's toolbox measured, as its result has them."""
+    from scipy.io import loadmat
+
+    found = loadmat(DATA / "chessboards" / "bouguet" / name)
+    numbers = sorted(int(key[2:]) for key in found if key.startswith("x_") and key[2:].isdigit())
+    pairs = [(found[f"X_{number}"].T, found[f"x_{number}"].T) for number in numbers]
+    pairs = [(points, places) for points, places in pairs if places.shape[1] == 2 and np.isfinite(places).all()]
+    return [Corners(points, places, np.tile(GIVEN_PX**2 * np.eye(2), (len(points), 1, 1))) for points, places in pairs]
+
+
+def listed(folder: Path, pitch_mm: float) -> list[Corners]:
+    """Corners of a comparator.csv."""
+    lines = (folder / "points.csv").read_text(encoding="utf-8").splitlines()[1:]
+    points = {line.split(",")[0]: [float(value) for value in line.split(",")[1:4]] for line in lines}
+    by_image: dict[str, list[Any]] = {}
+    for mark in read_comparator(folder / "comparator.csv"):
+        if mark.status.is_observation:
+            by_image.setdefault(mark.image, []).append(mark)
+    found = []
+    for marks in by_image.values():
+        places = np.array([mark.xy_mm for mark in marks]) * [1.0, -1.0] / pitch_mm
+        sigmas = np.array([mark.sigma_mm for mark in marks]) / pitch_mm
+        covariances = sigmas[:, :, None] * sigmas[:, None] * np.eye(2)
+        found.append(Corners(np.array([points[mark.point] for mark in marks]), places, covariances))
+    return found
+
+
+BOUGUET = "chessboards/bouguet/Image*.tif"
+SETS = {
+    "OpenCV left": BoardSet(
+        (640, 480), "opencv4", partial(measured, "chessboards/opencv/left[01]*.jpg", ChessboardSpec(9, 6, 25.0))
+    ),
+    "OpenCV right": BoardSet(
+        (640, 480), "opencv4", partial(measured, "chessboards/opencv/right[01]*.jpg", ChessboardSpec(9, 6, 25.0))
+    ),
+    "Bouguet left": BoardSet((640, 480), "opencv4", partial(published, "Calib_Results_left.mat")),
+    "Bouguet right": BoardSet((640, 480), "opencv4", partial(published, "Calib_Results_right.mat")),
+    "Bouguet, 25 pictures": BoardSet((640, 480), "opencv4", partial(measured, BOUGUET, ChessboardSpec(13, 12, 30.0))),
+    "BoofCV": BoardSet(
+        (640, 480), "opencv4", partial(measured, "circles/boofcv/*_Chess/frame*.jpg", ChessboardSpec(6, 4, 30.0))
+    ),
+    "carnd_34": BoardSet(
+        (1280, 720), "opencv5", partial(listed, DATA.parent / "reports" / "calibration" / "carnd_34", 0.01)
+    ),
+}
+
+
+def cells() -> Iterator[dict[str, Any]]:
+    for name in SETS:
+        yield {"set": name}
+
+
+def case(set: str, seed: int, corners: str | None = None) -> dict[str, Any]:
+    """The splits of one set; corners: a folder that keeps what was measured."""
+    chosen = SETS[set]
+    pictures = kept_corners(set, None if corners is None else Path(corners))
+    rng = np.random.default_rng(seed)
+    claims = ("ours", "model", "opencv")
+    scores: dict[str, list[Array]] = {claim: [] for claim in claims}
+    for _ in range(SPLITS):
+        order = rng.permutation(len(pictures))
+        half = len(pictures) // 2
+        halves = [[pictures[each] for each in part] for part in (order[:half], order[half:])]
+        both = [calibrated(chosen, part) for part in halves]
+        if None in both:
+            continue
+        for claim in claims:
+            (a, a_sigma), (b, b_sigma) = (each[claim] for each in both if each is not None)
+            scores[claim].append((a - b) / np.hypot(a_sigma, b_sigma))
+    sizes = {claim: np.abs(np.array(each)) for claim, each in scores.items()}
+    low, high = honest_range(len(pictures))
+    return {
+        "pictures": len(pictures),
+        "lens": chosen.lens,
+        "range": f"{low:.2f} to {high:.2f}",
+        "all": ROBUST * float(np.median(sizes["ours"])),
+        **{name: ROBUST * float(np.median(sizes["ours"][:, place])) for place, name in enumerate(QUANTITIES)},
+        "model": ROBUST * float(np.median(sizes["model"])),
+        "opencv": ROBUST * float(np.median(sizes["opencv"])),
+        "splits": len(sizes["ours"]),
+        "sizes": {claim: each.tolist() for claim, each in sizes.items()},
+    }
+
+
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    for claim in ("ours", "model", "opencv"):
+        sizes = np.concatenate([np.array(row["sizes"][claim]) for row in rows])
+        each = ", ".join(f"{name} {ROBUST * np.median(sizes[:, place]):.2f}" for place, name in enumerate(QUANTITIES))
+        yield f"pooled, {claim}: {ROBUST * np.median(sizes):.2f} ({each})"
+
+
+def kept_corners(name: str, folder: Path | None) -> Sequence[Corners]:
+    path = None if folder is None else folder / f"{name}.pickle"
+    if path is None:
+        return SETS[name].corners()
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(pickle.dumps(SETS[name].corners()))
+    return list(pickle.loads(path.read_bytes()))
+
+
+def calibrated(chosen: BoardSet, pictures: Sequence[Corners]) -> Mapping[str, tuple[Array, Array]] | None:
+    """Values and standard deviations of QUANTITIES, by who claims them; None without a solution."""
+    network = board_network(chosen, pictures)
+    result = adjust_unmodelled(network, adjust)
+    if not result.converged:
+        return None
+    images = CameraPictures("camera", *chosen.size_px, None, tuple(image.name for image in network.images))
+    camera = camera_intrinsics(result, images, PIXEL_MM, left_out={}, lens=None, pitch_um=None, check=None)
+    values = np.array([camera.values[name].value for name in QUANTITIES])
+    return {
+        "ours": (values, np.array([camera.values[name].sigma for name in QUANTITIES])),
+        "model": (values, np.array([camera.values[name].sigma_model for name in QUANTITIES])),
+        "opencv": by_opencv(chosen, pictures),
+    }
+
+
+def board_network(chosen: BoardSet, pictures: Sequence[Corners]) -> Network:
+    points = np.unique(np.concatenate([each.points for each in pictures]), axis=0)
+    names = {tuple(point): f"p{number}" for number, point in enumerate(points.tolist())}
+    counts = [len(each.points) for each in pictures]
+    free = Prior(chosen.size_px[0] * PIXEL_MM, np.inf)
+    width_mm, height_mm = (size * PIXEL_MM for size in chosen.size_px)
+    camera = Camera(
+        "camera", free, None, None, lens_of(chosen.lens, square_pixels=False),
+        center_mm=(width_mm / 2, -height_mm / 2), frame_mm=(width_mm, height_mm),
+    )  # fmt: skip
+    xy_mm = np.concatenate([each.places_px for each in pictures]) * [PIXEL_MM, -PIXEL_MM]
+    turned = np.array([[1.0, -1.0], [-1.0, 1.0]]) * PIXEL_MM**2
+    return Network(
+        cameras=(camera,),
+        images=tuple(Image(f"i{number}", "camera", "none") for number in range(len(pictures))),
+        points=tuple(ObjectPoint(name, *(Prior(value, 0.0) for value in point)) for point, name in names.items()),
+        observations=Observations(
+            image=tuple(f"i{number}" for number, count in enumerate(counts) for _ in range(count)),
+            point=tuple(names[tuple(point)] for each in pictures for point in each.points.tolist()),
+            kind=tuple("target" for _ in range(sum(counts))),
+            xy_mm=xy_mm,
+            covariance_mm2=np.concatenate([each.covariance_px2 for each in pictures]) * turned,
+        ),
+    )
+
+
+def by_opencv(chosen: BoardSet, pictures: Sequence[Corners]) -> tuple[Array, Array]:
+    flags = cv2.CALIB_FIX_K3 if chosen.lens == "opencv4" else 0
+    points, places = ([np.asarray(part, np.float32) for part in each] for each in zip(
+        *((each.points * [1, 1, 0], each.places_px) for each in pictures), strict=True
+    ))  # fmt: skip
+    found = cv2.calibrateCameraExtended(points, places, chosen.size_px, None, None, flags=flags)  # type: ignore[call-overload]
+    matrix, distortion, deviations = found[1], np.ravel(found[2]), np.ravel(found[5])
+    values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], distortion[0]])
+    return values, deviations[:5]
+
+
+@cache
+def honest_range(pictures: int) -> tuple[float, float]:
+    """90 % of the figures of one quantity: pictures are independent normal values, a half's estimate is their mean, and
+    the claim is its true standard deviation."""
+    rng, figures = np.random.default_rng(0), []
+    half = pictures // 2
+    for _ in range(SIMULATIONS):
+        values = rng.normal(size=pictures)
+        orders = np.array([rng.permutation(pictures) for _ in range(SPLITS)])
+        first, second = values[orders[:, :half]].mean(axis=1), values[orders[:, half:]].mean(axis=1)
+        sizes = np.abs(first - second) / np.sqrt(1.0 / half + 1.0 / (pictures - half))
+        figures.append(ROBUST * float(np.median(sizes)))
+    low, high = np.percentile(figures, (5, 95))
+    return float(low), float(high)
