@@ -236,7 +236,7 @@ def _adjusted_marks(
 
 def _given_marks(project: Project, new: Unpublished) -> tuple[ComparatorPoint, ...]:
     """The marks that this command, an earlier one or the user has left. Raises InputError where there are none."""
-    return read_comparator(_comparator(project, new))
+    return read_comparator(_comparator(project, new), project.list_pitch_um)
 
 
 def _comparator(project: Project, new: Unpublished) -> Path:

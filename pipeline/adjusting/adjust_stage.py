@@ -1,6 +1,6 @@
 """Comparator coordinates to the adjustment, with scanners' bends, disks corrected for their eccentricity on the way."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -18,9 +18,9 @@ from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
-from pipeline.files.project_file import Project
+from pipeline.files.project_file import ASSUMED_PITCH_UM, Project
 from pipeline.measuring.target_field import across, disk_normals, eccentricity_mm, plane_normal
-from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone
 from pipeline.text.wording import listed
 from pipeline.types import Array
 
@@ -100,7 +100,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
         *_not_corrected(network, uncorrected),
     )
     adjustment = replace(adjustment, unmodelled_mm=first.unmodelled_mm)
-    notes = (*_unmodelled(adjustment), *_correlated(adjustment), *_unmeasured(project, marks))
+    notes = (*_assumed_pitch(project), *_unmodelled(adjustment), *_correlated(adjustment), *_unmeasured(project, marks))
     return replace(adjustment, remarks=(*adjustment.remarks, *warnings), unused=notes)
 
 
@@ -178,6 +178,16 @@ def _largest_sigmas(network: Network, change_mm: Array) -> float:
     """The largest change of an observation, in its standard deviations."""
     sigmas = np.sqrt(np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2))
     return float(np.max(np.abs(change_mm) / sigmas, initial=0.0))
+
+
+def _assumed_pitch(project: Project) -> Iterator[str]:
+    """A note where a list of pixels was taken to mm by a size of a pixel that nobody gave."""
+    path = project.comparator
+    if project.pitch_um is None and not project.scans and path.exists() and has_pixels_alone(path):
+        yield (
+            f"Nothing says how large a pixel is: {ASSUMED_PITCH_UM:g} µm are assumed. Of all in mm and µm only ratios "
+            "count; set pitch_um in project.toml to have them."
+        )
 
 
 def _unmodelled(adjustment: Adjustment) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceReco
     """
     with unpublished(project) as new:
         with reporter.stage("comparing") as count:
-            marks = read_comparator(project.comparator)
+            marks = read_comparator(project.comparator, project.list_pitch_um)
             half_mm = {camera.name: _half(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm}
             own = adjust_marks(project, marks)
             choice = choose(

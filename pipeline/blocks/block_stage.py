@@ -55,7 +55,7 @@ def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: 
     quiet_colmap()  # before the resampling, which takes far longer
     if not project.comparator.exists():
         raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first: films come by it.")
-    marks = read_comparator(project.comparator)
+    marks = read_comparator(project.comparator, project.list_pitch_um)
     pitch_um = pitch_um or coarse_pitch_um(project)
     clock = _Clock()
     with clock.step("resampling"):

@@ -8,12 +8,10 @@ from pathlib import Path
 from pipeline.calibration.board_options import BoardOptions
 from pipeline.calibration.lens_choice import LensModel, LensSetting, lens_of
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures
-from pipeline.files.project_file import Project, read_project
+from pipeline.files.project_file import ASSUMED_PITCH_UM, Project, read_project
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
 from pipeline.text.wording import quoted
-
-ASSUMED_PITCH_UM = 5.0  # where nobody says it: results are in pixels, and it cancels
 
 
 @dataclass(frozen=True)

@@ -217,7 +217,7 @@ def read_block(project: Project) -> Block:
     """
     if not project.comparator.exists():
         raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first.")
-    marks = read_comparator(project.comparator)
+    marks = read_comparator(project.comparator, project.list_pitch_um)
     adjustment = _adjustment(project, marks)
     pitches = pitches_of(project.comparator)
     by_image: dict[str, list[ComparatorPoint]] = {mark.image: [] for mark in marks}

@@ -33,6 +33,7 @@ from pipeline.text.tables import Table, read_toml
 if TYPE_CHECKING:
     from measure.scans.scan import Scan
 
+ASSUMED_PITCH_UM = 5.0  # of digital cameras where nobody says it: results are in pixels, and it cancels
 DEFAULT_SCANNER = "1"  # the name of that of all images that name none
 
 
@@ -100,6 +101,14 @@ class Project:
         believed of any film."""
         stated_mm, model = self.adjust.film_sigma_um / 1000.0, self.adjust.transformation or ANY_FILM.model
         return BelievedFilm(stated_mm, True, model) if stated_mm else replace(ANY_FILM, model=model)
+
+    @property
+    def list_pitch_um(self) -> tuple[float, float] | None:
+        """Of a pixel of a comparator.csv that gives no mm: as the project says; assumed for digital cameras, of which
+        results are in pixels; None of film, and where a camera file gives lengths in mm."""
+        in_mm = any(each.fiducials or each.principal_distance_mm or each.frame_mm for each in self.cameras.values())
+        is_digital = self.adjust.transformation in (None, "none") and not in_mm
+        return self.pitch_um or ((ASSUMED_PITCH_UM, ASSUMED_PITCH_UM) if is_digital else None)
 
     @property
     def title(self) -> str:

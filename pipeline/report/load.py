@@ -51,7 +51,7 @@ def measured_data(
     comparator = at(project.comparator)
     data = ReportData(
         project=project.title,
-        comparator=read_comparator(comparator) if rows is None else rows,
+        comparator=read_comparator(comparator, project.list_pitch_um) if rows is None else rows,
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
         notes=tuple(filter(None, [outside_note(project), decisions_told(decisions_of(comparator))])),

@@ -28,6 +28,7 @@ from pipeline.types import Array
 COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",
 )  # fmt: skip
+PIXEL_SIGMAS = ("scol_px", "srow_px")  # of lists of pixels; rho then is that of column and row
 _KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 
 DecidedBy = tuple[str, str]  # camera, and who
@@ -216,11 +217,22 @@ def pitches_of(path: Path) -> dict[str, tuple[float, float]]:
     return {image: (float(x), float(y)) for image, x, y in _PITCH.findall(text)}
 
 
-def read_comparator(path: Path) -> tuple[ComparatorPoint, ...]:
-    """Read comparator.csv. Raises InputError naming the line: a duplicated mark, an unknown kind, no number."""
+def read_comparator(path: Path, pitch_um: tuple[float, float] | None = None) -> tuple[ComparatorPoint, ...]:
+    """Read comparator.csv.
+
+    Parameters
+    ----------
+    path : the file
+    pitch_um : width and height of a pixel, where a list of pixels (col_px, row_px) may give no mm; None refuses it
+
+    Raises
+    ------
+    InputError
+        Names the line: a duplicated mark, an unknown kind, no number, neither mm nor pixels.
+    """
     points: dict[tuple[str, str, str], ComparatorPoint] = {}
-    for row in csv_rows(path, COLUMNS[:5], COLUMNS[5:]):
-        point = _point(row)
+    for row in csv_rows(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS):
+        point = _point(row, pitch_um)
         key = (point.image, point.point, "fiducial" if point.kind == "fiducial" else "object")
         if key in points:
             raise InputError(
@@ -233,29 +245,60 @@ def read_comparator(path: Path) -> tuple[ComparatorPoint, ...]:
     return tuple(points.values())
 
 
-def _point(row: Row) -> ComparatorPoint:
-    kind, status = row.name("kind"), row.text("status") or Status.MEASURED
+def has_pixels_alone(path: Path) -> bool:
+    """Whether a comparator file has columns of pixels and none of mm. Raises InputError where it has neither."""
+    row = next(csv_rows(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS), None)
+    return row is not None and _has_pixels_alone(row)
+
+
+def _has_pixels_alone(row: Row) -> bool:
+    if row.cells.keys() >= {"x_mm", "y_mm"}:
+        return False
+    if not row.cells.keys() >= {"col_px", "row_px"}:
+        raise InputError(
+            f"{row.file}: the header lacks the columns x_mm, y_mm or col_px, row_px: where the marks are. Add them."
+        )
+    return True
+
+
+def _point(row: Row, pitch_um: tuple[float, float] | None) -> ComparatorPoint:
+    kind, status = row.text("kind") or "target", row.text("status") or Status.MEASURED
     if kind not in _KINDS:
         raise row.error("kind", f"is {kind!r}; possible are {', '.join(_KINDS)}.")
     if status not in list(Status):
         raise row.error("status", f"is {status!r}; possible are {', '.join(Status)}.")
-    x, y, sx, sy = row.number("x_mm"), row.number("y_mm"), row.sigma("sx_mm"), row.sigma("sy_mm")
+    names = ("x_mm", "y_mm", "sx_mm", "sy_mm")
+    if _has_pixels_alone(row):
+        names = ("col_px", "row_px", *PIXEL_SIGMAS)
+        if pitch_um is None:
+            raise InputError(
+                f"{row.file}: gives pixels but no mm, and nothing says how large a pixel is. Set pitch_um in "
+                "project.toml. A digital camera needs none if its camera file gives no length in mm."
+            )
+    x, y, sx, sy = row.number(names[0]), row.number(names[1]), row.sigma(names[2]), row.sigma(names[3])
     xy = None if x is None or y is None else np.array([x, y])
     if xy is None and Status(status).is_observation:
-        raise row.error("x_mm", f"is blank, but the status is {status!r}. Give x_mm and y_mm, or the status absent.")
+        raise row.error(
+            names[0], f"is blank, but the status is {status!r}. Give {names[0]} and {names[1]}, or the status absent."
+        )
     if sx == 0.0 or sy == 0.0:
         raise row.error(
-            "sx_mm", "an observation's standard deviation cannot be 0; leave it blank for the project's own."
+            names[2], "an observation's standard deviation cannot be 0; leave it blank for the project's own."
         )
     rho = row.number("rho") or 0.0
     if not math.fabs(rho) < 1.0:
         raise row.error("rho", f"is a correlation and must lie between -1 and 1, not {rho:g}.")
+    sigma = None if sx is None or sy is None else np.array([sx, sy])
+    if names[0] == "col_px" and pitch_um is not None:
+        xy = None if xy is None else comparator_from_pixel(xy, pitch_um)
+        sigma = None if sigma is None else sigma * pitch_um / 1000.0
+        rho = -rho  # y is turned round
     return ComparatorPoint(
         image=intern(image_name(row.name("image"))),
         point=intern(row.name("point")),
         kind=_KINDS[kind],
         xy_mm=xy,
-        sigma_mm=None if sx is None or sy is None else np.array([sx, sy]),
+        sigma_mm=sigma,
         rho=rho,
         status=Status(status),
         reason=row.text("reason"),

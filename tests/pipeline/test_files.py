@@ -320,6 +320,22 @@ def test_comparator_file_with_a_mistake(tmp_path: Path, row: str, words: list[st
         assert word in message
 
 
+def test_a_list_of_pixels_is_read_with_y_up_by_the_pitch(tmp_path: Path) -> None:
+    text = "image,point,col_px,row_px,scol_px,srow_px,rho\nf.png,1,100.5,200,0.1,0.2,0.3\n"
+    path = written(tmp_path, "comparator.csv", text)
+    (mark,) = read_comparator(path, (20.0, 10.0))
+    assert (mark.kind, mark.status) == ("target", Status.MEASURED)
+    assert mark.xy_mm is not None
+    assert mark.sigma_mm is not None
+    np.testing.assert_allclose([*mark.xy_mm, *mark.sigma_mm, mark.rho], [2.01, -2.0, 0.002, 0.002, -0.3])
+    assert "Set pitch_um in project.toml" in refused(read_comparator, path)
+    nothing = written(tmp_path, "nothing.csv", "image,point,col_px\nf,1,2\n")
+    assert "lacks the columns x_mm, y_mm or col_px, row_px" in refused(read_comparator, nothing)
+    blank = written(tmp_path, "blank.csv", "image,point,col_px,row_px\nf,1,2,\n")
+    with pytest.raises(InputError, match="column col_px: is blank"):
+        read_comparator(blank, (20.0, 10.0))
+
+
 def test_failed_write_leaves_the_earlier_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path, "out.json", "earlier")
 
