@@ -168,6 +168,7 @@ class Cause(StrEnum):
     SECOND_ORDER = "second order"
     UNLIKE_DRAWING = "unlike drawing"
     TONE = "tone"
+    SHARPENING = "sharpening"
     CHANGED_TONES = "changed tones"
     LANDSCAPE = "landscape"
     COMPRESSION = "compression"
@@ -187,6 +188,7 @@ CAUSE_MEANING = {
     Cause.SECOND_ORDER: "A soft and faint mark's picture bends within the errors of its place, blur and contrast.",
     Cause.UNLIKE_DRAWING: "At its edges the picture differs by more than noise: it is not quite as drawn.",
     Cause.TONE: "The curve through which light was stored as grey values is not known well enough.",
+    Cause.SHARPENING: "By how much the scan was sharpened is not known well enough.",
     Cause.CHANGED_TONES: "A learned mark's half tones may be others than where it was learned.",
     Cause.LANDSCAPE: "The background within a notch has texture.",
     Cause.COMPRESSION: "JPEG rounded the mark's edges away.",

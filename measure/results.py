@@ -15,6 +15,7 @@ from measure.array_types import Array
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import linear_scale
 from measure.tone.estimate import FrameTone, MarkTone
+from measure.tone.sharpening import SharpeningScore
 
 Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # what is a place of the film, and no point of the object
@@ -264,7 +265,8 @@ class MarkFit:
     share included, and size_sigma of the mark's size; infinite where they were not estimated, or the blur is at an end
     of its range. edges: the mark's place by another method, to compare;
     sloping: an ellipse's, if its paint may grow lighter or darker from side to side. own_shape: what the picture says
-    of rotation and scale, where the frame gave them; tone: and of a tone curve that is not known.
+    of rotation and scale, where the frame gave them; tone: and of a tone curve that is not known; sharpening: and of
+    a scan's sharpening.
     """
 
     converged: bool
@@ -289,6 +291,7 @@ class MarkFit:
     sloping: SecondPlace | None = None
     own_shape: OwnShape | None = None
     tone: MarkTone | None = None
+    sharpening: SharpeningScore | None = None
     covariance: Array | None = None
 
     @property

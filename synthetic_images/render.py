@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from synthetic_images.background import Background, scene_background
 from synthetic_images.frame import Frame, make_frame
 from synthetic_images.grain import grain, white_noise
-from synthetic_images.scene import Scene, SceneImage
+from synthetic_images.scene import Scene, SceneImage, UnsharpMask
 from synthetic_images.tiff import Grey, write_tiff
 from synthetic_images.tone_curve import coded
 from synthetic_images.truth import Truth, truth_json
@@ -63,13 +64,16 @@ def render_scene(scene: Scene, out_dir: Path, progress: Progress | None = None) 
 def grey_strips(frame: Frame, index: int, background: Background) -> Iterator[Grey]:
     """The scan's grey values as its file holds them, in strips of STRIP_PX rows: (rows, width) or (rows, width, 3)."""
     geometry, scene = frame.truth.geometry, background.scene
+    mask = scene.scanner.sharpen
     for row0 in range(0, geometry.height_px, STRIP_PX):
-        height = min(STRIP_PX, geometry.height_px - row0)
-        shares = _painted(frame, index, background, row0, height)
+        end = min(row0 + STRIP_PX, geometry.height_px)
+        first, last = max(row0 - mask.reach_px, 0), min(end + mask.reach_px, geometry.height_px)
+        shares = _painted(frame, index, background, first, last - first)
         if scene.film.grain > 0.0:
             seed = (scene.seed, index, 3)
-            shares = shares + scene.film.grain * grain(seed, row0, height, geometry.width_px, scene.film.grain_px)
-        yield _digitised(shares, scene, index, row0)
+            shares += scene.film.grain * grain(seed, first, last - first, geometry.width_px, scene.film.grain_px)
+        codes = _sharpened(_coded(shares, scene, index, first), mask)
+        yield _digitised(codes[row0 - first : end - first], scene)
 
 
 def _painted(frame: Frame, index: int, background: Background, row0: int, height: int) -> Picture:
@@ -103,9 +107,8 @@ def _border(scene: Scene, index: int, row0: int, height: int, width_px: int) -> 
     return border
 
 
-def _digitised(shares: Picture, scene: Scene, index: int, row0: int) -> Grey:
-    """Grey values: the channels, the noise of each, negative, the tone curve and white as zero, rounded and held within
-    the depth."""
+def _coded(shares: Picture, scene: Scene, index: int, row0: int) -> Picture:
+    """(rows, width, channels) codes: the channels, the noise of each, negative, the tone curve."""
     scanner = scene.scanner
     channels = shares[:, :, None] * np.asarray(CHANNEL_GAINS, np.float32) if scanner.colour else shares[:, :, None]
     if scanner.negative:
@@ -114,7 +117,21 @@ def _digitised(shares: Picture, scene: Scene, index: int, row0: int) -> Grey:
         height, width = shares.shape
         noise = [white_noise((scene.seed, index, 4, c), row0, height, width) for c in range(channels.shape[2])]
         channels = channels + scanner.noise * np.stack(noise, axis=2)
-    channels = coded(np.clip(channels, 0.0, 1.0), scanner.tone)
+    return coded(np.clip(channels, 0.0, 1.0), scanner.tone)
+
+
+def _sharpened(codes: Picture, mask: UnsharpMask) -> Picture:
+    """By an unsharp mask, before they are held within the depth."""
+    if mask.amount == 0.0:
+        return codes
+    blurred = gaussian_filter(codes, (mask.radius_px, mask.radius_px, 0.0), mode="nearest")
+    return np.asarray(codes + np.float32(mask.amount) * (codes - blurred), np.float32)
+
+
+def _digitised(channels: Picture, scene: Scene) -> Grey:
+    """Grey values: white as zero, rounded and held within the depth."""
+    scanner = scene.scanner
+    channels = np.clip(channels, 0.0, 1.0)
     if scanner.white_is_zero:
         channels = 1.0 - channels
     full_scale = 2**scanner.bit_depth - 1

@@ -289,6 +289,23 @@ class Film:
 
 
 @dataclass(frozen=True)
+class UnsharpMask:
+    """Codes are raised by amount times what they are above their mean under a Gaussian of radius_px."""
+
+    amount: float = 0.0
+    radius_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        not_negative("amount", self.amount)
+        positive("radius_px", self.radius_px)
+
+    @property
+    def reach_px(self) -> int:
+        """How far a code depends on others."""
+        return int(4 * self.radius_px + 0.5) if self.amount else 0
+
+
+@dataclass(frozen=True)
 class Scanner:
     """The scanner and its file.
 
@@ -296,7 +313,7 @@ class Scanner:
     area; noise: rms as a share of full scale, white; tile_px: edge of the file's tiles, 0 for strips.
     white_is_zero: only how the file keeps the same picture; negative: the picture is a negative. tone: the gamma by
     which light is coded, or one of TONES. bend_um: what the scanner bends in all scans alike, by the names of
-    `bend.Bend`.
+    `bend.Bend`. sharpen: the unsharp mask by which the codes are sharpened thereafter.
     """
 
     pitch_um: Point
@@ -311,6 +328,7 @@ class Scanner:
     tile_px: int = 256
     tone: float | str = 1.0
     bend_um: Mapping[str, float] = field(default_factory=dict)
+    sharpen: UnsharpMask = UnsharpMask()
 
     def __post_init__(self) -> None:
         positive("pitch_um", *self.pitch_um)

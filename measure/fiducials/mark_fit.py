@@ -98,6 +98,8 @@ def _unlike(fit: MarkFit, expected: MarkPrediction, full_scale_dn: float) -> Rea
     contrast = abs(fit.stored_contrast_dn) / full_scale_dn
     if contrast < FAINT:
         return Reason("there is no contrast at its place", Code.CONTRAST)
+    # On ground near black a grey value's own curve makes much of little light, and may be the wrong one.
+    contrast = min(contrast, abs(fit.contrast_dn) / full_scale_dn)
     if contrast * (1 - _SURE / max(fit.significance, _SURE)) > _MOST_CONTRAST:
         return Reason(
             "what lies there is far wider than the mark's lines: as fine as these, it would have "

@@ -14,7 +14,7 @@ from measure.fiducials.faint_marks import detect_faint_marks, faint_reach_px
 from measure.fiducials.frame import CLEAR_LIKENESS, MANY, Frame, orient_frame
 from measure.fiducials.mark_fit import Detection, detect_mark, not_found
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.refit import refit_frame
+from measure.fiducials.refit import refit_frame, sharpen_frame
 from measure.flags import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
 from measure.marks.shapes import FiducialLayout
 from measure.scans.parallel import map_in_threads
@@ -27,14 +27,27 @@ _ROUNDS = 2  # of detecting faint marks: the first ones tell where the others ar
 
 
 def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Measure a frame from its placement."""
-    return refit_frame(detect_frame(scan, layout, placement, options))
+    """Measure a frame from its placement. Marks that are not clear are detected again in a scan that shows itself to be
+    sharpened."""
+    frame = detect_frame(scan, layout, placement, options)
+    sharpened = sharpen_frame(frame)
+    if sharpened.scan.tone.sharpening and not scan.tone.sharpening:
+        sharpened = sharpen_frame(_detect_missing(_detect_unfitted(sharpened)))
+    return refit_frame(sharpened)
 
 
 def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
     """Measure a frame without the refit: which of its marks are there, and how they look."""
     frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
     return _detect_missing(orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px)))
+
+
+def _detect_unfitted(frame: Frame) -> Frame:
+    """Detect once more the marks that are not clear, or were placed by a filter only; what is no clearer stays."""
+    fits = [each.fit for each in frame.detections]
+    pending = [i for i, fit in enumerate(fits) if not frame.is_clear(i) or (fit and fit.covariance is None)]
+    again = _detect(frame, pending, frame.gate_px)
+    return orient_frame(frame.replace_detections({i: again.detections[i] for i in pending if again.is_clear(i)}))
 
 
 def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:

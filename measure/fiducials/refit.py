@@ -30,6 +30,7 @@ from measure.results import MarkFit
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import FrameTone, MarkTone
+from measure.tone.sharpening import estimate_sharpening
 
 _NEAR_MM = 3.0  # from the frame's edge: a mark nearer has it beside itself, in what is read of the scan anyway
 _BESIDE_MM, _LONGEST_MM = 0.5, 6.0  # from a mark, to where an edge begins and ends
@@ -39,6 +40,8 @@ _SHARE_PX, _FEWEST = 8.0, 5  # of an edge that a profile is of, and how many an 
 _STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
 _TONE_ROUNDS = 5  # of fitting by a better curve
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # powers; how unsettled a curve is that needs none of them
+_TELLING = 8  # marks, the plainest of a frame, that tell its scan's sharpening: more take their time
+_SHARPENING_ROUNDS = 6  # of fitting by a better estimate of a scan's sharpening
 _MOVED = 0.3  # of its standard deviation that a mark may still move
 _UNCHECKED = 3  # marks, which an affine transformation fits without residuals
 _REFIT_PX = 1.5  # about a mark that was fitted already
@@ -52,8 +55,31 @@ def refit_frame(frame: Frame) -> Frame:
     marks that hardly tell their own blur get that of the others.
     """
     if frame.inliers.sum() >= 2:
-        frame = _refit_with_blur(_refit_with_tone(frame))
+        frame = _refit_with_tone(frame)
+        frame = _refit_with_blur(frame)
     return _compare_shapes(_add_tone_covariance(frame))
+
+
+def sharpen_frame(frame: Frame) -> Frame:
+    """The frame with its clear marks fitted in what the scan was before it was sharpened, as they say by how much; the
+    same where they do not say that it was."""
+    if not frame.agrees:
+        return frame
+    plainest, begun = sorted(clear_fits(frame).items(), key=lambda item: -item[1].significance), frame
+    telling = [index for index, fit in plainest if fit.sharpening is not None]
+    for _ in range(_SHARPENING_ROUNDS):
+        before = frame.scan.tone.sharpening
+        scores = [fit.sharpening for index in telling if (fit := frame.detections[index].fit) and fit.sharpening]
+        found = estimate_sharpening(before, scores, len(frame.scan.tone.mean))
+        if found is None or found.is_as(before):
+            break
+        frame = replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(found)))
+        telling = telling[:_TELLING]
+        frame = _refit(frame, dict.fromkeys(telling, frame.options.match), orient=False)
+    if found is not None:
+        frame = replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(found)))
+    rest = {index for index, _ in plainest} - {*telling}
+    return begun if frame is begun else _refit(frame, dict.fromkeys(rest, frame.options.match))
 
 
 def _refit_with_tone(frame: Frame) -> Frame:
@@ -122,10 +148,13 @@ def _mark_tones(frame: Frame) -> dict[int, MarkTone]:
 
 
 def _add_tone_covariance(frame: Frame) -> Frame:
-    """What is not known of the tone curve, in the covariance of each mark that it moves."""
+    """What is not known of tone curve and sharpening, in the covariance of each mark that it moves."""
     for index, detection in enumerate(frame.detections):
         if detection.fit is not None and detection.fit.tone is not None:
             frame = frame.add_covariance(index, Cause.TONE, frame.tone.covariance_px2(detection.fit.tone))
+        if detection.fit is not None and detection.fit.sharpening is not None and frame.scan.tone.sharpening:
+            unknown = detection.fit.sharpening.covariance_px2(frame.scan.tone.sharpening)
+            frame = frame.add_covariance(index, Cause.SHARPENING, unknown)
     return frame
 
 

@@ -208,6 +208,8 @@ def _measure_in_its_pose(search: FrameSearch, placement: Placement) -> Frame:
     """The frame in a placement. At the right place in a wrong pose unlike marks are not found under one another's
     names: where that is so, the pictures there decide the pose, and the frame is measured in it."""
     frame = measure_frame(search.scan, search.layout, placement, search.options)
+    if frame.accepted and frame.scan.tone.sharpening:  # the scan's, wherever its frame lies
+        search.scan = search.scan.replace_tone(search.scan.tone.sharpened(frame.scan.tone.sharpening))
     if frame.may_settle and not frame.accepted and search.among is None:
         search.unsettled.append(placement)
     if frame.accepted or not frame.inliers.any() or search.options.pose != "auto":

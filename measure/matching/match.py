@@ -28,12 +28,17 @@ from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
 from measure.matching.models import GREY, PictureModel, background_px, is_round
 from measure.matching.options import MatchOptions
 from measure.matching.saturation import clear_of_ends
-from measure.matching.tone_information import mark_tone_information, tone_without_information
+from measure.matching.tone_information import (
+    mark_tone_information,
+    sharpening_score,
+    tone_without_information,
+)
 from measure.matching.window import ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured, taken_out
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, products
 from measure.results import Covariance, MarkFit
 from measure.tone.estimate import MarkTone
+from measure.tone.sharpening import SharpeningScore
 
 __all__ = ["MarkFit", "MatchOptions", "mark_window", "match"]
 
@@ -228,6 +233,7 @@ def _add_precision(result: MarkFit, fit: PictureFit, noise: NoiseModel, about: t
         sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
         own_shape=own_shape(linear, shape, strain, model.departures) if tells_shape else None,
         tone=_mark_tone(fit, linear, priors_dn2, landscape),
+        sharpening=_sharpening_score(fit, linear, priors_dn2),
     )
 
 
@@ -244,6 +250,17 @@ def _mark_tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, landscape:
     return mark_tone_information(
         linear, drawn, model.grey, clear, priors_dn2, model.departures, coding.tone, coding.full_scale_dn, landscape
     )
+
+
+def _sharpening_score(fit: PictureFit, linear: LinearFit, priors_dn2: Array) -> SharpeningScore | None:
+    """What the picture says of the scan's sharpening, None where it is not drawn with its surroundings. What counted as
+    damage counts: halos do, until they are drawn."""
+    model = fit.model
+    if model.background_px is not None or model.is_chip:
+        return None
+    drawn = model.drawn_light
+    shown = fit.area & model.tells & clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
+    return sharpening_score(replace(linear, used=shown), drawn, priors_dn2, model.departures, fit.window.coding)
 
 
 def _likeness(fit: PictureFit) -> float:

@@ -7,10 +7,12 @@ import numpy as np
 from measure.array_types import Array, Mask
 from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.models import GREY
+from measure.matching.window import Coding
 from measure.noise.noise_model import combined, products
 from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import MarkTone
 from measure.tone.score import ToneScore, tone_score
+from measure.tone.sharpening import RADII_PX, Sharpening, SharpeningScore
 
 _PIECE_PX = 8  # of a mark's edges that tell the curve by themselves, and of what JPEG rounds by itself
 _LEAST_CONTRAST = 1e-6  # of the light that is drawn: rounding is about that large
@@ -77,6 +79,42 @@ def tone_without_information(
     curve, for its surroundings are not drawn. light (height, width): with these; detail: takes them away."""
     changes = np.stack([detail(each) for each in tone.derivatives(light, full_scale_dn)])
     return _mark_tone(fit, ToneInformation.empty(), _moved_px(fit, changes), light, tone, full_scale_dn)
+
+
+def sharpening_score(
+    fit: LinearFit, drawn: Array, priors_dn2: Array, departures: Array, coding: Coding
+) -> SharpeningScore | None:
+    """What a linearised fit says of the scan's sharpening, beside its unknowns and the tone curve.
+
+    Parameters
+    ----------
+    fit : LinearFit
+        used: of pixels where halos count, too.
+    drawn : (height, width)
+        The light that the fit draws.
+    priors_dn2, departures : (unknowns,)
+        As of `tone_score`.
+    coding : Coding
+        How light was stored.
+    """
+    if not np.ptp(drawn) > _LEAST_CONTRAST * np.abs(drawn).max():
+        return None
+    tone, full_scale_dn, used = coding.tone, coding.full_scale_dn, fit.used
+    codes, slope = tone.code(drawn, full_scale_dn), tone.slope(drawn, full_scale_dn)
+    if tone.sharpening:
+        halos = tone.sharpening.changes(codes)
+    else:
+        halos = np.stack([Sharpening(0.0, radius_px).changes(codes)[0] for radius_px in RADII_PX])
+    # The light through a wrong curve lacks what the right one would add; of halos it has too much.
+    changes = np.concatenate([tone.derivatives(drawn, full_scale_dn), -slope * halos]) * (used * fit.steadiness)
+    flat = fit.design.reshape(len(fit.design), -1) * used.ravel()
+    residuals = np.where(used, fit.residuals, 0.0).ravel()
+    score = tone_score(flat, changes.reshape(len(changes), -1), residuals, priors_dn2, departures)
+    left, by_prior = score.left.reshape(changes.shape), score.by_unknown * np.sqrt(priors_dn2)[:, None]
+    covariance = fit.covariance(left) + fit.noise.variance_dn2 * by_prior.T @ by_prior
+    covariance += np.diag(_LEAST_VARIANCE * np.maximum(np.diag(fit.covariance(changes)), 1e-30))
+    on_place = products(fit.by_grey[:2], changes[-len(halos) :])
+    return SharpeningScore(score.value, score.normal, covariance, on_place)
 
 
 def _disagreement(score: ToneScore, left: Array, residuals: Array, covariance: Array, on_place: Array) -> float:

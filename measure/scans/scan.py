@@ -136,8 +136,15 @@ class Scan:
 
     def light(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
         """(height, width) as `window` has it, in light by the tone curve: what blurs linearly, and is fitted."""
-        samples = self.samples(col0, row0, width, height)
-        light = samples if self.tone.is_identity else self.tone.light(samples, self.full_scale_dn)
+        if not self.tone.sharpening:
+            samples = self.samples(col0, row0, width, height)
+            light = samples if self.tone.is_identity else self.tone.light(samples, self.full_scale_dn)
+            return weighted(light, self._weights(weights))
+        reach = self.tone.sharpening.reach_px
+        wide = self.samples(col0 - reach, row0 - reach, width + 2 * reach, height + 2 * reach)
+        codes = self.tone.sharpening.undone(np.moveaxis(wide, -1, 0).astype(np.float32))
+        codes = np.moveaxis(codes[:, reach : reach + height, reach : reach + width], 0, -1)
+        light = self.tone.light(np.clip(codes, 0.0, self.full_scale_dn), self.full_scale_dn)
         return weighted(light, self._weights(weights))
 
     def samples(self, col0: int, row0: int, width: int, height: int, out: Samples | None = None) -> Samples:

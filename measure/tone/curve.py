@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.array_types import Array, Single
+from measure.tone.sharpening import Sharpening
 
 _PIECES = 1024  # of the range of codes, in which a curve is straight
 _NODES = np.linspace(0.0, 1.0, _PIECES + 1)
@@ -125,7 +126,8 @@ class Tone:
     in units of the standard deviation that it has where nothing is known. source: where the curve is from, a part of a
     sentence; is_declared: by the file, which the pictures may contradict. other_scans: the curve before other scans of
     the scanner gave information, and that information; None where none did. before: the curve as it was believed
-    before this scan, where this one is to begin with, or estimated from it; None of that curve itself.
+    before this scan, where this one is to begin with, or estimated from it; None of that curve itself. sharpening: what
+    was done to the codes thereafter.
     """
 
     base: Array = field(default_factory=lambda: power(1.0))
@@ -135,6 +137,7 @@ class Tone:
     is_declared: bool = False
     other_scans: "tuple[Tone, tuple[ToneInformation, ...]] | None" = field(default=None, compare=False)
     before: "Tone | None" = field(default=None, compare=False)
+    sharpening: Sharpening = field(default_factory=Sharpening)
 
     @classmethod
     def unknown(cls) -> "Tone":
@@ -147,7 +150,7 @@ class Tone:
 
     @property
     def is_identity(self) -> bool:
-        return not self.mean.any() and bool(np.array_equal(self.base, _NODES))
+        return not (self.mean.any() or self.sharpening) and bool(np.array_equal(self.base, _NODES))
 
     @property
     def is_known(self) -> bool:
@@ -167,6 +170,12 @@ class Tone:
             apart = min(abs(power - each.equivalent_power(0.1, 0.9)[0]) for each in curves)
             curves += [self.shift_to_power(power)] if apart > _ANOTHER else []
         return tuple(curves[1:])
+
+    def doubted(self, other: "Tone", value: float) -> "Tone":
+        """The curve where pictures say another one, of a power that no scanner has: it may be as far off as that."""
+        off = other.mean - self.mean
+        source = f"{self.source}; the marks say {value:.2f}, as no scanner does, which was not taken"
+        return replace(self, covariance=self.covariance + np.outer(off, off), source=source, before=self)
 
     def vague_prior(self) -> "Tone":
         """The base with departures of which only the prior is known: the curve lies between linear and sRGB."""
@@ -252,6 +261,17 @@ class Tone:
     def code(self, light: NDArray[np.floating], full_scale: float) -> Array:
         """The grey value that such light is stored as."""
         return np.asarray(full_scale * np.interp(np.asarray(light) / full_scale, self._table, _NODES))
+
+    def sharpened(self, sharpening: Sharpening) -> "Tone":
+        """The curve of a scan that is sharpened so."""
+        before = self.before and replace(self.before, sharpening=sharpening)
+        return replace(self, sharpening=sharpening, before=before)
+
+    def slope(self, light: NDArray[np.floating], full_scale: float) -> Array:
+        """By how much light grows with the grey value that it is stored as."""
+        steps = np.diff(self._table) * _PIECES
+        share = np.asarray(self.code(light, full_scale)) / full_scale
+        return np.asarray(steps[np.clip((share * _PIECES).astype(int), 0, _PIECES - 1)])
 
     def derivatives(self, light: NDArray[np.floating], full_scale: float) -> Array:
         """(k, ...) derivatives of light by the departures, at the codes that stand for this light."""

@@ -8,6 +8,7 @@ import numpy as np
 from measure.array_types import Array
 from measure.tone.curve import Tone, ToneInformation
 
+_POWERS = 0.4, 3.0  # that curves are like: what marks say beyond has another cause
 _LONGEST = 1.0  # departure that is changed at a time, in its standard deviations
 
 
@@ -62,8 +63,16 @@ class FrameTone:
         estimate = prior.estimate(each)
         least, greatest = min(mark.least for mark in marks.values()), max(mark.greatest for mark in marks.values())
         step = estimate.tone.mean - matched_by.mean
-        information = None if prior.is_known else ToneInformation.pooled(each, estimate.scatter)
-        tone = estimate.tone if prior.is_known else replace(estimate.tone, before=prior)
+        information = ToneInformation.pooled(each, estimate.scatter)
+        if prior.is_known:
+            return cls(prior, None, least, greatest, estimate.scatter, float(step @ step))
+        value = estimate.tone.equivalent_power(least, greatest)[0]
+        sharpening = matched_by.sharpening
+        if not _POWERS[0] <= value <= _POWERS[1]:
+            off = estimate.tone.mean - prior.mean
+            doubted = prior.doubted(estimate.tone, value).sharpened(sharpening)
+            return cls(doubted, None, least, greatest, 0.0, float(off @ off))
+        tone = replace(estimate.tone, before=prior).sharpened(sharpening)
         return cls(tone, information, least, greatest, estimate.scatter, float(step @ step))
 
     @property
@@ -76,7 +85,7 @@ class FrameTone:
         """A sentence: which curve, and whence."""
         value, sigma = self.tone.equivalent_power(self.least, self.greatest)
         exact = f"{value:.2f}" if self.tone.is_known else f"{value:.2f} (σ {sigma:.2f})"
-        return f"Scanner gamma: {exact}: {self.tone.source}."
+        return f"Scanner gamma: {exact}: {self.tone.source}. {self.tone.sharpening.note}".rstrip()
 
     def shift_px(self, mark: MarkTone, before: Tone) -> float:
         """The distance of a mark's place by this curve from that by another one."""

@@ -188,7 +188,18 @@ def _scanner(table: Table) -> scene.Scanner:
         tile_px=table.whole("tile_px", 256),
         tone=table.number_or_text("tone", 1.0, scene.TONES, above=0.0),
         bend_um=bend_um,
+        sharpen=_unsharp_mask(table.table("sharpen")),
     )
+
+
+def _unsharp_mask(table: Table) -> scene.UnsharpMask:
+    usual = scene.UnsharpMask()
+    mask = scene.UnsharpMask(
+        amount=table.number("amount", usual.amount, least=0.0),
+        radius_px=table.number("radius_px", usual.radius_px, above=0.0),
+    )
+    table.done()
+    return mask
 
 
 def _tones(table: Table) -> scene.Tones:

@@ -15,6 +15,7 @@ from measure.flags import Cause, Reason, Status
 from measure.results import Covariance, FrameMeasurement, Kind, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, srgb
 from measure.tone.estimate import FrameTone
+from measure.tone.sharpening import Sharpening
 from pipeline.types import Array
 
 _SRGB = "srgb"
@@ -221,6 +222,7 @@ def _frame_tone(tone: FrameTone) -> dict[str, object]:
         "covariance": _numbers(tone.tone.covariance),
         "source": tone.tone.source,
         "is_declared": tone.tone.is_declared,
+        "sharpening": sharpening_record(tone.tone.sharpening),
         "said": tone.information and tone_information_record(tone.information),
         **{name: _numbers(getattr(tone, name)) for name in _TONE_NUMBERS},
     }
@@ -228,10 +230,33 @@ def _frame_tone(tone: FrameTone) -> dict[str, object]:
 
 def _read_frame_tone(tone: Mapping[str, Any]) -> FrameTone:
     prior = Tone(
-        _read_base(tone["base"]), _array(tone["mean"]), _array(tone["covariance"]), tone["source"], tone["is_declared"]
+        _read_base(tone["base"]),
+        _array(tone["mean"]),
+        _array(tone["covariance"]),
+        tone["source"],
+        tone["is_declared"],
+        sharpening=read_sharpening(tone.get("sharpening")),
     )
     information = tone["said"] and read_tone_information(tone["said"])
     return FrameTone(prior, information, *(float(tone[name]) for name in _TONE_NUMBERS))
+
+
+def sharpening_record(sharpening: Sharpening) -> dict[str, object] | None:
+    """As JSON, None where there is none."""
+    if not sharpening:
+        return None
+    return {
+        "amount": _numbers(sharpening.amount),
+        "radius_px": _numbers(sharpening.radius_px),
+        "covariance": _numbers(sharpening.covariance),
+    }
+
+
+def read_sharpening(record: Mapping[str, Any] | None) -> Sharpening:
+    """What `sharpening_record` wrote."""
+    if record is None:
+        return Sharpening()
+    return Sharpening(float(record["amount"]), float(record["radius_px"]), _array(record["covariance"]))
 
 
 def _base(base: Array) -> Any:

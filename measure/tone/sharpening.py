@@ -1,0 +1,221 @@
+"""The sharpening of a scan: an unsharp mask, by which scanners and converters raise edges after the tone curve.
+
+A code c is stored as c + amount (c - G c), G being a Gaussian of a radius. The spectrum of that,
+1 + amount (1 - exp(-(radius k)^2 / 2)), lies between 1 and 1 + amount: it is undone without amplifying any noise, but
+for what it drove beyond the scanner's range. So marks are fitted in light whose code is not sharpened.
+
+Sharpening is taken for a curve, for damage beside a mark and for a blur below any scanner's. How strong it is the
+edges of marks tell, by the same score as the tone curve, beside which it is estimated: see `measure.tone.score`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from measure.array_types import Array
+
+RADII_PX = (0.6, 1.0, 1.6, 2.6)  # with which sharpening is looked for; it is estimated from the best of them on
+_AMOUNTS, _RADIUS_RANGE_PX = (0.0, 2.5), (0.4, 5.0)
+_SIGMAS = np.array([1.0, 0.5])  # of the amount and of the logarithm of the radius, before any picture is seen
+_USUAL = np.array([0.0, 0.2])  # where these are expected
+_SCATTER = np.array([0.1, 0.1])  # from scan to scan of a scanner
+_LONGEST = np.array([1.0, 0.3])  # step of these
+_TAIL = 1e-3  # of a pixel: what is farther off than where the inverse has so little changes nothing
+_EVIDENCE = np.log(100.0)  # log-odds, at which a scan counts as sharpened
+_LEAST_AMOUNT = 0.1
+_FEWEST, _ODD = 3, 3.0  # marks that tell it; standard deviations from the others', beyond which a mark does not count
+_SAME = 0.01  # of amount and radius: less is no step
+_CLOSE = 0.5  # of its standard deviations: a step that needs no further one
+
+
+@dataclass(frozen=True, eq=False)
+class Sharpening:
+    """An unsharp mask. covariance (2, 2): of the amount and of the logarithm of the radius. prior: what other scans of
+    the scanner say, None where none does."""
+
+    amount: float = 0.0
+    radius_px: float = 1.0
+    covariance: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    prior: "Sharpening | None" = None
+
+    @classmethod
+    def pooled(cls, each: Sequence["Sharpening"]) -> "Sharpening":
+        """Of a scanner by some of its scans, none where most are not sharpened; covariance: of one more scan."""
+        found = [one for one in each if one]
+        if 2 * len(found) <= len(each):
+            return cls()
+        values = np.array([one.values for one in found])
+        weights = np.array([np.linalg.inv(one.covariance + np.diag(_SCATTER**2)) for one in found])
+        mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, values))
+        scatter = np.diag(_SCATTER**2) + (values - mean).T @ (values - mean) / len(found)
+        known = cls(float(mean[0]), float(np.exp(mean[1])), np.linalg.inv(weights.sum(axis=0)) + scatter)
+        return replace(known, prior=known)
+
+    @property
+    def values(self) -> Array:
+        """(2,) amount and logarithm of the radius."""
+        return np.array([self.amount, np.log(self.radius_px)])
+
+    def __bool__(self) -> bool:
+        return self.amount > 0
+
+    @property
+    def reach_px(self) -> int:
+        """How far what is stored tells of what it was before: the inverse is a sum of Gaussians of growing radius."""
+        share = self.amount / (1 + self.amount)
+        terms = max(np.log(_TAIL) / np.log(share), 1.0) if share > 0 else 0.0
+        return int(np.ceil(3.0 * self.radius_px * np.sqrt(terms)))
+
+    def undone(self, codes: NDArray[np.floating]) -> Array:
+        """(..., height, width) codes before they were sharpened; they are wrong within the reach of a border."""
+        return self._filtered(codes, 1 / self._gain(codes.shape))
+
+    def changes(self, codes: NDArray[np.floating]) -> Array:
+        """(2, height, width) by how much what `undone` gives grows where the true amount, and the logarithm of the
+        true radius, are larger by 1; codes (height, width): not sharpened."""
+        smooth = self._smooth(codes.shape)
+        by_amount = (1 - smooth) / self._gain(codes.shape)
+        by_radius = -2 * self.amount * smooth * np.log(np.maximum(smooth, 1e-30)) / self._gain(codes.shape)
+        return np.stack([self._filtered(codes, each) for each in (by_amount, by_radius)])
+
+    def _gain(self, shape: tuple[int, ...]) -> Array:
+        return 1 + self.amount * (1 - self._smooth(shape))
+
+    def _smooth(self, shape: tuple[int, ...]) -> Array:
+        """The spectrum of the Gaussian."""
+        rows, cols = (2 * np.pi * freq for freq in (fft.fftfreq(2 * shape[-2]), fft.rfftfreq(2 * shape[-1])))
+        return np.asarray(np.exp(-0.5 * self.radius_px**2 * (rows[:, None] ** 2 + cols**2)))
+
+    @staticmethod
+    def _filtered(codes: NDArray[np.floating], spectrum: Array) -> Array:
+        """By an even filter, as if the picture were mirrored at its borders."""
+        height, width = codes.shape[-2:]
+        mirrored = np.concatenate([codes, codes[..., ::-1]], axis=-1)
+        mirrored = np.concatenate([mirrored, mirrored[..., ::-1, :]], axis=-2)
+        return np.asarray(fft.irfft2(fft.rfft2(mirrored) * spectrum, s=mirrored.shape[-2:])[..., :height, :width])
+
+    def moved(self, step: Array, covariance: Array) -> "Sharpening":
+        """After a step (2,) of amount and logarithm of radius, shortened where it is long."""
+        step = step / max(float((np.abs(step) / _LONGEST).max()), 1.0)
+        amount = float(np.clip(self.amount + step[0], *_AMOUNTS))
+        radius_px = float(np.clip(self.radius_px * np.exp(step[1]), *_RADIUS_RANGE_PX))
+        return replace(self, amount=amount, radius_px=radius_px, covariance=covariance)
+
+    def is_as(self, other: "Sharpening") -> bool:
+        """Whether it differs from another one by hardly more than nothing, beside what is not known of it."""
+        step = np.array([self.amount - other.amount, np.log(self.radius_px / other.radius_px)])
+        return bool(np.all(np.abs(step) < _CLOSE * np.sqrt(np.diag(self.covariance)) + _SAME))
+
+    @property
+    def note(self) -> str:
+        """A sentence; empty where nothing is sharpened."""
+        if not self:
+            return ""
+        sigmas = np.sqrt(np.diag(self.covariance)) * (1.0, self.radius_px)
+        return (
+            f"The scan is sharpened, by an amount of {self.amount:.2f} (σ {sigmas[0]:.2f}) within "
+            f"{self.radius_px:.2f} px (σ {sigmas[1]:.2f}); marks were measured in what it was before."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SharpeningScore:
+    """What a mark says of sharpening beside the tone curve.
+
+    value (k + m,), normal and covariance (k + m, k + m): the score of k departures of the curve and of m changes by
+    sharpening, how it grows with them, and its covariance. Without sharpening these are the amounts with each of
+    `RADII_PX`, else the amount and the logarithm of the radius. on_place (2, m): px by which they move the mark.
+    """
+
+    value: Array
+    normal: Array
+    covariance: Array
+    on_place: Array
+
+    def covariance_px2(self, sharpening: Sharpening) -> Array:
+        """(2, 2) of the mark's place, for what is not known of the sharpening; all of it in a mark that was
+        fitted as if there were none."""
+        if self.on_place.shape[1] == len(RADII_PX):
+            nearest = int(np.argmin(np.abs(np.log(RADII_PX) - np.log(sharpening.radius_px))))
+            moved = sharpening.amount * self.on_place[:, nearest]
+            return np.outer(moved, moved)
+        return np.asarray(self.on_place @ sharpening.covariance @ self.on_place.T)
+
+    def information(self, among: Sequence[int]) -> tuple[Array, Array]:
+        """The normal equations of some of them."""
+        chosen = np.ix_(among, among)
+        weighted = np.linalg.solve(self.covariance[chosen], self.normal[chosen]).T
+        matrix = weighted @ self.normal[chosen]
+        return (matrix + matrix.T) / 2, weighted @ self.value[list(among)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimate:
+    """step (m,) from where the marks were fitted, its covariance (m, m), and the log-odds that there is one."""
+
+    step: Array
+    covariance: Array
+    log_odds: float
+
+
+def estimate_sharpening(before: Sharpening, scores: Sequence[SharpeningScore], departures: int) -> Sharpening | None:
+    """The sharpening by marks that were fitted with one of before.
+
+    Parameters
+    ----------
+    departures : of the tone curve, of the first figures of each score.
+
+    Returns
+    -------
+    None where the marks do not say that there is any.
+    """
+    scores = [score for score in scores if score.normal.any()]
+    if len(scores) < _FEWEST:
+        return None
+    tone, count = list(range(departures)), len(scores[0].value) - departures
+    if before:
+        found = _estimate(scores, tone, [departures, departures + 1], before)
+        after = before.moved(found.step, found.covariance)
+        return after if after.amount > _LEAST_AMOUNT else None
+    each = [_estimate(scores, tone, [departures + radius], before) for radius in range(count)]
+    best = int(np.argmax([one.log_odds for one in each]))
+    if each[best].log_odds < _EVIDENCE or each[best].step[0] < _LEAST_AMOUNT:
+        return None
+    start, variance = Sharpening(0.0, RADII_PX[best]), each[best].covariance[0, 0]
+    return start.moved(np.array([each[best].step[0], 0.0]), np.diag([variance, _SIGMAS[1] ** 2]))
+
+
+def _estimate(
+    scores: Sequence[SharpeningScore], tone: Sequence[int], among: Sequence[int], before: Sharpening
+) -> _Estimate:
+    """From some of the marks' figures, beside the curve's."""
+    prior, pull = np.eye(len(tone) + len(among)), np.zeros(len(tone) + len(among))
+    weight = np.diag(_SIGMAS**-2) if before.prior is None else np.linalg.inv(before.prior.covariance)
+    off = (_USUAL if before.prior is None else before.prior.values) - before.values
+    prior[len(tone) :, len(tone) :] = weight[: len(among), : len(among)]
+    pull[len(tone) :] = (weight @ off)[: len(among)] if before else 0.0
+    own = [score.information([*tone, *among]) for score in scores]
+    each = [_solved(*one, prior, np.zeros_like(pull), len(tone)) for one in own]
+    steps, variances = (np.array(values)[:, 0] for values in zip(*((s, np.diag(c)) for s, c in each), strict=True))
+    middle = float(np.median(steps))
+    kept = np.abs(steps - middle) <= _ODD * np.sqrt(variances + np.median((steps - middle) ** 2))
+    matrix, right = (
+        np.sum([part for part, ok in zip(parts, kept, strict=True) if ok], axis=0) for parts in zip(*own, strict=True)
+    )
+    step, covariance = _solved(matrix, right, prior, pull, len(tone))
+    spread = float(np.sum((steps - step[0])[kept] ** 2 / variances[kept])) / max(int(kept.sum()) - 1, 1)
+    covariance = covariance * max(spread, 1.0)
+    explained = right @ np.linalg.solve(matrix + prior, right)
+    curve = slice(None, len(tone))
+    explained -= right[curve] @ np.linalg.solve((matrix + prior)[curve, curve], right[curve])
+    shrunk = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(prior)[1]
+    return _Estimate(step, covariance, float(explained / max(spread, 1.0) + shrunk) / 2)
+
+
+def _solved(matrix: Array, right: Array, prior: Array, pull: Array, first: int) -> tuple[Array, Array]:
+    """The unknowns from the first one on, and their covariance."""
+    covariance = np.linalg.inv(matrix + prior)
+    return (covariance @ (right + pull))[first:], covariance[first:, first:]
