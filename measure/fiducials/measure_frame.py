@@ -102,7 +102,7 @@ def _detect(frame: Frame, indices: Iterable[int], search_px: float) -> Frame:
 def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
     """At a closer look a mark may be as faint as what texture feigns, where it seldom does so near by: all marks
     together decide of the frame."""
-    detection = detect_mark(frame.scan, expected, frame.options.match)
+    detection = detect_mark(frame.scan, expected, replace(frame.options.match, tells_sharpening=True))
     fit, closer = detection.fit, frame.placement.surroundings.robust
     sure = closer and detection.false_alarms <= FAINT_MARK_BY_NOISE
     likeness, significance = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)

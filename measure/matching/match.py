@@ -256,7 +256,8 @@ def _sharpening_score(fit: PictureFit, linear: LinearFit, priors_dn2: Array) -> 
     """What the picture says of the scan's sharpening, None where it is not drawn with its surroundings. What counted as
     damage counts: halos do, until they are drawn."""
     model = fit.model
-    if model.background_px is not None or model.is_chip:
+    is_asked = model.options.tells_sharpening or fit.window.coding.tone.sharpening
+    if not is_asked or model.background_px is not None or model.is_chip:
         return None
     drawn = model.drawn_light
     shown = fit.area & model.tells & clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)

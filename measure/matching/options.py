@@ -23,6 +23,7 @@ class MatchOptions:
     plain_px: where grey values farther from the mark vary much more than the nearer ones, the match fails.
     damage_rounds: how often damage is sought, cut out and the rest adjusted; 0: it stays in.
     max_shift_px: how far from its start the mark may move.
+    tells_sharpening: whether the picture is asked for sharpening even in a scan that is not known to be sharpened.
     Raises ValueError, naming the option, for a value that is none.
     """
 
@@ -37,6 +38,7 @@ class MatchOptions:
     plain_px: float = inf
     damage_rounds: int = 3
     max_shift_px: float = 8.0
+    tells_sharpening: bool = False
 
     def __post_init__(self) -> None:
         if self.freedom not in FREEDOMS:

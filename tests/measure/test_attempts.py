@@ -30,6 +30,7 @@ class Stand:
         self.name, self.is_complete, self.accepted, self.measured_count = name, False, False, 0
         self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
         self.may_settle = self.is_sure = False
+        self.scan = SCAN
 
     def misfit(self, ids: Sequence[str]) -> Reason:
         return Reason(f"not {self.name}")
