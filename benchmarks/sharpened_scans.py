@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
+from true_marks import KIND, some_mark
 
 from benchmarks.harness import Row
 from measure.fiducials.measurement import measure_fiducials
@@ -23,7 +24,6 @@ from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.scans.opening import open_scan
 from measure.tone.curve import Tone
 from synthetic_images.tone_curve import coded
-from tests.measure.true_marks import KIND, some_mark
 
 COLUMNS = {"frame": "d", "kind": "", "amount": ".2f", "radius_px": ".2f", "power": ".2f", "jpeg": "d", "snr": ".0f",
            "measured": "d", "wrong": "d", "whitened": ".2f", "found": ".2f", "found_px": ".2f"}  # fmt: skip

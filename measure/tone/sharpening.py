@@ -217,5 +217,5 @@ def _estimate(
 
 def _solved(matrix: Array, right: Array, prior: Array, pull: Array, first: int) -> tuple[Array, Array]:
     """The unknowns from the first one on, and their covariance."""
-    covariance = np.linalg.inv(matrix + prior)
+    covariance: Array = np.asarray(np.linalg.inv(matrix + prior), float)
     return (covariance @ (right + pull))[first:], covariance[first:, first:]
