@@ -46,7 +46,13 @@ class Effort:
     half_px: int
     all_orientations: bool
 
+    def scan_cache_bytes(self, scan: Scan) -> int:
+        """Of all searches in a scan: no more than many maps of a small one."""
+        return min(self.cache_bytes, max(_SMALL_MAPS * 4 * scan.width_px * scan.height_px, _LEAST_CACHED))
 
+
+_SMALL_MAPS = 32  # not reduced
+_LEAST_CACHED = 32 << 20  # bytes
 _SIXTEEN_MAPS = 768 << 20  # bytes: of four marks that differ, in a large scan
 FULL = Effort(cache_bytes=_SIXTEEN_MAPS, half_px=1000, all_orientations=True)
 

@@ -165,8 +165,15 @@ class FrameSearch:
         self.among: list[Placement] | None = None
         self._found: dict[tuple[PitchHypothesis, ...], list[Placement]] = {}
         # Of dilations there are two for each of the views of one pose.
-        self._caches = ByteCache[Map](2 * effort.cache_bytes // 3), ByteCache[Dilation](effort.cache_bytes // 3)
+        cache_bytes = effort.scan_cache_bytes(scan)
+        self._caches = ByteCache[Map](2 * cache_bytes // 3), ByteCache[Dilation](cache_bytes // 3)
         self._effort = effort
+
+    def with_surroundings(self, surroundings: Surroundings) -> "FrameSearch":
+        """The search with other surroundings of a mark; both share what they cache."""
+        search = FrameSearch(self.scan, self.layout, self.options, surroundings, self._effort)
+        search._caches = self._caches
+        return search
 
     def search_scan(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements in the whole scan, of all poses, best first."""

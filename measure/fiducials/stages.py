@@ -127,7 +127,7 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
     under other pitches; where nothing is, at a closer look: less of what lies beside a mark counts there, for the
     frame's edge may drown it else, and then less of what grain hides."""
     given, *others = hypotheses
-    closer = [FrameSearch(wide.scan, wide.layout, wide.options, surroundings) for surroundings in (CLOSE, GRAINY)]
+    closer = [wide.with_surroundings(surroundings) for surroundings in (CLOSE, GRAINY)]
     near, nearly = slightly_longer(given[0], _STRETCH) if is_given else ([], given)
     in_windows = is_given and not wide.options.part and is_searched_by_windows(wide.scan, wide.layout, given[0].mm)
     return [

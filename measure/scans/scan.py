@@ -163,13 +163,13 @@ class Scan:
         samples[:above], samples[above + len(rows) :] = rows[0], rows[-1]
         return samples
 
-    def inside(self, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
+    def inside(self, col0: int, row0: int, width: int, height: int, is_read: bool = False) -> NDArray[np.bool_]:
         """(height, width): which pixels of a window are the scan's: they do not repeat its edge, and were not lost by
-        the file."""
+        the file. is_read: all of the window has been read before, and what is lost is known."""
         cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
         in_rows = (rows >= 0) & (rows < self.height_px)
         known = np.asarray(in_rows[:, None] & (cols >= 0) & (cols < self.width_px))
-        for part in self._window_losses(col0, row0, width, height):
+        for part in self._window_losses(col0, row0, width, height, is_read):
             top, left = max(part.row0 - row0, 0), max(part.col0 - col0, 0)
             known[top : part.row0 + part.height - row0, left : part.col0 + part.width - col0] = False
         return known
@@ -241,9 +241,9 @@ class Scan:
     ) -> None:
         self.close()
 
-    def _window_losses(self, col0: int, row0: int, width: int, height: int) -> list[LostPart]:
+    def _window_losses(self, col0: int, row0: int, width: int, height: int, is_read: bool = False) -> list[LostPart]:
         """The parts of a window that the file does not give. What a file has in pieces is known once it is read."""
-        if self._source is self._cache:
+        if self._source is self._cache and not is_read:
             self.samples(col0, row0, width, height)
         return [
             part

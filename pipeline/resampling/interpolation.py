@@ -71,6 +71,10 @@ class _Decoded(_ByWindows):
         inside = np.array([np.frombuffer(read[row], self.dtype).reshape(-1, self.channels) for row in rows.tolist()])
         return inside[:, np.clip(np.arange(col0, col0 + width), left, right) - left]
 
+    def valid_mask(self, col0: int, row0: int, width: int, height: int) -> Mask:
+        inside = self.scan.inside(col0, row0, width, height, is_read=True)
+        return inside | ~_inside_mask(self, col0, row0, width, height)
+
 
 def _inside_mask(source: _ByWindows, col0: int, row0: int, width: int, height: int) -> Mask:
     cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
