@@ -24,6 +24,7 @@ from measure.targets.sheets import robust_view
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
+Integers = NDArray[np.int64]
 
 _UNEVEN = 0.25  # of a square, that a corner lies off an even grid: beside a line that is left out it is a half
 _TRUSTED = 0.1  # of a square, that no corner of the older detector is off, where its corners are taken
@@ -35,6 +36,9 @@ _MOST_LINES = 500  # of a board, along a side
 _THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _DRAWINGS = 3  # of the chessboard detector's random numbers for a second board: one in twenty missed one at the edge
 _CROSSINGS_SEEN = 0.8  # of a second board's, before it is searched
+_INTO_BORDER = 1.4  # of a square beyond the last crossings: where a border is light
+_LIGHT_BORDER = 0.4  # of the contrast, that it may be darker than the light squares
+_MOST = 0.85  # of a line
 _PLAIN_CORNERS = 8  # of a board of markers: two of them, which nothing else is read as
 _LEAST = 3  # lines that a chessboard has in either direction
 _FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
@@ -44,11 +48,15 @@ _LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be see
 
 @dataclass(frozen=True, eq=False)
 class WholePattern:
-    """The pattern that a grid belongs to: grid (rows, columns, 2), grown to where the pattern ends; is_bounded: whether
-    the picture shows its end on all four sides."""
+    """The pattern that a grid belongs to: grid (rows, columns, 2), grown to where the pattern ends; has_ended: before
+    its first row, behind its last column, its last row, and before its first column, whether the picture shows that."""
 
     grid: Array
-    is_bounded: bool
+    has_ended: tuple[bool, ...]
+
+    @property
+    def is_bounded(self) -> bool:
+        return all(self.has_ended)
 
 
 def is_even(grid: Array, size_px: tuple[int, int], farthest: float = np.inf) -> bool:
@@ -79,12 +87,12 @@ def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:
     is_crossing = crossings > _CROSSING * contrast
     if not (contrast > 0 and all(2 * line.sum() >= len(line) for line in (*is_crossing, *is_crossing.T))):
         return None
-    is_bounded = True
+    has_ended = []
     for _ in range(4):
-        grid, ends = _grown(picture, grid, contrast)
-        is_bounded &= ends
+        grid, ended = _grown(picture, grid, contrast)
+        has_ended.append(ended)
         grid = np.rot90(grid)
-    return WholePattern(grid, is_bounded)
+    return WholePattern(grid, tuple(has_ended))
 
 
 def _grown(picture: Bytes, grid: Array, contrast: float) -> tuple[Array, bool]:
@@ -101,6 +109,7 @@ def _grown(picture: Bytes, grid: Array, contrast: float) -> tuple[Array, bool]:
         crossings = parity * _crossing_contrast(picture, further[:3])[0]
         if 2 * np.sum(crossings[inside] > _CROSSING * contrast) < inside.sum() or len(further) > _MOST_LINES:
             return grid, True
+        further[0] = _refined(picture, further[:2])[0]
         grid = further
 
 
@@ -118,6 +127,20 @@ def _crossing_contrast(picture: Bytes, grid: Array) -> Array:
     return np.asarray(alternating * np.where(np.indices(grid.shape[:2]).sum(axis=0) % 2, -1.0, 1.0))
 
 
+def _refined(picture: Bytes, grid: Array) -> Array:
+    """The grid with its corners at the junctions near them, where there are any."""
+    half = max(round(_REFINED * float(_shorter_steps(grid).min())), 2)
+    height, width = picture.shape
+    inside = np.all((grid > 2 * half + 5) & (grid < (width - 2 * half - 6, height - 2 * half - 6)), axis=-1)
+    refined = grid.copy()
+    if inside.any():
+        places = np.array(grid[inside][:, None], np.float32, order="C")
+        cv2.cornerSubPix(picture, places, (half, half), (-1, -1), _REFINING_END)
+        near = np.hypot(*(places[:, 0] - grid[inside]).T) < half
+        refined[inside] = np.where(near[:, None], places[:, 0], grid[inside])
+    return refined
+
+
 def _shorter_steps(grid: Array) -> Array:
     """(rows, columns) the shorter of the steps to the next column and the next row, px."""
     across, down = (np.hypot(*np.moveaxis(np.gradient(grid, axis=axis), 2, 0)) for axis in (1, 0))
@@ -125,8 +148,8 @@ def _shorter_steps(grid: Array) -> Array:
 
 
 def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
-    """All inner corners of a chessboard that is wholly seen, and whether it is the only one. A board of another count
-    is refused, with its count: its corners would have their neighbours' names."""
+    """The inner corners of a chessboard, and whether it is the only one. A board of another count is refused, with its
+    count: its corners would have their neighbours' names; so is a part of a board that may be another part."""
     size_px = (picture.shape[1], picture.shape[0])
     other_size: WholePattern | None = None
     for grid, farthest in _grids(picture, spec):
@@ -139,7 +162,89 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
             corners = {f"r{row}c{column}": FoundCorner(grid[row, column], steps[row, column]) for row, column in places}
             return FoundBoard(corners, others_px=_other_chessboards(picture, grid, spec))
         other_size = pattern
+    if other_size is not None:
+        return _part_of_chessboard(picture, other_size, spec)
     return FoundBoard({}, Reason(_refusal(spec, other_size), Code.NO_BOARD))
+
+
+def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardSpec) -> FoundBoard:
+    """The corners of a board that is partly covered or outside of the picture, where its ends that are seen and the
+    colours of its squares leave one place on the board for them, but for a turn that changes nothing."""
+    borders = tuple(
+        ended and _has_border(picture, np.rot90(pattern.grid, side)) for side, ended in enumerate(pattern.has_ended)
+    )
+    sides_seen = (borders[0] or borders[2]) and (borders[1] or borders[3])
+    namings = list(_namings(picture, pattern.grid, borders, spec)) if sides_seen else []
+    if not namings or any(not _are_alike(namings[0], naming, spec) for naming in namings):
+        return FoundBoard({}, Reason(_refusal(spec, pattern), Code.NO_BOARD))
+
+    def uprightness(naming: Integers) -> float:
+        """How far to the right in the picture the board's columns follow one another."""
+        return float(np.cov(naming.ravel() % spec.columns, pattern.grid[..., 0].ravel())[0, 1])
+
+    naming = max(namings, key=uprightness)
+    grid, height, width = _refined(picture, pattern.grid), *picture.shape
+    contrasts = np.abs(_crossing_contrast(picture, grid))
+    inside = np.all((grid > 1) & (grid < (width - 2, height - 2)), axis=-1)
+    shown = inside & (contrasts > _CROSSING * np.median(contrasts[inside]))
+    # The sides of a square along the board's own rows and columns, however the grid lies on it.
+    board = np.stack([naming % spec.columns, naming // spec.columns], axis=-1).astype(float)
+    by_grid = np.stack([np.gradient(board, axis=1)[0, 0], np.gradient(board, axis=0)[0, 0]], axis=-1)
+    steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1) @ np.linalg.inv(by_grid)
+    corners = {
+        f"r{naming[place] // spec.columns}c{naming[place] % spec.columns}": FoundCorner(grid[place], steps[place])
+        for place in np.ndindex(naming.shape[0], naming.shape[1])
+        if shown[place]
+    }
+    return FoundBoard(corners, others_px=_other_chessboards(picture, grid, spec))
+
+
+def _namings(picture: Bytes, grid: Array, borders: tuple[bool, ...], spec: ChessboardSpec) -> Iterator[Integers]:
+    """Numbers (rows, columns) of the board's corners, row by row, that a grid's corners may have: neither its borders
+    nor the colours of its squares contradict them."""
+    board = np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns)
+    for turns in range(4):
+        turned = np.rot90(grid, turns)
+        rows, columns = turned.shape[:2]
+        top, right, bottom, left = np.roll(borders, -turns)
+        is_dark = bool(np.median(_crossing_contrast(picture, turned)) < 0)
+        for row, column in np.ndindex(max(spec.rows - rows + 1, 0), max(spec.columns - columns + 1, 0)):
+            last_row, last_column = row + rows == spec.rows, column + columns == spec.columns
+            ends = (row == 0 or not top) and (column == 0 or not left)
+            ends = ends and (last_row or not bottom) and (last_column or not right)
+            if ends and is_dark == ((row + column) % 2 == 0):
+                yield np.rot90(board[row : row + rows, column : column + columns], -turns)
+
+
+def _are_alike(naming: Integers, other: Integers, spec: ChessboardSpec) -> bool:
+    """Whether a turn of the board that changes nothing makes one naming of the other."""
+    board = np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns)
+    step = 1 if spec.rows == spec.columns and spec.rows % 2 else 4 if (spec.rows + spec.columns) % 2 else 2
+    return any(np.array_equal(np.rot90(board, turns).ravel()[naming], other) for turns in range(0, 4, step))
+
+
+def _has_border(picture: Bytes, grid: Array) -> bool:
+    """Whether a light border without squares lies beyond the half squares before a grid's first row."""
+    middles, outward = (grid[0, 1:] + grid[0, :-1]) / 2, grid[0] - grid[1]
+    step = (outward[1:] + outward[:-1]) / 2
+
+    def grey(places: Array) -> Array:
+        columns, rows = np.moveaxis(places.astype(np.float32), -1, 0)
+        values = cv2.remap(picture, columns[None], rows[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+        inside = (columns >= 0) & (rows >= 0) & (columns < picture.shape[1]) & (rows < picture.shape[0])
+        return np.where(inside, values.astype(float), np.nan)
+
+    squares, border = grey(middles + 0.5 * step), grey(middles + _INTO_BORDER * step)
+    known = np.isfinite(squares) & np.isfinite(border)
+    pairs = known[1:] & known[:-1]
+    if 2 * known.sum() < len(known) or not pairs.any():
+        return False
+    alternation = np.diff(squares)[pairs] * np.where(np.arange(len(pairs)) % 2, -1.0, 1.0)[pairs]
+    contrast = float(np.median(alternation))
+    light = float(np.max(squares[known]))
+    alternate = np.sign(contrast) * alternation > _CROSSING * abs(contrast)
+    is_light = border[known] > light - _LIGHT_BORDER * abs(contrast)
+    return bool(contrast and alternate.mean() >= _MOST and is_light.mean() >= _MOST)
 
 
 def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
@@ -155,7 +260,10 @@ def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
         return f"{message}: squares may have been counted in place of inner corners, which columns and rows count"
     if columns > spec.columns or rows > spec.rows or pattern.is_bounded:
         return f"{message}. Set columns and rows to the count of the board's inner corners"
-    return f"{message}, and the rest may lie outside of the scan"
+    return (
+        f"{message}, and the rest may lie outside of the scan or be covered; nothing tells which part it is. Show the "
+        "board's light border on two adjacent sides, and more of its longer side than the shorter one has"
+    )
 
 
 def _grids(picture: Bytes, spec: ChessboardSpec) -> Iterator[tuple[Array, float]]:

@@ -127,9 +127,13 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     board = find_board(scan, spec)
     fitted = _fit_found(scan, board.corners, spec)
     notes = board.notes
-    if isinstance(spec, ChessboardSpec) and fitted:
+    if isinstance(spec, ChessboardSpec) and len(fitted) == spec.columns * spec.rows:
         fitted, notes = _named_by_colour(fitted, board.corners, spec)
-    hidden = "its square was not found" if isinstance(spec, SquareGridSpec) else "not found: its markers were not read"
+    hidden = "not found: its markers were not read"
+    if isinstance(spec, ChessboardSpec):
+        hidden = "covered, or outside of the picture"
+    elif isinstance(spec, SquareGridSpec):
+        hidden = "its square was not found"
     unseen = board.reason or Reason(hidden, Code.UNNAMED)
     marks = []
     for name in spec.object_points():

@@ -19,8 +19,7 @@ class BoardOptions:
     """columns, rows: inner corners (chessboard), squares (charuco), markers (aprilgrid, aruco) or circles.
 
     spacing_mm: side of a square, or from one marker or circle to the next; of an asymmetric grid from row to row, half
-    of what lies between two circles of a row. size_mm: of a marker or a circle. first_id: of the markers. bend: whether
-    the board's bend is adjusted. transparent: whether it is seen from both sides, as in a mirror.
+    of what lies between two circles of a row. size_mm: of a marker or a circle. first_id: of the markers.
     """
 
     kind: BoardKind
@@ -31,8 +30,6 @@ class BoardOptions:
     dictionary: str | None = None
     legacy: bool = False
     first_id: int = 0
-    bend: bool = False
-    transparent: bool = False
 
     def __post_init__(self) -> None:
         """Raises InputError where an option of its kind is missing: before anything is read."""
@@ -60,7 +57,6 @@ class BoardOptions:
                 keys |= {"first_id": self.first_id}
             case "circle-grid" | "asymmetric-circle-grid":
                 keys |= {"spacing_mm": self.spacing_mm, "diameter_mm": self._size}
-        keys |= {"transparent": True} if self.transparent else {}
         return "[targets]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in keys.items())
 
     @property

@@ -53,7 +53,6 @@ def _project_text(out: Path, pictures: BoardPictureFiles, options: CalibrationOp
     scans = ", ".join(quoted(os.path.relpath(path, out)) for path in files)
     unknown = "" if options.pitch_um else "# The pixel size is not given: of all in mm only ratios count.\n"
     images = 'images = "images.csv"\n' if has_lines else ""
-    bend = 'board_bend = "free"\n' if options.board.bend else ""
     return f"""# Written by `reseau calibrate`; `reseau run` goes on with it.
 camera = "{pictures.cameras[0].name}.toml"
 scans = [{scans}]
@@ -62,7 +61,7 @@ scans = [{scans}]
 {options.board.table}
 [object]
 unit = "mm"
-{images}{bend}
+{images}
 [adjust]
 transformation = "none"
 unmodelled = "estimate"

@@ -280,6 +280,60 @@ def test_a_chessboard_of_another_count_is_refused_with_its_own(columns: int, row
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
 
+LARGE = ChessboardSpec(9, 6, 24.0)
+
+
+@pytest.fixture(scope="module")
+def large_board() -> tuple[Array, dict[str, Array]]:
+    homography = board_from_pixel(8.0, 3e-4)
+    return picture_of(LARGE, homography, chessboard_dark(LARGE)), truth_of(LARGE, homography)
+
+
+@parametrize_with_studies(
+    ("shown", "count"),
+    [
+        (np.s_[:, 60:], 51),
+        (np.s_[:, :250], 48),
+        (np.s_[:190, :], 45),
+        (np.s_[80:, 70:], 40),
+        (np.s_[:180, :240], 39),
+    ],
+    quick=(3,),
+)
+def test_a_part_of_a_chessboard_has_the_names_of_the_whole(
+    large_board: tuple[Array, dict[str, Array]], shown: Any, count: int
+) -> None:
+    """Its light border is seen on two sides or more; the colours tell which end is which."""
+    picture, truth = large_board
+    board = measure_board(scan_of(picture[shown]), LARGE)
+    errors = errors_px(
+        board, {name: place - [shown[1].start or 0, shown[0].start or 0] for name, place in truth.items()}
+    )
+    assert len(errors) == count
+    assert np.abs(errors).max() < 0.03
+    hidden = {str(mark.reason) for mark in board.marks if not mark.status.is_observation}
+    assert "covered, or outside of the picture" in hidden
+
+
+@parametrize_with_studies("covered", [np.s_[180:, 200:], np.s_[:, :70]], quick=(0,))
+def test_what_covers_a_chessboard_is_no_end_of_it(large_board: tuple[Array, dict[str, Array]], covered: Any) -> None:
+    picture, truth = large_board[0].copy(), large_board[1]
+    picture[covered] = 22000.0
+    errors = errors_px(measure_board(scan_of(picture), LARGE), truth)
+    assert len(errors) >= 45
+    assert np.abs(errors).max() < 0.03
+
+
+@parametrize_with_studies("shown", [np.s_[80:, 150:], np.s_[:, 60:250], np.s_[80:, 60:250]])
+def test_a_part_of_a_chessboard_that_may_be_another_is_refused(
+    large_board: tuple[Array, dict[str, Array]], shown: Any
+) -> None:
+    """Of one corner's border with fewer squares than tell the longer side; and without an end of the longer side."""
+    board = measure_board(scan_of(large_board[0][shown]), LARGE)
+    assert not any(mark.status.is_observation for mark in board.marks)
+    assert "nothing tells which part it is" in board.reason
+
+
 @pytest.mark.parametrize("left_out", [None, 0, 1, 3])
 def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int | None) -> None:
     """Of a lens with 6 % of distortion at the corner, seen at an angle; one line left out shows, wherever it is."""

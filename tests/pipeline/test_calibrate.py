@@ -187,7 +187,6 @@ def test_boards_as_project_files_have_them() -> None:
 
     def board(*given: Any, **options: Any) -> Any:
         table = tomllib.loads(board_options(*given, **options).table)["targets"]
-        assert table.get("transparent") is None
         return read_targets(Table(table, Path("project.toml"), "targets")).board
 
     circles = board("asymmetric-circle-grid", "4x11", "1in", "10mm")
