@@ -143,7 +143,8 @@ def _add_findings(
         for name, variance in zip(names, variances.tolist(), strict=True)
         if variance > 0
     }
-    problem = _problem(own, shared, names, 1000 * float(np.sqrt(variances.max())))
+    known_um = 1000 * float(np.sqrt(max(variances.max(), film_mm**2)))  # with what is added when it is adjusted
+    problem = _problem(own, shared, names, known_um)
     is_known = own.hypothesis is Hypothesis.PITCH and any(Code.PITCH in each.codes for each in frame.problems)
     problems = (*frame.problems, problem) if problem and not is_known else frame.problems
     return replace(add_doubts(frame, bent), problems=problems), film_mm

@@ -17,6 +17,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.special import chdtri, fdtrc, logsumexp
 
 from measure.array_types import Array
@@ -134,9 +135,13 @@ class FrameMarks:
         return float((reduced.residuals**2 / (reduced.variances + film_mm**2)).sum())
 
     def film_variance_mm2(self) -> float:
-        """What scatters the marks beyond their own covariances, unbiased but never negative."""
-        reduced = self._beyond_affine
-        return max(float((reduced.residuals**2 - reduced.variances).sum()) / max(self.redundancy, 1), 0.0)
+        """What scatters the marks beyond their own covariances: the variance with which chi-square is as large as its
+        redundancy (Paule and Mandel, 1982), so that a mark that is hardly known takes nothing from the others' misfit.
+        0 where the covariances explain it."""
+        if self.redundancy == 0 or self.chi_square(0.0) <= self.redundancy:
+            return 0.0
+        most = float(np.sqrt((self._beyond_affine.residuals**2).sum()))
+        return float(brentq(lambda film_mm: self.chi_square(film_mm) - self.redundancy, 0.0, most)) ** 2
 
     def log_density(self, film_mm: float) -> float:
         """Of the misfit, likewise, but for a constant."""

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from measure.fiducials.across_frames import check_frames
+from measure.fiducials.consistency import FrameMarks
 from measure.fiducials.options import BelievedFilm
 from measure.flags import Cause, Status
 from measure.geometry import up_from_camera
@@ -266,3 +267,17 @@ def test_good_marks_differ_by_their_edges_no_more_often_than_stated() -> None:
         for _ in range(200)
     )
     assert lost <= 6  # two are expected at most
+
+
+def test_a_mark_that_is_hardly_known_takes_nothing_from_the_misfit_of_the_others() -> None:
+    """Eight marks of a micrometre, one of them 60 µm off, and one that is known to a millimetre."""
+    places = np.array([(x, y) for x in (-100.0, 0.0, 100.0) for y in (-100.0, 0.0, 100.0)])
+    sigma_mm = np.where(np.arange(9) == 4, 1.0, 0.001)
+    measured = places + np.where(np.arange(9)[:, None] == 1, (0.06, 0.0), 0.0)
+    covariances = sigma_mm[:, None, None] ** 2 * np.eye(2)
+    marks = FrameMarks.from_places(places, measured, covariances)
+    film_mm = np.sqrt(marks.film_variance_mm2())
+    assert 0.008 < film_mm < 0.03  # 60 µm at one of eight, along one of two axes
+    assert marks.chi_square(film_mm) == pytest.approx(marks.redundancy, rel=1e-3)
+    sound = FrameMarks.from_places(places, places + 0.0, covariances)
+    assert sound.film_variance_mm2() == 0.0
