@@ -68,7 +68,8 @@ def present_frame(
             replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
         )
     problems = (*problems, *_problems(scan, frame, pitch_um))
-    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, frame.tone)
+    tone = replace(frame.tone, tone=frame.tone.tone.without_priors)
+    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, tone)
 
 
 def _predicted_frame(scan: Scan, layout: FiducialLayout, frame: Frame, why: Reason) -> FrameMeasurement:

@@ -61,7 +61,7 @@ class ToneInformation:
     matrix (k, k): the information; right_side (k,): the matrix times the most likely departures; sum_of_squares: of the
     misfit without departures, in units of its standard deviations; count: of independent figures. common_variance: of
     each departure by which all pictures deviate from the scanner's curve in the same way, as JPEG's rounding makes
-    them: it is not in the matrix, and no number of pictures averages it.
+    them: it is not in the matrix, and no number of pictures averages it. sharpening: of the scan.
     """
 
     matrix: Array
@@ -69,6 +69,7 @@ class ToneInformation:
     sum_of_squares: float
     count: int
     common_variance: float = 0.0
+    sharpening: Sharpening = field(default_factory=Sharpening)
 
     @classmethod
     def empty(cls) -> "ToneInformation":
@@ -162,6 +163,11 @@ class Tone:
         return self.before or self
 
     @property
+    def without_priors(self) -> "Tone":
+        """The curve as a result, without what was believed before."""
+        return replace(self, before=None, sharpening=replace(self.sharpening, prior=None))
+
+    @property
     def starting_curves(self) -> tuple["Tone", ...]:
         """Other curves to begin with, where this one is not known: noise and grain may hide a mark that is fitted
         through a curve far from the right one."""
@@ -205,7 +211,10 @@ class Tone:
 
         It is kept, and pooled anew with that of the scan itself: what is wrong alike in all scans does not average.
         """
-        return replace(self.estimate(others).tone, other_scans=(self, tuple(others))) if others else self
+        if not others:
+            return self
+        sharpening = Sharpening.pooled([one.sharpening for one in others])
+        return replace(self.estimate(others).tone, other_scans=(self, tuple(others)), sharpening=sharpening)
 
     def estimate(self, each: Sequence[ToneInformation]) -> ToneEstimate:
         """The curve after information from pictures.

@@ -63,7 +63,7 @@ class FrameTone:
         estimate = prior.estimate(each)
         least, greatest = min(mark.least for mark in marks.values()), max(mark.greatest for mark in marks.values())
         step = estimate.tone.mean - matched_by.mean
-        information = ToneInformation.pooled(each, estimate.scatter)
+        information = replace(ToneInformation.pooled(each, estimate.scatter), sharpening=matched_by.sharpening)
         if prior.is_known:
             return cls(prior, None, least, greatest, estimate.scatter, float(step @ step))
         value = estimate.tone.equivalent_power(least, greatest)[0]

@@ -39,7 +39,7 @@ class Sharpening:
     amount: float = 0.0
     radius_px: float = 1.0
     covariance: Array = field(default_factory=lambda: np.zeros((2, 2)))
-    prior: "Sharpening | None" = None
+    prior: "Sharpening | None" = field(default=None, compare=False)
 
     @classmethod
     def pooled(cls, each: Sequence["Sharpening"]) -> "Sharpening":

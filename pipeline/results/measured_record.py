@@ -282,10 +282,12 @@ def tone_information_record(tone: ToneInformation) -> dict[str, object]:
         "square": _numbers(tone.sum_of_squares),
         "count": tone.count,
         "alike": _numbers(tone.common_variance),
+        "sharpening": sharpening_record(tone.sharpening),
     }
 
 
 def read_tone_information(tone: Mapping[str, Any]) -> ToneInformation:
     """What `tone_information_record` wrote."""
     information, right = _array(tone["information"]), _array(tone["right"])
-    return ToneInformation(information, right, float(tone["square"]), int(tone["count"]), float(tone["alike"]))
+    square, count, alike = float(tone["square"]), int(tone["count"]), float(tone["alike"])
+    return ToneInformation(information, right, square, count, alike, read_sharpening(tone.get("sharpening")))

@@ -103,6 +103,10 @@ def test_scans_of_a_scanner_say_together_how_it_sharpens() -> None:
     assert pooled.radius_px == pytest.approx(1.2)
     assert 0.1 < np.sqrt(pooled.covariance[0, 0]) < 0.3
     assert not Sharpening.pooled([own[0], Sharpening(), Sharpening()])  # most are not
+    said = [replace(ToneInformation.empty(), sharpening=each) for each in own]
+    known = Tone.unknown().include_information(said).sharpening
+    assert known.amount == pytest.approx(1.5)
+    assert known.prior is not None  # a scan's own marks add to it
 
 
 @pytest.mark.parametrize(("value", "is_taken"), [(0.8, True), (0.2, False), (-0.1, False), (4.5, False)])

@@ -16,6 +16,7 @@ from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone
+from measure.tone.sharpening import Sharpening
 from pipeline.files.project_file import read_project
 from pipeline.results.measured_record import (
     Failure,
@@ -29,10 +30,16 @@ from pipeline.results.measured_record import (
 )
 
 RNG = np.random.default_rng(5)
-SAID = ToneInformation(RNG.normal(size=(5, 5)), RNG.normal(size=5), 3.3, 17, 0.2)
+SHARPENED = Sharpening(1 / 3, 0.7, RNG.normal(size=(2, 2)))
+SAID = ToneInformation(RNG.normal(size=(5, 5)), RNG.normal(size=5), 3.3, 17, 0.2, SHARPENED)
 CURVE = sampled_curve(np.linspace(0.0, 1.0, 50) ** 1.7 + 0.01 * np.linspace(0.0, 1.0, 50))
 TONE = FrameTone(
-    Tone(CURVE, RNG.normal(size=5), RNG.normal(size=(5, 5)), "its profile", True), SAID, 0.1, 0.7, 1.9, 0.4
+    Tone(CURVE, RNG.normal(size=5), RNG.normal(size=(5, 5)), "its profile", True, sharpening=SHARPENED),
+    SAID,
+    0.1,
+    0.7,
+    1.9,
+    0.4,
 )
 LINE = Line(
     {"90m": Reading("RUN 7", 0.93, 4.6), "270m": Reading("L NNꓤ", 1 / 3, 1.1)},
