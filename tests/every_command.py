@@ -33,10 +33,10 @@ CERTIFICATE = (
 )
 
 
-def chessboard(number: int) -> Any:
-    """A picture of a board of 5 x 4 inner corners, each number from another side."""
-    squares = 40 + 170 * (np.indices((5, 6)).sum(axis=0) % 2)
-    flat = np.pad(np.kron(squares, np.ones((40, 40))), 60, constant_values=210).astype(np.uint8)
+def chessboard(number: int, columns: int = 5, rows: int = 4) -> Any:
+    """A picture of a board of so many inner corners, each number from another side."""
+    squares, side = 40 + 170 * (np.indices((rows + 1, columns + 1)).sum(axis=0) % 2), 240 // (columns + 1)
+    flat = np.pad(np.kron(squares, np.ones((side, side))), 60, constant_values=210).astype(np.uint8)
     turn = 0.45 * np.array([np.cos(1.3 * number), np.sin(1.3 * number), 0.1 * number])
     camera = np.array([[420.0, 0.0, 200.0], [0.0, 420.0, 160.0], [0.0, 0.0, 1.0]])
     shift = np.array([[-180.0], [-160.0], [600.0]])
