@@ -78,7 +78,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
             return _message(message, INTERRUPTED)
         return code if isinstance(code, int) else DONE
     except typer.TyperException as error:
-        return _message(error.format_message(), WRONG_INPUT)
+        return _message(error.format_message().replace("Value error, ", ""), WRONG_INPUT)
     except (InputError, MeasurementError, AdjustmentError) as error:
         return _message(str(error), WRONG_INPUT)
     except BrokenExecutor:

@@ -76,7 +76,7 @@ def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
         groups[head.width_px, head.height_px, _focal_mm(exif)].append(name)
         turns[name] = TURNS_BY_TAG.get(exif.get("Orientation", 1))
     if not groups:
-        raise InputError(f"{next(iter(unreadable.values()))} No picture can be read.")
+        raise InputError(f"No picture can be read: {next(iter(unreadable.values())).rstrip('.')}.")
     by_count = sorted(groups.items(), key=lambda group: -len(group[1]))
     kinds = dict[_Kind, list[str]]()
     for (width, height, focal), images in by_count:  # of a size and the size turned by a quarter the more frequent

@@ -73,9 +73,10 @@ def _read(path: Path, options: ImportOptions) -> tuple[CameraFile, ForeignPose |
         return _camera_and_pose(path, options)
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: there is no such file.") from None
-    except (UnicodeDecodeError, cv2.error, SystemError) as error:
-        message = str(error).splitlines()[0][:80]
-        raise InputError(f"{path}: is no file of cv2.FileStorage with a camera in it ({message}).") from None
+    except (UnicodeDecodeError, cv2.error, SystemError):
+        raise InputError(
+            f"{path}: is no YAML, XML or JSON file of OpenCV (cv2.FileStorage) with a camera in it. Name one."
+        ) from None
 
 
 def _camera_and_pose(path: Path, options: ImportOptions) -> tuple[CameraFile, ForeignPose | None]:

@@ -1,5 +1,6 @@
 """The pages: their commands exist with their options, those of the README and of the start run, their tables hold."""
 
+import json
 import re
 import shlex
 import shutil
@@ -10,12 +11,14 @@ from unittest.mock import patch
 
 import cv2
 import pytest
+import real_data
 import typer
 from every_command import chessboard
 from test_tutorial import block
 
 from pipeline.cli import DONE, LOOK, app, run
 from pipeline.files.library import read_library
+from pipeline.results.adjustment_file import read_adjustment
 from pipeline.review import server
 
 ROOT = Path(__file__).parents[2]
@@ -148,3 +151,61 @@ def test_the_commands_of_the_page_of_archives_run(desk: Path) -> None:
         codes = run_all(page, lambda command: "--scan" in command)
     assert set(codes.values()) <= {DONE, LOOK}, codes
     assert (desk / "out" / "report.html").exists()
+
+
+@pytest.mark.study
+def test_the_figures_of_the_demonstration_on_the_pages(tmp_path: Path) -> None:
+    """Those of the tutorial, and the table of the page of models."""
+    assert run(["demo", str(tmp_path)]) == DONE
+    adjustment = read_adjustment(tmp_path / "out" / "adjustment.json")
+    (camera,) = adjustment.cameras.values()
+    c = camera.principal_distance_mm
+    tutorial = (ROOT / "docs" / "start" / "film-scan.md").read_text(encoding="utf-8")
+    assert f"c = {c.value:.3f} mm, with a standard deviation of {c.sigma:.3f}" in tutorial
+    assert f"Here it is {adjustment.sigma0:.2f}" in tutorial
+    assert run(["choose", str(tmp_path / "project.toml")]) == DONE
+    candidates = {
+        each["name"]: each for each in json.loads((tmp_path / "out" / "choose.json").read_text())["candidates"]
+    }
+    rows = table((ROOT / "docs" / "how-to" / "choose-a-model.md"), "model")
+    assert len(rows) == 6
+    for name, unknowns, redundancy, sigma0, *_ in rows:
+        found = candidates[name.strip("*")]
+        assert (int(unknowns), int(redundancy)) == (found["unknowns"], found["redundancy"])
+        assert float(sigma0) == pytest.approx(found["sigma0"], abs=0.006)
+
+
+@real_data.needs("chessboards", "opencv")
+@pytest.mark.study
+def test_the_table_of_the_page_of_boards(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pictures = sorted((real_data.DATA / "chessboards" / "opencv").glob("left[0-9]*.jpg"))
+    run(
+        [
+            "calibrate",
+            *map(str, pictures),
+            "--board",
+            "9x6",
+            "--square",
+            "25mm",
+            "--json",
+            "--out",
+            str(tmp_path / "out"),
+        ]
+    )
+    (camera,) = json.loads(capsys.readouterr().out)["cameras"]
+    page = ROOT / "docs" / "start" / "board.md"
+    rows = table(page, "parameter")
+    assert len(rows) >= 6
+    for name, value, sigma in rows:
+        word = name.removesuffix(", px")
+        found = camera["distortion"][word] if word not in ("fx", "fy", "cx", "cy") else camera[f"{word}_px"]
+        decimals = len(value.partition(".")[2])
+        assert float(value.replace("−", "-")) == pytest.approx(found["value"], abs=0.51 * 10**-decimals)
+        assert float(sigma) == pytest.approx(found["sigma"], abs=0.51 * 10**-decimals)
+    assert f"rms {camera['rms_px']:.3f} px a point" in page.read_text(encoding="utf-8")
+
+
+def table(page: Path, first: str) -> list[list[str]]:
+    """The cells of the table whose first column has this heading."""
+    lines = page.read_text(encoding="utf-8").split(f"| {first} |")[1].split("\n\n")[0].splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
