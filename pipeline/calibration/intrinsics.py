@@ -155,8 +155,8 @@ class CameraIntrinsics:
             yield f"Turned counter-clockwise, and turned back into the frame of the others: {shown}."
         if unsure := self.pictures.unsure_turns:
             yield (
-                f"Which way {listed(unsure)} {'was' if len(unsure) == 1 else 'were'} turned cannot be told: both ways "
-                "fit alike, for the principal point lies in the middle and the distortion is symmetric."
+                f"Which way {listed(unsure)} {'was' if len(unsure) == 1 else 'were'} turned is ambiguous: both ways "
+                "fit equally, for the principal point lies in the middle and the distortion is symmetric."
             )
         if self.left_out:
             yield f"Left out: {listed([f'{name} ({why})' for name, why in self.left_out.items()])}."
