@@ -159,12 +159,19 @@ class WholePicture(Segments):
     """A picture in memory: (height, width, channels) of 8 or 16 bits, one segment. damage: why it cannot be trusted, a
     part of a sentence, empty where it can."""
 
-    def __init__(self, samples: Samples, rounding_step_dn: float = 0.0, damage: str = "") -> None:
+    def __init__(
+        self,
+        samples: Samples,
+        rounding_step_dn: float = 0.0,
+        damage: str = "",
+        full_scale_dn: float | None = None,
+    ) -> None:
+        """full_scale_dn: None: all bits of a sample are used."""
         self._samples, self._damage, self.rounding_step_dn = samples, damage, rounding_step_dn
         self.height_px, self.width_px, self.channels = samples.shape
         self.segment_height_px, self.segment_width_px = self.height_px, self.width_px
         self.sample_bytes = samples.itemsize
-        self.full_scale_dn = float(2 ** (8 * samples.itemsize) - 1)
+        self.full_scale_dn = float(2 ** (8 * samples.itemsize) - 1) if full_scale_dn is None else full_scale_dn
         if damage:
             self._samples = np.full_like(samples, self.full_scale_dn // 2)
 

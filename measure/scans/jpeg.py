@@ -217,7 +217,8 @@ def open_jpeg(path: Path, max_pixels: int | None = None) -> OpenedPicture:
     samples, damage = _jpeg_samples(path, data, max_pixels)
     exif = _exif_page(data)
     orientation = 1 if exif is None else orientation_tag(exif)
-    picture = WholePicture(samples, rounding_step_dn(data), damage)
+    bits = (picture_form(data) or (0, 0, 0, 8))[3]
+    picture = WholePicture(samples, rounding_step_dn(data), damage, 2.0**bits - 1)
     return OpenedPicture(picture, jpeg_pitch(data), orientation_notes(orientation), orientation=orientation)
 
 

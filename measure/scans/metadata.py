@@ -29,7 +29,13 @@ MOST_PIXELS = 4_000_000_000  # 63,000 px a side: film of 23 cm at 4 um
 MOST_PER_BYTE = 1000  # bytes of a picture for each of its file: deflate cannot do more, and film's grain allows ten
 ALWAYS_BYTES = 128 << 20  # of a picture: a drawn one without any grain may be stored in next to nothing
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)  # of TIFF
-WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6  # PhotometricInterpretation
+WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _SEPARATED, _YCBCR = 0, 1, 2, 3, 5, 6  # PhotometricInterpretation
+_CIELAB, _ICCLAB = 8, 9
+_ICCLAB_FULL_DN = 65280.0  # L* of 100 in 16 bits (TIFF Technical Note 4); CIELab's is all ones (TIFF 6.0, section 23)
+_INK_WEIGHTS = (0.299, 0.587, 0.114)  # of red, green and blue, which cyan, magenta and yellow take away
+_UNSIGNED, _SIGNED, _FLOATING = 1, 2, 3  # SampleFormat
+_WORD_DN = 65535.0
+_INK_SET = 332  # 1: cyan, magenta, yellow and black
 _EXIF = 34665  # the tag of an Exif block (Exif 2.3)
 MOST_CHANNELS = 4  # of a pixel: colours and transparency
 _COARSEST_UM = 250.0  # about 100 dpi; 72 and 96 dpi are what programs write that know nothing
@@ -86,7 +92,8 @@ def check_size(
 def no_picture_error(path: Path, start: bytes) -> MeasurementError:
     """Of a file that begins so."""
     return MeasurementError(
-        f"{path} is no TIFF, JPEG or PNG picture (it begins with {start[:8]!r}): give the scan itself, or convert it"
+        f"{path} is no TIFF, JPEG, JPEG 2000 or PNG picture (it begins with {start[:8]!r}): give the scan itself, or "
+        "convert it"
     )
 
 
@@ -140,14 +147,26 @@ def pitch_from_density(x: float, y: float, unit: str | None) -> Pitch:
 
 @dataclass(frozen=True, eq=False)
 class Radiometry:
-    """channels: 1 (grey) or 3 (red, green, blue), the first samples of a pixel; what follows them (transparency)
-    is left out; full_scale_dn: the largest value; inverted: 0 is white; palette: (entries, 3) colours.
+    """channels: 1 (grey) or 3 (red, green, blue), from the first samples of a pixel; what follows them (transparency)
+    is left out; full_scale_dn: the largest value; inverted: 0 is white; palette: (entries, 3) colours; inks_full: the
+    value of a full ink, where the samples are cyan, magenta, yellow and black; span: the stored numbers that become 0
+    and full scale, of floating-point samples; bands: samples of a pixel that make one grey value, where there are
+    several; note: what of this is unusual.
     """
 
     channels: int
     full_scale_dn: float
     inverted: bool = False
     palette: Samples | None = None
+    inks_full: float = 0.0
+    span: tuple[float, float] | None = None
+    bands: int = 0
+    note: str = ""
+
+    @property
+    def used_samples(self) -> int:
+        """How many samples of a pixel, the first ones, its values are made of."""
+        return self.bands if self.inks_full else self.channels
 
     @classmethod
     def from_palette(cls, colormap: NDArray[np.generic]) -> "Radiometry":
@@ -169,8 +188,21 @@ class Radiometry:
             indices = np.minimum(stored[..., 0].astype(np.intp), len(self.palette) - 1)
             return self.palette[indices]
         dtype = np.uint8 if self.sample_bytes == 1 else np.uint16
+        if self.inks_full:
+            light = 1.0 - stored[..., : self.used_samples].astype(np.float32) / self.inks_full
+            luminance = light[..., 3] * (light[..., :3] @ np.array(_INK_WEIGHTS, np.float32))
+            return np.rint(self.full_scale_dn * luminance[..., None]).astype(dtype)
+        if self.span is not None:
+            low, high = self.span
+            share = (np.nan_to_num(stored[..., : self.channels].astype(np.float64), nan=low) - low) / (high - low)
+            return self._uninverted(np.rint(self.full_scale_dn * np.clip(share, 0.0, 1.0)).astype(dtype))
+        if stored.dtype.kind == "i":
+            stored = np.maximum(stored, 0)
         samples: Samples = np.ascontiguousarray(stored[..., : self.channels], dtype)
-        return dtype(self.full_scale_dn) - samples if self.inverted else samples
+        return self._uninverted(samples)
+
+    def _uninverted(self, samples: Samples) -> Samples:
+        return samples.dtype.type(self.full_scale_dn) - samples if self.inverted else samples
 
 
 def orientation_tag(page: TiffPage) -> int:
@@ -212,18 +244,42 @@ def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
     bits, kind, samples = page.bitspersample, int(page.photometric), page.samplesperpixel
     if not isinstance(bits, int):
         raise unsupported_error(path, f"samples are of {' and '.join(map(str, bits))} bits")
-    if page.sampleformat != 1 or not 1 < bits <= 16:
-        number = {1: "integers", 2: "signed integers", 3: "floating-point numbers"}.get(page.sampleformat, "numbers")
+    is_float = page.sampleformat == _FLOATING
+    if page.sampleformat not in (_UNSIGNED, _SIGNED, _FLOATING) or not (1 < bits <= 16 or is_float):
+        number = {_UNSIGNED: "integers", _SIGNED: "signed integers"}.get(page.sampleformat, "numbers")
         raise unsupported_error(path, f"samples are {number} of {bits} bits")
     if page.imagedepth != 1:
         raise unsupported_error(path, f"it is a volume of {page.imagedepth} slices")
     if kind == _PALETTE and page.colormap is not None:
         return Radiometry.from_palette(page.colormap)
-    is_colour = kind == _RGB or (kind == _YCBCR and page.compression in JPEG_COMPRESSIONS)  # its decoder gives RGB
+    is_jpeg, plain = page.compression in JPEG_COMPRESSIONS, page.sampleformat == _UNSIGNED
+    if kind == _SEPARATED and samples >= 4 and plain and not is_jpeg and page.tags.valueof(_INK_SET, default=1) == 1:
+        note = "its colours are inks (CMYK): the luminance of their print is used"
+        return Radiometry(1, _WORD_DN, inks_full=float(2**bits - 1), bands=4, note=note)
+    if kind in (_CIELAB, _ICCLAB) and plain and bits in (8, 16) and not is_jpeg:
+        full = _ICCLAB_FULL_DN if kind == _ICCLAB and bits == 16 else float(2**bits - 1)
+        return Radiometry(1, full, bands=3, note="its colours are CIE L*a*b*: the lightness L* is used")
+    is_colour = kind == _RGB or (kind == _YCBCR and is_jpeg)  # its decoder gives RGB
     if not (kind in (WHITE_IS_ZERO, _BLACK_IS_ZERO) or (is_colour and samples >= 3)):
         name = getattr(page.photometric, "name", str(page.photometric))
         raise unsupported_error(path, f"its colours are {name} with {samples} samples a pixel")
-    return Radiometry(3 if is_colour else 1, float(2**bits - 1), inverted=kind == WHITE_IS_ZERO)
+    channels, inverted = 3 if is_colour else 1, kind == WHITE_IS_ZERO
+    if is_float:
+        note = f"its samples are floating-point numbers of {bits} bits: they are taken in 65535 steps"
+        return Radiometry(channels, _WORD_DN, inverted, note=note)
+    if page.sampleformat == _SIGNED:
+        note = f"its samples are signed numbers of {bits} bits: negative ones are taken for 0"
+        return Radiometry(channels, float(2 ** (bits - 1) - 1), inverted, note=note)
+    return Radiometry(channels, float(2**bits - 1), inverted)
+
+
+def float_span(least: float, greatest: float) -> tuple[float, float]:
+    """Which floating-point numbers become 0 and full scale: those of the usual scale that holds all there are; where
+    none does, the extremes themselves."""
+    low = min(least, 0.0)
+    return low, next(
+        (full for full in (1.0, 255.0, _WORD_DN) if low == 0.0 and greatest <= full), max(greatest, low + 1e-9)
+    )
 
 
 def exif_tags(page: TiffPage) -> Mapping[str, Any]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from measure.errors import MeasurementError
 from measure.scans.cache import LostPart, OpenedPicture, Segments, WholePicture
 from measure.scans.jpeg import JPEG_START, jpeg_colour_tags, jpeg_pitch, open_jpeg, picture_form
+from measure.scans.jpeg2000 import JPEG2000_STARTS, jpeg2000_form, jpeg2000_pitch, open_jpeg2000
 from measure.scans.metadata import (
     DECODING_ERRORS,
     Pitch,
@@ -38,7 +39,7 @@ _GREY_BAND_PX = 1 << 20  # of the scan that is held in grey at a time, about
 
 
 def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
-    """Opens a TIFF, BigTIFF, JPEG or PNG file. Its first bytes give the format, not its name.
+    """Opens a TIFF, BigTIFF, JPEG, JPEG 2000 or PNG file. Its first bytes give the format, not its name.
 
     Parameters
     ----------
@@ -62,6 +63,7 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     if isinstance(path, ScanPart) and (path.page or 1) > 1 and start[:4] not in TIFF_STARTS:
         raise MeasurementError(f"{path}: such a file has one page: take `page` out of images.csv")
     openers = dict.fromkeys(TIFF_STARTS, open_tiff) | {JPEG_START: open_jpeg, PNG_START: open_png}
+    openers |= dict.fromkeys(JPEG2000_STARTS, open_jpeg2000)
     open_picture = next((openers[first] for first in openers if start.startswith(first)), None)
     if open_picture is None:
         raise no_picture_error(path, start)
@@ -76,8 +78,8 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
 
 @dataclass(frozen=True)
 class ScanHead:
-    """file_format: TIFF, JPEG or PNG; bits: of a sample, as they are measured; notes: what is unusual, a sentence
-    each."""
+    """file_format: TIFF, JPEG, JPEG 2000 or PNG; bits: of a sample, as they are measured; notes: what is unusual, a
+    sentence each."""
 
     file_format: str
     width_px: int
@@ -98,8 +100,8 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
     Raises
     ------
     MeasurementError
-        For a file that cannot be opened as a scan, as far as its head and its length show. Damage of a JPEG or PNG
-        picture shows only when it is decoded.
+        For a file that cannot be opened as a scan, as far as its head and its length show. Damage of a JPEG, JPEG 2000
+        or PNG picture shows only when it is decoded.
     """
     start = first_bytes(path)
     if start[:4] in TIFF_STARTS:
@@ -108,11 +110,14 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         segments.close()
         bits = int(segments.full_scale_dn + 1).bit_length() - 1
         return ScanHead("TIFF", segments.width_px, segments.height_px, segments.channels, bits, opened.pitch, notes)
-    if not start.startswith((JPEG_START, PNG_START)):
+    if not start.startswith((JPEG_START, PNG_START, *JPEG2000_STARTS)):
         raise no_picture_error(path, start)
     data, end = _head_and_end(path)
     if start.startswith(JPEG_START):
         file_format, form, marker, pitch = "JPEG", picture_form(data), b"\xff\xd9", jpeg_pitch(data)
+    elif start.startswith(JPEG2000_STARTS):
+        file_format, own, marker, pitch = "JPEG 2000", jpeg2000_form(data), b"\xff\xd9", jpeg2000_pitch(data)
+        form = own and (own.width_px, own.height_px, own.channels, own.bits)
     else:
         file_format, form, marker, pitch = "PNG", png_form(data), b"IEND", png_pitch(data)
     if form is None or 0 in form:

@@ -187,8 +187,8 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
     Raises
     ------
     MeasurementError
-        For a truncated file, for pictures that are no grey, palette or colour scan of up to 16 bits a sample, and for
-        those that claim more than such a file can hold.
+        For a truncated file, for pictures of a kind that `page_radiometry` does not know, and for those that claim more
+        than such a file can hold.
     """
     try:
         taken = check_directories(path)
@@ -260,10 +260,13 @@ def _is_picture(page: TiffPage) -> bool:
 def _band_notes(page: TiffPage, radiometry: Radiometry) -> tuple[str, ...]:
     """Which of several bands is used; transparency is none."""
     bands = page.samplesperpixel - sum(int(kind) in _ALPHA for kind in page.extrasamples)
-    if bands <= radiometry.channels:
-        return ()
-    used = "the first is used" if radiometry.channels == 1 else "the first three are used, as red, green and blue"
-    return (f"the picture has {bands} bands: {used}",)
+    notes = (radiometry.note,) if radiometry.note else ()
+    if bands <= max(radiometry.bands, radiometry.channels):
+        return notes
+    used = {1: "the first is used", 3: "the first three are used, as red, green and blue"}[radiometry.channels]
+    if radiometry.bands:
+        used = f"the first {radiometry.bands} are used"
+    return (f"the picture has {bands} bands: {used}", *notes)
 
 
 def _overviews(file: TiffFile, full: TiffPage, path: Path) -> tuple[Segments, ...]:

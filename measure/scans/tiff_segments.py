@@ -1,6 +1,9 @@
 """The tiles and strips of a TIFF page, each decoded on its own: what is damaged in one costs none of the others."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from itertools import product
 from mmap import ACCESS_READ, ALLOCATIONGRANULARITY, mmap
 from pathlib import Path
 from threading import Lock
@@ -19,12 +22,14 @@ from measure.scans.metadata import (
     Radiometry,
     Samples,
     damage_error,
+    float_span,
     unsupported_error,
 )
 from measure.scans.remote import Address
 
 _PLAIN = 1  # of Compression: no compression (TIFF 6.0)
 _INTO_MEMORY = (5, 8, 32773, 32946, 34926, 50000)  # LZW, deflate, PackBits, zstd: these give bytes
+_FLOAT_PREDICTOR = 3  # of Predictor (TIFF Technical Note 3)
 _MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time; larger tiles and strips are not copied
 
 
@@ -44,17 +49,19 @@ class TiffSegments(Segments):
         self.segment_height_px = page.tilelength if page.is_tiled else min(page.rowsperstrip, self.height_px)
         self.segment_width_px = page.tilewidth if page.is_tiled else self.width_px
         self._grid = (-(-self.height_px // self.segment_height_px), -(-self.width_px // self.segment_width_px))
-        self._planes = radiometry.channels if page.planarconfig == 2 else 1
+        self._planes = radiometry.used_samples if page.planarconfig == 2 else 1
         self._stored_dtype = np.dtype(page.dtype).newbyteorder(file.byteorder)
         self._samples = page.samplesperpixel if page.planarconfig == 1 else 1
         self._row_bytes = -(-self.segment_width_px * self._samples * page.bitspersample // 8)
+        self._is_float, self._spanning = self._stored_dtype.kind == "f", Lock()
         self._lost: dict[tuple[int, int], LostPart] = {}
         wanted = self._planes * self._grid[0] * self._grid[1]
         if min(len(page.dataoffsets), len(page.databytecounts)) < wanted:
             raise damage_error(path, f"{len(page.dataoffsets)} of {wanted} tiles or strips are listed")
         if not (page.compression == _PLAIN or page.compression in TIFF.DECOMPRESSORS):
             raise unsupported_error(path, f"compression {int(page.compression)}")
-        if page.predictor not in (1, 2) and page.compression in (_PLAIN, *_INTO_MEMORY):
+        known = (1, 2, _FLOAT_PREDICTOR) if self._is_float else (1, 2)
+        if page.predictor not in known and page.compression in (_PLAIN, *_INTO_MEMORY):
             raise unsupported_error(path, f"predictor {int(page.predictor)}")
         if page.compression == _PLAIN:
             self._check_bytes()
@@ -108,7 +115,30 @@ class TiffSegments(Segments):
             self._lost[row, column] = LostPart(*place, width, height, f"{part} {indices[0]}: {error}")
             dtype = np.uint8 if self.sample_bytes == 1 else np.uint16
             return np.full((height, width, self.channels), self.full_scale_dn // 2, dtype)
-        return self._radiometry.apply(samples[:height, :width])
+        return self._values(samples[:height, :width])
+
+    def _values(self, stored: NDArray[np.generic]) -> Samples:
+        """Values of stored numbers; of floating-point ones all are read once for their scale."""
+        if self._is_float:
+            with self._spanning:
+                if self._radiometry.span is None:
+                    self._radiometry = replace(self._radiometry, span=float_span(*self._stored_extremes()))
+        return self._radiometry.apply(stored)
+
+    def _stored_extremes(self) -> tuple[float, float]:
+        """The least and the greatest finite number of the picture; what cannot be decoded is passed over."""
+        extremes = list[float]()
+        page = TiffSegments(self._file, self._page, self._path, self._radiometry, self.rounding_step_dn)
+        rows, columns = page._grid
+        for row, column in product(range(rows), range(columns)):
+            height = min(page.segment_height_px, self.height_px - row * page.segment_height_px)
+            width = min(page.segment_width_px, self.width_px - column * page.segment_width_px)
+            for index in page._indices(row, column):
+                with suppress(*DECODING_ERRORS):
+                    stored = np.asarray(page._decode(index, None, height, width))[:height, :width]
+                    finite = stored[..., : self.channels][np.isfinite(stored[..., : self.channels])]
+                    extremes += [float(finite.min()), float(finite.max())] if finite.size else []
+        return min(extremes, default=0.0), max(extremes, default=1.0)
 
     def _decode(self, index: int, given: bytes | None, height_px: int, width_px: int) -> NDArray[np.generic]:
         """(height, width, samples) of the stored numbers, height_px by width_px or more of them; a tile that was left
@@ -120,7 +150,7 @@ class TiffSegments(Segments):
         data = self._stored_bytes(index) if given is None else given
         if page.compression in JPEG_COMPRESSIONS:
             return self._decode_jpeg(bytes(data), height_px, width_px)
-        if page.compression == _PLAIN or page.compression in _INTO_MEMORY:
+        if page.predictor != _FLOAT_PREDICTOR and page.compression in (_PLAIN, *_INTO_MEMORY):
             return self._decode_bytes(data, height_px)
         samples, _, _ = page.decode(bytes(data), index)
         if samples is None:
@@ -231,7 +261,7 @@ class RawRows(TiffSegments):
         shape = (height, self.width_px, self._page.samplesperpixel)
         if self._address is not None:
             (data,) = self._address.ranges([(start, start + height * self._row_bytes)])
-            samples[:] = self._radiometry.apply(np.ndarray(shape, self._stored_dtype, data)[:, col0 : col0 + width])
+            samples[:] = self._values(np.ndarray(shape, self._stored_dtype, data)[:, col0 : col0 + width])
             return
         before = start % ALLOCATIONGRANULARITY
         size = before + height * self._row_bytes
@@ -239,7 +269,7 @@ class RawRows(TiffSegments):
             # Of the rows only the pages with these columns are read, and none of them is held afterwards.
             with mmap(self._file.filehandle.fileno(), size, access=ACCESS_READ, offset=start - before) as mapped:
                 rows = np.ndarray(shape, self._stored_dtype, mapped, before)
-                samples[:] = self._radiometry.apply(rows[:, col0 : col0 + width])
+                samples[:] = self._values(rows[:, col0 : col0 + width])
                 del rows
         except (ValueError, OSError) as error:
             raise damage_error(self._path, f"rows {row0} to {row0 + height - 1} lie beyond its end") from error

@@ -31,7 +31,7 @@ _BROKEN = "cannot be read"
 _COPIES = "the same bytes as another scan"
 _NAMESAKES = "another picture of the same name is taken"
 _UNKNOWN = "their camera is unknown: give them one in images.csv, and remove them from `exclude`"
-_FORMATS = ("JPEG", "PNG", "TIFF")  # the later the better, of one name and size
+_FORMATS = ("JPEG", "JPEG 2000", "PNG", "TIFF")  # the later the better, of one name and size
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.text.text_file import shown
 
-SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".png")
+SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".j2k", ".png")
 
 
 def image_name(text: str) -> str:

@@ -56,7 +56,7 @@ def test_a_folder_is_no_scan(tmp_path: Path) -> None:
 
 def test_a_text_file_named_tif(tmp_path: Path) -> None:
     (tmp_path / "s.tif").write_text("These are my notes on the scans.")
-    with pytest.raises(MeasurementError, match=r"s\.tif is no TIFF, JPEG or PNG.*These ar"):
+    with pytest.raises(MeasurementError, match=r"s\.tif is no TIFF, JPEG, JPEG 2000 or PNG.*These ar"):
         open_scan(tmp_path / "s.tif")
 
 
@@ -232,11 +232,15 @@ def test_bytes_that_a_jpeg_lost_are_noticed_and_none_in_a_whole_one() -> None:
 @pytest.mark.parametrize(
     ("values", "options", "words"),
     [
-        (np.zeros((9, 9), np.float32), {}, "floating-point"),
-        (np.zeros((9, 9), np.int16), {}, "signed"),
+        (np.zeros((9, 9), np.complex64), {}, "numbers of 64 bits"),
+        (np.zeros((9, 9), np.int32), {}, "signed integers of 32 bits"),
         (np.zeros((9, 9), np.uint32), {}, "32 bits"),
         (np.zeros((9, 9), np.bool_), {}, "1 bits"),
-        (np.zeros((9, 9, 4), np.uint8), {"photometric": "separated", "extrasamples": ()}, "SEPARATED"),
+        (
+            np.zeros((9, 9, 4), np.uint8),
+            {"photometric": "separated", "extrasamples": (), "extratags": [(332, 3, 1, 2, True)]},  # of other inks
+            "SEPARATED",
+        ),
     ],
 )
 def test_unsupported_kinds_are_named(tmp_path: Path, values: Any, options: dict[str, Any], words: str) -> None:

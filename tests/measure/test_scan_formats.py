@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import imagecodecs
 import numpy as np
 import PIL.Image
 import pytest
@@ -13,7 +14,7 @@ import tifffile
 from stored_picture import HEIGHT, WIDTH, picture, whole
 
 from measure.errors import MeasurementError
-from measure.scans.opening import open_scan
+from measure.scans.opening import open_scan, read_head
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -297,3 +298,130 @@ def test_twelve_bits_have_their_own_full_scale(tmp_path: Path) -> None:
     with open_scan(tmp_path / "s.tif") as scan:
         assert scan.full_scale_dn == 4095.0
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), 4095.0 - (picture() >> 4))
+
+
+# --- formats of archives: inks, Lab, signed and floating-point samples, JPEG of 12 bits, JPEG 2000
+
+
+@pytest.mark.parametrize("planar", ["contig", "separate"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_inks_give_the_luminance_of_their_print(
+    tmp_path: Path, dtype: type[np.unsignedinteger[Any]], planar: str
+) -> None:
+    """Full cyan takes red away, and black everything."""
+    full = np.iinfo(dtype).max
+    inks = (np.random.default_rng(3).random((60, 70, 4)) * full).astype(dtype)
+    inks[0, 0], inks[0, 1], inks[0, 2], inks[0, 3] = (0, 0, 0, 0), (full, 0, 0, 0), (0, 0, 0, full), (0, full, full, 0)
+    stored = inks if planar == "contig" else np.moveaxis(inks, -1, 0)
+    tifffile.imwrite(tmp_path / "s.tif", stored, photometric="separated", planarconfig=planar)
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert (scan.channels, scan.full_scale_dn) == (1, 65535.0)
+        assert scan.notes == ("its colours are inks (CMYK): the luminance of their print is used",)
+    grey = whole(tmp_path / "s.tif")
+    np.testing.assert_allclose(grey[0, :4] / 65535, [1.0, 0.701, 0.0, 0.299], atol=1e-5)
+    share = 1 - inks / full
+    np.testing.assert_allclose(grey / 65535, share[..., 3] * (share[..., :3] @ [0.299, 0.587, 0.114]), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "dtype", "full"),
+    [("cielab", np.uint8, 255.0), ("cielab", np.uint16, 65535.0), ("icclab", np.uint16, 65280.0)],
+)
+def test_lab_gives_its_lightness(tmp_path: Path, kind: str, dtype: type[np.unsignedinteger[Any]], full: float) -> None:
+    lightness = np.minimum(picture(dtype), int(full)).astype(dtype)
+    lab = np.dstack([lightness, *[np.full_like(lightness, 128)] * 2])
+    tifffile.imwrite(tmp_path / "s.tif", lab, photometric=kind, compression="lzw")
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert (scan.channels, scan.full_scale_dn) == (1, full)
+        assert scan.notes == ("its colours are CIE L*a*b*: the lightness L* is used",)
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), lightness)
+
+
+def test_signed_numbers_keep_their_values_and_negative_ones_are_black(tmp_path: Path) -> None:
+    truth = picture().astype(np.int32) // 2 - 100
+    tifffile.imwrite(tmp_path / "s.tif", truth.astype(np.int16), photometric="minisblack")
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert scan.full_scale_dn == 32767.0
+        assert "negative ones are taken for 0" in scan.notes[0]
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), np.maximum(truth, 0))
+
+
+@pytest.mark.parametrize(("greatest", "full"), [(1.0, 1.0), (0.7, 1.0), (255.0, 255.0), (40000.0, 65535.0), (1e6, 1e6)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"rowsperstrip": 7, "compression": "lzw"}, {"tile": (64, 48), "compression": "zlib", "predictor": True}],
+)
+def test_floating_point_is_scaled_by_what_its_numbers_are(
+    tmp_path: Path, greatest: float, full: float, dtype: type[np.floating[Any]], options: dict[str, Any]
+) -> None:
+    truth = (picture() / picture().max() * greatest).astype(dtype)
+    tifffile.imwrite(tmp_path / "s.tif", truth, photometric="minisblack", **options)
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert (scan.channels, scan.full_scale_dn) == (1, 65535.0)
+        assert "floating-point" in scan.notes[0]
+    np.testing.assert_allclose(whole(tmp_path / "s.tif") / 65535, truth / full, atol=0.6 / 65535)
+
+
+def test_floating_point_with_holes_and_negative_numbers(tmp_path: Path) -> None:
+    truth = np.linspace(-1.0, 3.0, 6000, dtype=np.float32).reshape(60, 100)
+    holed = truth.copy()
+    holed[5, 5] = np.nan
+    tifffile.imwrite(tmp_path / "s.tif", np.stack([holed] * 3, axis=-1), photometric="rgb")
+    grey = whole(tmp_path / "s.tif")
+    assert grey[5, 5] == 0.0
+    grey[5, 5] = (truth[5, 5] + 1) / 4 * 65535
+    np.testing.assert_allclose(grey / 65535, (truth + 1) / 4, atol=2e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_jpeg_of_twelve_bits_has_its_own_full_scale(tmp_path: Path, channels: int) -> None:
+    smooth = cv2.GaussianBlur(picture(np.uint16, channels), (0, 0), 3) >> 4
+    (tmp_path / "s.jpg").write_bytes(imagecodecs.jpeg_encode(smooth, level=97, bitspersample=12))
+    with open_scan(tmp_path / "s.jpg") as scan:
+        assert (scan.channels, scan.full_scale_dn, scan.damage) == (channels, 4095.0, "")
+    truth = smooth @ [0.299, 0.587, 0.114] if channels == 3 else smooth
+    assert np.sqrt(np.mean((whole(tmp_path / "s.jpg") - truth) ** 2)) < 6.0
+
+
+@pytest.mark.parametrize("ending", ["jp2", "j2k"])
+@pytest.mark.parametrize(("bits", "channels"), [(8, 1), (8, 3), (12, 1), (16, 1), (16, 3)])
+def test_jpeg_2000_without_loss(tmp_path: Path, bits: int, channels: int, ending: str) -> None:
+    truth = picture(np.uint16, channels) >> (16 - bits)
+    truth = truth.astype(np.uint8) if bits == 8 else truth
+    path = tmp_path / f"s.{ending}"
+    path.write_bytes(imagecodecs.jpeg2k_encode(truth, codecformat=ending, bitspersample=bits, reversible=True))
+    with open_scan(path) as scan:
+        assert (scan.width_px, scan.height_px, scan.channels) == (WIDTH, HEIGHT, channels)
+        assert (scan.full_scale_dn, scan.is_lossy, scan.notes) == (2.0**bits - 1, False, ())
+    np.testing.assert_allclose(whole(path), truth @ [0.299, 0.587, 0.114] if channels == 3 else truth, rtol=1e-5)
+    head = read_head(path)
+    assert (head.file_format, head.width_px, head.bits, head.channels) == ("JPEG 2000", WIDTH, bits, channels)
+
+
+def test_jpeg_2000_with_loss_says_so_and_its_resolution(tmp_path: Path) -> None:
+    smooth = cv2.GaussianBlur(picture(np.uint8), (0, 0), 3)
+    data = imagecodecs.jpeg2k_encode(smooth, codecformat="jp2", level=60, reversible=False)
+    at = data.index(b"jp2h") - 4
+    (length,) = struct.unpack_from(">I", data, at)
+    resolution = struct.pack(">I4sI4s4H2b", 26, b"res ", 18, b"resc", 500, 1, 400, 1, 2, 2)
+    head = struct.pack(">I", length + len(resolution)) + data[at + 4 : at + length] + resolution
+    (tmp_path / "s.jp2").write_bytes(data[:at] + head + data[at + length :])
+    with open_scan(tmp_path / "s.jp2") as scan:
+        assert scan.is_lossy
+        assert "compressed as JPEG 2000 with loss" in scan.notes[0]
+        assert scan.pitch_um == pytest.approx((25.0, 20.0))
+    assert np.abs(whole(tmp_path / "s.jp2") - smooth).max() < 12
+
+
+def test_a_jpeg_2000_that_is_cut_short_or_signed_is_refused(tmp_path: Path) -> None:
+    data = imagecodecs.jpeg2k_encode(picture(np.uint8), codecformat="jp2", reversible=True)
+    (tmp_path / "s.jp2").write_bytes(data[: len(data) // 2])
+    with pytest.raises(MeasurementError, match="end marker is missing"):
+        open_scan(tmp_path / "s.jp2")
+    (tmp_path / "s.jp2").write_bytes(data[:60])
+    with pytest.raises(MeasurementError, match="header is cut short"):
+        open_scan(tmp_path / "s.jp2")
+    (tmp_path / "s.jp2").write_bytes(imagecodecs.jpeg2k_encode(picture(np.uint8).astype(np.int8), codecformat="jp2"))
+    with pytest.raises(MeasurementError, match="signed samples of 8 bits"):
+        open_scan(tmp_path / "s.jp2")
