@@ -99,6 +99,11 @@ class Parameter(NamedTuple):
         return f"{CODES[self.kind]}.{owner}.{self.quantity}"
 
     @property
+    def label_in_camera(self) -> str:
+        """The quantity of a camera, by itself or by its fiducial."""
+        return f"{self.quantity} of fiducial {self.id}" if self.id else self.quantity
+
+    @property
     def label(self) -> str:
         """As messages name it: "k3 of camera Wild RC8", "x of fiducial 3, camera Wild RC8"."""
         return f"{self.quantity} of {self._owner_label}"

@@ -113,6 +113,7 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
     if not start.startswith((JPEG_START, PNG_START, *JPEG2000_STARTS)):
         raise no_picture_error(path, start)
     data, end = _head_and_end(path)
+    form: tuple[int, int, int, int] | None
     if start.startswith(JPEG_START):
         file_format, form, marker, pitch = "JPEG", picture_form(data), b"\xff\xd9", jpeg_pitch(data)
     elif start.startswith(JPEG2000_STARTS):

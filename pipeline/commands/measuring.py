@@ -1,5 +1,6 @@
 """Commands about scans: what they are of, their marks, and what needs a look."""
 
+import dataclasses
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -230,10 +231,23 @@ def cameras(
     pitch_um: Annotated[
         float | None, pitch_option("The scan's pixel in µm, if its file does not say.", "--pitch")
     ] = None,
+    saved: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--save",
+            metavar="PROJECT.toml",
+            help="Write its adjusted cameras as files for later projects; several projects are joined.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Where --save writes; by default out/cameras.")
+    ] = None,
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
-    """List film cameras, print one, or name a scan's camera."""
+    """List film cameras, print one, name a scan's camera, or save adjusted ones."""
+    if saved:
+        return _save_cameras([read(one) for one in saved], out, as_json)
     if own is not None or scan is not None:
         project = None if own is None else read(own)
         given = [*(scan or ()), *(Path(name) for name in names or ())] or (project.scans.values() if project else ())
@@ -247,6 +261,16 @@ def cameras(
     else:
         show(as_json, library_json, print_library)
         print_next(as_json, command_step("init", "FOLDER", why="finds the camera of each scan"), LIBRARY_STEP)
+    return DONE
+
+
+def _save_cameras(projects: "Sequence[Project]", out: Path | None, as_json: bool) -> int:
+    from pipeline.exchange.saved_cameras import save_cameras
+
+    cameras = save_cameras(projects, out or projects[0].output / "cameras")
+    content = {one.name: {"file": str(one.path), "source": dataclasses.asdict(one.source)} for one in cameras}
+    show(as_json, lambda: {"cameras": content}, lambda _: say(*(one.sentence() for one in cameras)))
+    print_next(as_json, f'camera = "{cameras[0].path}" in a later project')
     return DONE
 
 

@@ -218,7 +218,7 @@ def read_block(project: Project) -> Block:
     if not project.comparator.exists():
         raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first.")
     marks = read_comparator(project.comparator, project.list_pitch_um)
-    adjustment = _adjustment(project, marks)
+    adjustment = current_adjustment(project, marks)
     pitches = pitches_of(project.comparator)
     by_image: dict[str, list[ComparatorPoint]] = {mark.image: [] for mark in marks}
     for mark in in_sensor_frame(project, marks):
@@ -231,7 +231,8 @@ def read_block(project: Project) -> Block:
     return Block(project, tuple(frames), adjustment)
 
 
-def _adjustment(project: Project, marks: tuple[ComparatorPoint, ...]) -> AdjustmentRecord | None:
+def current_adjustment(project: Project, marks: tuple[ComparatorPoint, ...]) -> AdjustmentRecord | None:
+    """The adjustment, None where none converged. Raises InputError for one of other inputs than there are now."""
     path = project.adjustment_path
     if not path.exists():
         return None

@@ -121,10 +121,20 @@ _WRITTEN = re.compile(
 
 @dataclass(frozen=True, config=TABLE)
 class Source:
-    """[source] of a camera file: where its numbers come from, and from how many calibration reports."""
+    """[source] of a camera file: where its numbers come from, and how many reports or frames stand behind them."""
 
     text: Annotated[str, TEXT] = Field(description="Where the numbers come from.")
     reports: Annotated[int, whole()] = Field(default=0, description="How many calibration reports.")
+    frames: Annotated[int, whole()] = Field(default=0, description="How many frames were adjusted.")
+    scanners: Annotated[int, whole()] = Field(default=0, description="Of how many scanners.")
+    archives: Annotated[int, whole()] = Field(default=0, description="In how many projects.")
+    spread_mm: Annotated[
+        Mapping[str, float], Key("numbers by quantity", lambda table, key: _numbers(table.table(key)))
+    ] = Field(default_factory=dict, description="Standard deviation between archives, beyond their own.")
+
+
+def _numbers(table: Table) -> dict[str, float]:
+    return {name: table.number(name, least=0.0) for name in table.names()}
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)

@@ -1,5 +1,6 @@
 """A camera as the text of a camera file: what `read_camera` reads back."""
 
+import dataclasses
 import os
 from collections.abc import Callable, Iterable, Mapping
 
@@ -9,7 +10,7 @@ from adjust.problem.camera import FiducialDistance
 from measure.marks import shapes
 from pipeline.files.camera_file import NO_MARK, CameraFile, GivenFiducial, written_place_text
 from pipeline.files.mark_table import LearnedFrom, SavePicture, template_lines
-from pipeline.text.wording import numbers, quoted, sigma, sigmas
+from pipeline.text.wording import numbers, quoted, sigma, sigmas, table_lines
 
 
 def camera_text(camera: CameraFile, save: SavePicture) -> str:
@@ -33,6 +34,9 @@ def camera_text(camera: CameraFile, save: SavePicture) -> str:
     if camera.calibration is not None:
         lines.append(f"calibration = {quoted(os.path.relpath(camera.calibration.path, camera.path.parent))}")
         lines.append(f"calibration_fiducials = {str(camera.calibration.tells_fiducials).lower()}")
+    if camera.source is not None:
+        given = {key: value for key, value in dataclasses.asdict(camera.source).items() if value}
+        lines += ["", "[source]", *table_lines(given, "source")]
     lines += _distortion_lines(camera)
     for fiducial in camera.fiducials:
         lines += ["", "[[fiducial]]", f"id = {quoted(fiducial.id)}", f"xy_mm = {numbers(fiducial.xy_mm)}"]

@@ -376,7 +376,7 @@ def test_floating_point_with_holes_and_negative_numbers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_jpeg_of_twelve_bits_has_its_own_full_scale(tmp_path: Path, channels: int) -> None:
-    smooth = cv2.GaussianBlur(picture(np.uint16, channels), (0, 0), 3) >> 4
+    smooth = np.asarray(cv2.GaussianBlur(picture(np.uint16, channels), (0, 0), 3), np.uint16) >> 4
     (tmp_path / "s.jpg").write_bytes(imagecodecs.jpeg_encode(smooth, level=97, bitspersample=12))
     with open_scan(tmp_path / "s.jpg") as scan:
         assert (scan.channels, scan.full_scale_dn, scan.damage) == (channels, 4095.0, "")

@@ -1,0 +1,255 @@
+"""`reseau cameras --save`: calibrated cameras as camera files, each beside its calibration with covariance, for later
+projects to take as prior knowledge.
+
+Several projects (archives) of one camera are joined by their covariances. What they differ by more than these explain
+is their spread, a variance component between archives by the method of moments (DerSimonian and Laird, 1986, for each
+quantity by itself), which is added to the joint variances.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from adjust.functional_model.lens import Prior
+from adjust.problem.parameter import Parameter
+from pipeline.errors import InputError
+from pipeline.exchange.block import current_adjustment
+from pipeline.files.camera_file import CameraFile, Source, read_camera
+from pipeline.files.camera_text import camera_text
+from pipeline.files.earlier_calibration import EarlierCalibration
+from pipeline.files.mark_table import saved_in
+from pipeline.files.project_file import Project
+from pipeline.provenance import of_file
+from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity
+from pipeline.results.comparator_file import read_comparator
+from pipeline.results.covariance_file import covariance_path, read_own_covariance
+from pipeline.results.record_json import json_text
+from pipeline.text.atomic import atomic_path, write_atomically
+from pipeline.text.wording import counted, listed
+from pipeline.types import Array
+
+_ONE_CAMERA = ("interior", "fiducial")  # kinds of quantities of a camera
+Changed = Callable[[Parameter, Quantity], Quantity]
+_HEAD = "# Adjusted camera, saved by reseau"
+
+
+@dataclass(frozen=True, eq=False)
+class _Calibration:
+    """A camera as one project's adjustment has it: its quantities with values (n,) and covariance (n, n)."""
+
+    project: Project
+    camera: CameraFile
+    record: AdjustmentRecord
+    parameters: tuple[Parameter, ...]
+    values: Array
+    covariance: Array
+    frames: int
+    scanners: int
+
+
+@dataclass(frozen=True)
+class SavedCamera:
+    """A camera file that was written, and what stands behind it."""
+
+    name: str
+    path: Path
+    source: Source
+
+    def sentence(self) -> str:
+        """What was saved."""
+        return f"{self.name}: {self.path}, {self.source.text}"
+
+
+def save_cameras(projects: Sequence[Project], folder: Path) -> list[SavedCamera]:
+    """Write every calibrated camera of adjusted projects into a folder; cameras of one name are one camera.
+
+    Raises InputError where nothing is adjusted or is of other inputs than there are now, where no camera is calibrated,
+    where calibrations of one camera are of different lens models, and for a file of that name that was not saved so.
+    """
+    found: dict[str, list[_Calibration]] = {}
+    for project in projects:
+        for one in _calibrations(project):
+            found.setdefault(one.camera.name, []).append(one)
+    if not found:
+        paths = ", ".join(str(project.adjustment_path) for project in projects)
+        raise InputError(f"{paths}: no camera is calibrated there, for no object point was observed.")
+    files = {name: folder / f"{own[0].camera.path.stem}.toml" for name, own in found.items()}
+    repeated = [path.name for path in files.values() if list(files.values()).count(path) > 1]
+    if repeated:
+        raise InputError(f"several cameras have a file {repeated[0]}. Give their camera files names of their own.")
+    for path in files.values():
+        if path.exists() and not path.read_bytes().startswith(_HEAD.encode()):
+            raise InputError(f"{path}: is there already, and was not saved so. Name another folder with --out.")
+    return [_save(own, files[name]) for name, own in found.items()]
+
+
+def _calibrations(project: Project) -> list[_Calibration]:
+    path = project.adjustment_path
+    record = current_adjustment(project, read_comparator(project.comparator, project.list_pitch_um))
+    if record is None:
+        raise InputError(f"{path}: there is no adjustment that converged. Run `reseau adjust {project.path}` first.")
+    covariance = read_own_covariance(path)
+    values = dict(zip(covariance.parameters, covariance.values.tolist(), strict=True))
+    found = []
+    for camera in project.cameras.values():
+        if camera.name not in record.cameras or not record.cameras[camera.name].is_calibrated:
+            continue
+        own = tuple(one for one in values if one.kind in _ONE_CAMERA and one.owner == camera.name)
+        images = record.images_of(camera.name)
+        frames = {record.images[image].part_of or image for image in images}
+        scanners = {project.scanner_of(image) for image in images}
+        numbers = np.array([values[one] for one in own])
+        found.append(
+            _Calibration(project, camera, record, own, numbers, covariance.of(own), len(frames), len(scanners))
+        )
+    return found
+
+
+def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
+    first = calibrations[0]
+    values, covariance, spread = _joined(calibrations)
+    record = _with_quantities(first, dict(zip(first.parameters, values.tolist(), strict=True)), covariance)
+    frames, scanners = sum(one.frames for one in calibrations), sum(one.scanners for one in calibrations)
+    archives = listed([one.project.title for one in calibrations])
+    text = f"adjusted from {counted(frames, 'frame')} of {counted(scanners, 'scanner')} in {archives}"
+    labels = {one.label_in_camera: value for one, value in spread.items()}
+    source = Source(text, frames=frames, scanners=scanners, archives=len(calibrations), spread_mm=labels)
+    earlier = path.with_name(f"{path.stem}-calibration.json")
+    _write_calibration(first, record, values, covariance, earlier)
+    camera = _adjusted_camera(first, record.cameras[first.camera.name], earlier, path, source)
+    body = camera_text(camera, saved_in(path.parent, f"{path.stem}-"))
+    write_atomically(path, f"{_HEAD}: values, and in {earlier.name} their covariance.\n{body}")
+    read_camera(path)  # raises for what later projects could not read
+    return SavedCamera(first.camera.name, path, source)
+
+
+def _joined(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mapping[Parameter, float]]:
+    """Values and covariance of the first one's quantities by all calibrations, and the standard deviation between
+    archives of each that is estimated."""
+    first = calibrations[0]
+    if len(calibrations) == 1:
+        return first.values, first.covariance, {}
+    orders = [_order(first, one) for one in calibrations]
+    is_free = np.diag(first.covariance) > 0.0
+    at = [order[is_free] for order in orders]
+    own = [one.values[rows] for one, rows in zip(calibrations, at, strict=True)]
+    cofactors = [one.covariance[np.ix_(rows, rows)] for one, rows in zip(calibrations, at, strict=True)]
+    scale = np.sqrt(np.diag(cofactors[0]))
+    normals = [np.linalg.inv(matrix / np.outer(scale, scale)) for matrix in cofactors]
+    joint = np.linalg.inv(np.sum(normals, axis=0))
+    means = scale * (joint @ np.sum([n @ (x / scale) for n, x in zip(normals, own, strict=True)], axis=0))
+    variances = _variances_between(np.array(own), np.array([np.diag(matrix) for matrix in cofactors]))
+    values, covariance = first.values.copy(), first.covariance.copy()
+    values[is_free] = means
+    covariance[np.ix_(is_free, is_free)] = joint * np.outer(scale, scale) + np.diag(variances / len(own))
+    free = [one for one, free in zip(first.parameters, is_free.tolist(), strict=True) if free]
+    return values, covariance, dict(zip(free, np.sqrt(variances).tolist(), strict=True))
+
+
+def _variances_between(values: Array, variances: Array) -> Array:
+    """(n,) variance between archives of quantities (archives, n) with their own variances, by the method of moments; 0
+    where their differences are no larger than these explain."""
+    weights = 1.0 / variances
+    total = weights.sum(axis=0)
+    mean = (weights * values).sum(axis=0) / total
+    excess = (weights * (values - mean) ** 2).sum(axis=0) - (len(values) - 1)
+    return np.asarray(np.maximum(excess / (total - (weights**2).sum(axis=0) / total), 0.0))
+
+
+def _order(first: _Calibration, other: _Calibration) -> Array:
+    """Where the quantities of one calibration stand in another of the same camera."""
+    name = first.camera.name
+    ours, theirs = first.record.cameras[name].distortion, other.record.cameras[name].distortion
+    where = {one: at for at, one in enumerate(other.parameters)}
+    alike = ours.settings() == theirs.settings() and where.keys() == set(first.parameters)
+    order = np.array([where.get(one, 0) for one in first.parameters], dtype=int)
+    fixed = [np.diag(one.covariance) > 0.0 for one in (first, other)]
+    held = ~fixed[0] if alike else np.zeros(0, bool)
+    if (
+        not alike
+        or (fixed[0] != fixed[1][order]).any()
+        or not np.allclose(first.values[held], other.values[order][held], rtol=1e-9, atol=0.0)
+    ):
+        raise InputError(
+            f"{other.project.adjustment_path}: the camera {name} has another lens model, other fiducials or other "
+            f"fixed values than in {first.project.adjustment_path}. Adjust both with the same camera file."
+        )
+    return order
+
+
+def _with_quantities(one: _Calibration, values: Mapping[Parameter, float], covariance: Array) -> AdjustmentRecord:
+    """The adjustment with these quantities of the one camera, and without images, points and residuals."""
+    name, record = one.camera.name, one.record
+    sigmas = dict(zip(one.parameters, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+
+    def changed(parameter: Parameter, quantity: Quantity) -> Quantity:
+        return replace(quantity, value=values[parameter], sigma=sigmas[parameter]) if parameter in values else quantity
+
+    camera = record.cameras[name]
+    interior = {key: changed(Parameter.interior(name, key), each) for key, each in camera.interior.items()}
+    point = replace(camera.principal_point_mm, x=interior["x0"], y=interior["y0"])
+    lens = {key: interior[key] for key in camera.distortion.parameters}
+    fiducials = {id: _fiducial(one, id, mark, changed, covariance) for id, mark in camera.fiducials.items()}
+    camera = replace(
+        camera,
+        principal_distance_mm=interior["c"],
+        principal_point_mm=point,
+        distortion=replace(camera.distortion, parameters=lens),
+        fiducials=fiducials,
+    )
+    return replace(
+        record, cameras={name: camera}, images={}, frames={}, points={}, residuals=(), suspects=(), correlations=()
+    )
+
+
+def _fiducial(one: _Calibration, id: str, mark: FiducialRecord, changed: Changed, covariance: Array) -> FiducialRecord:
+    x, y = (Parameter.fiducial(one.camera.name, id, axis) for axis in "xy")
+    rho = mark.rho
+    if x in one.parameters and y in one.parameters:
+        at = [one.parameters.index(each) for each in (x, y)]
+        scale = math.sqrt(covariance[at[0], at[0]] * covariance[at[1], at[1]])
+        rho = float(covariance[at[0], at[1]] / scale) if scale else 0.0
+    return replace(mark, x_mm=changed(x, mark.x_mm), y_mm=changed(y, mark.y_mm), rho=rho)
+
+
+def _write_calibration(
+    one: _Calibration, record: AdjustmentRecord, values: Array, covariance: Array, path: Path
+) -> None:
+    with atomic_path(covariance_path(path)) as arrays, atomic_path(path) as result:
+        with result.open("w", encoding="utf-8", newline="\n") as file:
+            file.writelines(json_text(record))
+        names = np.array([each.text for each in one.parameters], dtype=np.str_)
+        with arrays.open("wb") as data:
+            content = {"fingerprint": np.array(of_file(result)), "names": names, "values": values, "matrix": covariance}
+            np.savez_compressed(data, allow_pickle=False, **content)
+
+
+def _adjusted_camera(one: _Calibration, record: CameraRecord, earlier: Path, path: Path, source: Source) -> CameraFile:
+    """The project's camera with adjusted values; the calibration takes the place of the standard deviations of all that
+    it holds."""
+    camera, point = one.camera, record.principal_point_mm
+    parameters = {
+        name: Prior(record.distortion.parameters[name].value, prior.sigma)
+        if name in record.distortion.parameters
+        else prior
+        for name, prior in camera.distortion.parameters.items()
+    }
+    fiducials = tuple(
+        replace(each, xy_mm=record.fiducials[each.id].xy_mm) if each.id in record.fiducials else each
+        for each in camera.fiducials
+    )
+    calibration = EarlierCalibration(earlier, {}, one.parameters, one.values, one.covariance, {})
+    return replace(
+        camera,
+        path=path,
+        principal_distance_mm=record.principal_distance_mm.value,
+        principal_point_mm=(point.x.value, point.y.value),
+        distortion=replace(camera.distortion, parameters=parameters),
+        fiducials=fiducials,
+        calibration=calibration,
+        clicks=None,
+        source=source,
+    )
