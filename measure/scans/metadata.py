@@ -191,7 +191,7 @@ class Radiometry:
         if self.inks_full:
             light = 1.0 - stored[..., : self.used_samples].astype(np.float32) / self.inks_full
             luminance = light[..., 3] * (light[..., :3] @ np.array(_INK_WEIGHTS, np.float32))
-            return np.rint(self.full_scale_dn * luminance[..., None]).astype(dtype)
+            return np.asarray(np.rint(self.full_scale_dn * luminance[..., None]), dtype)
         if self.span is not None:
             low, high = self.span
             share = (np.nan_to_num(stored[..., : self.channels].astype(np.float64), nan=low) - low) / (high - low)

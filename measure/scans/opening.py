@@ -118,7 +118,7 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         file_format, form, marker, pitch = "JPEG", picture_form(data), b"\xff\xd9", jpeg_pitch(data)
     elif start.startswith(JPEG2000_STARTS):
         file_format, own, marker, pitch = "JPEG 2000", jpeg2000_form(data), b"\xff\xd9", jpeg2000_pitch(data)
-        form = own and (own.width_px, own.height_px, own.channels, own.bits)
+        form = None if own is None else (own.width_px, own.height_px, own.channels, own.bits)
     else:
         file_format, form, marker, pitch = "PNG", png_form(data), b"IEND", png_pitch(data)
     if form is None or 0 in form:
