@@ -1,56 +1,81 @@
-"""How long work shows itself: a bar on a terminal, plain lines elsewhere, always on stderr."""
+"""How long work shows itself: one line with a bar on a terminal, a plain line now and then elsewhere, on stderr."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn
 
 from pipeline.terminal import PlainConsole
 
-Count = Callable[[str, int, int], None]
+_EVERY_S = 20.0  # between two plain lines of a stage
+_HOUR_S, _MINUTE_S = 3600.0, 60.0
+
+
+Count = Callable[[str, int, int], None]  # of the thing in hand, the steps done and their total
+
+
+class TimedCount(Protocol):
+    """A `Count` that may be told how long the rest takes."""
+
+    def __call__(self, what: str, done: int, total: int, /, left_s: float | None = None) -> None:
+        """left_s: what the rest takes; None: at the pace so far."""
+
+
+def time_left(seconds: float) -> str:
+    """In minutes."""
+    minutes = round(seconds / _MINUTE_S)
+    if seconds >= 2 * _HOUR_S:
+        return f"about {seconds / _HOUR_S:.1f} hours left"
+    return f"about {minutes} minutes left" if minutes > 1 else "about a minute left"
 
 
 class Reporter:
-    """Where the stages say how far they are."""
+    """Where the stages say how far they are. quiet: nowhere."""
 
-    def __init__(self, console: Console | None = None) -> None:
-        self._console = console or PlainConsole(stderr=True, soft_wrap=True)
-
-    @property
-    def is_terminal(self) -> bool:
-        return self._console.is_terminal
+    def __init__(self, console: Console | None = None, quiet: bool = False) -> None:
+        self._console = console or PlainConsole(stderr=True, soft_wrap=True, quiet=quiet)
 
     @contextmanager
-    def stage(self, title: str) -> Iterator[Count]:
-        """A stage: call what it yields with the thing in hand, the steps done and their total."""
-        if self._console.is_terminal:
-            columns = (
-                TextColumn("{task.description}", markup=False),
-                BarColumn(),
-                TaskProgressColumn(),
-                TimeRemainingColumn(),
-            )
+    def stage(self, title: str) -> Iterator[TimedCount]:
+        """A stage, which calls what it yields."""
+        started_s = time.monotonic()
+
+        def line(what: str, done: int, total: int, left_s: float | None) -> str:
+            passed_s = time.monotonic() - started_s
+            if left_s is None and done and passed_s > _EVERY_S:
+                left_s = passed_s / done * (total - done)
+            count = f"{done} of {total}" if total > 1 else ""
+            left = time_left(left_s) if left_s is not None and done < total else ""
+            return ", ".join(part for part in (" ".join(part for part in (title, count, what) if part), left) if part)
+
+        if self._console.is_terminal and not self._console.quiet:
+            columns = TextColumn("{task.description}", markup=False), BarColumn()
             with Progress(*columns, console=self._console, transient=True) as bar:
                 task = bar.add_task(title)
-                yield lambda what, done, total: bar.update(
-                    task, description=f"{title} {what}", completed=done, total=total
-                )
+
+                def show(what: str, done: int, total: int, /, left_s: float | None = None) -> None:
+                    bar.update(task, description=line(what, done, total, left_s), completed=done, total=total)
+
+                yield show
         else:
-            yield self._lines(title)
+            yield self._lines(line)
 
     def say(self, text: str) -> None:
         """A line that stays, above the bar where there is one."""
         self._console.print(text, markup=False, highlight=False)
 
-    def _lines(self, title: str) -> Count:
-        """A plain line whenever another thing is in hand."""
-        last = ""
+    def _lines(self, line: Callable[[str, int, int, float | None], str]) -> TimedCount:
+        """The first line, the last one, and those between at intervals."""
+        said_s = -_EVERY_S
 
-        def line(what: str, _done: int, _total: int) -> None:
-            nonlocal last
-            if what and what != last:
-                self.say(f"{title} {what}")
-            last = what
+        def show(what: str, done: int, total: int, /, left_s: float | None = None) -> None:
+            nonlocal said_s
+            now_s = time.monotonic()
+            if now_s - said_s >= _EVERY_S or (done == total and total > 1):
+                said_s = now_s
+                self.say(line(what, done, total, left_s))
 
-        return line
+        return show

@@ -16,7 +16,7 @@ from rich.text import Text
 from measure.flags import Status
 from measure.results import Pose
 from pipeline.archive.status import NAMED, ArchiveStatus, archive_status, worst_named
-from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
+from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts, scan_verdict
 from pipeline.files.project_file import Project
 from pipeline.report.data import Problem, ReportData
 from pipeline.report.fiducials import Figure, figure
@@ -89,6 +89,8 @@ def _forms(data: ReportData) -> dict[str, Figure]:
 
 def print_summary(summary: Summary, console: Console) -> None:
     """The summary for a person; file paths are never folded."""
+    if any(summary.verdicts.values()) and (counts := f"{scan_counts(summary.verdicts)}.") != summary.verdict.sentence:
+        console.print(Text(counts))
     console.print(Text(summary.verdict.sentence, style=STYLES[summary.verdict.level]))
     for next_step, problems in groupby(summary.verdict.problems, attrgetter("next_step")):
         for problem in problems:
@@ -201,8 +203,7 @@ def shard_summary(project: Project, path: Path, shard: tuple[int, int]) -> Summa
 
 
 def _scan_summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
-    counts = ", ".join(f"{count} {verdict}" for verdict, count in status.counts.items() if count) or "none"
-    sentence = f"Measured: {len(status.scans)} scans: {counts}."
+    sentence = f"{status.sentence}."
     named, more = worst_named(status.scans, NAMED, False)
     problems = [Problem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
     problems += [Problem(f"decisions.jsonl, {line}", "It does not count.") for line in status.idle_decisions]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.boards.lattice import find_squares
-from measure.boards.markers import find_aruco, find_charuco
+from measure.boards.markers import find_aruco, find_charuco, read_any_markers
 from measure.boards.saddle_points import largest_lattice, saddle_strength
 from measure.boards.specs import (
     ArucoSpec,
@@ -41,6 +41,7 @@ _LIGHT_BORDER = 0.4  # of the contrast, that it may be darker than the light squ
 _MOST = 0.85  # of a line
 _PLAIN_CORNERS = 8  # of a board of markers: two of them, which nothing else is read as
 _LEAST = 3  # lines that a chessboard has in either direction
+_FEWEST_MARKERS = 6  # that are no chance readings
 _FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
 _ENOUGH_PIXELS = 100_000  # for the range of grey values
 _LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
@@ -282,13 +283,18 @@ def _grids(picture: Bytes, spec: ChessboardSpec) -> Iterator[tuple[Array, float]
         drawn = _drawn_chessboard_grid(picture, spec, flags, drawings=1)
         if drawn is not None:
             yield _right_handed(drawn), np.inf
+    largest = _chessboard_of_any_count(picture)
+    if largest is not None:
+        is_turned = largest.shape[:2] == (spec.columns, spec.rows)
+        yield _right_handed(largest.transpose(1, 0, 2) if is_turned else largest), np.inf
+
+
+def _chessboard_of_any_count(picture: Bytes) -> Array | None:
+    """(rows, columns, 2) the largest chessboard that the newer detector sees."""
     cv2.setRNGSeed(1)
     flags = _THOROUGHLY | cv2.CALIB_CB_LARGER
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, (_LEAST, _LEAST), flags)
-    if found:
-        grid = np.asarray(corners, float).reshape(*meta.shape, 2)
-        is_turned = meta.shape == (spec.columns, spec.rows)
-        yield _right_handed(grid.transpose(1, 0, 2) if is_turned else grid), np.inf
+    return np.asarray(corners, float).reshape(*meta.shape, 2) if found else None
 
 
 def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, drawings: int) -> Array | None:
@@ -376,6 +382,25 @@ def _find_markers(picture: Bytes, spec: ArucoSpec | CharucoSpec) -> FoundBoard:
     mirrored = find(np.ascontiguousarray(picture[:, ::-1]))
     is_mirrored = len(mirrored.corners) >= max(_PLAIN_CORNERS, len(upright.corners) + 1)
     return mirrored.mirrored(picture.shape[1]) if is_mirrored else upright
+
+
+def recognise_board(scan: Scan) -> str:
+    """What board a scan shows at reduced size, as `reseau calibrate` takes it: "--board 9x6" of a chessboard, the kind
+    and dictionary of markers; "" where none is seen."""
+    factor = max(round(max(scan.width_px, scan.height_px) / _FIRST_SIZE_PX), 1)
+    picture, reason = _searchable(scan, factor)
+    if reason:
+        return ""
+    dictionary, markers = read_any_markers(picture)
+    grid = _chessboard_of_any_count(picture)
+    pattern = whole_pattern(picture, _right_handed(grid)) if grid is not None else None
+    if markers >= _FEWEST_MARKERS:
+        kind = "charuco" if grid is not None else "aruco"
+        return f"--kind {kind} --dictionary {dictionary} --board COLUMNSxROWS --marker SIZE"
+    if pattern is None or not is_even(pattern.grid, (picture.shape[1], picture.shape[0])):
+        return ""
+    rows, columns = sorted(pattern.grid.shape[:2])
+    return f"--board {columns}x{rows}"
 
 
 def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:

@@ -30,6 +30,7 @@ Layout = TypeVar("Layout", ArucoSpec, CharucoSpec)
 _OFF_SQUARES = 0.25  # of a square, that a corner lies off where the markers beside it put it
 _NO_LEGACY: tuple[Changes, ...] = ({},)
 _LEGACIES: tuple[Changes, ...] = ({"legacy": False}, {"legacy": True})  # OpenCV's two layouts of ChArUco boards
+_COMMON_DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36h11")
 _FEWEST_CORNERS = 4  # that a homography takes
 
 
@@ -75,6 +76,13 @@ def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary, border_module
         readings.setdefault(number, []).append(np.asarray(outline, float).reshape(4, 2))
     border = border_modules / (dictionary.markerSize + 2 * border_modules)
     return MarkerReadings(readings, (picture.shape[1], picture.shape[0]), border)
+
+
+def read_any_markers(picture: Bytes) -> tuple[str, int]:
+    """The dictionary of which most markers are read in a picture, and how many different ones."""
+    numbers = {name: len(read_markers(picture, aruco_dictionary(name)).outlines_px) for name in _COMMON_DICTIONARIES}
+    name = max(numbers, key=lambda each: numbers[each])
+    return name, numbers[name]
 
 
 def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:

@@ -1,11 +1,11 @@
 """The frames of a camera checked together: wrong marks, bent film, wrong given coordinates, scanner distortion.
 
-What a frame's marks leave beside an affine transformation is alike in all frames in the camera's axes where given
+What a frame's marks leave after an affine transformation is alike in all frames in the camera's axes where given
 coordinates are wrong, in the scan's axes where the scanner bends; in one frame it is its film or a mark (`misfits`).
 Nothing that was measured is changed: film is a variance of its frame's marks, and a mark that alone is wrong is weak.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -137,39 +137,53 @@ def _add_findings(
         reason = Reason(f"it lies {off:.3f} mm from where {has_it}", code)
         frame = add_doubts(frame, {names[mark]: Doubt((off * px_per_mm) ** 2 / 2, cause, reason)})
     added = film_mm**2 - film.added_later_mm**2 if film_mm > film.sigma_mm else 0.0
-    variances = np.maximum(added, own.suspect_mm2 * np.ones(len(names)))
+    suspect_mm2 = own.suspect_mm2 * np.ones(len(names))
+    variances = np.maximum(added, suspect_mm2)
+    suspects = {name: float(np.sqrt(2 * mm2)) for name, mm2 in zip(names, suspect_mm2, strict=True) if mm2 > 0}
     bent = {
-        name: Doubt(variance * px_per_mm**2, Cause.FILM)
+        name: Doubt(variance * px_per_mm**2, Cause.FILM, _suspicion(suspects[name]) if name in suspects else NO_REASON)
         for name, variance in zip(names, variances.tolist(), strict=True)
         if variance > 0
     }
     known_um = 1000 * float(np.sqrt(max(variances.max(), film_mm**2)))  # with what is added when it is adjusted
-    problem = _problem(own, shared, names, known_um)
+    problem = _problem(own, shared, names, suspects, known_um)
     is_known = own.hypothesis is Hypothesis.PITCH and any(Code.PITCH in each.codes for each in frame.problems)
     problems = (*frame.problems, problem) if problem and not is_known else frame.problems
     return replace(add_doubts(frame, bent), problems=problems), film_mm
 
 
-def _problem(own: FrameMisfit, shared: Explanation, names: Sequence[str], known_um: float) -> Reason:
-    """A sentence on a frame that stands out, whose marks are known to known_um then; empty of any other."""
+def _suspicion(off_mm: float) -> Reason:
+    """Why a mark is weak that may be the wrong one of its frame."""
+    return Reason(f"it may be wrong, by {off_mm:.3f} mm then: its frame is bent or one mark is off", Code.BENT_FRAME)
+
+
+def _problem(
+    own: FrameMisfit, shared: Explanation, names: Sequence[str], suspects: Collection[str], known_um: float
+) -> Reason:
+    """A sentence on a frame that stands out, whose marks are known to known_um then; empty of any other.
+
+    It speaks of the frame. Marks are named as wrong only if they are weak for it: suspects.
+    """
     if own.film_mm is None:
         return NO_REASON
     alone = len(shared.frames) == 1
-    off = _distances(names, shared.pattern.expected_marks(own, own.film_mm).distances_mm())
+    most_mm = float(shared.pattern.expected_marks(own, own.film_mm).distances_mm().max())
     than = "the given coordinates" if alone else "what the camera's frames have in common"
     p_value = f"p = {own.p_value:.1g} for film deformation alone"
     widened = f"The standard deviation of its marks is set to {known_um:.0f} µm."
+    listed = f"{', '.join(list(suspects)[:_NAMED_MARKS])}{' and others' * (len(suspects) > _NAMED_MARKS)}"
     if own.hypothesis is Hypothesis.PITCH:
         return Reason(
-            f"its marks are stretched against {than}; {p_value}. A wrong pitch, or film that is stretched more, "
+            f"the frame is stretched against {than}; {p_value}. A wrong pitch, or film that is stretched more, "
             "explains it best: check pitch_um in the project.",
             Code.BENT_FRAME,
             Code.PITCH,
         )
     if own.hypothesis is Hypothesis.PERSPECTIVE:
         return Reason(
-            f"its marks show a perspective against {than}, {off} after an affine transformation; {p_value}. The film "
-            f'was photographed obliquely: set transformation = "projective" under [adjust]. {widened}',
+            f"the frame shows a perspective against {than}, up to {most_mm:.3f} mm after an affine transformation; "
+            f'{p_value}. The film was photographed obliquely: set transformation = "projective" under [adjust]. '
+            f"{widened}",
             Code.BENT_FRAME,
         )
     if not own.marks.redundancy:
@@ -178,14 +192,15 @@ def _problem(own: FrameMisfit, shared: Explanation, names: Sequence[str], known_
             f"checks three marks. One of the marks is off, or the pitch is wrong. {widened}",
             Code.OFF_GIVEN if alone else Code.OFF_FRAMES,
         )
-    cause = "Its film is bent, or was moved while it was scanned, or one of few marks is wrong."
+    cause = "Its film is bent, or was moved while it was scanned."
     if alone:
         cause = (
-            "Film or scanner bent it, a mark is wrong, or the coordinates are not those of this camera; one frame does "
-            "not tell."
+            "Film or scanner bent it, or the coordinates are not those of this camera; one frame does not tell which."
         )
+    wrong = f" Or a mark is wrong, which {listed} may be: these are weak." if suspects else ""
     return Reason(
-        f"no affine transformation takes {than} to its marks, which lie off, {off}; {p_value}. {cause} {widened}",
+        f"the frame is deformed against {than} by up to {most_mm:.3f} mm after an affine transformation; {p_value}. "
+        f"{cause}{wrong} {widened}",
         Code.BENT_FRAME,
     )
 
@@ -193,9 +208,9 @@ def _problem(own: FrameMisfit, shared: Explanation, names: Sequence[str], known_
 def _wrong_places(shared: Explanation, layout: FiducialLayout, rest: str) -> Reason:
     off = _distances([mark.id for mark in layout.marks], np.hypot(*shared.pattern.mm.T))
     return Reason(
-        f"in all frames of the camera the marks differ from the given coordinates in the same way, {off}, after an "
-        f"affine transformation: p = {shared.pattern.p_value:.1g} for their standard deviations. Check whether these "
-        f"are the coordinates of this camera.{rest}",
+        f"the given coordinates differ from all frames of the camera in the same way, {off}, after an affine "
+        f"transformation: p = {shared.pattern.p_value:.1g} for their standard deviations. Check whether they are those "
+        f"of this camera.{rest}",
         Code.OFF_GIVEN,
     )
 

@@ -41,6 +41,7 @@ from measure.scans.metadata import (
     orientation_tag,
     pitch_from_density,
     tag_pitch,
+    taking_camera,
 )
 from measure.tone.declared import ColourTags
 
@@ -247,6 +248,12 @@ def jpeg_pitch(data: bytes) -> Pitch:
     exif = _exif_page(data) if pitch.um is None else None
     by_exif = pitch if exif is None else tag_pitch(exif)
     return by_exif if by_exif.um is not None or pitch is NO_TAGS else pitch
+
+
+def jpeg_camera(data: bytes) -> str:
+    """The digital camera that took a stream's picture, as `taking_camera` names it."""
+    exif = _exif_page(data)
+    return "" if exif is None else taking_camera(exif)
 
 
 def _exif_page(data: bytes) -> TiffPage | None:

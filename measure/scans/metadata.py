@@ -1,5 +1,7 @@
 """What a scan file says of itself: pitch, orientation, how stored numbers become grey values; and checks of it."""
 
+import math
+import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -37,6 +39,8 @@ _UNSIGNED, _SIGNED, _FLOATING = 1, 2, 3  # SampleFormat
 _WORD_DN = 65535.0
 _INK_SET = 332  # 1: cyan, magenta, yellow and black
 _EXIF = 34665  # the tag of an Exif block (Exif 2.3)
+_EXPOSURE = ("FocalLength", "FNumber", "ExposureTime", "ISOSpeedRatings")  # in it, of a camera's picture
+_LONGEST_NAME = 60
 MOST_CHANNELS = 4  # of a pixel: colours and transparency
 _COARSEST_UM = 250.0  # about 100 dpi; 72 and 96 dpi are what programs write that know nothing
 _FINEST_UM = 1.0  # a pixel: no film scanner is as fine
@@ -280,6 +284,29 @@ def float_span(least: float, greatest: float) -> tuple[float, float]:
     return low, next(
         (full for full in (1.0, 255.0, _WORD_DN) if low == 0.0 and greatest <= full), max(greatest, low + 1e-9)
     )
+
+
+def taking_camera(page: TiffPage) -> str:
+    """The digital camera that took a picture, by maker, model and focal length; "" of a scanner's file, whose Exif
+    block says nothing of an exposure."""
+    exif = exif_tags(page)
+    if not any(tag in exif for tag in _EXPOSURE):
+        return ""
+    make, model = (_words(page.tags.valueof(tag)) for tag in ("Make", "Model"))
+    name = model if model.lower().startswith(make.split(" ")[0].lower()) else f"{make} {model}".strip()
+    focal_mm = exif_number(exif.get("FocalLength"))
+    return (name or "a digital camera") + (f", {focal_mm:g} mm" if focal_mm else "")
+
+
+def _words(tag: object) -> str:
+    return " ".join(re.sub(r"[^\w ./-]", " ", tag).split())[:_LONGEST_NAME] if isinstance(tag, str) else ""
+
+
+def exif_number(tag: object) -> float | None:
+    """A number of an Exif block, which has fractions; None of anything else, and of 0."""
+    if isinstance(tag, tuple) and len(tag) == 2:
+        tag = tag[0] / tag[1] if tag[1] else 0.0
+    return (round(tag, 3) or None) if isinstance(tag, float | int) and math.isfinite(tag) else None
 
 
 def exif_tags(page: TiffPage) -> Mapping[str, Any]:

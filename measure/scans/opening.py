@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
 from measure.scans.cache import LostPart, OpenedPicture, Segments, WholePicture
-from measure.scans.jpeg import JPEG_START, jpeg_colour_tags, jpeg_pitch, open_jpeg, picture_form
+from measure.scans.jpeg import JPEG_START, jpeg_camera, jpeg_colour_tags, jpeg_pitch, open_jpeg, picture_form
 from measure.scans.jpeg2000 import JPEG2000_STARTS, jpeg2000_form, jpeg2000_pitch, open_jpeg2000
 from measure.scans.metadata import (
     DECODING_ERRORS,
@@ -79,7 +79,7 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
 @dataclass(frozen=True)
 class ScanHead:
     """file_format: TIFF, JPEG, JPEG 2000 or PNG; bits: of a sample, as they are measured; notes: what is unusual, a
-    sentence each."""
+    sentence each; camera: the digital camera that took it, by its Exif block, "" of a scan."""
 
     file_format: str
     width_px: int
@@ -88,6 +88,7 @@ class ScanHead:
     bits: int
     pitch: Pitch
     notes: tuple[str, ...] = ()
+    camera: str = ""
 
 
 def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
@@ -127,7 +128,8 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         open_scan(path, max_pixels).close()  # which says whether it stands before something else
     width, height, channels, bits = form
     check_size(path, "a picture", (width, height), width * height * channels, path.stat().st_size, max_pixels)
-    return ScanHead(file_format, width, height, min(channels, 3), bits, pitch)
+    camera = jpeg_camera(data) if file_format == "JPEG" else ""
+    return ScanHead(file_format, width, height, min(channels, 3), bits, pitch, camera=camera)
 
 
 def declared_tone(path: Path) -> Tone | None:

@@ -14,14 +14,15 @@ from measure.errors import MeasurementError
 from measure.scans.opening import ScanHead
 from measure.scans.remote import Address, is_address, scan_path
 from pipeline.archive.catalogue import Catalogue, catalogue
-from pipeline.archive.scan_groups import GroupedScans, ScanGroup, name_cameras, trial_of_cameras
+from pipeline.archive.scan_groups import CANDIDATES, GroupedScans, ScanGroup, name_cameras, trial_of_cameras
 from pipeline.errors import InputError
-from pipeline.files.library import PREFIX, read_library
+from pipeline.files.camera_file import read_camera
+from pipeline.files.library import PREFIX, camera_words, library_path, read_library
 from pipeline.progress import Reporter
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
 from pipeline.text.names import image_name, names_below
-from pipeline.text.wording import counted, quoted
+from pipeline.text.wording import count_sentence, counted, listed, quoted
 from pipeline.workers import worker_pool
 
 OUTPUT = "out"
@@ -30,7 +31,9 @@ _SHOWN = 12  # of each kind of remark on the terminal
 _BROKEN = "cannot be read"
 _COPIES = "the same bytes as another scan"
 _NAMESAKES = "another picture of the same name is taken"
-_UNKNOWN = "their camera is unknown: give them one in images.csv, and remove them from `exclude`"
+_UNKNOWN = "their camera is unknown: add them to images.csv with one, and remove them from `exclude`"
+_DIGITAL = "pictures by a digital camera, which `reseau calibrate` takes"
+TEMPLATE_COMMAND = "reseau template camera --marks cross --square 212 > camera.toml"
 _FORMATS = ("JPEG", "JPEG 2000", "PNG", "TIFF")  # the later the better, of one name and size
 
 
@@ -49,30 +52,57 @@ class NewProject:
         return [group for group in self.found.groups if group.camera]
 
     @property
+    def needs_look(self) -> bool:
+        """Whether anything is left to decide."""
+        return any(cases for _, cases in self.remarks())
+
+    @property
+    def digital(self) -> list[ScanGroup]:
+        """Groups of pictures by digital cameras."""
+        return [group for group in self.found.groups if group.digital]
+
+    @property
+    def unknown(self) -> list[ScanGroup]:
+        """Groups of film scans whose camera is not known."""
+        return [group for group in self.found.groups if not group.camera and not group.digital]
+
+    @property
     def cameras(self) -> dict[Path, str]:
         """The camera of each scan that is to be measured; "" where none is told of any."""
         out = {path for paths in self.left_out.values() for path in paths}
         return {path: group.camera for group in self.found.groups for path in group.paths if path not in out}
 
+    @property
+    def sentence(self) -> str:
+        """How many scans can be measured, and why the others cannot."""
+        scans = {"without a camera": self.unknown, "by a digital camera": self.digital}
+        rest = {word: sum(len(group.paths) for group in groups) for word, groups in scans.items()}
+        rest |= {"broken": len(self.left_out[_BROKEN])}
+        rest |= {"copies": len(self.left_out[_COPIES]) + len(self.left_out[_NAMESAKES])}
+        return count_sentence("can be measured", len(self.cameras) if self.named else 0, self.found.files, rest)
+
     def remarks(self) -> Iterator[tuple[str, list[str]]]:
         """What needs a look, and the single cases of it."""
         yield "cannot be read, and are left out", list(self.found.broken.values())
         yield (
-            "show no known camera"
-            + ("" if self.named else ": draw it in camera.toml (`reseau template camera`), or have its marks learned"),
+            "show no known camera" + ("" if self.named else ": draw it, or have its marks learned"),
             [
-                f"{group.folder}, {len(group.paths)} scans, {_form(group.head)}: {group.why_not()}"
-                for group in self.found.groups
-                if not group.camera
+                line
+                for group in self.unknown
+                for line in (f"{_place(group)}: {group.why_not()}", *_candidate_lines(group.candidates))
             ],
         )
         yield (
             "have marks that several cameras have: that of most calibration reports is taken, images.csv sets another",
             [
-                f"{group.folder}: {group.camera} of {', '.join(group.cameras)}"
-                for group in self.named
-                if group.cameras[1:]
+                line
+                for camera, folders in self._alike_cameras().items()
+                for line in (f"{', '.join(folders)}: {camera[0]}", *_candidate_lines(camera[1:]))
             ],
+        )
+        yield (
+            "are no scans of film, and are left out",
+            [f"{_place(group)}: {group.why_not()}" for group in self.digital],
         )
         numbers = defaultdict[str, set[str]](set)
         for group in self.named:
@@ -118,9 +148,19 @@ class NewProject:
             "left_out": {reason: [str(path) for path in paths] for reason, paths in self.left_out.items()},
             "broken": {str(path): reason for path, reason in self.found.broken.items()},
             "copies": {str(path): str(first) for path, first in self.found.copies.items()},
+            "digital": {str(group.folder): group.calibrate_command for group in self.digital},
             "needs_a_look": {what: cases for what, cases in self.remarks() if cases},
             "notes": list(self.notes()),
         }
+
+    def _alike_cameras(self) -> Mapping[tuple[str, ...], list[str]]:
+        """By cameras that have the same marks, the one that is taken first, the folders of their scans."""
+        alike = defaultdict[tuple[str, ...], list[str]](list)
+        for group in self.named:
+            if group.cameras[1:]:
+                others = [name for name in group.candidates if name != group.camera][: CANDIDATES - 1]
+                alike[group.camera, *others].append(str(group.folder))
+        return {cameras: sorted(set(folders)) for cameras, folders in alike.items()}
 
     def _contradicted_pitches(self) -> Iterator[str]:
         for group in self.named:
@@ -146,6 +186,8 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
             raise InputError(str(error)) from error
     found = _with_cameras(found, reporter, max_pixels)
     new = NewProject(folder, tuple(given), found, _left_out(found))
+    if new.digital and not new.cameras:
+        raise InputError(_only_digital(new))
     write_atomically(folder / "project.toml", project_text(new))
     write_atomically(folder / "images.csv", images_text(new))
     return new
@@ -168,6 +210,12 @@ def _with_cameras(found: Catalogue, reporter: Reporter, max_pixels: int | None) 
     return replace(found, groups=named.groups, broken=named.unread)
 
 
+def _only_digital(new: NewProject) -> str:
+    """What pictures there are, and the command for each group of them."""
+    lines = [f"{_place(group)}, {group.digital}: {group.calibrate_command}" for group in new.digital]
+    return "\n".join([f"{listed(list(map(str, new.given)))}: no scan of film. SIZE: of a square, as 25mm.", *lines])
+
+
 def project_text(new: NewProject) -> str:
     """project.toml. Raises InputError where no scan is left."""
     cameras = new.cameras
@@ -178,11 +226,13 @@ def project_text(new: NewProject) -> str:
     for camera in cameras.values():
         names[camera] += 1
     usual = max(names, key=lambda name: names[name])
-    camera = f"{PREFIX}{usual}" if usual else "camera.toml"
+    camera = f"camera = {quoted(PREFIX + usual)}    # of {names[usual]} scans; images.csv has each one's own"
+    if not usual:
+        camera = f'# camera = "camera.toml"    # draw it: {TEMPLATE_COMMAND}'
     lines = [
         "# What `reseau init` found. Paths are relative to it; `reseau template project` shows what may stand in it.",
         "",
-        f"camera = {quoted(camera)}    # of {names[usual]} scans; images.csv has each one's own",
+        camera,
         f"scans = [{', '.join(quoted(pattern) for pattern in _patterns(new))}]",
         *_exclude_lines(new),
         f"output = {quoted(OUTPUT)}",
@@ -206,9 +256,9 @@ def print_new_project(new: NewProject, console: Console) -> None:
     def say(text: str, style: str = "") -> None:
         console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)
 
-    say(f"{new.found.files} files examined.")
+    say(f"{counted(new.found.files, 'file')} examined: {new.sentence}.")
     for (camera, form), (scans, folders) in sorted(_totals(new).items()):
-        say(f"{camera or 'camera unknown'}: {scans} scans in {folders} folder{'s' * (folders > 1)}, {form}", "bold")
+        say(f"{camera}: {counted(scans, 'scan')} in {counted(folders, 'folder')}, {form}", "bold")
     for what, cases in new.remarks():
         if cases:
             say(f"Needs a look: {what}:", "yellow")
@@ -218,19 +268,26 @@ def print_new_project(new: NewProject, console: Console) -> None:
                 say(f"    and {len(cases) - _SHOWN} more; --json lists all")
     for note in new.notes():
         say(note)
-    project = new.folder / "project.toml"
-    say(f"Written: {project}, {new.folder / 'images.csv'} ({len(new.cameras)} scans).")
-    say(f"Next: look at them, then `reseau measure {project}`.")
+    say(f"Written: {new.folder / 'project.toml'}, {new.folder / 'images.csv'} ({len(new.cameras)} scans).")
 
 
 def _left_out(found: Catalogue) -> dict[str, list[Path]]:
     """By reason. Where no camera is told at all, the project's own file has to say it, and is of all scans."""
     is_named = any(group.camera for group in found.groups)
     broken = [path for path in found.broken if isinstance(path, Address) or path.exists() or path.is_symlink()]
-    unknown = [path for group in found.groups if is_named and not group.camera for path in group.paths]
-    taken = set(broken) | set(unknown)
+    unknown = [
+        path for group in found.groups if is_named and not group.camera and not group.digital for path in group.paths
+    ]
+    digital = [path for group in found.groups if group.digital for path in group.paths]
+    taken = {*broken, *unknown, *digital}
     whole = [(path, group.head) for group in found.groups for path in group.paths if path not in taken]
-    return {_BROKEN: broken, _COPIES: list(found.copies), _NAMESAKES: _namesakes(whole), _UNKNOWN: unknown}
+    return {
+        _BROKEN: broken,
+        _COPIES: list(found.copies),
+        _NAMESAKES: _namesakes(whole),
+        _UNKNOWN: unknown,
+        _DIGITAL: digital,
+    }
 
 
 def _namesakes(scans: Iterable[tuple[Path, ScanHead]]) -> list[Path]:
@@ -298,10 +355,20 @@ def _totals(new: NewProject) -> dict[tuple[str, str], tuple[int, int]]:
     """Scans and folders by camera and form."""
     scans, folders = defaultdict[tuple[str, str], int](int), defaultdict[tuple[str, str], set[Path]](set)
     for group in new.found.groups:
-        key = (group.camera, _form(group.head))
+        key = (group.camera or ("digital camera" if group.digital else "camera unknown"), _form(group.head))
         scans[key] += len(group.paths)
         folders[key].add(group.folder)
     return {key: (count, len(folders[key])) for key, count in scans.items()}
+
+
+def _place(group: ScanGroup) -> str:
+    return f"{group.folder}, {counted(len(group.paths), 'scan')}, {_form(group.head)}"
+
+
+def _candidate_lines(names: Sequence[str]) -> list[str]:
+    """Cameras of the library with what tells them apart, a line each."""
+    library = {name: read_camera(library_path(name)) for name in names}
+    return [f"    {name}: {camera_words(camera)}" for name, camera in library.items()]
 
 
 def _form(head: ScanHead) -> str:

@@ -1,5 +1,6 @@
 """Scan groups: scans of one format, size and resolution, of which a few are tried to name the camera of all."""
 
+import shlex
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -10,18 +11,23 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from measure.boards.find import recognise_board
 from measure.errors import MeasurementError
-from measure.scans.opening import ScanHead, read_head
+from measure.scans.opening import ScanHead, open_scan, read_head
 from measure.scans.parallel import map_items
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_identification import Identification
 from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Count, Reporter
+from pipeline.text.wording import counted
 
 SAMPLES = 3  # scans of each group
 _ALIKE = 0.03  # of their sides: scans of one roll are cut by hand
 _SAME_PITCH = 0.01
 _EVERY = 200  # files after which it is told how far it is
+_SHAPES = (4 / 3, 3 / 2, 16 / 9)  # of digital cameras' pictures, whose sides are multiples of this:
+_SIDES_PX = 8
+CANDIDATES = 3  # cameras that are named where several may be it
 _TELLING = {"camera_type", "principal_distance_mm"}  # of a plate's fields: what tells cameras apart
 
 
@@ -51,11 +57,41 @@ class ScanGroup:
         return tuple(sorted(frozenset.intersection(*named) - against))
 
     @property
+    def candidates(self) -> tuple[str, ...]:
+        """The few cameras that most samples show, of these those with the most calibration reports."""
+        counts, reports = Counter(name for names in self._named for name in names), self._reports
+        ranked = sorted(counts, key=lambda name: (-counts[name], -reports.get(name, 0), name))
+        return tuple(ranked[:CANDIDATES])
+
+    @property
+    def board(self) -> str:
+        """The calibration board that most samples show, as `reseau calibrate` takes it."""
+        boards = Counter(sample.board for sample in self.samples if sample.board)
+        ((board, count),) = boards.most_common(1) or [("", 0)]
+        return board if 2 * count >= len(self.samples) else ""
+
+    @property
+    def digital(self) -> str:
+        """What tells that these are pictures by a digital camera, a part of a sentence; "" of scans of film."""
+        if self.head.camera:
+            return f"taken by {self.head.camera}"
+        if self.board:
+            return "pictures of a calibration board"
+        is_named = any(self._named)
+        return "" if is_named or not has_sensor_size(self.head) else "of the size of digital cameras' pictures"
+
+    @property
+    def calibrate_command(self) -> str:
+        """The command that calibrates the camera of such pictures."""
+        return f"reseau calibrate {shlex.quote(str(self.folder))} {self.board or '--board COLUMNSxROWS'} --square SIZE"
+
+    @property
     def camera(self) -> str:
         """Of cameras with the same marks the one that rests on most calibration reports; "" without any, and where the
         form of marks alone names them: then they may be of a camera that is not in the library."""
-        reports = {name: count for sample in self.samples for name, count in sample.reports.items()}
-        return "" if self.much_alike else max(self.cameras, key=lambda name: reports.get(name, 0), default="")
+        if self.much_alike or self.digital:
+            return ""
+        return max(self.cameras, key=lambda name: self._reports.get(name, 0), default="")
 
     @property
     def much_alike(self) -> tuple[str, ...]:
@@ -84,21 +120,28 @@ class ScanGroup:
 
     def why_not(self) -> str:
         """Why no camera is named, a part of a sentence."""
+        if self.digital:
+            board = f"the command has the board that they show ({self.board})" if self.board else "no board was seen"
+            return f"{self.digital}, no film: {board}"
         if self.cameras:
             firsts = [trial for sample in self.samples for trial in sample.best[:1]]
             found, drawn = sum(trial.found for trial in firsts), sum(trial.drawn for trial in firsts)
+            alike = " or ".join(self.much_alike[:CANDIDATES])
             return (
-                f"perhaps {' or '.join(self.cameras)}, {found} of {drawn} marks found, but that rests on the form of "
-                f"its marks alone, and {' or '.join(self.much_alike)} has marks much like them: compare the drawings "
-                "with a scan"
+                f"perhaps {' or '.join(self.candidates)}, {found} of {drawn} marks found, but that rests on the form of "
+                f"its marks alone, and {alike} has marks much like them: compare the drawings with a scan"
             )
         counts = Counter(name for names in self._named for name in names)
         if not counts:
             return f"no camera stands out in {len(self.samples)} of them"
-        counts_text = ", ".join(f"{name} in {count}" for name, count in counts.most_common())
+        counts_text = ", ".join(f"{name} in {counts[name]}" for name in self.candidates)
         if 2 * sum(map(bool, self._named)) > len(self.samples) and frozenset.intersection(*filter(None, self._named)):
             return f"the marks are those of {counts_text}, but the camera's plate in the picture names another camera"
         return f"of {len(self.samples)} samples not all show the same camera ({counts_text})"
+
+    @property
+    def _reports(self) -> Mapping[str, int]:
+        return {name: count for sample in self.samples for name, count in sample.reports.items()}
 
     @property
     def _named(self) -> list[frozenset[str]]:
@@ -112,6 +155,9 @@ class ScanGroup:
             "size_px": [self.head.width_px, self.head.height_px],
             "best": list(self.cameras),
             "camera": self.camera,
+            "candidates": list(self.candidates),
+            "digital": self.digital,
+            "board": self.board,
             "sentence": self.sentence(),
             "samples": [sample.as_json() for sample in self.samples],
         }
@@ -147,13 +193,13 @@ def group_scans(
     number = 0
     for done, path in enumerate(files):
         if done % _EVERY == 0:
-            count(f"{done} of {len(files)}", done, len(files))
+            count("files", done, len(files))
         try:
             head = read_head(path, max_pixels)
         except MeasurementError as error:
             unread[path] = str(error)
             continue
-        alike = heads[head.file_format, head.channels, head.bits, head.pitch.um is None]
+        alike = heads[head.file_format, head.channels, head.bits, head.pitch.um is None, head.camera]
         own = next((known for known, other in alike if _is_like(other, head)), None)
         if own is None:
             own, number = number, number + 1
@@ -172,25 +218,43 @@ def _is_like(one: ScanHead, other: ScanHead) -> bool:
     return all(abs(a - b) <= _ALIKE * a for a, b in sides) and all(abs(a - b) <= _SAME_PITCH * a for a, b in pitches)
 
 
+def has_sensor_size(head: ScanHead) -> bool:
+    """Whether a picture is as digital cameras make them: of one of their shapes, without a resolution."""
+    short, long = sorted((head.width_px, head.height_px))
+    is_whole = short % _SIDES_PX == long % _SIDES_PX == 0
+    return is_whole and head.pitch.um is None and any(abs(long / short / shape - 1) < 1e-3 for shape in _SHAPES)
+
+
 Try = Callable[[Path], Identification | str]
 
 
 def name_cameras(grouped: GroupedScans, identified: Try, reporter: Reporter, workers: Executor | None) -> GroupedScans:
     """The groups with what their samples show. identified: of a scan, or why it cannot be read."""
     samples = [path for group in grouped.groups for path in group.to_try]
+    of_groups = f"scans of {counted(len(grouped.groups), 'group')} on the camera library"
     answers = dict[Path, Identification | str]()
     with reporter.stage("tried") as count:
         for done, (path, answer) in enumerate(zip(samples, map_items(workers, identified, samples), strict=True), 1):
             answers[path] = answer
-            count(f"{done} of {len(samples)} scans on the camera library", done, len(samples))
-    groups = (
+            count(of_groups, done, len(samples))
+    groups = [
         replace(
             group, samples=tuple(answer for path in group.to_try if isinstance(answer := answers[path], Identification))
         )
         for group in grouped.groups
-    )
+    ]
     unread = {path: answer for path, answer in answers.items() if isinstance(answer, str)}
-    return GroupedScans(tuple(groups), {**grouped.unread, **unread})
+    return GroupedScans(tuple(part for group in groups for part in _of_one_camera(group)), {**grouped.unread, **unread})
+
+
+def _of_one_camera(group: ScanGroup) -> list[ScanGroup]:
+    """The group; where all its scans were tried and show several cameras, the scans of each."""
+    if group.camera or group.digital or len(group.samples) < len(group.paths) or len(group.paths) < 2:
+        return [group]
+    parts = defaultdict[str, list[Identification]](list)
+    for sample in group.samples:
+        parts[replace(group, samples=(sample,)).camera].append(sample)
+    return [replace(group, paths=tuple(one.scan for one in own), samples=tuple(own)) for own in parts.values()]
 
 
 def trial_of_cameras(cameras: Mapping[str, CameraFile], pitch_um: float | None, max_pixels: int | None) -> Try:
@@ -202,9 +266,20 @@ def _identified(
     path: Path, cameras: Mapping[str, CameraFile], pitch_um: float | None, max_pixels: int | None
 ) -> Identification | str:
     try:
-        return identify(path, cameras, pitch_um, Reporter(Console(quiet=True)), max_pixels)
+        head = read_head(path, max_pixels)
+        board = _board(path, max_pixels) if head.camera or has_sensor_size(head) else ""
+        if board or head.camera:
+            return Identification(path, (), board=board)
+        found = identify(path, cameras, pitch_um, Reporter(Console(quiet=True)), max_pixels)
+        is_scan = head.pitch.um is not None
+        return found if found.best or is_scan else replace(found, board=_board(path, max_pixels))
     except MeasurementError as error:
         return str(error)
+
+
+def _board(path: Path, max_pixels: int | None) -> str:
+    with open_scan(path, max_pixels) as scan:
+        return recognise_board(scan)
 
 
 def print_groups(grouped: GroupedScans, console: Console) -> None:

@@ -24,7 +24,7 @@ from pipeline.archive.review_decisions import (
     shortened,
     unknown_images,
 )
-from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
+from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, scan_counts
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
 from pipeline.provenance import FileStates
@@ -59,6 +59,11 @@ class ArchiveStatus:
     def counts(self) -> Mapping[Verdict, int]:
         counts = Counter(scan.verdict for scan in self.scans)
         return {verdict: counts[verdict] for verdict in Verdict}
+
+    @property
+    def sentence(self) -> str:
+        """How many scans are measured, and how the rest stands."""
+        return scan_counts(self.counts)
 
     @property
     def all_good(self) -> bool:
@@ -195,6 +200,7 @@ def print_status(status: ArchiveStatus, console: Console, every: bool = False) -
     for verdict, count in status.counts.items():
         if count:
             table.add_row(str(verdict), str(count), Text(MEANING[verdict]), Text(NEXT_STEP[verdict]))
+    console.print(Text(status.sentence))
     console.print(table)
     named, more = worst_named(status.scans, len(status.scans) if every else NAMED, every)
     for scan in named:

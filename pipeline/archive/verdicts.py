@@ -1,10 +1,11 @@
 """What became of a scan, in one table: the documentation and `reseau status` are made from it."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from enum import StrEnum
 
 from measure.flags import Code, Status
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.text.wording import count_sentence
 
 
 class Verdict(StrEnum):
@@ -44,9 +45,18 @@ NEXT_STEP = {
 }
 
 _MARK_VERDICTS = {status: Verdict.GOOD if status is Status.MEASURED else Verdict.LOOK for status in Status}
+_MEASURED = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR)
 _ANSWERED = frozenset((Code.DECIDED, Code.CLICKED))
 _LEAST_FIDUCIALS = 3  # two give a frame, and nothing to check it by
 MarkState = tuple[str, Status, Collection[str]]  # kind, status, codes of the reason
+
+
+def scan_counts(counts: Mapping[Verdict, int]) -> str:
+    """How many scans are measured, and how many there are of each verdict."""
+    measured = sum(counts.get(verdict, 0) for verdict in _MEASURED)
+    return count_sentence(
+        "measured", measured, sum(counts.values()), {str(each): counts.get(each, 0) for each in Verdict}
+    )
 
 
 def scan_verdict(scan: MeasuredScan) -> Verdict:

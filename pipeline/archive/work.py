@@ -1,7 +1,6 @@
 """What is missing of a project's scans measured, and kept as each is done."""
 
 import os
-import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -19,12 +18,9 @@ from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 from pipeline.provenance import FileState, FileStates, Identity, options_hash, parts_hash, result_key
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.text.wording import counted, drop_file_name, listed
+from pipeline.text.wording import count_sentence, counted, drop_file_name, listed
 from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, results_of
 
-_HOUR_S, _MINUTE_S = 3600.0, 60.0
-_NAMED = 3
-_SAID_EVERY_S = 30.0
 _hash_of = lru_cache(maxsize=4096)(options_hash)
 
 
@@ -36,14 +32,13 @@ class ExpectedTime:
         kinds = zip(tasks, cameras, strict=True)
         self._kind = {task.name: f"{camera} {task.shown_scan.rpartition('.')[2].lower()}" for task, camera in kinds}
         self._left = Counter(self._kind.values())
-        self._done, self._bytes = defaultdict[str, list[float]](list), defaultdict[str, float](float)
+        self._done = defaultdict[str, list[float]](list)
         self._at_a_time = at_a_time
 
-    def is_done(self, name: str, seconds: float, bytes_read: int) -> None:
+    def is_done(self, name: str, seconds: float) -> None:
         kind = self._kind[name]
         self._left[kind] -= 1
         self._done[kind].append(seconds)
-        self._bytes[kind] += max(bytes_read, 0)
 
     @property
     def left_s(self) -> float:
@@ -54,26 +49,10 @@ class ExpectedTime:
         return sum(left * means.get(kind, usual) for kind, left in self._left.items()) / self._at_a_time
 
     @property
-    def sentence(self) -> str:
-        """About how long, and by which kinds."""
-        kinds = [
-            f"{kind}: {self._left[kind]} left, {duration(sum(done) / len(done), 1)} and "
-            f"{self._bytes[kind] / len(done) / 1e6:.0f} MB read each"
-            for kind, done in sorted(self._done.items())
-        ]
-        more = f"; and {len(kinds) - _NAMED} kinds more" if len(kinds) > _NAMED else ""
-        return f"about {duration(self.left_s)} left ({'; '.join(kinds[:_NAMED])}{more})"
-
-
-def duration(seconds: float, decimals: int = 0) -> str:
-    """In words, to two digits or so. decimals: of less than ten seconds."""
-    if seconds >= 2 * _HOUR_S:
-        return f"{seconds / _HOUR_S:.1f} hours"
-    return (
-        f"{seconds / _MINUTE_S:.0f} minutes"
-        if seconds >= 2 * _MINUTE_S
-        else f"{seconds:.{decimals if seconds < 10 else 0}f} s"
-    )
+    def groups(self) -> str:
+        """How many kinds are done."""
+        done = sum(not self._left[kind] for kind in self._left)
+        return f"{done} of {counted(len(self._left), 'group')}"
 
 
 def state_of(task: ScanTask, files: FileStates) -> FileState:
@@ -103,7 +82,6 @@ class Work:
         self._asked = asked_of(project)
         self._decisions = by_image(project.decisions)
         self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, of what was asked for last
-        self._now: set[int] = set()  # rows that were measured now
         self.results: dict[str, int] = {}  # by image, the row of what was asked for last
 
     def measure(self, tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
@@ -124,12 +102,9 @@ class Work:
         known = {task.name: row for task in tasks if (row := self._row(task)) is not None}
         missing = [task for task in tasks if task.name not in known]
         self.results |= known
-        now = sum(row in self._now for row in known.values())  # for what they tell the others
-        earlier = len(known) - now
         self._store.set_current({row: self._asked(name) for name, row in known.items()})
-        if earlier or len(missing) > 1:
-            before = f", {now} more in the steps before" if now else ""
-            reporter.say(f"{earlier} of {len(tasks)} scans are measured already{before}; {len(missing)} to measure")
+        if known or len(missing) > 1:
+            reporter.say(count_sentence("measured already", len(known), len(tasks), {"to measure": len(missing)}))
         if missing:
             self._complete(missing, len(tasks), reporter)
 
@@ -184,24 +159,20 @@ class Work:
         """Measure these, the last of so many scans: those that are measured already count as done."""
         cameras = [self._project.camera_of(task.name).path.stem for task in tasks]
         expected = ExpectedTime(tasks, cameras, self._at_a_time)
-        reported_s, failed = time.monotonic(), defaultdict[str, list[str]](list)
+        failed = defaultdict[str, list[str]](list)
         with reporter.stage("measured") as count:
             for done, (task, row, kept) in enumerate(self._measured(tasks, as_scans=True), 1):
                 measured = scans - len(tasks) + done
                 self.results[task.name] = row
-                expected.is_done(task.name, kept.scan.seconds, kept.bytes_read)
+                expected.is_done(task.name, kept.scan.seconds)
                 if kept.scan.failure:
                     same = drop_file_name(kept.scan.failure.sentence, task.shown_scan)
                     if same not in failed:  # that of many others would be the same
                         reporter.say(f"failed: {task.name}: {same}")
                     failed[same].append(task.name)
                 failures = sum(map(len, failed.values()))
-                left = f"{measured} of {scans}{f', {failures} failed' if failures else ''}"
-                count(left if reporter.is_terminal or len(tasks) <= TASKS_A_CORE else "", measured, scans)
-                now_s = time.monotonic()
-                if done < len(tasks) and (done == self._at_a_time or now_s - reported_s > _SAID_EVERY_S):
-                    reported_s = now_s
-                    reporter.say(f"{left}; {expected.sentence}")
+                what = f"scans, {expected.groups}{f', {failures} failed' if failures else ''}"
+                count(what, measured, scans, expected.left_s)
         for first, *others in failed.values():
             if others:
                 reporter.say(f"failed as {first} did: {counted(len(others), 'scan')} more, {listed(others)}")
@@ -250,7 +221,6 @@ class Work:
             request_hash = self._asked(task.name) if as_scans else None
             row = self._store.keep(kept, task.name if as_scans else None, as_scans, request_hash)
             self._identities[kept.identity.state.uri], self._rows[kept.fingerprint] = kept.identity, row
-            self._now.add(row)
             yield task, row, kept
 
     def _kept(self, task: ScanTask, state: FileState, file: MeasuredFile) -> Kept:

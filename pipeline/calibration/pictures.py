@@ -1,6 +1,5 @@
 """The pictures of `reseau calibrate`, by the camera that took them."""
 
-import math
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import Any
 
 from measure.errors import MeasurementError
 from measure.scans.jpeg import jpeg_colour_tags
-from measure.scans.metadata import DECODING_ERRORS
+from measure.scans.metadata import DECODING_ERRORS, exif_number
 from measure.scans.opening import read_head
 from pipeline.errors import InputError
 from pipeline.files.scan_files import folders_below
@@ -73,7 +72,7 @@ def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
             unreadable[name] = str(error)
             continue
         exif = _exif(path)
-        groups[head.width_px, head.height_px, _focal_mm(exif)].append(name)
+        groups[head.width_px, head.height_px, exif_number(exif.get("FocalLength"))].append(name)
         turns[name] = TURNS_BY_TAG.get(exif.get("Orientation", 1))
     if not groups:
         raise InputError(f"No picture can be read: {next(iter(unreadable.values())).rstrip('.')}.")
@@ -111,13 +110,6 @@ def _exif(path: Path) -> Mapping[str, Any]:
         return jpeg_colour_tags(path).exif
     except (*DECODING_ERRORS, OSError):
         return {}
-
-
-def _focal_mm(exif: Mapping[str, Any]) -> float | None:
-    focal = exif.get("FocalLength")
-    if isinstance(focal, tuple) and len(focal) == 2:  # a fraction, as the tag has it
-        focal = focal[0] / focal[1] if focal[1] else 0.0
-    return (round(focal, 3) or None) if isinstance(focal, float | int) and math.isfinite(focal) else None
 
 
 def _names(cameras: Sequence[_Kind]) -> list[str]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipeline.archive.verdicts import Verdict
-from pipeline.commands.next_steps import command_step, print_next, verdict_steps
+from pipeline.commands.next_steps import command_step, init_steps, print_next, summary_steps, verdict_steps
 from pipeline.commands.shared import (
     DONE,
     LOOK,
     AsJson,
     MaxPixels,
     ProjectFile,
+    Quiet,
     finish,
     pitch_option,
     read,
@@ -32,6 +33,7 @@ from pipeline.text.wording import counted
 if TYPE_CHECKING:
     from pipeline.files.project_file import Project
 
+PROJECT = "project.toml"
 LIBRARY_STEP = command_step("cameras NAME > camera.toml", why="a camera file to start from; or: reseau template camera")
 
 
@@ -59,6 +61,7 @@ def init(
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where project.toml and images.csv go.")] = Path(),
     max_pixels: MaxPixels = None,
+    quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
     """Write a project for a folder of scans, cameras named."""
@@ -66,48 +69,101 @@ def init(
     from pipeline.archive.new_project import init_project, print_new_project
     from pipeline.progress import Reporter
 
-    new = init_project([scan_path(text) for text in scans], out, Reporter(), max_pixels)
+    new = init_project([scan_path(text) for text in scans], out, Reporter(quiet=quiet), max_pixels)
     show(as_json, new.as_json, lambda console: print_new_project(new, console))
-    return LOOK if any(cases for _, cases in new.remarks()) else DONE
+    run_step = [command_step("run", new.folder / PROJECT)] if new.named else []
+    print_next(as_json, *init_steps(new), *run_step)
+    return LOOK if new.needs_look else DONE
 
 
-def measuring(stage: str, help_text: str) -> Callable[..., int]:
-    """The command that does a stage of `pipeline.stages` which measures scans."""
-
-    def command(
-        project: ProjectFile,
-        shard: Annotated[
-            str | None,
-            typer.Option(metavar="K/N", help="The K-th of N parts of the scans, with a results database of its own."),
-        ] = None,
-        cluster: Annotated[
-            str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786, or `local`.")
-        ] = None,
-        retry: Annotated[bool, typer.Option("--retry", help="Measure again the scans that failed.")] = False,
-        moved: Annotated[
-            bool, typer.Option("--moved", help="Know moved or touched files by their content, which is read whole.")
-        ] = False,
-        workers: Annotated[
-            int | None,
-            typer.Option(metavar="N", min=1, max=1024, help="Processes that measure; by default one a core."),
-        ] = None,
-        as_json: AsJson = False,
-        max_pixels: MaxPixels = None,
-    ) -> int:
-        from pipeline import stages
-        from pipeline.workers import WorkOptions
-
-        work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
-        return run_stage(project, partial(getattr(stages, stage), work=work), as_json, max_pixels)
-
-    command.__doc__ = help_text
-    return command
+Shard = Annotated[
+    str | None,
+    typer.Option(metavar="K/N", help="The K-th of N parts of the scans, with a results database of its own."),
+]
+Cluster = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786, or `local`.")
+]
+Retry = Annotated[bool, typer.Option("--retry", help="Measure again the scans that failed.")]
+Moved = Annotated[
+    bool, typer.Option("--moved", help="Know moved or touched files by their content, which is read whole.")
+]
+Workers = Annotated[
+    int | None, typer.Option(metavar="N", min=1, max=1024, help="Processes that measure; by default one a core.")
+]
 
 
-run = measuring("run_all", "Measure, adjust, check and report.\n\nGoes on where an earlier call stopped.")
-measure = measuring(
-    "run_measure", "Measure marks in the scans: comparator.csv.\n\nGoes on where an earlier call stopped."
-)
+def run(
+    project: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PROJECT.toml|FOLDER",
+            help="The project file, or a folder with it; or a folder of film scans, of which a project is made.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where a folder's project goes; by default into the folder.")
+    ] = None,
+    shard: Shard = None,
+    cluster: Cluster = None,
+    retry: Retry = False,
+    moved: Moved = False,
+    workers: Workers = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    max_pixels: MaxPixels = None,
+) -> int:
+    """Measure, adjust, check and report.
+
+    Goes on where an earlier call stopped. A folder of film scans without a project gets one first, as by `reseau init`.
+    """
+    from pipeline.progress import Reporter
+    from pipeline.stages import run_all
+    from pipeline.summary import print_summary
+    from pipeline.workers import WorkOptions
+
+    work, reporter = WorkOptions(_shard(shard), cluster, retry, moved, workers), Reporter(quiet=quiet)
+    if out is not None and not project.is_dir():
+        raise InputError(f"--out goes with a folder of scans, and {project} is none: its project file says `output`.")
+    file = (out or project) / PROJECT if project.is_dir() else project
+    new = None
+    if project.is_dir() and not file.exists():
+        from pipeline.archive.new_project import init_project, print_new_project
+
+        new = init_project([project], file.parent, reporter, max_pixels)
+        if not as_json:
+            print_new_project(new, PlainConsole())
+        if not new.named:
+            show(as_json, new.as_json, lambda _: None)
+            print_next(as_json, *init_steps(new))
+            return LOOK
+    summary = run_all(read(file, max_pixels), reporter, work)
+    record = summary.as_json if new is None else lambda: {**summary.as_json(), "init": new.as_json()}
+    show(as_json, record, lambda console: print_summary(summary, console))
+    print_next(as_json, *(init_steps(new) if new else ()), *summary_steps(file, summary))
+    return max(summary.verdict.exit_code, LOOK) if new and new.needs_look else summary.verdict.exit_code
+
+
+def measure(
+    project: ProjectFile,
+    shard: Shard = None,
+    cluster: Cluster = None,
+    retry: Retry = False,
+    moved: Moved = False,
+    workers: Workers = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    max_pixels: MaxPixels = None,
+) -> int:
+    """Measure marks in the scans: comparator.csv.
+
+    Goes on where an earlier call stopped.
+    """
+    from pipeline.stages import run_measure
+    from pipeline.workers import WorkOptions
+
+    work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
+    return run_stage(project, partial(run_measure, work=work), as_json, max_pixels, quiet)
 
 
 def status(

@@ -15,6 +15,7 @@ from pipeline.terminal import plain
 from pipeline.text.wording import counted
 
 if TYPE_CHECKING:
+    from pipeline.archive.new_project import NewProject
     from pipeline.summary import Summary
 
 MOST = 3
@@ -60,6 +61,22 @@ def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
             yield command_step("export", project, "opencv", "DIR", why="or colmap, metashape, micmac, ...")
         else:
             yield command_step("resample", project, "DIR", why="rectifies the scans")
+
+
+def init_steps(new: "NewProject") -> Iterator[str]:
+    """What the scans need that a new project does not measure yet."""
+    from pipeline.archive.new_project import TEMPLATE_COMMAND
+
+    if new.unknown:
+        scans = counted(sum(len(group.paths) for group in new.unknown), "scan")
+        if new.named:
+            images, project = (shlex.quote(str(new.folder / name)) for name in ("images.csv", "project.toml"))
+            what = f"{scans} without a camera: add them with one, and take them out of exclude in {project}"
+            yield f"edit {images}  # {what}"
+        else:
+            yield f"{TEMPLATE_COMMAND}  # {scans} without a camera: draw it, then name it in project.toml"
+    for group in sorted(new.digital, key=lambda group: -len(group.paths))[:1]:
+        yield f"{group.calibrate_command}  # {counted(len(group.paths), 'picture')}, {group.digital}"
 
 
 def verdict_steps(project: Path, counts: Mapping[Verdict, int]) -> Iterator[str]:

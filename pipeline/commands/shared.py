@@ -25,6 +25,7 @@ ProjectFile = Annotated[Path, typer.Argument(metavar="PROJECT.toml", help="The p
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE.toml", help="The scene file.", show_default=False)]
 OutDir = Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the results go.", show_default=False)]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
 MaxPixels = Annotated[
     int | None,
     typer.Option("--max-pixels", metavar="N", min=1, help="Read scans of up to N pixels, whatever their file's size."),
@@ -47,12 +48,16 @@ def read(path: Path, max_pixels: int | None = None) -> "Project":
 
 
 def run_stage(
-    path: Path, stage: "Callable[[Project, Reporter], Summary]", as_json: bool, max_pixels: int | None = None
+    path: Path,
+    stage: "Callable[[Project, Reporter], Summary]",
+    as_json: bool,
+    max_pixels: int | None = None,
+    quiet: bool = False,
 ) -> int:
     """Run a stage on a project and print its summary; the exit code."""
     from pipeline.progress import Reporter
 
-    return finish(stage(read(path, max_pixels), Reporter()), as_json, path)
+    return finish(stage(read(path, max_pixels), Reporter(quiet=quiet)), as_json, path)
 
 
 def finish(summary: "Summary", as_json: bool, project: Path | None) -> int:

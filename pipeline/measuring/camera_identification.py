@@ -180,7 +180,8 @@ class Identification:
     """The trials, best first, and what follows from them. unreported: by name, what cameras without any calibration
     report rest on. pitch_um: of the scan in x and y, as given or as its file has it. plate: what the camera's own plate
     says, by field; contradicted: by name, how it says that it is of no such camera. alike: by name, other cameras whose
-    marks are drawn much like its own; reports: on how many calibration reports it rests."""
+    marks are drawn much like its own; reports: on how many calibration reports it rests. board: the calibration board
+    that it shows, as `reseau calibrate` takes it."""
 
     scan: Path
     trials: tuple[Trial, ...]
@@ -190,6 +191,7 @@ class Identification:
     contradicted: Mapping[str, Sequence[str]] = field(default_factory=dict)
     alike: Mapping[str, Sequence[str]] = field(default_factory=dict)
     reports: Mapping[str, int] = field(default_factory=dict)
+    board: str = ""
 
     @property
     def best(self) -> tuple[Trial, ...]:

@@ -36,6 +36,12 @@ def counted(number: int, one: str, many: str = "") -> str:
     return f"{number} {one if number == 1 else many or one + 's'}"
 
 
+def count_sentence(what: str, done: int, of: int, rest: Mapping[str, int]) -> str:
+    """How many scans of all are so: the one form in which commands count scans. rest: how many others, by word."""
+    others = ", ".join(f"{number} {word}" for word, number in rest.items() if number)
+    return f"{done} of {counted(of, 'scan')} {what}" + (f" ({others})" if others else "")
+
+
 def drop_file_name(sentence: str, file: str) -> str:
     """The sentence without the name of the file that it begins with."""
     name = f"{PurePosixPath(file.replace(chr(92), '/')).name}: "

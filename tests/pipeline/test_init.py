@@ -172,6 +172,9 @@ def test_where_no_camera_is_told_all_scans_are_of_the_one_that_the_user_draws(
     assert "have its marks learned" in capsys.readouterr().out
     (box / "1958/camera.toml").write_text("frame_mm = [230.0, 230.0]\n", encoding="utf-8")
     scan(box / "1958" / "out" / "learned" / "mark.TIF")
+    text = Path("project.toml").read_text(encoding="utf-8")
+    assert '\n# camera = "camera.toml"' in text  # no name of a file that is not there
+    Path("project.toml").write_text(text.replace("# camera", "camera"), encoding="utf-8")
     project = read_project(Path("project.toml"))
     assert [path.name for path in project.scans.values()] == ["0001.TIF"]  # the larger of two of one name
     assert (box / "1958/images.csv").read_text(encoding="utf-8") == "image,camera\n0001,\n"
