@@ -62,7 +62,8 @@ def present_frame(
         return replace(_predicted_frame(scan, layout, frame, chance), pose=pose, problems=tuple(problems))
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
     marks = tuple(_weaken_assumed_name(row, mark, pose) for row, mark in zip(marks, layout.marks, strict=True))
-    weak = chance or (_FAINT if frame.placement.surroundings.robust else NO_REASON)
+    unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
+    weak = chance or unnamed or (_FAINT if frame.placement.surroundings.robust else NO_REASON)
     if weak:
         marks = tuple(
             replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks

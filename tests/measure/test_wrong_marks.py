@@ -65,7 +65,7 @@ def test_a_lone_frame_with_a_wrong_mark_is_flagged_and_its_marks_cover_the_error
     for _ in range(10):
         frames, wrong, error_mm = folder(rng, 1)
         result = checked(frames)
-        assert named(result) == set()
+        assert named(result) == {("0", str(mark)) for mark in range(4)}  # each may be the wrong one, and is weak
         assert len(result.frames[0].problems) == 1
         known = result.frames[0].marks[wrong].covariance_px2
         assert known is not None
@@ -79,7 +79,9 @@ def test_of_four_good_marks_on_bent_film_none_is_called_wrong(count: int) -> Non
     for _ in range(5):
         bends = [0.15] + [rng.uniform(0.0, 0.02) for _ in range(count - 1)]
         result = checked([frame_of(str(k), bent_film(rng, bend), rng) for k, bend in enumerate(bends)])
-        assert named(result) == set()
+        reasons = {str(mark.reason).split(",")[0] for frame in result.frames for mark in frame.marks if mark.reason}
+        assert reasons <= {"it may be wrong"}
+        assert {image for image, _ in named(result)} <= {"0"}
         assert result.frames[0].problems
 
 
