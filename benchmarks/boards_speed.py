@@ -26,7 +26,7 @@ from measure.scans.opening import open_scan
 from pipeline.calibration.board_options import board_options
 from pipeline.calibration.calibrate_stage import calibrate_pictures
 from pipeline.calibration.project_files import CalibrationOptions
-from pipeline.progress import Count, Reporter
+from pipeline.progress import Reporter, TimedCount
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -101,7 +101,7 @@ class CpuReporter(Reporter):
         self.cpu_s = defaultdict[str, float](float)
 
     @contextmanager
-    def stage(self, title: str) -> Iterator[Count]:
+    def stage(self, title: str) -> Iterator[TimedCount]:
         begun = time.process_time()
         with super().stage(title) as count:
             yield count

@@ -128,8 +128,8 @@ class ScanGroup:
             found, drawn = sum(trial.found for trial in firsts), sum(trial.drawn for trial in firsts)
             alike = " or ".join(self.much_alike[:CANDIDATES])
             return (
-                f"perhaps {' or '.join(self.candidates)}, {found} of {drawn} marks found, but that rests on the form of "
-                f"its marks alone, and {alike} has marks much like them: compare the drawings with a scan"
+                f"perhaps {' or '.join(self.candidates)}, {found} of {drawn} marks found, but that rests on the form "
+                f"of its marks alone, and {alike} has marks much like them: compare the drawings with a scan"
             )
         counts = Counter(name for names in self._named for name in names)
         if not counts:

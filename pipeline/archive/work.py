@@ -82,6 +82,7 @@ class Work:
         self._asked = asked_of(project)
         self._decisions = by_image(project.decisions)
         self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, of what was asked for last
+        self._now: set[int] = set()  # rows that were measured now
         self.results: dict[str, int] = {}  # by image, the row of what was asked for last
 
     def measure(self, tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
@@ -102,9 +103,11 @@ class Work:
         known = {task.name: row for task in tasks if (row := self._row(task)) is not None}
         missing = [task for task in tasks if task.name not in known]
         self.results |= known
+        now = sum(row in self._now for row in known.values())  # for what they tell the others
         self._store.set_current({row: self._asked(name) for name, row in known.items()})
         if known or len(missing) > 1:
-            reporter.say(count_sentence("measured already", len(known), len(tasks), {"to measure": len(missing)}))
+            rest = {"in the steps before": now, "to measure": len(missing)}
+            reporter.say(count_sentence("measured already", len(known) - now, len(tasks), rest))
         if missing:
             self._complete(missing, len(tasks), reporter)
 
@@ -221,6 +224,7 @@ class Work:
             request_hash = self._asked(task.name) if as_scans else None
             row = self._store.keep(kept, task.name if as_scans else None, as_scans, request_hash)
             self._identities[kept.identity.state.uri], self._rows[kept.fingerprint] = kept.identity, row
+            self._now.add(row)
             yield task, row, kept
 
     def _kept(self, task: ScanTask, state: FileState, file: MeasuredFile) -> Kept:

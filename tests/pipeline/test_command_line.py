@@ -192,11 +192,11 @@ def test_wrong_input_gets_one_message_and_code_2_and_leaves_earlier_results(
 
 
 def test_a_folder_in_place_of_a_project_is_answered_by_what_it_holds(tmp_path: Path, capsys: SAID) -> None:
-    assert run(["run", str(tmp_path)]) == 2
+    assert run(["adjust", str(tmp_path)]) == 2
     assert "is a folder; a TOML file is needed here. It holds none; `reseau template`" in capsys.readouterr().err
     for name in ("project.toml", "camera.toml"):
         (tmp_path / name).touch()
-    assert run(["run", str(tmp_path)]) == 2
+    assert run(["adjust", str(tmp_path)]) == 2
     assert f"Name one that it holds: {tmp_path}/camera.toml, {tmp_path}/project.toml." in capsys.readouterr().err
 
 
