@@ -22,7 +22,7 @@ class Status(StrEnum):
 
 
 STATUS_MEANING = {
-    Status.MEASURED: "Found and fitted, and nothing speaks against this mark; what its frame has is in its sigma.",
+    Status.MEASURED: "Found, fitted, and no check doubts this mark; a deformation of its frame is in its sigma.",
     Status.WEAK: "Fitted, but damaged, faint, partly covered or not well known; its standard deviation says how well.",
     Status.PREDICTED: "Not found; the coordinates are predicted from the other marks.",
     Status.REJECTED: "Something was found and measured, but a check says that it is not this mark.",

@@ -121,7 +121,7 @@ class ScanGroup:
     def why_not(self) -> str:
         """Why no camera is named, a part of a sentence."""
         if self.digital:
-            board = f"the command has the board that they show ({self.board})" if self.board else "no board was seen"
+            board = f"the command has the board that they show ({self.board})" if self.board else "no board was found"
             return f"{self.digital}, no film: {board}"
         if self.cameras:
             firsts = [trial for sample in self.samples for trial in sample.best[:1]]

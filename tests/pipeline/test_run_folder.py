@@ -46,7 +46,7 @@ def photograph(path: Path, size: tuple[int, int] = (640, 480), board: tuple[int,
 
 @pytest.fixture
 def drawn_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder of four small film scans, and a library that has their camera, which all samples show."""
+    """A folder with a small film scan, and a library that has their camera, which all samples show."""
     cameras = tmp_path / "cameras"
     cameras.mkdir()
     source = '[source]\ntext = "drawn for a test"\n'
@@ -62,7 +62,7 @@ def drawn_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     monkeypatch.setattr(new_project, "name_cameras", samples)
     folder = tmp_path / "box"
-    write_project(folder, ["a", "b"])
+    write_project(folder, ["a"])
     (folder / "project.toml").unlink()
     (folder / "camera.toml").unlink()
     return folder
@@ -71,7 +71,7 @@ def drawn_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_folder_is_measured_by_one_command_and_by_the_same_again(
     drawn_library: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside two film scans of a known camera: a photograph, a scan of no camera, and a broken file. What follows the
+    """Beside a film scan of a known camera: a photograph, a scan of no camera, and a broken file. What follows the
     measuring is left out here."""
     monkeypatch.setattr(stages, "run_all", stages.run_measure)
     photograph(drawn_library / "IMG_1.jpg", board=(7, 5))
@@ -81,10 +81,10 @@ def test_a_folder_is_measured_by_one_command_and_by_the_same_again(
     said = capsys.readouterr()
     assert said.err == ""
     assert (
-        "5 files examined: 2 of 5 scans can be measured (1 without a camera, 1 by a digital camera, 1 broken)."
+        "4 files examined: 1 of 4 scans can be measured (1 without a camera, 1 by a digital camera, 1 broken)."
         in said.out
     )
-    assert "2 of 2 scans measured" in said.out
+    assert "1 of 1 scan measured" in said.out
     steps = [line for line in said.out.splitlines() if line.startswith("Next: ")]
     assert said.out.rstrip().splitlines()[-len(steps) :] == steps
     assert len(steps) <= 3
@@ -92,8 +92,8 @@ def test_a_folder_is_measured_by_one_command_and_by_the_same_again(
     assert steps[1].startswith(f"Next: reseau calibrate {drawn_library} --board")
     assert run(["run", str(drawn_library), "--json", "--workers", "1"]) in (0, 1)  # the project that stands there
     again = capsys.readouterr()
-    assert set(json.loads(again.out)["frames"]) == {"a", "b"}
-    assert "2 of 2 scans measured already" in again.err
+    assert set(json.loads(again.out)["frames"]) == {"a"}
+    assert "1 of 1 scan measured already" in again.err
 
 
 def test_a_folder_of_photographs_alone_is_refused_with_the_command_that_takes_it(tmp_path: Path, capsys: SAID) -> None:
