@@ -156,3 +156,16 @@ def test_the_curve_by_which_a_scan_stores_light_does_not_decide_whether_its_fram
     result = measure_fiducials(bent, ring_cross_corners, pitch_um)
     off = observations(result, ring_cross_corners)[1] - observations(at_first, ring_cross_corners)[1]
     assert np.hypot(*off.T).max() < 0.1
+
+
+@pytest.mark.study
+def test_crosses_of_a_sharpened_scan_are_measured_in_their_places() -> None:
+    layout = lattice()
+    with (SCANS / "reseau_sharpened" / "apollo17-HFE_places.csv").open(encoding="utf-8") as file:
+        places = [(float(row["col_px"]), float(row["row_px"])) for row in csv.DictReader(file)]
+    with open_scan(SCANS / "reseau_sharpened" / "apollo17-HFE.jpg") as scan:
+        result = measure_fiducials(scan.replace_tone(Tone.unknown()), layout, (22.0, 22.0))
+    measured = [mark.center_px for mark in result.marks if mark.status is Status.MEASURED]
+    distance = np.hypot(*np.moveaxis(np.array(measured)[:, None] - np.array(places)[None], -1, 0))
+    assert (distance.min(axis=0) < 1.2).sum() >= 0.8 * len(places)
+    assert distance.min(axis=1).max() < 1.2
