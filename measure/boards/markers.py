@@ -62,11 +62,14 @@ class ReadMarkers:
     agreeing: int
 
 
-def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary, border_modules: int = 1) -> MarkerReadings:
-    """Read all markers of a dictionary, of whatever board. border_modules: about the code of each."""
+def read_markers(
+    picture: Bytes, dictionary: cv2.aruco.Dictionary, border_modules: int = 1, touched: bool = False
+) -> MarkerReadings:
+    """Read all markers of a dictionary, of whatever board. border_modules: about the code of each; touched: whether
+    squares touch the corners, which an outline cuts off."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_modules
-    if border_modules > 1:  # squares touch the corners, which an outline cuts off
+    if touched:
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     outlines, numbers, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(picture)
     readings: dict[int, list[Array]] = {}
@@ -203,8 +206,13 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
 def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
     """A board's markers; and the layout, the one that is described or a better one, under which most of those that were
     read lie where their board has them."""
-    border_modules = spec.border_modules if isinstance(spec, ArucoSpec) else 1
-    readings: MarkerReadings = read_markers(picture, aruco_dictionary(spec.dictionary), border_modules)
+    touched = isinstance(spec, AprilGridSpec)
+    borders = (spec.border_modules, 1) if isinstance(spec, AprilGridSpec) else (1,)
+    dictionary = aruco_dictionary(spec.dictionary)
+    readings: MarkerReadings = max(
+        (read_markers(picture, dictionary, border, touched) for border in borders),
+        key=lambda each: len(each.outlines_px),
+    )
     best, layout = placed_markers(readings, _markers(spec)), spec
     # Programs that print AprilTags do not agree which of a tag's corners is the first.
     turned = [readings.quarter_turned(turns) for turns in range(4 if isinstance(spec, AprilGridSpec) else 1)]

@@ -131,8 +131,8 @@ class ArucoSpec(_Spec):
 
 @dataclass(frozen=True)
 class AprilGridSpec(ArucoSpec):
-    """Kalibr's grid of AprilTags: two modules of border, a dark square in each gap that touches the markers' corners,
-    the first marker in the LOWER left corner, then row by row upwards.
+    """Kalibr's grid of AprilTags: two modules of border, or one as some programs print it, a dark square in each gap
+    that touches the markers' corners, the first marker in the LOWER left corner, then row by row upwards.
 
     Corners are named as those of `ArucoSpec`.
     """
