@@ -125,14 +125,20 @@ def transformations(network: Network) -> tuple[Transformation, ...]:
 def lenses(network: Network, transformation: Transformation, with_sets: bool) -> tuple[Model, ...]:
     """No distortion, a ladder of the camera's own family (Torlegård's where that has none), the sets.
 
-    And the network's own, where it is none of these. Fiducials alone say nothing of a lens: then there is none.
+    Each rung with b1, too, where no film takes the difference of the scales of x and y. And the network's own, where it
+    is none of these. Fiducials alone say nothing of a lens: then there is none.
     """
     if len(network.idle_cameras) == len(network.cameras):
         return (Model(transformation),)
     own_family = network.cameras[0].distortion.family
     ladder = own_family if family(own_family).ladder else "torlegard"
+    rungs = [tuple(names.split()) for names in family(ladder).ladder]
+    has_affinity = "b1" in parameter_names(ladder) and not any("b1" in rung for rung in rungs)  # b1 may be another term
     models = [Model(transformation)]
-    models += [Model(transformation, ladder, tuple(names.split())) for names in family(ladder).ladder]
+    for rung in rungs:
+        models.append(Model(transformation, ladder, rung))
+        if transformation == "none" and has_affinity:
+            models.append(Model(transformation, ladder, (*rung, "b1")))
     if with_sets:
         for name, affinity in SETS.items():
             films = (transformation, *TRANSFORMATIONS.get(transformation, ()))

@@ -189,6 +189,15 @@ def test_the_ladder_is_of_the_cameras_own_family_and_the_networks_own_model_is_o
     assert set(with_affinity.parameters) - set(without.parameters) == {"b1", "b2"}
 
 
+@pytest.mark.parametrize("family", ["brown", "opencv"])
+def test_digital_cameras_may_have_unequal_scales_in_x_and_y(family: str) -> None:
+    network = network_of(1, "none", "affine", points=10)
+    lens = Distortion(family, {"k1": Prior(0.0, np.inf)})
+    digital = replace(network, cameras=(replace(network.cameras[0], distortion=lens),))
+    names = [each.name for each in lenses(digital, "none", with_sets=False)]
+    assert names[:3] == ["no distortion", f"{family} k1", f"{family} k1 b1"]
+
+
 @pytest.mark.parametrize("robust", ["huber", "igg3"])
 def test_all_candidates_get_the_weights_of_the_networks_own_adjustment(robust: WeightFunction) -> None:
     """Held, these weights lead to the very same result."""

@@ -82,6 +82,7 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     assert camera["distortion"]["family"] == "opencv"
     assert abs(camera["distortion"]["k1"]["value"]) < 4.0 * camera["distortion"]["k1"]["sigma"]
     assert 0.0 < camera["rms_px"] < 0.1
+    assert 0.5 < camera["known_share"] < 1.0  # no picture shows the board in a corner
     assert camera["opencv"]["verdict"] == "agrees"
     assert camera["opencv"]["fx_px"] == pytest.approx(camera["fx_px"]["value"], abs=0.2)
     storage = cv2.FileStorage(str(out / "camera.yaml"), cv2.FILE_STORAGE_READ)

@@ -33,3 +33,21 @@ def test_a_richer_lens_is_taken_where_it_predicts_other_pictures_better(
     rms_px = {score.model: score.rms_px for score in choices[k3].scores}
     assert set(rms_px) == {"opencv4", "opencv5"}
     assert rms_px[wanted] == pytest.approx(np.sqrt(2.0) * ERROR_PX, rel=0.15)
+
+
+def test_a_fisheye_is_tried_where_the_field_is_wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half the diagonal of these pictures is 0.74 of the principal distance."""
+    monkeypatch.delitem(lens_choice.PARAMETERS, "opencv5")
+    monkeypatch.delitem(lens_choice.PARAMETERS, "opencv8")
+    network = board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM)
+    for limit, tried in ((1.0, {"opencv4"}), (0.7, {"opencv4", "fisheye"})):
+        monkeypatch.setattr(lens_choice, "WIDE", limit)
+        choice = choose_lens(network, True, PIXEL_MM, adjust)
+        assert {score.model for score in choice.scores} == tried
+
+
+@pytest.mark.parametrize("model", ["opencv4", "opencv5", "opencv8", "fisheye"])
+def test_focal_lengths_are_apart_unless_pixels_are_square(model: LensModel) -> None:
+    assert lens_choice.lens_of(model, square_pixels=False).parameters.keys() - lens_choice.lens_of(
+        model, square_pixels=True
+    ).parameters.keys() == {"b1"}
