@@ -1,7 +1,7 @@
 """What a command says when it is done: the verdict, the problems, the main numbers, where the files are."""
 
-from collections import Counter
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from itertools import groupby
@@ -18,24 +18,29 @@ from measure.results import Pose
 from pipeline.archive.status import NAMED, ArchiveStatus, archive_status, worst_named
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts, scan_verdict
 from pipeline.files.project_file import Project
+from pipeline.report.camera_values import CameraValue, camera_values
 from pipeline.report.data import Problem, ReportData
-from pipeline.report.fiducials import Figure, figure
+from pipeline.report.fiducials import Figure, correction_sentences, figure
 from pipeline.report.marks import current_scans
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.verdict import Level, ReportVerdict, judge
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.check_file import Check
+from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.results.measured_record import pose_record
+from pipeline.text.wording import counted
 
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
-FRAME_ROWS = 50  # of frames at most in a table in the terminal: the report has all
+FRAME_ROWS = 8  # of frames in a table in the terminal: the report has all
+NOTES = 3  # that are printed: the report has all
 
 
 @dataclass(frozen=True)
 class Summary:
     """The end of a command. poses: of the scans, each with its evidence, as measurement.db has them. files: what was
-    written, by a word for it. forms: of the fiducials of cameras of which nothing else was adjusted. verdicts: numbers
-    of scans. parts: in how many the scans are measured, where these are those of one."""
+    written, by a word for it. forms: of the fiducials of cameras of which nothing else was adjusted; values: of the
+    calibrated cameras; unit: of lengths in images. verdicts: numbers of scans. parts: in how many the scans are
+    measured, where these are those of one."""
 
     verdict: ReportVerdict
     frames: Mapping[str, Mapping[str, int]]
@@ -44,6 +49,8 @@ class Summary:
     check: Check | None
     files: Mapping[str, Path] = field(default_factory=dict)
     forms: Mapping[str, Figure] = field(default_factory=dict)
+    values: Mapping[str, Sequence[CameraValue]] = field(default_factory=dict)
+    unit: ImageUnit = FILM_UNIT
     verdicts: Mapping[Verdict, int] = field(default_factory=dict)
     parts: int = 0
 
@@ -75,7 +82,10 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     verdicts = Counter(map(scan_verdict, scans.values()))
     if data.totals:
         verdicts = Counter({each: data.totals.count(each) for each in Verdict})
-    return Summary(judge(data), frames, poses, data.adjustment, data.check, files, _forms(data), verdicts)
+    cameras = data.adjustment.cameras if data.adjustment else {}
+    values = {name: camera_values(data, name) for name, camera in cameras.items() if camera.is_calibrated}
+    unit = next(iter(data.image_units.values()), FILM_UNIT)
+    return Summary(judge(data), frames, poses, data.adjustment, data.check, files, _forms(data), values, unit, verdicts)
 
 
 def _forms(data: ReportData) -> dict[str, Figure]:
@@ -88,27 +98,29 @@ def _forms(data: ReportData) -> dict[str, Figure]:
 
 
 def print_summary(summary: Summary, console: Console) -> None:
-    """The summary for a person; file paths are never folded."""
-    if any(summary.verdicts.values()) and (counts := f"{scan_counts(summary.verdicts)}.") != summary.verdict.sentence:
-        console.print(Text(counts))
+    """The summary for a person, in the report's order; file paths are never folded."""
     console.print(Text(summary.verdict.sentence, style=STYLES[summary.verdict.level]))
+    if summary.adjustment and summary.values and summary.adjustment.converged:
+        console.print(_camera_table(summary.adjustment, summary.values))
     for next_step, problems in groupby(summary.verdict.problems, attrgetter("next_step")):
         for problem in problems:
             console.print(Text(f"- {problem.what}"))
         if next_step:
             console.print(Text(f"  {next_step}", style="dim"))
+    if any(summary.verdicts.values()) and (counts := f"{scan_counts(summary.verdicts)}.") != summary.verdict.sentence:
+        console.print(Text(counts))
     if summary.frames:
-        console.print(_frame_table(summary.frames, summary.poses))
-        for name, pose in summary.poses.items():
-            if pose.decided:
-                console.print(Text(f"{name}: pose {pose.name}. {' '.join(pose.evidence)}", style="dim"))
-    if summary.adjustment:
-        calibrated = any(camera.is_calibrated for camera in summary.adjustment.cameras.values())
-        console.print((_camera_table if calibrated else _film_table)(summary.adjustment))
+        console.print(_frame_table(summary))
+    if summary.adjustment and not summary.values:
+        console.print(Text(f"Film transformations: {_quality(summary.adjustment)}."))
         for name, form in summary.forms.items():
-            console.print(_form_table(name, form))
-    for note in summary.verdict.notes:
+            for sentence in correction_sentences(form, summary.adjustment.cameras[name].fiducials):
+                console.print(Text(f"{name}: {sentence}"))
+    notes = summary.verdict.notes
+    for note in notes[:NOTES]:
         console.print(Text(note, style="dim"))
+    if len(notes) > NOTES:
+        console.print(Text(f"{counted(len(notes) - NOTES, 'more note')}: in the report.", style="dim"))
     for word, path in summary.files.items():
         if word == "report":  # is the next step
             continue
@@ -121,72 +133,54 @@ def _main_numbers(adjustment: AdjustmentRecord) -> dict[str, object]:
     return {**numbers, "sigma0_from": adjustment.variance_factor, "cameras": adjustment.cameras}
 
 
-def _frame_table(frames: Mapping[str, Mapping[str, int]], poses: Mapping[str, Pose]) -> Table:
-    columns = ("image", "pose", *Status) if poses else ("image", *Status)
-    title, fewest_measured = "Marks", sorted(frames, key=lambda name: frames[name][str(Status.MEASURED)])
-    shown = set(fewest_measured[:FRAME_ROWS])
-    if len(shown) < len(frames):
-        title += f"; the {len(shown)} of {len(frames)} frames with the fewest measured"
-    table = Table(*(str(column) for column in columns), title=title, title_justify="left")
-    for name, counts in frames.items():
-        if name in shown:
-            pose = poses.get(name)
-            name_of_pose = "" if pose is None else pose.name + ("" if pose.decided else ", assumed")
-            row = [name_of_pose] if poses else []
-            table.add_row(Text(name), *row, *(str(counts[status]) for status in Status))
+def _frame_table(summary: Summary) -> Table:
+    """Marks and residuals by frame, the worst first; columns without anything are left out."""
+    frames, poses, rms = summary.frames, summary.poses, _rms_um(summary.adjustment)
+    lost = {name: sum(counts.values()) - counts[Status.MEASURED] for name, counts in frames.items()}
+    worst = sorted(frames, key=lambda name: (rms.get(name, 0.0), lost[name]), reverse=True)
+    statuses = [status for status in Status if any(counts[status] for counts in frames.values())]
+    title = "Frames, the worst first" + (f" ({FRAME_ROWS} of {len(worst)})" if len(worst) > FRAME_ROWS else "")
+    unit = summary.unit.short_name
+    columns = ["frame", *(["orientation"] if poses else []), *map(str, statuses), *([f"rms, {unit}"] if rms else [])]
+    table = Table(*columns, title=title, title_justify="left")
+    for name in worst[:FRAME_ROWS]:
+        pose = poses.get(name)
+        row = [("" if pose is None else pose.name + ("" if pose.decided else ", assumed"))] if poses else []
+        row += [str(frames[name][status]) for status in statuses]
+        if rms:
+            known = rms.get(name)
+            row.append("" if known is None else f"{known * summary.unit.per_um:.{summary.unit.decimals}f}")
+        table.add_row(Text(name), *row)
     return table
 
 
-def _sigma0(adjustment: AdjustmentRecord) -> str:
+def _rms_um(adjustment: AdjustmentRecord | None) -> dict[str, float]:
+    """Of the residuals of each frame, per axis."""
+    squares: dict[str, list[float]] = defaultdict(list)
+    for row in adjustment.residuals if adjustment else ():
+        squares[row.image] += [row.vx_um**2, row.vy_um**2]
+    return {name: float(np.sqrt(np.mean(each))) for name, each in squares.items()}
+
+
+def _camera_table(adjustment: AdjustmentRecord, values: Mapping[str, Sequence[CameraValue]]) -> Table:
+    """The values to cite, in mm or px, with sigma0 and the redundancy that it comes from."""
+    quality = _quality(adjustment)
+    columns = ("parameter", "value", "standard deviation", "unit")
+    table = Table(*(("camera", *columns) if len(values) > 1 else columns), title_justify="left")
+    table.title = f"Camera {next(iter(values))} ({quality})" if len(values) == 1 else f"Cameras ({quality})"
+    for name, rows in values.items():
+        for each in rows:
+            words = f"{each.name} {each.meaning}".strip()
+            cells = (words, *value_and_sigma(each.value, each.sigma), each.unit)
+            table.add_row(*([Text(name)] if len(values) > 1 else []), *cells)
+    return table
+
+
+def _quality(adjustment: AdjustmentRecord) -> str:
     """sigma0 with the redundancy of what it comes from; without any, what standard deviations are."""
     if not adjustment.has_sigma0:
         return "standard deviations a priori"
-    return f"sigma0 = {adjustment.sigma0:.3f}, redundancy {adjustment.variance_factor.redundancy:.0f}"
-
-
-def _film_table(adjustment: AdjustmentRecord) -> Table:
-    """What an adjustment of fiducials alone gives of every image."""
-    title = f"Film transformations ({_sigma0(adjustment)})"
-    datum = adjustment.groups.get("datum")
-    if datum:
-        title += f"; given fiducials: rms {datum.rms_x_um:.2f}, {datum.rms_y_um:.2f} µm"
-    columns = ("image", "transformation", "fiducials", "rms x, µm", "rms y, µm")
-    squares: dict[str, list[tuple[float, float]]] = {}
-    for row in adjustment.residuals:
-        squares.setdefault(row.image, []).append((row.vx_um**2, row.vy_um**2))
-    rms = {name: np.sqrt(np.mean(of_image, axis=0)) for name, of_image in squares.items()}
-    worst = sorted(rms, key=lambda name: -float(np.hypot(*rms[name])))[:FRAME_ROWS]
-    shown = [name for name in adjustment.images if name in set(worst)]
-    if len(shown) < len(rms):
-        title += f"; the {len(shown)} of {len(rms)} frames with the largest residuals"
-    table = Table(*columns, title=title, title_justify="left")
-    for name in shown:
-        kind = adjustment.images[name].transformation.kind
-        table.add_row(Text(name), kind, str(len(squares[name])), *(f"{value:.2f}" for value in rms[name]))
-    return table
-
-
-def _form_table(name: str, form: Figure) -> Table:
-    """Where marks stand otherwise than they are given, free of the datum, and the distances that films keep."""
-    after = "" if form.transformation == "none" else f", after a transformation to these ({form.transformation})"
-    title = f"Corrections to the given fiducials of {name}{after}"
-    table = Table("mark", "x, µm", "sigma", "y, µm", "sigma", title=title, title_justify="left")
-    for id, change, sigma in zip(form.ids, form.change_um, form.sigmas_um, strict=True):
-        table.add_row(Text(id), *(f"{value:.3f}" for pair in zip(change, sigma, strict=True) for value in pair))
-    for each in form.distances:
-        between = Text(f"{each.start} to {each.end}: {each.length_mm:.4f} mm")
-        table.add_row(between, f"{each.change_um:.3f}", f"{each.sigma_um:.3f}", "", "")
-    return table
-
-
-def _camera_table(adjustment: AdjustmentRecord) -> Table:
-    title = f"Camera ({_sigma0(adjustment)})"
-    table = Table("camera", "parameter", "value", "sigma", title=title, title_justify="left")
-    words = {"c": "principal distance, mm", "x0": "principal point x', mm", "y0": "principal point y', mm"}
-    for name, camera in adjustment.cameras.items():
-        for word, each in camera.interior.items() if camera.is_calibrated else ():
-            table.add_row(Text(name), words.get(word, word), *value_and_sigma(each.value, each.sigma))
-    return table
+    return f"sigma0 {adjustment.sigma0:.3f}, redundancy {adjustment.variance_factor.redundancy:.0f}"
 
 
 def archive_summary(project: Project, files: Mapping[str, Path]) -> Summary:

@@ -10,7 +10,6 @@ from adjust.functional_model.scanner import carriage_terms, smooth_terms
 from adjust.model_selection.scanner_choice import bent_network, choose_bends
 from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import Network
-from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 from adjust.solution.unmodelled_error import adjust_unmodelled
@@ -26,7 +25,6 @@ from pipeline.types import Array
 
 UM_PER_MM = 1000.0
 
-LARGER = 1.5  # times a standard deviation, which a dozen pictures hardly make by chance
 _ROUNDS = 4  # the correction changes by its own relative error, so the second round is already below the noise
 _SETTLED_SIGMAS = 0.01
 _NOTICEABLE_SIGMAS = 0.2  # of the coordinate: an eccentricity that is not corrected and as large deserves a word
@@ -100,7 +98,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
         *_not_corrected(network, uncorrected),
     )
     adjustment = replace(adjustment, unmodelled_mm=first.unmodelled_mm)
-    notes = (*_assumed_pitch(project), *_unmodelled(adjustment), *_correlated(adjustment), *_unmeasured(project, marks))
+    notes = (*_assumed_pitch(project), *_unmeasured(project, marks))
     return replace(adjustment, remarks=(*adjustment.remarks, *warnings), unused=notes)
 
 
@@ -188,35 +186,6 @@ def _assumed_pitch(project: Project) -> Iterator[str]:
             f"Nothing says how large a pixel is: {ASSUMED_PITCH_UM:g} µm are assumed. Of all in mm and µm only ratios "
             "count; set pitch_um in project.toml to have them."
         )
-
-
-def _unmodelled(adjustment: Adjustment) -> tuple[str, ...]:
-    """A note on what was added to the standard deviations of each camera's targets."""
-    return tuple(
-        f"Camera {camera}: {UM_PER_MM * sigma_mm:.3g} µm are added to the standard deviations of all targets, for what "
-        "lens model, object and the picture's processing leave."
-        for camera, sigma_mm in adjustment.unmodelled_mm.items()
-        if sigma_mm > 0.0
-    )
-
-
-def _correlated(adjustment: Adjustment) -> tuple[str, ...]:
-    """A note on cameras whose standard deviations are larger by leaving out one picture at a time."""
-    notes = []
-    for camera in adjustment.network.cameras if adjustment.unmodelled_mm else ():
-        keys = [Parameter.interior(camera.name, name) for name in ("c", "x0", "y0", *camera.distortion.parameters)]
-        keys = [key for key in keys if adjustment.sigma(key) > 0.0]
-        covariance = adjustment.cluster_covariance_of(keys)
-        if covariance is None:
-            continue
-        ratios = np.sqrt(np.diagonal(covariance)) / [adjustment.sigma(key) for key in keys]
-        larger = [f"{key.quantity} {ratio:.1f}" for key, ratio in zip(keys, ratios, strict=True) if ratio > LARGER]
-        if larger:
-            notes.append(
-                f"Camera {camera.name}: errors within a picture are correlated. By leaving out one picture at a time, "
-                f"standard deviations are larger than those stated here, by these factors: {', '.join(larger)}."
-            )
-    return tuple(notes)
 
 
 def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:

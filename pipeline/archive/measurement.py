@@ -134,13 +134,12 @@ def measured_scans(path: Path, digest: str = "", images: Collection[str] | None 
 @dataclass(frozen=True, eq=False)
 class MarkColumns:
     """Marks of frames, one a row: frame, the place of its frame among so many; kind and status as numbers of the names
-    that there are of each; center_px (n, 2), sigma_um (n, 2), NaN where there is none."""
+    that there are of each; center_px (n, 2), NaN where there is none."""
 
     frame: NDArray[np.int64]
     kind: NDArray[np.int64]
     status: NDArray[np.int64]
     center_px: Array
-    sigma_um: Array
     kinds: tuple[str, ...]
     statuses: tuple[str, ...]
 
@@ -200,7 +199,7 @@ class StoredMarks:
         """Of the marks of the plain frames."""
         place = {frame.result: number for number, frame in enumerate(self.plain)}
         kinds, statuses = dict[str, int](), dict[str, int]()
-        parts: list[Array] = [np.empty((0, 7))]
+        parts: list[Array] = [np.empty((0, 5))]
         with Store(self._path) as store:
             found = store.connection.execute(_MARKS, (self._judging.row, str(Verdict.GOOD)))
             while rows := found.fetchmany(_AT_A_TIME):
@@ -209,10 +208,10 @@ class StoredMarks:
                     for result, kind, status, *px in rows
                     if result in place
                 ]
-                parts.append(np.array(numbers, dtype=np.float64).reshape(-1, 7))
+                parts.append(np.array(numbers, dtype=np.float64).reshape(-1, 5))
         every = np.concatenate(parts)
         frame, kind, status = every[:, :3].T.astype(np.int64)
-        return MarkColumns(frame, kind, status, every[:, 3:5], every[:, 5:7], tuple(kinds), tuple(statuses))
+        return MarkColumns(frame, kind, status, every[:, 3:5], tuple(kinds), tuple(statuses))
 
 
 _PLAIN = """
@@ -223,6 +222,5 @@ where f.judging = ?1 and f.verdict = ?2 and f.result not in (
 ) order by f.name
 """
 _MARKS = """
-select m.result, kind, status, col_px, row_px, sqrt(var_col) * r.pitch_x_um, sqrt(var_row) * r.pitch_y_um
-from checked_mark m join result r on r.id = m.result where judging = ? and m.verdict = ?
+select result, kind, status, col_px, row_px from checked_mark where judging = ? and verdict = ?
 """

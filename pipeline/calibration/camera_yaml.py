@@ -3,7 +3,8 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from pipeline.calibration.intrinsics import CENTRE, CameraIntrinsics
+from pipeline.calibration.intrinsics import CameraIntrinsics
+from pipeline.results.pixel_intrinsics import CENTRE
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 FISHEYE_ORDER = ("k1", "k2", "k3", "k4")

@@ -14,10 +14,10 @@ from adjust.solution.result import Adjustment
 from pipeline.calibration.lens_choice import LensChoice
 from pipeline.calibration.pictures import CameraPictures
 from pipeline.results.check_file import CameraCheck, PixelCalibration
+from pipeline.results.pixel_intrinsics import CENTRE, in_pixels
 from pipeline.text.wording import counted, listed
 from pipeline.types import Array
 
-CENTRE = ("fx", "fy", "cx", "cy")
 HIGHLY_CORRELATED = 0.9
 
 
@@ -182,7 +182,7 @@ def camera_intrinsics(
     (camera,) = adjustment.network.cameras
     names = [name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0]
     keys = [Parameter.interior(camera.name, name) for name in ("c", "x0", "y0", *names)]
-    values, by_mm = _in_pixels({key.quantity: adjustment.value(key) for key in keys}, pixel_mm)
+    values, by_mm = in_pixels({key.quantity: adjustment.value(key) for key in keys}, pixel_mm)
     covariance = by_mm @ (adjustment.sigma0**2 * adjustment.cofactor_of(keys)) @ by_mm.T
     clusters = adjustment.cluster_covariance_of(keys)
     scatter = None if clusters is None else np.sqrt(np.diagonal(by_mm @ clusters @ by_mm.T))
@@ -210,22 +210,6 @@ def camera_intrinsics(
         pitch_um=pitch_um,
         check=check,
     )
-
-
-def _in_pixels(mm: Mapping[str, float], pixel_mm: float) -> tuple[dict[str, float], Array]:
-    """fx, fy, cx, cy and the distortion from c, x0', y0' and its parameters, and their derivatives (m, n).
-
-    The unit of x is c (1 + b1), that of y is c; y0' counts upward (`adjust.functional_model.opencv_family`).
-    """
-    stretch = 1.0 + mm.get("b1", 0.0)
-    values = {"fx": mm["c"] * stretch / pixel_mm, "fy": mm["c"] / pixel_mm}
-    values |= {"cx": mm["x0"] / pixel_mm, "cy": -mm["y0"] / pixel_mm}
-    by = {"fx": {"c": stretch / pixel_mm, "b1": mm["c"] / pixel_mm}, "fy": {"c": 1.0 / pixel_mm}}
-    by |= {"cx": {"x0": 1.0 / pixel_mm}, "cy": {"y0": -1.0 / pixel_mm}}
-    for name in mm.keys() - {"c", "x0", "y0", "b1"}:
-        by[name] = {name: 1.0}
-    values |= {name: value for name, value in mm.items() if name not in ("c", "x0", "y0", "b1")}
-    return values, np.array([[by[row].get(column, 0.0) for column in mm] for row in values])
 
 
 def _high_correlations(names: Sequence[str], matrix: Array) -> Iterator[tuple[str, str, float]]:

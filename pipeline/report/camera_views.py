@@ -1,5 +1,7 @@
-"""What the report shows of each camera: its parameters, distortion, fiducial marks, residuals and check."""
+"""What the report shows of each camera: its values, distortion, residuals, maps over its frame, fiducials and check."""
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,48 +11,60 @@ from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import parameter_from_text
 from adjust.quality.distortion_curves import Curves, distortion_curves, is_defined_over_frame
 from pipeline.report import fiducials, lens, vectors
+from pipeline.report.camera_values import CameraValue, camera_values
 from pipeline.report.data import ReportData
+from pipeline.report.frame_maps import contour_plot, coverage_plot
 from pipeline.report.frame_views import residuals_by_image
-from pipeline.report.numbers import fixed
+from pipeline.report.numbers import fixed, significant
 from pipeline.report.parameters import ParameterRow, high_correlations, parameter_rows
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord
 from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.check_file import CameraCheck
 from pipeline.results.covariance_file import Covariance
+from pipeline.results.image_unit import ImageUnit
 
-PLOT_PX = 560.0
-LONGEST_VECTOR_PX = 60.0
+PLOT_PX = 400.0
+LONGEST_VECTOR_PX = 44.0
 MOST_VECTORS = 10_000  # in the picture of all frames
 CURVE_TABLE_ROWS = 6
 
 
 @dataclass(frozen=True)
 class LensView:
-    """The distortion of a camera. rows: of the curves' table, by their positions."""
+    """The distortion of a camera. rows: of the curves' table, by their positions; certificate: of film cameras."""
 
     curves: Curves
     plot: Markup
     rows: list[int]
-    certificate: lens.Certificate
+    certificate: lens.Certificate | None
     map: lens.LensMap | None
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera; None or empty where the files do not hold what is needed."""
+    """A camera; None or empty where the files do not hold what is needed.
+
+    values: those to cite; parameters: what was given of them, and what they say. maps: contours of the standard
+    deviation of projected points, with what each is of. observed: how many observations the coverage shows.
+    """
 
     name: str
     record: CameraRecord
     is_calibrated: bool
     images: int
+    unit: ImageUnit
+    values: list[CameraValue]
     effect_where: str
     parameters: list[ParameterRow]
     correlations: list[tuple[str, str, float]]
-    trade_offs: list[str]
+    correlation_causes: list[str]
     lens: LensView | None
-    figure: fiducials.Figure | None
-    figure_plot: Markup | None
     vectors: Markup | None
+    coverage: Markup | None
+    observed: int
+    maps: list[tuple[str, Markup]]
+    corrections: fiducials.Figure | None
+    corrections_plot: Markup | None
     check: CameraCheck | None
 
 
@@ -63,26 +77,34 @@ def camera_views(data: ReportData) -> list[CameraView]:
 def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraRecord) -> CameraView:
     images, by_image = stored.images_of(name), residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
-    known = data.covariance if stored.converged else None
+    known, unit = data.covariance if stored.converged else None, data.unit_of_camera(name)
     # Where there is no solution, none of what is missing was left out.
     is_calibrated = camera.is_calibrated or not stored.converged
     covariance = known if is_calibrated else None
-    radius_mm, frame_mm = _observed_radius_mm(camera, rows), data.frame_mm.get(name)
+    radius_mm, on = _observed_radius_mm(camera, rows), _plane(data, name, camera, rows, unit)
     figure = fiducials.figure(name, stored, known) if known else None
-    over_frame = is_defined_over_frame(camera.lens())
+    radius = fixed(radius_mm * unit.per_mm, 0)
+    places = np.array([(row.camera_x_mm, row.camera_y_mm) for row in rows if row.kind not in ("fiducial", "join")])
+    parameters = list(parameter_rows(name, camera, _prior_scale(name, stored), radius_mm, unit))
     return CameraView(
         name=name,
         record=camera,
         is_calibrated=is_calibrated,
         images=len(images),
-        effect_where="in the frame" if over_frame else f"at {fixed(radius_mm, 0)} mm",
-        parameters=list(parameter_rows(name, camera, _prior_scale(name, stored), radius_mm)) if is_calibrated else [],
+        unit=unit,
+        values=camera_values(data, name) if is_calibrated else [],
+        effect_where="in the frame" if is_defined_over_frame(camera.lens()) else f"at {radius} {unit.long_name}",
+        # Of a digital camera c, x0' and y0' in mm of the pixels' size would be second values of the same.
+        parameters=(parameters[3:] if unit.is_pixel else parameters) if is_calibrated else [],
         correlations=high_correlations(name, camera, covariance) if covariance else [],
-        trade_offs=_trade_offs(name, stored),
-        lens=_lens_view(name, camera, covariance, rows, radius_mm, frame_mm) if covariance else None,
-        figure=figure,
-        figure_plot=fiducials.figure_plot(figure) if figure else None,
-        vectors=_vectors(rows, frame_mm) if rows else None,
+        correlation_causes=_correlation_causes(name, stored),
+        lens=_lens_view(name, camera, covariance, on, radius_mm, unit) if covariance else None,
+        vectors=_vectors(rows, on) if on is not None and is_calibrated else None,
+        coverage=coverage_plot(on, places) if on is not None and is_calibrated and len(places) else None,
+        observed=len(places),
+        maps=list(_uncertainty_maps(camera, on, data.unit)) if on is not None else [],
+        corrections=figure,
+        corrections_plot=fiducials.figure_plot(figure) if figure else None,
         check=data.check.cameras.get(name) if data.check else None,
     )
 
@@ -94,14 +116,25 @@ def _observed_radius_mm(camera: CameraRecord, rows: list[ResidualRecord]) -> flo
     return max((float(np.hypot(x - point.x.value, y - point.y.value)) for x, y in targets), default=0.0)
 
 
+def _plane(
+    data: ReportData, name: str, camera: CameraRecord, rows: list[ResidualRecord], unit: ImageUnit
+) -> vectors.Plane | None:
+    """The camera's picture, or where its size is not known, what was observed of it; None without observations."""
+    if not rows:
+        return None
+    if camera.lens_known is not None and camera.lens_known.frame_mm is not None:
+        return vectors.padded_plane(np.array(camera.lens_known.frame_mm), PLOT_PX, unit=unit)
+    return vectors.plane(vectors.VectorField.from_residuals(rows).places_mm, data.frame_mm.get(name), PLOT_PX, unit)
+
+
 def _prior_scale(name: str, stored: AdjustmentRecord) -> float:
     """What sigma0 multiplies the given standard deviations of an interior orientation by."""
     is_left_out = ("interior", name) in stored.variance_factor.left_out
     return stored.sigma0 if stored.sigma0 > 0.0 and not is_left_out else 1.0
 
 
-def _trade_offs(name: str, stored: AdjustmentRecord) -> list[str]:
-    """What of a camera trades off, in words."""
+def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
+    """What makes quantities of a camera highly correlated, in words."""
     firsts = (parameter_from_text(each.parameters[0]) for each in stored.correlations)
     return [
         f"{each.cause} {each.remedy}"
@@ -111,40 +144,41 @@ def _trade_offs(name: str, stored: AdjustmentRecord) -> list[str]:
 
 
 def _lens_view(
-    name: str,
-    camera: CameraRecord,
-    covariance: Covariance,
-    rows: list[ResidualRecord],
-    radius_mm: float,
-    frame_mm: tuple[float, float] | None,
+    name: str, camera: CameraRecord, covariance: Covariance, on: vectors.Plane | None, radius_mm: float, unit: ImageUnit
 ) -> LensView | None:
     """Out to the frame's corner where its size is known, else to the outermost target. Of a family that is defined over
     the frame: on circles that lie in it."""
     reach = camera.lens_known
-    corner_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
-    largest = max(radius_mm, reach.corner_mm if reach is not None and reach.corner_mm > 0.0 else corner_mm)
+    corner_mm = reach.corner_mm if reach is not None and reach.corner_mm > 0.0 else 0.0
+    if corner_mm == 0.0 and on is not None:
+        corner_mm = 0.5 * float(np.hypot(*np.ptp(on.corners_mm, axis=0)))
+    largest = max(radius_mm, corner_mm)
     if not parameter_names(camera.distortion.family) or largest == 0.0:
         return None
     known = lens.lens(name, camera, covariance)
     if is_defined_over_frame(known):
         largest = min(largest, *known.distortion.half_mm)
     curves = distortion_curves(known, largest)
-    lens_map = None
-    if rows:
-        on = vectors.plane(vectors.VectorField.from_residuals(rows).places_mm, frame_mm, PLOT_PX)
-        if reach is not None and reach.frame_mm is not None:
-            on = vectors.padded_plane(np.array(reach.frame_mm), PLOT_PX)
-        lens_map = lens.lens_map(known, on, radius_mm)
+    reach_mm = min(radius_mm or np.inf, float(curves.radius_mm[-1]))
     return LensView(
         curves,
-        lens.curves_plot(curves, radius_mm),
+        lens.curves_plot(curves, radius_mm, unit),
         np.linspace(0, len(curves.radius_mm) - 1, CURVE_TABLE_ROWS + 1).round().astype(int)[1:].tolist(),
-        lens.certificate(known, min(radius_mm or np.inf, float(curves.radius_mm[-1]))),
-        lens_map,
+        None if unit.is_pixel else lens.certificate(known, reach_mm),
+        lens.lens_map(known, on, radius_mm) if on is not None else None,
     )
 
 
-def _vectors(rows: list[ResidualRecord], frame_mm: tuple[float, float] | None) -> Markup:
+def _vectors(rows: list[ResidualRecord], on: vectors.Plane) -> Markup:
     scale = vectors.VectorField.from_residuals(rows).scale(LONGEST_VECTOR_PX)
     residuals = vectors.VectorField.from_residuals(rows[:: -(-len(rows) // MOST_VECTORS)])  # evenly over the frames
-    return vectors.all_images_plot(residuals, vectors.plane(residuals.places_mm, frame_mm, PLOT_PX), scale)
+    return vectors.all_images_plot(residuals, on, scale)
+
+
+def _uncertainty_maps(camera: CameraRecord, on: vectors.Plane, unit: str) -> Iterator[tuple[str, Markup]]:
+    for known in camera.projection:
+        where = "at infinity" if math.isnan(known.distance) else f"at {significant(known.distance, 3)} {unit}"
+        title = f"Standard deviation of projected points {where} over the camera frame"
+        x_mm, y_mm, sigma_um = (np.array(each, dtype=float) for each in (known.x_mm, known.y_mm, known.sigma_um))
+        if (plot := contour_plot(on, x_mm, y_mm, sigma_um, title)) is not None:
+            yield where, plot

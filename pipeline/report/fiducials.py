@@ -12,10 +12,14 @@ from adjust.quality.fiducial_corrections import KEEPS_DISTANCES, corrections_to_
 from pipeline.drawing import svg
 from pipeline.results.adjustment_record import AdjustmentRecord, FiducialRecord
 from pipeline.results.covariance_file import Covariance
+from pipeline.text.wording import listed
 from pipeline.types import Array
 
 LONGEST_PX = 46.0
 WIDTH_PX = 400.0
+SIGNIFICANT = 3.0  # standard deviations of a coordinate
+DATUM_UM = 100.0  # given standard deviations from which on coordinates place the datum alone
+LEAST_UM = 0.1  # of a correction, below which no certificate has digits
 MARGIN_PX = 58.0
 BETTER = 2.0  # how many times as well as coordinates distances must be known to tell the form
 _CALIBRATED = Film("similarity", np.array([0.0, 0.0, 1.0, 0.0]), np.zeros(2))  # the camera as it lies
@@ -59,6 +63,31 @@ class Figure:
     def sigmas_um(self) -> Array:
         """(n, 2) of the changes."""
         return np.sqrt(np.maximum(np.diag(self.covariance_um2), 0.0)).reshape(-1, 2)
+
+
+def correction_sentences(form: Figure, fiducials: Mapping[str, FiducialRecord]) -> list[str]:
+    """What the corrections say of the certificate, in words: against the larger of their own standard deviations and of
+    those of the given coordinates, where these do more than place the datum."""
+    size = np.hypot(*form.change_um.T)
+    worst, rms = int(size.argmax()), float(np.sqrt(np.mean(form.change_um**2)))
+    pairs = [(fiducials[id].x_mm.given, fiducials[id].y_mm.given) for id in form.ids]
+    given_um = np.array([[1e3 * each.sigma if each is not None else 0.0 for each in pair] for pair in pairs])
+    limit_um = SIGNIFICANT * np.maximum(form.sigmas_um, np.where(given_um < DATUM_UM, given_um, 0.0))
+    excess_um = (np.abs(form.change_um) - np.maximum(limit_um, LEAST_UM)).max(axis=1)
+    moved = [id for id, each in zip(form.ids, excess_um.tolist(), strict=True) if each > 0.0]
+    taken = "shift, rotation and scale" if form.transformation == "none" else f"{form.transformation} transformation"
+    found = (
+        f"The marks lie where the camera file has them but for {rms:.1f} µm (rms of a coordinate), mark "
+        f"{form.ids[worst]} farthest off ({size[worst]:.1f} µm); a common {taken} is taken out."
+    )
+    if not moved:
+        return [found, f"No correction exceeds {SIGNIFICANT:g} standard deviations: the certificate agrees."]
+    names = f"mark {moved[0]} differs" if len(moved) == 1 else f"marks {listed(moved)} differ"
+    return [
+        found,
+        f"From the certificate {names} by more than {SIGNIFICANT:g} standard deviations: compare the camera file with "
+        "it, and take the coordinates below where the file is right.",
+    ]
 
 
 def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figure | None:

@@ -1,6 +1,6 @@
-"""Fractional parts of measured pixel positions, histograms of these and of residuals, totals of very many frames."""
+"""Fractional parts of measured pixel positions, and their histograms."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtrik, chdtrc
 
 from pipeline.drawing import svg
-from pipeline.report.data import ReportData
 from pipeline.report.marks import Frame
-from pipeline.text.wording import counted
 from pipeline.types import Array
 
 BINS = 10
@@ -19,9 +17,6 @@ LEAST_MARKS = 50  # five a bin, below which the chi-square test means nothing
 LEAST_PROBABILITY = 1e-4  # grids of targets that lie nearly along the pixels are a little uneven by themselves
 LEAST_BIAS_PX = 0.01  # with very many marks even a bias that harms nobody is beyond chance
 SAME_PLACE_PX = 0.5  # marks that lie at random are seldom so near to another one's column or row
-COLUMNS = 40
-TAIL = 0.002  # of the values, on either side: the rest make the scale
-ROWS = 200  # cameras and kinds of file at most
 
 
 @dataclass(frozen=True)
@@ -110,17 +105,6 @@ def fraction_plot(axis: str, test: FractionTest) -> Markup:
     return svg.picture(axes.width, axes.height, title, *bars, band, axes.grid(label, "marks"))
 
 
-def histogram(label: str, values: Array) -> Markup:
-    """How values (n,) are spread; the few of each side that lie far out are counted in the last column there."""
-    low, high = np.quantile(values, (TAIL, 1.0 - TAIL))
-    margin = max(0.05 * (high - low), 1e-3 * max(abs(low), abs(high)), 1e-9)
-    edges = np.linspace(low - margin, high + margin, COLUMNS + 1)
-    counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
-    axes = svg.Axes((edges[0], edges[-1]), (0.0, 1.1 * float(counts.max())), width=330.0, height=220.0)
-    title = f"Histogram of the {label}"
-    return svg.picture(axes.width, axes.height, title, *_columns(axes, edges, counts), axes.grid(label, "marks"))
-
-
 def _columns(axes: svg.Axes, edges: Array, counts: NDArray[np.int64]) -> Iterator[Markup]:
     total = int(counts.sum())
     for left, right, count in zip(edges[:-1], edges[1:], counts.tolist(), strict=True):
@@ -133,47 +117,3 @@ def _columns(axes: svg.Axes, edges: Array, counts: NDArray[np.int64]) -> Iterato
             height=float(axes.y(0.0) - axes.y(count)),
             class_="column",
         )
-
-
-@dataclass(frozen=True)
-class TotalsView:
-    """Ready to print. verdicts: those that occur; rows: of cameras and kinds of file, with a number for each of them;
-    left_out: further rows; all: of all frames. histograms: with what each shows."""
-
-    frames: int
-    needs_look: int
-    shown: int
-    verdicts: tuple[str, ...]
-    rows: tuple[tuple[str, str, tuple[int, ...]], ...]
-    left_out: int
-    all: tuple[int, ...]
-    histograms: tuple[tuple[str, Markup], ...]
-
-
-def totals_view(data: ReportData) -> TotalsView:
-    """Of data that has totals."""
-    assert data.totals is not None
-    counts = data.totals.verdicts
-    named = dict.fromkeys(verdict for each in counts.values() for verdict in each)
-    verdicts = tuple(verdict for verdict in named if any(each[verdict] for each in counts.values()))
-    rows = tuple((*kind, tuple(each[verdict] for verdict in verdicts)) for kind, each in counts.items())
-    residuals = data.adjustment.residuals if data.adjustment else ()
-    v_um = dict(zip("xy", np.array([row.v_um for row in residuals]).reshape(-1, 2).T, strict=True))
-    return TotalsView(
-        frames=len(data.totals.marks),
-        needs_look=data.totals.needs_look,
-        shown=len({*(data.measurement or {}), *(row.image for row in data.comparator)}),
-        verdicts=verdicts,
-        rows=rows[:ROWS],
-        left_out=max(len(rows) - ROWS, 0),
-        all=tuple(sum(each[verdict] for each in counts.values()) for verdict in verdicts),
-        histograms=(*_histograms("residual", v_um), *_histograms("σ", data.totals.sigmas_um)),
-    )
-
-
-def _histograms(what: str, by_axis: Mapping[str, Array]) -> Iterator[tuple[str, Markup]]:
-    for axis, values in by_axis.items():
-        if len(values):
-            rms, largest = np.sqrt(np.mean(values**2)), np.abs(values).max()
-            caption = f"{counted(len(values), 'mark')}, rms {rms:.2f} µm, at most {largest:.2f} µm"
-            yield caption, histogram(f"{what} in {axis} (µm)", values)

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import TypeVar
 
 from pipeline.report.data import Problem
@@ -44,7 +45,7 @@ def assumed_poses(shots: list[Frame]) -> Iterator[Problem]:
 
 def _together(shots: list[Frame], evidence: Callable[[Frame], Iterable[Problem]]) -> Iterator[Problem]:
     for problem, images in images_by_sentence(shots, evidence).items():
-        yield Problem(f"{listed(images)}: {problem.what}", problem.next_step)
+        yield replace(problem, what=f"{listed(images)}: {problem.what}", images=tuple(images))
 
 
 def images_by_sentence(
@@ -83,8 +84,9 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
     if lost and (found or pose):  # a frame that was not found at all has said so
         yield Problem(
             f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured ({_reasons(lost)}).",
-            "Look at their pictures in the report."
+            "Settle them with `reseau review`."
             + (" The frame is used; its film transformation is less certain." if found else ""),
+            marks=tuple((frame.image, mark.kind, mark.point) for mark in lost),
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
     is_lost = frame.scan is not None and frame.scan.failure is not None
@@ -118,5 +120,6 @@ def pixel_locking(places_px: Mapping[str, Array]) -> Iterator[Problem]:
             yield Problem(
                 f"The {axis} positions of the marks prefer parts of a pixel (pixel locking): they are biased by up to "
                 f"{fixed(test.bias_px)} px.",
-                "Look at the histogram of fractional parts in the report; scan with a finer pitch or in 16 bit.",
+                "Scan with a finer pitch or in 16 bit.",
+                section="fractions",
             )

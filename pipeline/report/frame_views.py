@@ -1,7 +1,7 @@
 """What the report shows of each frame: a line of the summary, its marks, residuals, orientation and writing."""
 
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,11 +19,13 @@ from pipeline.report.numbers import fixed
 from pipeline.report.verdict import suspect_rows
 from pipeline.results.adjustment_record import ImageRecord
 from pipeline.results.assessment_record import ResidualRecord
+from pipeline.results.image_unit import ImageUnit
 from pipeline.results.measured_record import MeasuredScan
 
 _WIDTH_PX = 1000.0  # plates of 20 mm on film of 230 are read
 _LEAST_PX = 7.0  # of letters
-OPEN_FRAMES = 12  # with more frames, only those with a lost mark are unfolded
+LARGE_W = 3.0  # of a standardised residual that is shown
+MOST_CARDS = 60  # of marks that need a look
 PLOT_PX = 330.0
 LONGEST_VECTOR_PX = 42.0
 _LEAST_PART_PX = 0.0005  # a thousandth of a pixel is the last digit that is printed
@@ -56,14 +58,14 @@ def _writing_line(line: Line, zoom: float, is_evidence: bool) -> Markup:
         "text",
         line.text,
         transform=f"matrix({' '.join(f'{value:g}' for value in matrix)})",
-        class_="told" if is_evidence else "read",
+        class_="evidence" if is_evidence else "read",
         font_size=f"{size:.1f}",
         text_anchor="middle",
         dominant_baseline="central",
         textLength=f"{max(sides):.1f}",
         lengthAdjust="spacingAndGlyphs",
     )
-    return svg.line(cols, rows, "told" if is_evidence else "read", closed=True) + text
+    return svg.line(cols, rows, "evidence" if is_evidence else "read", closed=True) + text
 
 
 @dataclass(frozen=True)
@@ -75,26 +77,40 @@ class Card:
     picture: Markup | None
     causes: tuple[tuple[str, str, str], ...]
     is_suspect: bool
+    unit: ImageUnit
+
+    @property
+    def needs_look(self) -> bool:
+        """Whether it is anything but measured, or fits badly."""
+        return self.is_suspect or self.mark.status is not Status.MEASURED or abs(self.mark.w or 0.0) > LARGE_W
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """A frame of the report. rms_um: of its residuals along x and y; stored: what is adjusted of it; None without."""
+    """A frame of the report. id: of its place in the page; rms: of its residuals along x and y, in its unit; stored:
+    what is adjusted of it; None without."""
 
+    id: str
     frame: Frame
+    unit: ImageUnit
     fiducials: str
     targets: str
-    rms_um: tuple[float, float] | None
+    rms: tuple[float, float] | None
     largest_w: float | None
     cards: tuple[Card, ...]
     plot: Markup | None
     writing: Markup | None
     stored: ImageRecord | None
-    is_open: bool
+
+    @property
+    def badness(self) -> tuple[bool, float, int]:
+        """The key that sorts frames from good to bad: not found, then by the residuals, then by marks that are lost."""
+        is_lost = not any(mark.status.is_observation for mark in self.frame.marks)
+        return is_lost, sum(self.rms or (0.0,)), sum(mark.is_open for mark in self.frame.marks)
 
 
 def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) -> list[FrameView]:
-    """All frames, drawn to the same scales. every_mark: picture them all, however many."""
+    """All frames, the worst first, drawn to the same scales. every_mark: picture them all, however many."""
     shown = {frame.image: list(frame.marks) for frame in shots} if every_mark else mark_pictures.shown_marks(shots)
     px_per_um, most_px = thumbnail_scale(shots), mark_pictures.stored_px(shown)
     by_image = residuals_by_image(data)
@@ -104,24 +120,31 @@ def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) 
     def card(mark: Mark) -> Card:
         thumbnail = data.thumbnail(mark.image, mark.point, mark.kind) if data.thumbnail else None
         picture = mark_pictures.mark_picture(mark, thumbnail, px_per_um, most_px) if thumbnail else None
-        return Card(mark, picture, _causes(mark.covariance), mark.residual in suspects)
+        return Card(mark, picture, _causes(mark.covariance), mark.residual in suspects, data.unit_of_image(mark.image))
 
-    return [
+    views = [
         FrameView(
+            id=f"frame-{number}",
             frame=frame,
+            unit=data.unit_of_image(frame.image),
             fiducials=_observed_share([mark for mark in frame.marks if mark.is_fiducial]),
             targets=_observed_share([mark for mark in frame.marks if not mark.is_fiducial]),
-            rms_um=_rms_um(by_image.get(frame.image, [])),
+            rms=_rms(by_image.get(frame.image, []), data.unit_of_image(frame.image)),
             largest_w=max((abs(row.w) for row in by_image.get(frame.image, ()) if np.isfinite(row.w)), default=None),
             cards=tuple(map(card, shown[frame.image])),
             plot=plots.get(frame.image),
             writing=writing_picture(frame.scan),
             stored=data.adjustment.images.get(frame.image) if data.adjustment else None,
-            is_open=len(shots) <= OPEN_FRAMES
-            or (data.totals is None and any(mark.is_fiducial and mark.is_open for mark in frame.marks)),
         )
-        for frame in shots
+        for number, frame in enumerate(shots, 1)
     ]
+    return sorted(views, key=lambda view: view.badness, reverse=True)
+
+
+def cards_to_show(views: Iterable[FrameView]) -> tuple[list[Card], int]:
+    """Cards of marks that need a look, the worst frame's first, and how many more there are."""
+    cards = [card for view in views for card in view.cards if card.needs_look]
+    return cards[:MOST_CARDS], len(cards[MOST_CARDS:])
 
 
 def thumbnail_scale(shots: list[Frame]) -> float:
@@ -146,10 +169,13 @@ def _plots(
     if stored is None or not by_image:
         return {}
     scale = vectors.VectorField.from_residuals(stored.residuals).scale(LONGEST_VECTOR_PX)
-    frame_mm = {image: data.frame_mm.get(stored.camera_of(image)) for image in images}
-    return {
-        image: vectors.image_plot(image, by_image[image], frame_mm[image], PLOT_PX, scale, suspects) for image in images
-    }
+
+    def plot(image: str) -> Markup:
+        places, unit = vectors.VectorField.from_residuals(by_image[image]).places_mm, data.unit_of_image(image)
+        on = vectors.plane(places, data.frame_mm.get(stored.camera_of(image)), PLOT_PX, unit)
+        return vectors.image_plot(image, by_image[image], on, scale, suspects)
+
+    return {image: plot(image) for image in images}
 
 
 def _causes(covariance: Covariance | None) -> tuple[tuple[str, str, str], ...]:
@@ -171,8 +197,8 @@ def _observed_share(marks: list[Mark]) -> str:
     return f"{observed} of {len(marks)}" + (f" ({others})" if others else "")
 
 
-def _rms_um(residuals: list[ResidualRecord]) -> tuple[float, float] | None:
+def _rms(residuals: list[ResidualRecord], unit: ImageUnit) -> tuple[float, float] | None:
     if not residuals:
         return None
-    x, y = np.sqrt(np.mean(np.square([row.v_um for row in residuals]), axis=0))
+    x, y = unit.per_um * np.sqrt(np.mean(np.square([row.v_um for row in residuals]), axis=0))
     return float(x), float(y)

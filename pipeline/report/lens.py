@@ -22,6 +22,7 @@ from pipeline.drawing import svg
 from pipeline.report.vectors import Plane, grid_mm, longest_vector, strokes_and_dots
 from pipeline.results.adjustment_record import CameraRecord
 from pipeline.results.covariance_file import Covariance
+from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.types import Array
 
 FRAME_GRID = 17
@@ -183,18 +184,20 @@ def _circle(center_mm: Array, radius_mm: float, on: Plane) -> Markup:
     return svg.strokes(on.page(points[:-1][shown]), on.page(points[1:][shown]), "reach")
 
 
-def curves_plot(drawn: Curves, observed_radius_mm: float) -> Markup:
+def curves_plot(drawn: Curves, observed_radius_mm: float, unit: ImageUnit = FILM_UNIT, width: float = 400.0) -> Markup:
     """Both curves with their 95 % bands; grey beyond the outermost target, where nothing was observed."""
-    curve_of = {"first": (drawn.radial_um, drawn.radial_sigma_um)}
+    pairs = {"first": (drawn.radial_um, drawn.radial_sigma_um)}
     if np.any(drawn.asymmetric_um > 1e-6):
-        curve_of = {"second": (drawn.asymmetric_um, drawn.asymmetric_sigma_um), **curve_of}
+        pairs = {"second": (drawn.asymmetric_um, drawn.asymmetric_sigma_um), **pairs}
+    curve_of = {kind: (unit.per_um * value, unit.per_um * sigma) for kind, (value, sigma) in pairs.items()}
+    radius = unit.per_mm * drawn.radius_mm
     low = min(0.0, *(float((value - BAND * sigma).min()) for value, sigma in curve_of.values()))
     high = max(0.0, *(float((value + BAND * sigma).max()) for value, sigma in curve_of.values()))
     room = 0.06 * max(high - low, 1e-3)
-    axes = svg.Axes((0.0, float(drawn.radius_mm[-1])), (low - room, high + room), height=320.0)
-    x = axes.x(drawn.radius_mm)
-    labels = axes.grid("radius from the principal point (mm)", "displacement (µm)")
-    content = [_extrapolation(axes, observed_radius_mm), labels]
+    axes = svg.Axes((0.0, float(radius[-1])), (low - room, high + room), width=width, height=0.75 * width)
+    x = axes.x(radius)
+    labels = axes.grid(f"radius from the principal point ({unit.long_name})", f"displacement ({unit.short_name})")
+    content = [_extrapolation(axes, unit.per_mm * observed_radius_mm), labels]
     for kind, (value, sigma) in curve_of.items():
         for half in (BAND * sigma, sigma) if kind == "first" else (BAND * sigma,):
             edge = np.concatenate([axes.y(value + half), axes.y(value - half)[::-1]])
@@ -203,8 +206,8 @@ def curves_plot(drawn: Curves, observed_radius_mm: float) -> Markup:
     return svg.picture(axes.width, axes.height, "Distortion over the radius with its 95 % band", *content)
 
 
-def _extrapolation(axes: svg.Axes, observed_radius_mm: float) -> Markup:
-    start, end = float(axes.x(min(observed_radius_mm, axes.x_range[1]))), axes.width - axes.right
+def _extrapolation(axes: svg.Axes, observed_radius: float) -> Markup:
+    start, end = float(axes.x(min(observed_radius, axes.x_range[1]))), axes.width - axes.right
     if end - start < 1.0:
         return Markup("")
     height = axes.height - axes.bottom - axes.top

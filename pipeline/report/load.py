@@ -30,7 +30,9 @@ from pipeline.results.comparator_file import (
     ComparatorPoint,
     decisions_of,
     decisions_told,
+    has_pixels_alone,
     measurement_of,
+    pitches_of,
     read_comparator,
 )
 from pipeline.results.covariance_file import read_covariance
@@ -49,9 +51,14 @@ def measured_data(
     marks, where not all are to be read; then no scans are.
     """
     comparator = at(project.comparator)
+    marks = read_comparator(comparator, project.list_pitch_um) if rows is None else rows
+    pitch_um = pitches_of(comparator)
+    if project.list_pitch_um is not None and has_pixels_alone(comparator):
+        pitch_um = dict.fromkeys((mark.image for mark in marks), project.list_pitch_um)
     data = ReportData(
         project=project.title,
-        comparator=read_comparator(comparator, project.list_pitch_um) if rows is None else rows,
+        comparator=marks,
+        pitch_um=pitch_um,
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
         notes=tuple(filter(None, [outside_note(project), decisions_told(decisions_of(comparator))])),

@@ -2,10 +2,11 @@
 
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from heapq import nsmallest
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
@@ -17,13 +18,14 @@ from pipeline.report.fractions import centers_px, places_apart
 from pipeline.report.frame_problems import masked_text, single_frame_problems
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.marks import Frame, frames
-from pipeline.report.verdict import is_film_alone, suspect_rows
+from pipeline.report.verdict import suspect_rows
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import counted, listed
 
 MOST_FRAMES = 200  # that a report shows with their marks
 _MOST_PROBLEMS = 50  # different ones that it lists
+_ROWS = 200  # cameras and kinds of file at most
 _BEST_FIRST = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR, Verdict.FAILED)
 
 
@@ -36,7 +38,6 @@ class _Totals:
     verdicts: dict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     problems: dict[tuple[str, str], tuple[Problem, list[str]]] = field(default_factory=dict)
     centers_px: "array[float]" = field(default_factory=lambda: array("d"))
-    sigmas_um: "array[float]" = field(default_factory=lambda: array("d"))
 
     def add(self, frame: Frame, kind: tuple[str, str], verdict: Verdict, problems: Iterable[Problem]) -> None:
         self.verdicts[kind][verdict] += 1
@@ -47,9 +48,6 @@ class _Totals:
             self.problems.setdefault(alike, (problem, []))[1].append(frame.image)
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
-        for mark in frame.marks:
-            if mark.status.is_observation and mark.sigma_um is not None:
-                self.sigmas_um.extend(mark.sigma_um.tolist())
 
     def add_plain(self, plain: Sequence[StoredFrame], columns: MarkColumns, camera_of: Callable[[str], str]) -> None:
         """Frames of which only totals are told."""
@@ -66,11 +64,10 @@ class _Totals:
                     here = (columns.kind == kind) & (columns.status == status)
                     self.of_targets[name, word] += int(here.sum())
         used = np.array([Status(word).is_observation for word in columns.statuses], dtype=bool)[columns.status]
-        for kept, values in ((self.centers_px, columns.center_px), (self.sigmas_um, columns.sigma_um)):
-            kept.frombytes(values[used & np.isfinite(values).all(axis=1)].tobytes())
+        is_known = np.isfinite(columns.center_px).all(axis=1)
+        self.centers_px.frombytes(columns.center_px[used & is_known].tobytes())
 
     def result(self, needs_look: int) -> FrameTotals:
-        x_um, y_um = np.array(self.sigmas_um).reshape(-1, 2).T
         return FrameTotals(
             needs_look=needs_look,
             marks=self.marks,
@@ -78,7 +75,6 @@ class _Totals:
             verdicts={kind: {v: counts[v] for v in _BEST_FIRST} for kind, counts in sorted(self.verdicts.items())},
             problems=tuple(_listed(self.problems)),
             places_px=places_apart(np.array(self.centers_px)),
-            sigmas_um={"x": x_um, "y": y_um},
         )
 
 
@@ -96,7 +92,7 @@ def reduced(
     totals, needs_look = _Totals(), 0
     if stored is not None:
         totals.add_plain(stored.plain, stored.columns(), camera_of)
-    with_pose = not is_film_alone(data)
+    with_pose = not data.is_film_alone
     suspect = {row.image for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
 
     def frames_to_show() -> Iterator[tuple[tuple[float, float], ReportData]]:
@@ -170,7 +166,54 @@ def _listed(problems: dict[tuple[str, str], tuple[Problem, list[str]]]) -> Itera
             if len(images) > 1 and masked_text(problem.what) != problem.what
             else ""
         )
-        yield Problem(f"{listed(images)}: {problem.what}{of_first}", problem.next_step)
+        yield replace(problem, what=f"{listed(images)}: {problem.what}{of_first}", images=tuple(images))
     rest = sum(len(images) for _, images in ordered[_MOST_PROBLEMS:])
     if rest:
         yield Problem(f"{counted(rest, 'more problem')} of frames, all different.", "`reseau status --csv` has them.")
+
+
+@dataclass(frozen=True)
+class TotalsView:
+    """Numbers of frames. verdicts: those that occur; rows: by camera and kind of file, with a number for each verdict;
+    left_out: further rows; all: of all frames; shown: those that the report shows, None where it shows all."""
+
+    frames: int
+    needs_look: int
+    shown: int | None
+    verdicts: tuple[str, ...]
+    rows: tuple[tuple[str, str, tuple[int, ...]], ...]
+    left_out: int
+    all: tuple[int, ...]
+
+
+def totals_view(data: ReportData, shots: Sequence[Frame]) -> TotalsView | None:
+    """Of more frames than are shown, and of an archive; else None."""
+    if data.totals is None and not data.is_film_alone:
+        return None
+    counts = dict[tuple[str, str], Mapping[Any, int]](
+        _verdicts(data, shots) if data.totals is None else data.totals.verdicts
+    )
+    verdicts = tuple(each for each in _BEST_FIRST if any(row.get(each) for row in counts.values()))
+    rows = tuple((*kind, tuple(row.get(each, 0) for each in verdicts)) for kind, row in sorted(counts.items()))
+    total = {each: sum(row.get(each, 0) for row in counts.values()) for each in _BEST_FIRST}
+    needs_look = sum(count for each, count in total.items() if each.needs_look)
+    return TotalsView(
+        frames=sum(total.values()),
+        needs_look=data.totals.needs_look if data.totals else needs_look,
+        shown=len({*(data.measurement or {}), *(row.image for row in data.comparator)}) if data.totals else None,
+        verdicts=tuple(map(str, verdicts)),
+        rows=rows[:_ROWS],
+        left_out=max(len(rows) - _ROWS, 0),
+        all=tuple(total[each] for each in verdicts),
+    )
+
+
+def _verdicts(data: ReportData, shots: Sequence[Frame]) -> Mapping[tuple[str, str], Counter[Verdict]]:
+    """Numbers of an archive's frames."""
+    stored, counts = data.adjustment, defaultdict[tuple[str, str], Counter[Verdict]](Counter)
+    assert stored is not None
+    for frame in shots:
+        camera = stored.camera_of(frame.image) if frame.image in stored.images else "none"
+        kind = camera, _ending(frame.scan.scan) if frame.scan else "given"
+        counts[kind][_verdict(frame, with_pose=False)] += 1
+    return counts

@@ -1,10 +1,13 @@
 """report.html: one file, no network, readable without scripts and on paper."""
 
+import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -13,27 +16,39 @@ from markupsafe import Markup
 from measure import flags
 from pipeline.drawing import svg
 from pipeline.report.camera_views import camera_views
-from pipeline.report.data import ReportData
+from pipeline.report.data import Problem, ReportData
+from pipeline.report.fiducials import correction_sentences
 from pipeline.report.fractions import (
     LEAST_MARKS,
     FractionTest,
     fraction_plot,
     fraction_test,
     places_px,
-    totals_view,
 )
-from pipeline.report.frame_views import frame_views, thumbnail_scale
+from pipeline.report.frame_views import FrameView, cards_to_show, frame_views, thumbnail_scale
+from pipeline.report.many_frames import totals_view
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, fixed_list, significant, value_and_sigma
 from pipeline.report.parameters import axes_sentence, group_sentences, spoken_name
 from pipeline.report.scanner_views import scanner_views
 from pipeline.report.vectors import joined_view
-from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, judge, sigma0_bounds
-from pipeline.results.adjustment_record import AdjustmentRecord, FiducialRecord, PointRecord
+from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, judge, lens_sentences, sigma0_bounds
+from pipeline.results.adjustment_record import AdjustmentRecord, PointRecord
+from pipeline.results.image_unit import FILM_UNIT
 from pipeline.text.atomic import write_atomically
 from pipeline.types import Array
 
 LIST_LIMIT = 200  # rows of a long table
+LINKS = 3  # to frames of a problem
+SECTIONS = {
+    "frames": "Frames",
+    "coverage": "Coverage",
+    "fiducials": "Fiducial marks",
+    "reliability": "Reliability",
+    "check": "Check against OpenCV",
+    "fractions": "Histograms",
+}
+_SENTENCE = re.compile(r"(?<=[.:]) (?=[A-Z])")
 
 
 def write_report(data: ReportData, path: Path) -> None:
@@ -70,7 +85,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals["drawing_css"] = Markup(svg.style())
-    words = (value_and_sigma, axes_sentence, group_sentences, moved_um)
+    words = (value_and_sigma, axes_sentence, group_sentences, correction_sentences)
     environment.globals |= {function.__name__: function for function in words}
     environment.filters |= {"fixed": fixed, "fixed_list": fixed_list, "significant": significant}
     return environment
@@ -82,18 +97,20 @@ def _context(data: ReportData) -> dict[str, object]:
     cameras = camera_views(data)
     calibrated = any(camera.is_calibrated for camera in cameras)
     places = data.totals.places_px if data.totals else places_px(shots)
+    verdict, frame_context = judge(data), _frame_context(data, shots)
     return {
         **_common(data),
-        **_frame_context(data, shots),
+        **frame_context,
         "title": "Calibration report" if calibrated or not adjustment else "Film report",
         "calibrated": calibrated,
-        "verdict": judge(data),
+        "verdict": verdict,
+        "problems": [_problem_view(problem, frame_context["frames"]) for problem in verdict.problems],
         "check": data.check,
-        "totals": totals_view(data) if data.totals else None,
+        "totals": totals_view(data, shots),
         "contradiction": lambda test: contradiction(test, adjustment.cameras if adjustment else {}),
         "spoken": lambda name: spoken_name(name, adjustment.cameras if adjustment else ()),
-        "measured": bool(data.measurement),
         "cameras": cameras,
+        "lens_reach": {name: sentence for name, sentence, _ in lens_sentences(data)},
         "scanners": scanner_views(data),
         "joined": [(name, joined_view(each)) for name, each in sorted(adjustment.frames.items())] if adjustment else [],
         "fractions": list(_fractions(places)),
@@ -113,6 +130,7 @@ def _common(data: ReportData) -> dict[str, object]:
         "version": version("reseau"),
         "made_from": ", ".join(f"{name} {fingerprint}" for name, fingerprint in data.made_from.items()) or "memory",
         "unit": data.unit,
+        "group_unit": next(iter(data.image_units.values()), FILM_UNIT),
         "adjustment": data.adjustment,
         "critical_w": critical_w(2 * len(data.adjustment.residuals)) if data.adjustment else 0.0,
         "has_pictures": data.thumbnail is not None,
@@ -121,18 +139,55 @@ def _common(data: ReportData) -> dict[str, object]:
     }
 
 
-def _frame_context(data: ReportData, shots: list[Frame], every_mark: bool = False) -> dict[str, object]:
+def _frame_context(data: ReportData, shots: list[Frame], every_mark: bool = False) -> dict[str, Any]:
+    views = frame_views(data, shots, every_mark)
+    cards, hidden = cards_to_show(views)
+    marks = [mark for frame in shots for mark in frame.marks]
+    has_fiducials = any(mark.is_fiducial for mark in marks)
     return {
-        "frames": frame_views(data, shots, every_mark),
+        "frames": views,
+        "every_mark": every_mark,
+        "cards": [] if every_mark else cards,
+        "hidden_cards": hidden,
+        "has_orientations": has_fiducials and any(frame.scan and frame.scan.frame.pose for frame in shots),
+        "has_fiducials": has_fiducials,
+        "has_points": any(not mark.is_fiducial for mark in marks),
+        "has_residuals": any(view.rms for view in views),
         "points_word": _points_word(shots),
         "reasons": Counter(code for frame in shots for mark in frame.marks for code in mark.codes).most_common(),
-        "arrow_bar": _arrow_bar(shots),
+        "arrow_bar": _arrow_bar(data, shots),
     }
 
 
-def moved_um(mark: FiducialRecord) -> tuple[float | None, ...]:
-    """Estimated less given, in x and y."""
-    return tuple(1e3 * (each.value - each.given.value) if each.given else None for each in (mark.x_mm, mark.y_mm))
+@dataclass(frozen=True)
+class ProblemView:
+    """A problem as it is printed: its cause, what else there is to say, and what to do; links with their words."""
+
+    cause: str
+    detail: str
+    remedy: str
+    links: list[tuple[str, str]]
+    picture: Markup | None
+
+
+def _problem_view(problem: Problem, views: Sequence[FrameView]) -> ProblemView:
+    """A problem without a next step has its remedy in its last sentences."""
+    cause, *rest = _SENTENCE.split(problem.what, maxsplit=1)
+    detail, remedy = ("".join(rest), problem.next_step) if problem.next_step else ("", "".join(rest))
+    known = {view.frame.image: view for view in views}
+    images = dict.fromkeys((*problem.images, *(image for image, *_ in problem.marks)))
+    links = [(image, f"#{known[image].id}") for image in images if image in known][:LINKS]
+    if problem.section:
+        links.append((SECTIONS[problem.section], f"#{problem.section}"))
+    marks = (
+        card
+        for image, kind, point in problem.marks
+        if image in known
+        for card in known[image].cards
+        if (card.mark.kind, card.mark.point) == (kind, point)
+    )
+    picture = next((card.picture for card in marks if card.picture), None)
+    return ProblemView(cause, detail, remedy, links, picture)
 
 
 def _points_word(shots: list[Frame]) -> str:
@@ -151,11 +206,11 @@ def _fractions(places: Mapping[str, Array]) -> Iterator[tuple[str, FractionTest,
             yield axis, test, fraction_plot(axis, test)
 
 
-def _arrow_bar(shots: list[Frame]) -> tuple[float, float]:
-    """A round length in um for the legend of the marks' pictures, and its page pixels."""
-    px_per_um = thumbnail_scale(shots)
-    um = svg.round_step(40.0 / px_per_um)
-    return um, um * px_per_um
+def _arrow_bar(data: ReportData, shots: list[Frame]) -> tuple[float, float]:
+    """A round length for the legend of the marks' pictures, and its page pixels."""
+    px_per_unit = thumbnail_scale(shots) / next(iter(data.image_units.values()), FILM_UNIT).per_um
+    length = svg.round_step(40.0 / px_per_unit)
+    return length, length * px_per_unit
 
 
 def _points(adjustment: AdjustmentRecord) -> list[tuple[str, PointRecord]]:

@@ -10,20 +10,20 @@ from adjust.functional_model.families import family as family_of
 from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import Parameter, parameter_from_text
 from adjust.quality.significance import LEVEL
+from pipeline.report.camera_values import SYMBOLS
 from pipeline.report.lens import largest_effects_um, lens
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.results.adjustment_record import CameraRecord, GivenQuantity, GroupTestRecord, Quantity
 from pipeline.results.covariance_file import Covariance
+from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 
 MOSTLY_PRIOR = 0.9  # of the prior's sigma is left: the data have told little
 HIGH_CORRELATION = 0.9
 
-_SYMBOLS = {"x0": "x₀′", "y0": "y₀′"}
-
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """A quantity of the table, what was given of it, and what that says. effect: at the outermost target, in um."""
+    """A quantity of the table, what was given of it, and what that says. effect: at the outermost target."""
 
     symbol: str
     unit: str
@@ -33,30 +33,38 @@ class ParameterRow:
     meaning: str
 
 
-def parameter_rows(name: str, camera: CameraRecord, prior_scale: float, radius_mm: float) -> Iterator[ParameterRow]:
+def parameter_rows(
+    name: str, camera: CameraRecord, prior_scale: float, radius_mm: float, unit: ImageUnit = FILM_UNIT
+) -> Iterator[ParameterRow]:
     """Principal distance, principal point and distortion. radius_mm: where the distortion's effect is stated;
     prior_scale: what the adjustment has multiplied given standard deviations by."""
     family, names = family_of(camera.distortion.family), parameter_names(camera.distortion.family)
-    for parameter, quantity in list(camera.interior.items())[:3]:
-        meaning = _origin(quantity, prior_scale)
-        yield ParameterRow(_SYMBOLS.get(parameter, parameter), "mm", quantity, _given_text(quantity), "", meaning)
+    for parameter, in_mm in list(camera.interior.items())[:3]:
+        quantity, symbol = _scaled(in_mm, unit.per_mm), SYMBOLS.get(parameter, parameter)
+        meaning = _origin(quantity, prior_scale, unit)
+        yield ParameterRow(symbol, unit.long_name, quantity, _given_text(quantity), "", meaning)
     effects = largest_effects_um(lens(name, camera), radius_mm) if names else {}
     for parameter, um_per_unit in effects.items():
         known = camera.distortion.parameters.get(parameter)
         if known is not None and (known.value != 0.0 or known.sigma != 0.0):
-            effect = significant(um_per_unit * known.value, 3)
+            effect = _scaled(known, um_per_unit * unit.per_um)
+            made = significant(effect.value, 3)
             if known.sigma > 0.0:
-                effect = " ± ".join(value_and_sigma(um_per_unit * known.value, um_per_unit * known.sigma))
-            unit = family.unit(parameter)
-            yield ParameterRow(parameter, unit, known, _given_text(known), effect, _significance(known))
+                made = " ± ".join(value_and_sigma(effect.value, effect.sigma))
+            yield ParameterRow(parameter, family.unit(parameter), known, _given_text(known), made, _significance(known))
 
 
 def term_rows(terms: Mapping[str, Quantity]) -> Iterator[ParameterRow]:
     """The terms of a scanner's bend, in um."""
     for name, known in terms.items():
-        given = known.given and GivenQuantity(1e3 * known.given.value, 1e3 * known.given.sigma)
-        in_um = replace(known, value=1e3 * known.value, sigma=1e3 * known.sigma, given=given)
+        in_um = _scaled(known, 1e3)
         yield ParameterRow(name, "µm", in_um, _given_text(in_um), "", _significance(known))
+
+
+def _scaled(known: Quantity, factor: float) -> Quantity:
+    """The same in another unit."""
+    given = known.given and GivenQuantity(factor * known.given.value, factor * known.given.sigma)
+    return replace(known, value=factor * known.value, sigma=factor * known.sigma, given=given)
 
 
 def high_correlations(name: str, camera: CameraRecord, covariance: Covariance) -> list[tuple[str, str, float]]:
@@ -101,7 +109,7 @@ def spoken_name(text: str, cameras: Collection[str]) -> str:
     parameter = parameter_from_text(text, cameras)
     whose = f", {parameter.owner}" if len(cameras) > 1 else ""
     if parameter.kind == "interior":
-        return _SYMBOLS.get(parameter.quantity, parameter.quantity) + whose
+        return SYMBOLS.get(parameter.quantity, parameter.quantity) + whose
     if parameter.kind == "fiducial":
         return f"{parameter.quantity}′ of fiducial {parameter.id}{whose}"
     return parameter.label
@@ -122,14 +130,15 @@ def _undetermined(sigma: float) -> str:
     return "not determined" if math.isnan(sigma) else "held at the given value" if sigma == 0.0 else ""
 
 
-def _origin(quantity: Quantity, prior_scale: float) -> str:
+def _origin(quantity: Quantity, prior_scale: float, unit: ImageUnit) -> str:
     """How far the value moved from the given one, and whether data or prior determined it."""
     given, sigma = quantity.given, quantity.sigma
     if sentence := _undetermined(sigma):
         return sentence
     if given is None or not given.sigma > 0.0:
         return "determined by the observations alone"
-    moved = f"moved by {fixed(1e3 * (quantity.value - given.value), 0, sign=True)} µm"
+    moved_by = (quantity.value - given.value) * unit.per_um / unit.per_mm * 1e3
+    moved = f"moved by {fixed(moved_by, 2 if unit.is_pixel else 0, sign=True)} {unit.short_name}"
     if quantity.p is not None and quantity.p < LEVEL:
         moved += f", more than the given σ allows ({_p_value(quantity.p)})"
     left = sigma / (prior_scale * given.sigma)

@@ -7,9 +7,10 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.drawing import svg
-from pipeline.report.numbers import fixed
+from pipeline.report.numbers import fixed, fixed_list
 from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord
 from pipeline.results.assessment_record import ResidualRecord
+from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.types import Array, Mask
 
 MARGIN_PX = 26.0
@@ -21,10 +22,11 @@ LONGEST_JOIN_PX = 40.0
 
 @dataclass(frozen=True)
 class Plane:
-    """The camera frame on the page: corners (2, 2) lower left and upper right in mm, y up."""
+    """The camera frame on the page: corners (2, 2) lower left and upper right in mm, y up; unit: of its scale bars."""
 
     corners_mm: Array
     width_px: float
+    unit: ImageUnit = FILM_UNIT
 
     @property
     def px_per_mm(self) -> float:
@@ -39,17 +41,21 @@ class Plane:
         low_x, high_y = self.corners_mm[0, 0], self.corners_mm[1, 1]
         return MARGIN_PX + self.px_per_mm * np.stack([xy_mm[:, 0] - low_x, high_y - xy_mm[:, 1]], axis=1)
 
-    def picture(self, title: str, px_per_um: float, *content: Markup) -> Markup:
-        """The frame's outline with vectors in it, and below a bar of a round length in um, and one of mm."""
+    def picture(self, title: str, px_per_um: float | None, *content: Markup) -> Markup:
+        """The frame's outline with what is in it, below a bar of a round length for vectors, if any, and one for the
+        frame."""
         (x0, y0), (x1, y1) = self.page(self.corners_mm)
         outline = svg.tag("rect", x=x0, y=y1, width=x1 - x0, height=y0 - y1, class_="frame")
+        bars = [(self.px_per_mm / self.unit.per_mm, f"{self.unit.long_name} (frame)")]
+        if px_per_um is not None:
+            bars.insert(0, (px_per_um / self.unit.per_um, f"{self.unit.short_name} (vectors)"))
+        drawn = [self._scale_bar(4.0 + 15.0 * row, *bar) for row, bar in enumerate(bars)]
         height = self.height_px + FOOT_PX
-        return svg.picture(self.width_px, height, title, outline, *content, self._scale_bars(px_per_um))
+        return svg.picture(self.width_px, height, title, outline, *content, *drawn)
 
-    def _scale_bars(self, px_per_um: float) -> Markup:
-        um, mm = svg.round_step(60.0 / px_per_um), svg.round_step(60.0 / self.px_per_mm)
-        um_bar = svg.scale_bar(MARGIN_PX, self.height_px + 4.0, um * px_per_um, f"{um:g} µm (vectors)")
-        return um_bar + svg.scale_bar(MARGIN_PX, self.height_px + 19.0, mm * self.px_per_mm, f"{mm:g} mm (frame)")
+    def _scale_bar(self, below: float, px_per_unit: float, words: str) -> Markup:
+        length = svg.round_step(60.0 / px_per_unit)
+        return svg.scale_bar(MARGIN_PX, self.height_px + below, length * px_per_unit, f"{length:g} {words}")
 
 
 @dataclass(frozen=True)
@@ -84,20 +90,22 @@ class VectorField:
         return starts, starts + px_per_um * self.vectors_um * (1.0, -1.0)
 
 
-def plane(places_mm: Array, frame_mm: tuple[float, float] | None, width_px: float) -> Plane:
+def plane(
+    places_mm: Array, frame_mm: tuple[float, float] | None, width_px: float, unit: ImageUnit = FILM_UNIT
+) -> Plane:
     """The camera's frame, or where it is not known or not about the origin (a digital camera), what is observed."""
     low, high = places_mm.min(axis=0), places_mm.max(axis=0)
     half = 0.5 * np.array(frame_mm) if frame_mm is not None else np.zeros(2)
     if np.all(np.abs([low, high]) <= half):
         low, high = -half, half
-    return padded_plane(np.stack([low, high]), width_px)
+    return padded_plane(np.stack([low, high]), width_px, unit=unit)
 
 
-def padded_plane(corners_mm: Array, width_px: float, share: float = 0.02) -> Plane:
+def padded_plane(corners_mm: Array, width_px: float, share: float = 0.02, unit: ImageUnit = FILM_UNIT) -> Plane:
     """The rectangle between two corners (2, 2), with a little room about it: a share of its longer side."""
     # A single point, or points in a row, still need a plane to stand in.
     room = share * max(float(np.ptp(corners_mm, axis=0).max()), 1.0)
-    return Plane(corners_mm + np.array([[-room], [room]]), width_px)
+    return Plane(corners_mm + np.array([[-room], [room]]), width_px, unit)
 
 
 def grid_mm(axes: Iterable[Array]) -> Array:
@@ -114,21 +122,15 @@ def longest_vector(vectors_um: Array, covariances_um2: Array) -> tuple[float, fl
 
 
 def image_plot(
-    image: str,
-    rows: Sequence[ResidualRecord],
-    frame_mm: tuple[float, float] | None,
-    width_px: float,
-    px_per_um: float,
-    suspects: Collection[ResidualRecord],
+    image: str, rows: Sequence[ResidualRecord], on: Plane, px_per_um: float, suspects: Collection[ResidualRecord]
 ) -> Markup:
     """The residuals of one image, each with its name and numbers to point at."""
-    residuals = VectorField.from_residuals(rows)
-    on = plane(residuals.places_mm, frame_mm, width_px)
+    residuals, unit = VectorField.from_residuals(rows), on.unit
     marks = []
     for start, end, row in zip(*residuals.ends(on, px_per_um), rows, strict=True):
         kind = "suspect" if row in suspects else "fiducial" if row.kind == "fiducial" else "target"
-        vx, vy = (fixed(v, 1, sign=True) for v in row.v_um)
-        hint = f"{row.kind} {row.point}: v = ({vx}, {vy}) µm in the scan, w = {fixed(row.w, 1)}"
+        v = fixed_list((unit.per_um * v for v in row.v_um), unit.decimals, sign=True)
+        hint = f"{row.kind} {row.point}: v = ({v}) {unit.short_name} in the scan, w = {fixed(row.w, 1)}"
         marks.append(svg.tag("g", svg.tag("title", hint), strokes_and_dots(start[None], end[None], kind)))
     return on.picture(f"Residual vectors of {image}", px_per_um, *marks)
 

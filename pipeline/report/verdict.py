@@ -10,7 +10,8 @@ from scipy.special import chdtri, ndtri
 
 from adjust.problem.parameter import description, parameter_from_text
 from measure.flags import Status
-from pipeline.report.data import Problem, ReportData
+from pipeline.report.camera_values import LARGER, camera_values, cluster_ratio
+from pipeline.report.data import MarkKey, Problem, ReportData
 from pipeline.report.fractions import places_px
 from pipeline.report.frame_problems import assumed_poses, frame_problems, images_by_sentence, pixel_locking
 from pipeline.report.marks import Frame, frames
@@ -37,6 +38,7 @@ A_PRIORI = (
     "their own that would tell σ₀. Given coordinates with a large sigma place the datum and check nothing."
 )
 CONTRADICTED = 0.01  # probability of so much against an earlier calibration, below which it is a problem
+ON_FRAMES = ("target", "fiducial", "tie")  # groups of marks
 MOST_QUANTITIES = 3  # of it that are named
 LEAST_SHARE = 0.5  # of the corner's radius within which an estimated lens is known
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
@@ -108,8 +110,9 @@ def _no_solution(adjustment: AdjustmentRecord) -> Iterator[Problem]:
             "The images hardly determine what is named below as practically singular: add what is advised there, or "
             "fix it."
             if is_practically
-            else "Look for wrong point numbers and gross errors among the largest residuals, at the approximate "
-            "orientations, and at the units: [object] unit of points and stations, mm in the camera's file.",
+            else "Look for wrong point numbers among the largest residuals, at the approximate orientations, and at "
+            "the units: [object] unit of points and stations, mm in the camera's file.",
+            section="frames",
         )
 
 
@@ -126,16 +129,25 @@ def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     kept, removed = ([_suspect(row) for row in rows if row.removed is removed] for removed in (False, True))
     if kept:
         yield Problem(
-            f"{counted(len(kept), 'observation')} beyond chance: {listed(kept)}.",
-            "Look at the picture or the records: a wrong point number or a disturbed mark is rejected in "
-            "comparator.csv (status rejected), a wrong given coordinate corrected, and the adjustment run again; "
-            "snooping = true under [adjust] leaves them out.",
+            f"{counted(len(kept), 'gross error')} suspected: {listed(kept)}.",
+            "Look at the picture: reject a disturbed mark or a wrong number in comparator.csv, or correct the given "
+            "coordinate. snooping = true under [adjust] leaves them out.",
+            marks=_suspect_marks(rows, False),
+            section="reliability",
         )
     if removed:
         yield Problem(
-            f"Left out, for beyond chance: {listed(removed)}.",
-            "The adjustment does without them. Look at the picture or the records, and reject or correct them there.",
+            f"Left out as gross errors: {listed(removed)}.",
+            "Look at the picture or the records, and reject or correct them there.",
+            marks=_suspect_marks(rows, True),
+            section="reliability",
         )
+
+
+def _suspect_marks(rows: Sequence[SuspectRecord], removed: bool) -> tuple[MarkKey, ...]:
+    """Those that are marks of a frame."""
+    marks = (row for row in rows if row.removed is removed and row.group in ON_FRAMES)
+    return tuple((row.owner, row.group, row.point) for row in marks)
 
 
 def _suspect(row: SuspectRecord) -> str:
@@ -147,11 +159,13 @@ def _further_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     """Distances, earlier calibrations and antennas that the images contradict."""
     heading, remedy = DISTANCES
     if bad := _outlying(adjustment, adjustment.distances):
-        yield Problem(f"{counted(len(bad), 'distance')} {heading}: {_named(bad, [row.name for row in bad])}.", remedy)
+        what = f"{counted(len(bad), 'distance')} {heading}: {_named(bad, [row.name for row in bad])}."
+        yield Problem(what, remedy, section="reliability")
     heading, remedy = FIDUCIAL_DISTANCES
     if bad := _outlying(adjustment, adjustment.fiducial_distances):
         count = counted(len(bad), "distance between fiducials", "distances between fiducials")
-        yield Problem(f"{count} {heading}: {_named(bad, [row.name for row in bad])}.", remedy)
+        what = f"{count} {heading}: {_named(bad, [row.name for row in bad])}."
+        yield Problem(what, remedy, section="fiducials")
     heading, remedy = CALIBRATION
     tests = [test for test in adjustment.calibration_tests if test.p < CONTRADICTED]
     yield from (Problem(f"{heading}: {contradiction(test, adjustment.cameras)}.", remedy) for test in tests)
@@ -192,15 +206,18 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     if adjustment.sigma0 <= high:
         yield from explained
         return
-    size = f"{_sigma0_and('above', high, adjustment.sigma0)}: the residuals are larger than the sigmas given"
+    size = (
+        f"{_sigma0_and('above', high, adjustment.sigma0)}: the residuals are larger than the standard deviations given"
+    )
     if explained:
         yield replace(explained[0], what=f"{size}. {explained[0].what}")
         yield from explained[1:]
         return
     yield Problem(
         f"{size} ({_group_sigmas(adjustment)}).",
-        "Reject gross errors first; then the film or lens has deformation that the model lacks: state it by "
-        "film_sigma_um or add distortion parameters. All sigmas of the result are already multiplied by σ₀.",
+        "Reject gross errors first. What remains the model lacks: add distortion parameters, or state it by "
+        "film_sigma_um. All standard deviations are already multiplied by σ₀.",
+        section="reliability",
     )
 
 
@@ -209,10 +226,8 @@ def _too_small(adjustment: AdjustmentRecord) -> Iterator[str]:
     low, _ = sigma0_bounds(adjustment.variance_factor.redundancy)
     if adjustment.sigma0 < low:
         yield (
-            f"{_sigma0_and('below', low, adjustment.sigma0)}: the marks fit better than the sigmas given "
-            f"({_group_sigmas(adjustment)}). Lower the sigmas of the group that is below 1 (sigma_target_um, "
-            "sigma_fiducial_um, film_sigma_um, or comparator.csv; datum: sigma_mm of the fiducials); all sigmas of the "
-            "result are already multiplied by σ₀."
+            f"{_sigma0_and('below', low, adjustment.sigma0)}: the marks fit better than the standard deviations given "
+            f"({_group_sigmas(adjustment)}), which may be lowered."
         )
 
 
@@ -227,19 +242,28 @@ def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
     return f"σ₀ = {sigma0:.{digits}f} is {side} {bound:.{digits}f}"
 
 
-def _lens_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
+def _lens_problems(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
     """Lenses that were estimated in less than half of the picture: from half the radius to the corner the seventh power
     of k3 grows by 128, so that a hundredth of a pixel inside is more than a pixel there."""
     remedy = "Observe targets out to the corners of the picture, or use the lens within that radius only."
-    lenses = adjustment.estimated_lenses()
-    yield from (Problem(known.sentence(name), remedy) for name, known in lenses if known.share < LEAST_SHARE)
+    for _, sentence, share in lens_sentences(data):
+        if share < LEAST_SHARE:
+            yield Problem(sentence, remedy, section="coverage")
+
+
+def lens_sentences(data: ReportData) -> Iterator[tuple[str, str, float]]:
+    """By camera how far out its lens is known, in words and as a share of the way to the corner."""
+    if data.adjustment is not None and _is_solved(data):
+        for name, known in data.adjustment.estimated_lenses():
+            yield name, known.sentence(name, data.unit_of_camera(name)), known.share
 
 
 def _check_problems(check: Check) -> Iterator[Problem]:
     if check.verdict == "differs":
         yield Problem(
             f"OpenCV's calibration of the same observations differs. {check.reason}",
-            "See the table of the check: a parameter that differs by many sigmas points to the cause.",
+            "See the table of the check: a parameter that differs by many standard deviations points to the cause.",
+            section="check",
         )
 
 
@@ -264,11 +288,6 @@ def _is_solved(data: ReportData) -> bool:
     return data.adjustment is not None and not any(_no_solution(data.adjustment))
 
 
-def is_film_alone(data: ReportData) -> bool:
-    """Whether fiducial marks are all there was to adjust."""
-    return data.adjustment is not None and not any(camera.is_calibrated for camera in data.adjustment.cameras.values())
-
-
 def _solution_check(found: Callable[[AdjustmentRecord], Iterator[Problem]], checked: bool = False) -> Evidence:
     """What an adjustment needs a look at where it has a solution, and redundancy if that is asked for."""
 
@@ -283,7 +302,7 @@ def _frame_check(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
     if data.totals:
         yield from data.totals.problems
         return
-    if not is_film_alone(data):
+    if not data.is_film_alone:
         yield from assumed_poses(shots)
     yield from frame_problems(shots)
 
@@ -297,7 +316,7 @@ NEEDS_A_LOOK: dict[str, Evidence] = {
     "warnings": lambda data, _: map(Problem, data.adjustment.warnings if data.adjustment else ()),
     "σ₀": _solution_check(_too_large, checked=True),
     "redundancy": _solution_check(_unchecked),
-    "reach of the lens": _solution_check(_lens_problems),
+    "reach of the lens": _lens_problems,
     "distances, calibrations, antennas": _solution_check(_further_problems),
     "gross errors": _solution_check(_suspects),
     "OpenCV": lambda data, _: _check_problems(data.check) if data.check else (),
@@ -314,22 +333,21 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
             yield "These marks are not adjusted yet: run `reseau adjust`."
     elif not data.adjustment.converged:
         yield "There is no solution: all values and residuals of this report are those of the last iteration."
-    elif not data.check:
+    elif not data.check and not data.is_film_alone:
         yield "There is no check against OpenCV yet: run `reseau check`."
-    elif data.check.verdict == "not possible" and not is_film_alone(data):
+    elif data.check and data.check.verdict == "not possible" and not data.is_film_alone:
         yield f"OpenCV cannot check this calibration. {data.check.reason}"
     if data.check:
         yield from _corners_notes(data.check)
     if data.adjustment:
         yield from data.adjustment.notes
-        lenses = data.adjustment.estimated_lenses()
-        yield from (known.sentence(name) for name, known in lenses if known.share >= LEAST_SHARE)
+        yield from _unmodelled_notes(data, data.adjustment)
         yield from _weight_notes(data.adjustment)
         if _is_solved(data) and data.adjustment.has_sigma0:
             yield from _too_small(data.adjustment)
         elif _is_solved(data):
             yield A_PRIORI
-    if is_film_alone(data):
+    if data.is_film_alone:
         for problem in assumed_poses(shots):
             yield f"{problem.what} {problem.next_step}"
         yield (
@@ -346,6 +364,22 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
             )
             if number:
                 yield f"{counted(number, *words)} {status} (their reasons stand with the marks)."
+
+
+def _unmodelled_notes(data: ReportData, adjustment: AdjustmentRecord) -> Iterator[str]:
+    """What was added for errors that the model lacks, and what errors that a picture's marks share make."""
+    for name, sigma_mm in adjustment.unmodelled_mm.items():
+        unit, ratio = data.unit_of_camera(name), cluster_ratio(name, adjustment.cameras[name], data.covariance)
+        if sigma_mm > 0.0:
+            yield (
+                f"{name}: {1e3 * sigma_mm * unit.per_um:.3g} {unit.short_name} are added to the standard deviations of "
+                "all targets, for what lens model, object and the picture's processing leave."
+            )
+        if ratio > LARGER:
+            yield (
+                f"{name}: errors within a picture are correlated. Standard deviations by leaving out one picture at a "
+                f"time are up to {ratio:.1f} times those of independent errors: the table of the camera has the larger."
+            )
 
 
 def _weight_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
@@ -377,25 +411,23 @@ def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int)
     if level == "failed":
         why = "the network is singular" if data.adjustment.singular else "the iteration did not come to rest"
         return f"There is no calibration: {why}."
-    constants = []
-    for name, camera in data.adjustment.cameras.items():
-        if camera.is_calibrated:
-            constants.append(f"{name} has c = {_principal_distance(data, name, camera)}")
+    constants = [
+        f"{name} has {_focal_lengths(data, name)}"
+        for name, camera in data.adjustment.cameras.items()
+        if camera.is_calibrated
+    ]
     if not constants:
         return f"Film transformations from {found}; no frame is oriented, and no camera calibrated{ending}"
     return f"Calibrated from {found}: {'; '.join(constants)}{ending}"
 
 
-def _principal_distance(data: ReportData, name: str, camera: CameraRecord) -> str:
-    """With its standard deviation: of a digital camera in pixels, whose size need not be known."""
-    given, unit_mm, unit = camera.principal_distance_mm, 1.0, "mm"
-    if data.adjustment and data.measurement and not camera.fiducials:
-        images = [image for image, each in data.adjustment.images.items() if each.camera in ("", name)]
-        pitches = {um for image in images if image in data.measurement for um in data.measurement[image].pitch_um}
-        if len(pitches) == 1:
-            unit_mm, unit = pitches.pop() / 1000.0, "px"
-    value, sigma = value_and_sigma(given.value / unit_mm, given.sigma / unit_mm)
-    return f"{value} {unit}, fixed" if sigma == "fixed" else f"{value} ± {sigma} {unit}"
+def _focal_lengths(data: ReportData, camera: str) -> str:
+    shown = []
+    for each in camera_values(data, camera):
+        value, sigma = value_and_sigma(each.value, each.sigma)
+        if each.is_focal:
+            shown.append(f"{each.symbol} = {value} ± {sigma} {each.unit}".replace("± fixed", "(fixed)"))
+    return ", ".join(shown)
 
 
 def _observed(data: ReportData, shots: list[Frame]) -> int:

@@ -1,7 +1,7 @@
 """From the adjustment to the record of it that `adjustment.json` keeps."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 
@@ -17,6 +17,7 @@ from adjust.problem.network import EXTERIOR_NAMES, Image, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
 from adjust.problem.tested import Tested
 from adjust.quality.contradiction import CalibrationTest
+from adjust.quality.projection_uncertainty import projection_uncertainty
 from adjust.quality.reliability import Reliability
 from adjust.quality.residuals import FurtherResidual
 from adjust.quality.significance import SignificanceTest
@@ -36,6 +37,7 @@ from pipeline.results.adjustment_record import (
     LensReachRecord,
     PointRecord,
     PrincipalPointRecord,
+    ProjectionRecord,
     Quantity,
     ScannerRecord,
     Sigma0Record,
@@ -61,6 +63,7 @@ from pipeline.types import Array
 ANGLES = ("omega", "phi", "kappa", "angle")
 DEG_PER_RAD = 180.0 / math.pi
 UM_PER_MM = 1e3
+MOST_IMAGES = 500  # up to which projection is worth its time with every adjustment
 
 
 def adjustment_record(
@@ -97,6 +100,7 @@ def adjustment_record(
         warnings=adjustment.warnings,
         notes=adjustment.notes,
         left_out=adjustment.left_out,
+        unmodelled_mm=adjustment.unmodelled_mm,
         variance_factors=adjustment.variance_factors,
         variance_sigmas=adjustment.variance_sigmas,
         explanations=adjustment.explanations,
@@ -166,7 +170,22 @@ def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float
             for x, y in [[Parameter.fiducial(camera.name, id, axis) for axis in "xy"]]
         },
         lens_known=None if reach is None else LensReachRecord(**asdict(reach), share=reach.share),
+        projection=() if reach is None else tuple(_projection(adjustment, camera.name)),
     )
+
+
+def _projection(adjustment: Adjustment, camera: str) -> Iterator[ProjectionRecord]:
+    """How well a camera projects at infinity, and at the median distance of its targets."""
+    if len(adjustment.network.images) > MOST_IMAGES:
+        return
+    by_images = adjustment.cluster_covariance_of if adjustment.unmodelled_mm else lambda _: None
+    infinite = projection_uncertainty(adjustment, by_images, camera)
+    near = projection_uncertainty(adjustment, by_images, camera, infinite.median_distance)
+    for known in (infinite, near):
+        x_mm, y_mm = known.places_mm[0, :, 0], known.places_mm[::-1, 0, 1]
+        sigma_um = [[float(f"{UM_PER_MM * each:.4g}") for each in row] for row in known.sigma_mm[::-1]]
+        distance = known.distance if math.isfinite(known.distance) else math.nan
+        yield ProjectionRecord(distance, tuple(x_mm.tolist()), tuple(y_mm.tolist()), tuple(map(tuple, sigma_um)))
 
 
 def _board(adjustment: Adjustment, number: int) -> BoardRecord:

@@ -31,6 +31,7 @@ from pipeline.results.assessment_record import (
     ResidualRecord,
     SuspectRecord,
 )
+from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.results.record_json import KEY, REST, Finite
 from pipeline.types import Array
 
@@ -142,19 +143,30 @@ class LensReachRecord:
     frame_mm: tuple[tuple[float, float], tuple[float, float]] | None
     share: float
 
-    def sentence(self, camera: str) -> str:
+    def sentence(self, camera: str, unit: ImageUnit = FILM_UNIT) -> str:
         """How far out the lens of a camera is known, how well there and beyond."""
+        inside, corner = (f"{um * unit.per_um:.2g} {unit.short_name}" for um in (self.sigma_um, self.corner_sigma_um))
         is_known = math.isfinite(self.corner_sigma_um)
-        beyond = (
-            f"there its standard deviation is {self.corner_sigma_um:.2g} µm"
-            if is_known
-            else "the lens shows nothing there"
-        )
-        inside = f", with a standard deviation of up to {self.sigma_um:.2g} µm" if math.isfinite(self.sigma_um) else ""
+        beyond = f"there its standard deviation is {corner}" if is_known else "the lens shows nothing there"
+        within = f", with a standard deviation of up to {inside}" if math.isfinite(self.sigma_um) else ""
         return (
-            f"The distortion of {camera} is known up to {self.radius_mm:.3g} mm from the principal point{inside}, "
-            f"{100.0 * self.share:.0f} % of the way to the corner of the picture; beyond it is extrapolated, {beyond}."
+            f"The distortion of {camera} is known up to {self.radius_mm * unit.per_mm:.3g} {unit.long_name} from the "
+            f"principal point{within}, {100.0 * self.share:.0f} % of the way to the corner of the picture; beyond it "
+            f"is extrapolated, {beyond}."
         )
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectionRecord:
+    """Standard deviations of projected points at the nodes of a grid over a camera's picture, both axes ascending.
+
+    distance: of the points, object units, NaN at infinity; sigma_um: by rows of y_mm.
+    """
+
+    distance: float
+    x_mm: tuple[float, ...]
+    y_mm: tuple[float, ...]
+    sigma_um: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +189,7 @@ class CameraRecord:
     significance: tuple[GroupTestRecord, ...] = ()
     fiducials: Mapping[str, FiducialRecord]
     lens_known: LensReachRecord | None = None
+    projection: tuple[ProjectionRecord, ...] = ()
     converted: ConvertedFrom | None = None
 
     @property
@@ -377,6 +390,7 @@ class AdjustmentRecord:
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
+    unmodelled_mm: Mapping[str, float] = field(default_factory=dict)
     variance_factors: Mapping[str, float]
     variance_sigmas: Mapping[str, float]
     explanations: tuple[Explanation, ...] = ()

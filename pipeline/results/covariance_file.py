@@ -27,13 +27,16 @@ AFFORDABLE = 3000  # quantities whose covariance is written as one matrix
 class Covariance:
     """The a-posteriori covariance of all unknowns: parameters (n), values (n,), matrix (n, n); mm, object units, rad.
 
-    adjustment: the fingerprint of the adjustment.json that it belongs to; "" where the file does not say it.
+    adjustment: the fingerprint of the adjustment.json that it belongs to; "" where the file does not say it. clusters:
+    the covariance of quantities of cameras by leaving out one image at a time, where errors within an image may be
+    correlated; None where it was not computed.
     """
 
     parameters: tuple[Parameter, ...]
     values: Array
     matrix: Array
     adjustment: str = ""
+    clusters: "Covariance | None" = None
 
     def of(self, parameters: Iterable[Parameter | str]) -> Array:
         """The covariance (k, k) of some unknowns, by keys or by their texts in the file; one that is not listed was
@@ -76,7 +79,16 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
             matrices[lengths == length, :length, :length] = adjustment.sigma0**2 * cofactors
         named = _named(adjustment, padded) | {"matrices": matrices}
         arrays |= {f"{kind}_{name}": array for name, array in named.items()}
-    return arrays
+    return arrays | _cluster_arrays(adjustment)
+
+
+def _cluster_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
+    """cluster_names (k), cluster_matrix (k, k): of interior orientations, where an unmodelled error is estimated."""
+    keys = [key for key in adjustment.parameters if key.kind == "interior"] if adjustment.unmodelled_mm else []
+    matrix = adjustment.cluster_covariance_of(keys) if keys else None
+    if matrix is None:
+        return {}
+    return {"cluster_names": np.array([key.text for key in keys], dtype=np.str_), "cluster_matrix": matrix}
 
 
 def covariance_note(adjustment: Adjustment) -> str:
@@ -128,22 +140,34 @@ def read_covariance(path: Path) -> Covariance:
         data = read_bytes(file)
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{file}: there is no such file; it goes with {path.name}. {AGAIN}") from None
-    names, values, matrix = (_array(data, name, file) for name in ("names", "values", "matrix"))
-    if names.dtype.kind != "U" or values.dtype.kind != "f" or matrix.dtype.kind != "f":
-        kinds = ", ".join(f"{array.dtype}" for array in (names, values, matrix))
-        raise InputError(f"{file}: names, values and matrix are to be text and real numbers, not {kinds}. {AGAIN}")
-    if names.ndim != 1 or values.shape != names.shape or matrix.shape != (*names.shape, *names.shape):
+    values = _array(data, "values", file)
+    parameters, matrix = _named_matrix(data, "", file)
+    if values.dtype.kind != "f" or values.shape != (len(parameters),):
+        raise InputError(f"{file}: {len(parameters)} names do not fit values of shape {values.shape}. {AGAIN}")
+    adjustment = str(_array(data, "fingerprint", file)) if b"fingerprint.npy" in data else ""
+    clusters = None
+    if b"cluster_names.npy" in data:
+        keys, scatter = _named_matrix(data, "cluster_", file)
+        clusters = Covariance(keys, np.full(len(keys), np.nan), scatter, adjustment)
+    return Covariance(parameters, values.astype(np.float64), matrix, adjustment, clusters)
+
+
+def _named_matrix(data: bytes, prefix: str, file: Path) -> tuple[tuple[Parameter, ...], Array]:
+    """Parameters and their covariance matrix. Raises InputError where these do not fit."""
+    names, matrix = (_array(data, prefix + name, file) for name in ("names", "matrix"))
+    if names.dtype.kind != "U" or matrix.dtype.kind != "f":
+        kinds = f"{names.dtype} and {matrix.dtype}"
+        raise InputError(f"{file}: names and matrix are to be text and real numbers, not {kinds}. {AGAIN}")
+    if names.ndim != 1 or matrix.shape != (*names.shape, *names.shape):
         raise InputError(f"{file}: {names.size} names do not fit a matrix of shape {matrix.shape}. {AGAIN}")
     texts = tuple(str(name) for name in names)
     twice = next((name for name, count in Counter(texts).items() if count > 1), None)
     if twice is not None:
         raise InputError(f"{file}: {twice!r} is named twice. {AGAIN}")
-    adjustment = str(_array(data, "fingerprint", file)) if b"fingerprint.npy" in data else ""
     try:
-        parameters = parameters_from_texts(texts)
+        return parameters_from_texts(texts), matrix.astype(np.float64)
     except ValueError as error:
         raise InputError(f"{file}: {error}. {AGAIN}") from None
-    return Covariance(parameters, values.astype(np.float64), matrix.astype(np.float64), adjustment)
 
 
 def read_own_covariance(path: Path) -> Covariance:

@@ -25,6 +25,7 @@ from measure.flags import Cause, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline.report import ReportData, Thumbnail
 from pipeline.results.adjustment_file import read_adjustment, write_adjustment
+from pipeline.results.adjustment_record import FilmRecord
 from pipeline.results.check_file import CameraCheck, Check, Estimate, Row
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.covariance_file import read_covariance
@@ -272,3 +273,57 @@ def _with(result: Adjustment) -> ReportData:
     )
     camera = CameraCheck("agrees", "All parameters agree within 0.1 sigma.", 5, 120, 4.61, 4.60, 0.012, rows)
     return replace(measured(), adjustment=stored, covariance=covariance, check=Check.of({CAMERA: camera}))
+
+
+@cache
+def digital() -> ReportData:
+    """The same by a digital camera: no film, no fiducials, pixels of PITCH_UM."""
+    data = adjusted()
+    assert data.adjustment is not None
+    assert data.measurement is not None
+    stored = data.adjustment
+    cameras = {name: replace(camera, fiducials={}) for name, camera in stored.cameras.items()}
+    images = {name: replace(image, transformation=FilmRecord(kind="none")) for name, image in stored.images.items()}
+    scans = {
+        name: replace(
+            scan, frame=replace(scan.frame, marks=tuple(m for m in scan.frame.marks if m.kind == "target"), pose=None)
+        )
+        for name, scan in data.measurement.items()
+    }
+    targets = tuple(row for row in stored.residuals if row.kind == "target")
+    groups = {name: group for name, group in stored.groups.items() if name != "fiducial"}
+    return replace(
+        data,
+        comparator=[row for row in data.comparator if row.kind == "target"],
+        measurement=scans,
+        adjustment=replace(stored, cameras=cameras, images=images, residuals=targets, groups=groups),
+        pitch_um=dict.fromkeys(FRAMES, (PITCH_UM, PITCH_UM)),
+        check=None,
+    )
+
+
+@cache
+def film_alone() -> ReportData:
+    """The fiducials alone: no frame is oriented, and no camera calibrated."""
+    data = adjusted()
+    assert data.adjustment is not None
+    assert data.measurement is not None
+    stored, unknown = data.adjustment, math.nan
+    cameras = {
+        name: replace(
+            camera, principal_distance_mm=replace(camera.principal_distance_mm, sigma=unknown), lens_known=None
+        )
+        for name, camera in stored.cameras.items()
+    }
+    scans = {
+        name: replace(scan, frame=replace(scan.frame, marks=tuple(m for m in scan.frame.marks if m.kind == "fiducial")))
+        for name, scan in data.measurement.items()
+    }
+    residuals = tuple(row for row in stored.residuals if row.kind == "fiducial")
+    return replace(
+        data,
+        comparator=[row for row in data.comparator if row.kind == "fiducial"],
+        measurement=scans,
+        adjustment=replace(stored, cameras=cameras, residuals=residuals, reliability=None),
+        check=None,
+    )

@@ -92,7 +92,7 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     )
     assert storage.getNode("distortion_coefficients").mat().shape == (1, 4)
     assert "distortion_model: plumb_bob" in (out / "camera-ros.yaml").read_text(encoding="utf-8")
-    assert re.search(r"c = 520\.\d+ ± 0\.\d+ px", (out / "out" / "report.html").read_text(encoding="utf-8"))
+    assert re.search(r"fx = 520\.\d+ ± 0\.\d+ px", (out / "out" / "report.html").read_text(encoding="utf-8"))
 
 
 def test_in_python_it_can_be_plotted_in_pixels_and_shown_in_a_notebook(

@@ -105,4 +105,4 @@ def test_a_narrow_camera_has_angles_of_its_own() -> None:
 
 def test_the_report_shows_it(finished: tuple[Path, int]) -> None:
     text = (finished[0] / "out" / "report.html").read_text(encoding="utf-8")
-    assert "Certificate style: calibrated principal distance" in text
+    assert "The calibrated principal distance" in text

@@ -7,7 +7,9 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from browser import browser_page, needs_browser
 from demonstration import FRAMES
+from playwright.sync_api import Browser, Page
 from single_scans import measure_scan
 
 from pipeline.cli import DONE, run
@@ -47,6 +49,35 @@ def test_its_frames_agree_with_opencv_and_are_reported(finished: tuple[Path, int
     assert_agrees_with_opencv_and_reports(finished[0], f"frame{FRAMES}")
 
 
+def assert_report_is_short(page: Page, folder: Path) -> None:
+    """Without what is closed, at 1300 px: the limits that a reader has to get through."""
+    page.goto((folder / "out" / "report.html").as_uri())
+    assert page.evaluate("document.documentElement.scrollHeight") <= 6000
+    assert len(page.inner_text("body").split()) <= 2500
+    assert page.locator("#camera").bounding_box()["y"] < 300  # type: ignore[index]
+    assert page.locator("#camera svg").count() == 2
+    assert page.evaluate("document.documentElement.scrollWidth") <= 1300
+
+
+@needs_browser
+def test_its_report_is_short_and_begins_with_the_camera(browser: Browser, finished: tuple[Path, int]) -> None:
+    with browser_page(browser) as page:
+        assert_report_is_short(page, finished[0])
+        page.goto((finished[0] / "out" / "report.html").as_uri() + "#frame-2")
+        assert page.locator("#frame-2 .cards").is_visible()  # a link opens what it leads to
+
+
+def test_its_summary_has_the_camera_first_and_at_most_40_lines(
+    finished: tuple[Path, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(["report", str(finished[0] / "project.toml")])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 40
+    text = "\n".join(lines)
+    assert lines[0].startswith("Calibrated from")
+    assert 0 < text.index("c principal distance") < text.index("Frames, the worst first")
+
+
 @pytest.mark.study
 def test_the_order_of_points_csv_changes_no_digit(finished: tuple[Path, int], tmp_path: Path) -> None:
     shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("out", "comparator.csv"))
@@ -67,8 +98,11 @@ def marks_of(image: str, comparator: list[str]) -> list[str]:
 
 
 @pytest.mark.study
-def test_the_demonstration_as_it_is_shown(tmp_path: Path) -> None:
+def test_the_demonstration_as_it_is_shown(browser: Browser, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """All five frames, by the command that shows them."""
     assert run(["demo", str(tmp_path / "demo")]) == DONE
     assert_measured_right_and_calibrated_within_its_sigmas(tmp_path / "demo", 5)
     assert_agrees_with_opencv_and_reports(tmp_path / "demo", "frame5")
+    assert len(capsys.readouterr().out.splitlines()) <= 40
+    with browser_page(browser) as page:
+        assert_report_is_short(page, tmp_path / "demo")

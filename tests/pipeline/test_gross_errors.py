@@ -55,7 +55,7 @@ def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, t
     assert given["given fiducial 3 x (camera C)"]["smallest_error"] > 0.0
     assert run(["report", str(project)]) == 1
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert f"{'Left out, for' if removed else '1 observation'} beyond chance: {name} (w = " in report
+    assert f"{'Left out as gross errors' if removed else '1 gross error suspected'}: {name} (w = " in report
     assert "of an undetected error in" in report
     if "variance" in adjust:
         assert result["variance_sigmas"].keys() == {"target", "fiducial"}

@@ -18,6 +18,7 @@ from pipeline.archive.results_database import Store
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.report import ReportData, Thumbnail, judge, render_report
+from pipeline.report.frame_views import MOST_CARDS
 from pipeline.report.load import report_data
 from pipeline.report.many_frames import MOST_FRAMES, reduced
 from pipeline.report.page import render_frame_page
@@ -75,10 +76,10 @@ def page(many: ReportData) -> str:
 
 def test_a_report_on_thousands_of_frames_is_small(page: str) -> None:
     assert len(page.encode()) < 2_000_000
-    assert page.count("<details id=") == MOST_FRAMES
+    assert page.count('<details class="frame"') == MOST_FRAMES
 
 
-def test_its_counts_are_those_of_the_frames(many: ReportData, page: str) -> None:
+def test_its_counts_are_those_of_the_frames(many: ReportData) -> None:
     assert many.totals is not None
     assert many.totals.needs_look == len(BAD) + len(FAILED)
     good = FRAMES - len(BAD) - len(FAILED)
@@ -88,10 +89,6 @@ def test_its_counts_are_those_of_the_frames(many: ReportData, page: str) -> None
     assert {kind for _, kind in many.totals.verdicts} == {"tif", "jpg"}
     observed = FRAMES * MARKS - len(BAD) - MARKS * len(FAILED)
     assert judge(many).sentence.startswith(f"Measured: {observed} marks in {FRAMES} frames, but ")
-    assert {axis: np.unique(sigmas).round(9).tolist() for axis, sigmas in many.totals.sigmas_um.items()} == {
-        "x": [SIGMA_UM[0]], "y": [SIGMA_UM[1]],
-    }  # fmt: skip
-    assert f"{observed} marks, rms 3.00 µm" in page
 
 
 def test_the_worst_frames_are_shown_and_alike_problems_said_once(many: ReportData, page: str) -> None:
@@ -117,7 +114,7 @@ def test_only_what_is_shown_is_kept(many: ReportData) -> None:
 def test_pictures_of_all_that_is_shown_leave_it_small(many: ReportData) -> None:
     grey = np.random.default_rng(1).normal(2e4, 3e3, (81, 81))  # noise, which no format makes small
     page = render_report(replace(many, thumbnail=lambda *_: Thumbnail(grey, (0.0, 0.0))))
-    assert page.count("data:image/png") == MOST_FRAMES * MARKS
+    assert page.count("data:image/png") == MOST_FRAMES * MARKS + MOST_CARDS + 1  # with the first problem's
     assert len(page.encode()) < 10_000_000
 
 
@@ -179,8 +176,8 @@ def test_few_frames_are_shown_one_by_one(tmp_path: Path) -> None:
     assert run(["adjust", str(project)]) in (0, 1)
     assert run(["report", str(project)]) in (0, 1)
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert 'id="totals"' not in report
-    assert report.count("<details id=") == 3
+    assert "Of 3 frames 0 need a look." in report
+    assert report.count('<details class="frame"') == 3
 
 
 def stored(folder: Path) -> tuple[Path, list[MeasuredScan]]:
@@ -223,7 +220,7 @@ def test_scans_come_from_the_store_one_after_the_other(tmp_path: Path, is_writte
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     bad, lost, blind = (sum(map(n, range(len(scans)))) for n in (BAD.__contains__, FAILED.__contains__, is_blind))
     assert f"Of {len(scans)} frames {bad + lost + blind} need a look. They are shown below." in report
-    assert report.count("<details id=") == bad + lost + blind
+    assert report.count('<details class="frame"') == bad + lost + blind
     assert "scan 5 is damaged" in report
 
 
@@ -248,9 +245,6 @@ def test_frames_that_need_no_look_are_counted_as_if_each_were_read(tmp_path: Pat
     assert few.totals.problems == every.totals.problems
     for axis in ("column", "row"):
         np.testing.assert_array_equal(few.totals.places_px[axis], every.totals.places_px[axis])
-    for axis in "xy":
-        own, read = (np.sort(totals.sigmas_um[axis]) for totals in (few.totals, every.totals))
-        np.testing.assert_allclose(own, read, rtol=2e-5)  # comparator.csv has seven digits
     assert set(few.measurement or {}) == set(every.measurement or {})
 
 

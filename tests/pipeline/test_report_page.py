@@ -88,11 +88,98 @@ def test_a_good_calibration_says_so_first() -> None:
     document = Document(html)
     assert "✓ Good" in document.text
     assert "Calibrated from 160 marks in 5 frames: RC 20 has c = 153.6640 ± 0.0041 mm." in document.text
-    assert "Exit code 0" in document.text
     assert "None: nothing here needs a look." in document.text
-    assert (
-        html.index("✓ Good") < html.index('id="problems"') < html.index('id="frames"') < html.index('id="distortion"')
-    )
+    assert [id for id in document.ids if not id.startswith("frame-")] == [
+        "verdict", "camera", "problems", "frames", "marks", "coverage", "fiducials", "reliability", "check", "notes",
+    ]  # fmt: skip
+
+
+def test_no_section_and_no_column_is_empty(adjusted: ReportData) -> None:
+    without = replace(adjusted, measurement=None, thumbnail=None, check=None, covariance=None)
+    for html in (good_page(), render_report(without), digital_page(), render_report(film_alone())):
+        for section in re.findall(r"<section.*?</section>", html, re.DOTALL):
+            assert len(Document(section).text.split()) > 5, section
+        for table in re.findall(r"<table.*?</table>", html, re.DOTALL):
+            rows = re.findall(r"<tr.*?</tr>", re.sub(r"<thead.*?</thead>", "", table, flags=re.DOTALL), re.DOTALL)
+            cells = [re.findall(r"<td[^>]*>(.*?)</td>", row, re.DOTALL) for row in rows]
+            assert all(any(cell.strip(" –") for cell in column) for column in zip(*cells, strict=False)), table
+
+
+def test_one_value_is_to_be_cited(adjusted: ReportData) -> None:
+    """And the certificate's other reference is closed, and says that it is another."""
+    html = good_page()
+    (row,) = re.findall(r'<tr class="cite">.*?</tr>', html, re.DOTALL)
+    assert Document(row).text.split() == ["c", "principal", "distance", "153.6640", "0.0041", "mm", "cite"]
+    before = html[: html.index("as calibration certificates print it")]
+    assert before.rindex("<details>") > before.rindex("</details>")
+    assert "not to cite with c above" in html
+
+
+@cache
+def digital_page() -> str:
+    return render_report(made_up_calibration.digital())
+
+
+def test_a_digital_camera_is_reported_in_pixels_without_film() -> None:
+    """c = 153.664 mm at 20 µm is 7683.2 px, its standard deviation 0.0041 mm 0.21 px. mm⁻² is the family's own."""
+    document = Document(digital_page())
+    assert not re.search(r"(?i)\bfilm|\bpose\b|fiducial|scan orientation|µm|\bmm\b(?!⁻)", document.text)
+    assert "RC 20 has c = 7683.20 ± 0.21 px." in document.text
+    assert re.search(r"c principal distance 7683\.20 0\.21 px cite", document.text)
+    assert "radius from the principal point (px)" in document.text
+    assert "rms x (px)" in document.text
+    targets = made_up_calibration.digital().adjustment
+    assert targets is not None
+    rms = (sum(row.vx_um**2 for row in targets.residuals if row.image == "f1") / 24) ** 0.5
+    assert f"{rms / 20.0:.3f}" in document.text
+
+
+def test_standard_deviations_by_leaving_out_pictures_are_shown_where_they_are_larger() -> None:
+    data = made_up_calibration.digital()
+    assert data.covariance is not None
+    clusters = replace(data.covariance, matrix=9.0 * data.covariance.matrix)
+    text = rendered(replace(data, covariance=replace(data.covariance, clusters=clusters))).text
+    assert "c = 7683.20 ± 0.62 px" in text  # 3 times 0.205
+    smaller = replace(data.covariance, matrix=data.covariance.matrix / 9.0)
+    assert "± 0.21 px" in rendered(replace(data, covariance=replace(data.covariance, clusters=smaller))).text
+
+
+def film_alone() -> ReportData:
+    """The fiducials of the good calibration, without anything else."""
+    return made_up_calibration.film_alone()
+
+
+def test_an_archive_has_totals_first_and_corrections_in_words() -> None:
+    document = rendered(film_alone())
+    assert [id for id in document.ids if not id.startswith("frame-")] == [
+        "verdict", "totals", "problems", "frames", "marks", "fiducials", "reliability", "notes",
+    ]  # fmt: skip
+    assert "Of 5 frames 0 need a look." in document.text
+    assert "corrections to the certificate" in document.text
+    assert re.search(r"The marks lie where the camera file has them but for \d+\.\d µm", document.text)
+    assert "Residuals of all frames" not in document.text
+
+
+def test_marks_that_fit_badly_are_shown_and_all_others_closed(adjusted: ReportData) -> None:
+    assert adjusted.adjustment is not None
+    first, *others = adjusted.adjustment.residuals
+    rows = (replace(first, w=-3.4), *others)
+    html = render_report(replace(adjusted, adjustment=replace(adjusted.adjustment, residuals=rows)))
+    shown, closed = html[html.index("<h2>Frames") :].split('<details id="marks">')
+    assert shown.count('<div class="card"') == 1
+    assert "w</dt><dd>−3.4" in shown
+    assert closed.count('<div class="card"') == 160
+    assert '<div class="card"' not in good_page().split('<details id="marks">')[0]
+
+
+def test_a_problem_has_cause_remedy_link_and_thumbnail(adjusted: ReportData) -> None:
+    lost = replace(adjusted.comparator[2], status=Status.REJECTED, reason="4.2 px off")
+    html = render_report(replace(adjusted, comparator=[*adjusted.comparator[:2], lost, *adjusted.comparator[3:]]))
+    (problem,) = re.findall(r"<li>.*?</li>", html[: html.index("<h2>Frames")], re.DOTALL)
+    assert "<b>f1: 1 fiducial mark not measured" in problem
+    assert 'class="step">Settle them with' in problem
+    assert '<a href="#frame-1">f1</a>' in problem
+    assert problem.count("data:image/png") == 1
 
 
 def test_nothing_is_loaded_from_anywhere() -> None:
@@ -171,7 +258,6 @@ def test_a_frame_that_was_not_found_says_so_once(measured: ReportData) -> None:
     assert text.count(f"{reason}.") == 1
     assert "fiducial marks not measured" not in text
     assert "run `reseau adjust`" not in text
-    assert "No pixel positions are known: no mark was measured." in text
 
 
 def test_tie_points_are_not_called_targets(measured: ReportData) -> None:
@@ -179,13 +265,12 @@ def test_tie_points_are_not_called_targets(measured: ReportData) -> None:
     text = rendered(replace(measured, comparator=tuple(points), measurement=None, thumbnail=None)).text
     assert "Tie points" in text
     assert "sights of tie points weak" in text
-    assert "targets" not in text[: text.index("Pixel fractions")]
+    assert "targets" not in text[: text.index("Notes")]
 
 
 def test_given_coordinates_without_scans(adjusted: ReportData) -> None:
     text = rendered(replace(adjusted, measurement=None, thumbnail=None)).text
     assert "There are no pictures: the scans are not at hand." in text
-    assert "No pixel positions are known: the comparator coordinates were given." in text
 
 
 def test_exterior_orientations_stand_in_the_users_unit(adjusted: ReportData) -> None:
@@ -217,16 +302,15 @@ def test_a_singular_network_names_cause_and_remedy(singular: ReportData) -> None
     assert "Fix c." in text
     assert "all values and residuals of this report are those of the last iteration" in text
     assert not re.search(r"\bnan\b|\bNone\b", text)
-    assert "There is no solution to draw it from." in text
+    assert "There is no solution to draw the distortion from." in text
 
 
-def test_what_trades_off_is_told_with_the_cameras_parameters(adjusted: ReportData) -> None:
+def test_why_parameters_are_highly_correlated_stands_with_the_camera(adjusted: ReportData) -> None:
     stored = adjusted.adjustment
     assert stored is not None
     (camera,) = stored.cameras
     pair = CorrelationRecord((f"IO.{camera}.c", "EO.*.Z0"), 0.98, "c and Z0 trade off.", "Tilt.")
     text = rendered(replace(adjusted, adjustment=replace(stored, correlations=(pair,)))).text
-    assert "What trades off, with the datum of the fiducials taken out:" in text
     assert "c and Z0 trade off. Tilt." in text
 
 
@@ -277,8 +361,8 @@ def test_of_many_targets_the_worst_are_shown_and_all_fiducials(adjusted: ReportD
     html = render_report(first)
     assert html.count("data:image/png") == 60 * (8 + 10)
     assert "14 more targets of this frame are not pictured" in html
-    assert html.count("<details") == 60
-    assert html.count(" open>") == 0, "with many frames only those with a lost fiducial are unfolded"
+    assert html.count('<details class="frame"') == 60
+    assert " open>" not in html
 
 
 def _copy_pictures(data: ReportData) -> ReportData:
@@ -326,7 +410,7 @@ def test_marks_can_be_chosen_by_the_code_of_their_reason(measured: ReportData) -
     )
     scans = {**measured.measurement, image: replace(scan, frame=replace(scan.frame, marks=marks))}
     html = render_report(replace(measured, comparator=rows, measurement=scans))
-    assert html.count('data-codes="covered size"') == 1  # what a person wrote has no code
+    assert html.count('data-codes="covered size"') == 2  # with its frame, and above; what a person wrote has no code
     assert '<option value="covered">covered (1)</option>' in html
     text = Document(html).text
     assert "half of it is gone covered size" in text

@@ -75,7 +75,7 @@ def test_sigma0_above_and_below_its_bounds(adjusted: ReportData) -> None:
 def test_what_explains_a_large_sigma0_stands_in_place_of_advice_on_gross_errors(adjusted: ReportData) -> None:
     found = (Explanation("pixels", "The pixels are not square.", "Give b1.", 1e-9, (1.6, 1.0)),)
     text = told(changed(adjusted, sigma0=1.6, explanations=found))
-    assert "larger than the sigmas given. The pixels are not square. Give b1." in text
+    assert "larger than the standard deviations given. The pixels are not square. Give b1." in text
     assert "gross errors" not in text
     assert told(changed(adjusted, explanations=found)) == "The pixels are not square. Give b1."
 
@@ -88,7 +88,7 @@ def suspect(**values: Any) -> tuple[SuspectRecord]:
 
 def test_a_gross_error_is_named_with_its_image(adjusted: ReportData) -> None:
     text = told(changed(adjusted, suspects=suspect()))
-    assert "1 observation beyond chance: target 1 in image f2 (w = −9.3)." in text
+    assert "1 gross error suspected: target 1 in image f2 (w = −9.3)." in text
     assert "snooping = true" in text
 
 
@@ -100,7 +100,7 @@ def test_what_could_as_well_be_wrong_is_named_too(adjusted: ReportData) -> None:
 def test_what_was_left_out_needs_a_look(adjusted: ReportData) -> None:
     given = suspect(name="given fiducial 7 (camera RC 20)", group="datum", removed=True)
     text = told(changed(adjusted, suspects=given))
-    assert "Left out, for beyond chance: given fiducial 7 (camera RC 20) (w = −9.3)." in text
+    assert "Left out as gross errors: given fiducial 7 (camera RC 20) (w = −9.3)." in text
 
 
 def test_warnings_of_the_adjustment_need_a_look(adjusted: ReportData) -> None:

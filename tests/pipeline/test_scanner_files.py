@@ -60,7 +60,7 @@ def test_two_scanners_of_images_csv_are_adjusted_and_shown(tmp_path: Path) -> No
         assert term["p"] < 0.001
         assert scanner["significance"][0]["parameters"] == list(TRUTH)
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    section = report[report.index('id="scanners"') : report.index('id="groups"')]
+    section = report[report.index('id="scanners"') : report.index('id="notes"')]
     assert section.count("<svg") == 2
     assert section.count('class="ellipse"') >= 2 * 72
     assert "other (4 scans)" in section

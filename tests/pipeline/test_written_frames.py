@@ -300,7 +300,7 @@ def test_the_report_draws_lines_in_place_and_those_that_told_stand_out() -> None
     # 5 page pixels a pixel. Right in its own frame is up in the scan after mirror and turn: down the page.
     matrix = [float(value) for value in drawn.split("matrix(")[1].split(")")[0].split()]
     assert matrix == pytest.approx([0.0, 1.0, 1.0, 0.0, 75.0, 250.0])
-    assert 'class="told"' in drawn.split(">RUN 7<")[0].rsplit("<text", 1)[1]
+    assert 'class="evidence"' in drawn.split(">RUN 7<")[0].rsplit("<text", 1)[1]
     assert 'class="read"' in drawn.split(">8617<")[0].rsplit("<text", 1)[1]
     assert writing_picture(scan("a", None)) is None
     assert writing_picture(None) is None
