@@ -116,6 +116,9 @@ def print_summary(summary: Summary, console: Console) -> None:
         for name, form in summary.forms.items():
             for sentence in correction_sentences(form, summary.adjustment.cameras[name].fiducials):
                 console.print(Text(f"{name}: {sentence}"))
+            for each in form.distances[:FRAME_ROWS]:
+                change = f"{each.change_um:+.3f} µm from the given one, standard deviation {each.sigma_um:.3f} µm"
+                console.print(Text(f"{each.start} to {each.end}: {each.length_mm:.4f} mm, {change}"))
     notes = summary.verdict.notes
     for note in notes[:NOTES]:
         console.print(Text(note, style="dim"))

@@ -91,7 +91,7 @@ def correction_sentences(form: Figure, fiducials: Mapping[str, FiducialRecord]) 
 
 
 def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figure | None:
-    """A camera's fiducials free of its datum; None where its datum takes up all that they tell."""
+    """A camera's fiducials free of its datum; None where its datum covers all that they tell."""
     camera = stored.cameras[name]
     if _is_measured(name, stored):
         return figure_of_films(name, camera.fiducials, covariance, {}, _MEASURED)
@@ -103,7 +103,8 @@ def _is_measured(name: str, stored: AdjustmentRecord) -> bool:
     """Whether distances tell the form of a camera's fiducials, much better than given coordinates do."""
     sigmas = [row.sigma_mm for row in stored.fiducial_distances if row.camera == name]
     given = [each.given for mark in stored.cameras[name].fiducials.values() for each in (mark.x_mm, mark.y_mm)]
-    least = min((each.sigma for each in given if each is not None), default=np.inf)
+    known = [each.sigma for each in given if each is not None and np.isfinite(each.sigma)]  # NaN: free
+    least = min(known, default=np.inf)
     return bool(sigmas) and BETTER * max(sigmas) < least
 
 

@@ -15,7 +15,7 @@ from pipeline.types import Array
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 _ONE_ANSWER = (
-    "One answer holds for all of them: say in the camera file beside which side of the frame it writes, and how, as "
+    "One answer holds for all of them: say in the camera file at which side of the frame it writes, and how, as "
     'writing = ["left: reads upward"].'
 )
 
@@ -85,7 +85,7 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
         yield Problem(
             f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured ({_reasons(lost)}).",
             "Settle them with `reseau review`."
-            + (" The frame is used; its film transformation is less certain." if found else ""),
+            + (" The frame is used; its film transformation is less precise." if found else ""),
             marks=tuple((frame.image, mark.kind, mark.point) for mark in lost),
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]

@@ -153,7 +153,7 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
         what = f"of other {' and '.join(others)} than there are now" if made else "of what it does not say"
         not_shown = f"{path.name} is {what}: it is not shown."
     elif covariance.adjustment != fingerprint:
-        not_shown = f"adjustment.npz belongs to another {path.name}: both are not shown."
+        not_shown = f"adjustment.npz goes with another {path.name}: both are not shown."
     if not_shown:
         return _add_problems(data, Problem(not_shown, "Run `reseau adjust`."))
     made_from = {**data.made_from, path.name: fingerprint}
@@ -183,7 +183,7 @@ def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem
             yield Problem(f"{what}: {listed(names)}.", "Run `reseau measure`; what is shown is of the earlier scans.")
     if DECISIONS in others:
         yield Problem(
-            "Decisions were made, or taken back, since the marks were judged.",
+            "Decisions were made, or taken back, since the cross-scan checks.",
             "Run `reseau measure`, which takes them in; what is shown is without them.",
         )
     changed = ["project" if name == SETTINGS else name for name in others if name in made and name in now]

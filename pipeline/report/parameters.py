@@ -98,7 +98,7 @@ def axes_sentence(camera: CameraRecord) -> str:
     if not shown:
         return ""
     return (
-        f"The values of {name} are OpenCV’s own and belong to its axes, x right and y down. With y up, as everywhere "
+        f"The values of {name} are OpenCV’s own and refer to its axes, x right and y down. With y up, as everywhere "
         f"else here, {', '.join(shown)} would have the other sign."
     )
 

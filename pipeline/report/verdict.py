@@ -45,18 +45,21 @@ CONFIDENCE = 0.99  # of the global test, and that no good observation of the who
 
 # Observations other than marks: how a list of them is headed, and what to do.
 DISTANCES = (
-    "beyond chance",
+    "contradicted by the images (p < 0.01)",
     "Look for a wrong point or unit in the file of distances; two distances that contradict each other are both named.",
 )
 FIDUCIAL_DISTANCES = (
-    "beyond chance (v in µm)",
+    "contradicted by the images (p < 0.01; v in µm)",
     "Compare the camera file with the certificate; two distances that contradict each other are both named.",
 )
 CALIBRATION = (
     "The images contradict the earlier calibration",
     "The camera has changed since, or the earlier adjustment lacked something; calibrate without it and compare.",
 )
-ANTENNAS = ("beyond chance", "Look for a wrong image or time, and at the antenna's offset and its sign.")
+ANTENNAS = (
+    "contradicted by the images (p < 0.01)",
+    "Look for a wrong image or time, and at the antenna's offset and its sign.",
+)
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,7 @@ def _suspect_marks(rows: Sequence[SuspectRecord], removed: bool) -> tuple[MarkKe
 
 
 def _suspect(row: SuspectRecord) -> str:
-    alike = f"; it cannot be told apart from {', '.join(row.alike)}" if row.alike else ""
+    alike = f"; not distinguishable from {', '.join(row.alike)}" if row.alike else ""
     return f"{row.name} (w = {fixed(row.w, 1)}{alike})"
 
 
@@ -189,8 +192,8 @@ def contradiction(test: ContradictionRecord, cameras: Mapping[str, CameraRecord]
         f"{spoken_name(row.name, cameras)} {row.difference:+.3g} (its sigma {row.sigma:.2g})" for row in known
     )
     return (
-        f"so much comes by chance with a probability of {test.p:.2g} (F = {fixed(test.F, 1)}, {test.freedom} "
-        f"degrees of freedom). They put it elsewhere most in {by}, in mm and powers of it"
+        f"p = {test.p:.2g} (F = {fixed(test.F, 1)}, {test.freedom} degrees of freedom). They differ from it most in "
+        f"{by}, in mm and powers of it"
     )
 
 

@@ -55,5 +55,5 @@ def test_a_lens_from_the_camera_file_to_the_report(name: str, tmp_path: Path) ->
     assert check["verdict"] == ("agrees" if name == "opencv_fisheye" else "not possible"), check["reason"]
     assert ("OpenCV's model cannot take this lens" in check["reason"]) == (name != "opencv_fisheye")
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert ("belong to its axes, x right and y down" in page) == name.startswith("opencv")
+    assert ("refer to its axes, x right and y down" in page) == name.startswith("opencv")
     assert "Distortion over the radius with its 95 % band" in page

@@ -74,7 +74,7 @@ def test_distances_through_files(tmp_path: Path) -> None:
     assert written.groups["distance"].redundancy == pytest.approx(1.8, abs=0.2)
     assert sum(group.redundancy for group in written.groups.values()) == pytest.approx(written.redundancy)
     verdict = judge(ReportData("t", adjustment=written))
-    assert any("beyond chance" in each.what and "5 to 7 (v = " in each.what for each in verdict.problems)
+    assert any("contradicted" in each.what and "5 to 7 (v = " in each.what for each in verdict.problems)
     assert written.redundancy == case["result"]["redundancy"] + 2
 
 
@@ -316,7 +316,7 @@ def test_a_wrong_distance_of_a_certificate_is_named(tmp_path: Path) -> None:
     result = adjusted(project.parent)
     write_adjustment(result, tmp_path / "adjustment.json")
     verdict = judge(ReportData("t", adjustment=read_adjustment(tmp_path / "adjustment.json")))
-    assert any("beyond chance" in each.what and "1 to 3 of K" in each.what for each in verdict.problems)
+    assert any("contradicted" in each.what and "1 to 3 of K" in each.what for each in verdict.problems)
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def test_a_gross_error_is_named_with_its_image(adjusted: ReportData) -> None:
 
 def test_what_could_as_well_be_wrong_is_named_too(adjusted: ReportData) -> None:
     text = told(changed(adjusted, suspects=suspect(alike=("control point 1 Z",))))
-    assert "target 1 in image f2 (w = −9.3; it cannot be told apart from control point 1 Z)." in text
+    assert "target 1 in image f2 (w = −9.3; not distinguishable from control point 1 Z)." in text
 
 
 def test_what_was_left_out_needs_a_look(adjusted: ReportData) -> None:

@@ -177,7 +177,7 @@ def moved_point(folder: Path) -> None:
         (robust, "adjustment.json is of other settings than there are now", set()),
         (surer_camera, "adjustment.json is of other cameras than there are now", set()),
         (old_check, "check.json is of another adjustment: it is not shown.", {"adjustment"}),
-        (old_covariance, "adjustment.npz belongs to another adjustment.json: both are not shown.", set()),
+        (old_covariance, "adjustment.npz goes with another adjustment.json: both are not shown.", set()),
         (of_an_earlier_version, "adjustment.json is of what it does not say: it is not shown.", set()),
         (old_measurement, "measurement.db is of other marks than comparator.csv", {"adjustment", "check"}),
     ],
