@@ -160,6 +160,15 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
         return summary
 
 
+def run_plots(project: Project, folder: Path, reporter: Reporter) -> list[Path]:
+    """The plots of all calibrated cameras, in files of a folder. Raises InputError where there is none."""
+    from pipeline.report.plots import write_plots
+
+    with reporter.stage("plotting") as count:
+        count(str(folder), 0, 1)
+        return write_plots(report_data(project, lambda path: path), folder)
+
+
 def run_frame_pages(project: Project, images: Sequence[str], reporter: Reporter) -> dict[str, Path]:
     """Everything about some images, each in a page of its own; where these stand, by image. Raises InputError for an
     image that there is not."""

@@ -62,6 +62,7 @@ def calls(folder: Path) -> Iterator[tuple[str, Sequence[str | Path]]]:
     yield "", ("check", project)
     yield "", ("report", project)
     yield "", ("report", project, "--frames", "a")
+    yield "plots", ("report", project, "--plots", folder / "plots")
     yield "", ("status", project)
     yield "", ("run", project, "--json")
     yield "cluster", ("measure", project, "--cluster", "local", "--retry")

@@ -215,13 +215,18 @@ def report(
         list[str] | None,
         typer.Option("--frames", metavar="NAME", help="Only pages of these images, in out/frames, with all marks."),
     ] = None,
+    plots: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write each camera's plots there as PNG and PDF (extra plots).")
+    ] = None,
     as_json: AsJson = False,
     max_pixels: MaxPixels = None,
 ) -> int:
     """Write report.html, or a page of single frames."""
     from pipeline.progress import Reporter
-    from pipeline.stages import run_frame_pages, run_report
+    from pipeline.stages import run_frame_pages, run_plots, run_report
 
+    if plots is not None:
+        run_plots(read(project, max_pixels), plots, Reporter())
     if not frames:
         if names:
             raise InputError("images are named after --frames: reseau report PROJECT.toml --frames NAME...")

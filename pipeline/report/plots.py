@@ -1,0 +1,109 @@
+"""The plots of `reseau report --plots`: of every camera what `plot_residuals` and the others draw, as PNG and PDF."""
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from adjust.display.camera_plots import CameraPlots
+from adjust.errors import AdjustmentError
+from pipeline.errors import InputError, missing_extra
+from pipeline.report.data import ReportData
+from pipeline.report.frame_views import residuals_by_image
+from pipeline.report.lens import lens
+from pipeline.results.adjustment_record import CameraRecord
+from pipeline.text.atomic import atomic_path
+from pipeline.text.names import file_word
+from pipeline.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SIZE_IN = (7.0, 5.5)
+DPI = 150
+
+
+def write_plots(data: ReportData, folder: Path) -> list[Path]:
+    """Write the plots of all calibrated cameras; their files.
+
+    Raises
+    ------
+    InputError
+        Without Matplotlib, without a calibrated camera, and where a file cannot be written.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise missing_extra("--plots", "Matplotlib", "plots") from None
+    files = []
+    for camera, record in calibrated_cameras(data):
+        figure = Figure(figsize=SIZE_IN, layout="constrained")
+        for name in _drawn(camera, record, figure):
+            for ending in ("png", "pdf"):
+                path = folder / f"{file_word(camera.name)}-{name}.{ending}"
+                with atomic_path(path) as new:
+                    figure.savefig(new, format=ending, dpi=DPI)
+                files.append(path)
+            figure.clear()
+    if not files:
+        raise InputError("There is no calibrated camera to plot. Run `reseau adjust` on a project that shows targets.")
+    return files
+
+
+def _drawn(plots: CameraPlots, record: CameraRecord, figure: "Figure") -> Iterator[str]:
+    """Draw one plot after the other; its name in the files."""
+    plots.plot_residuals(figure.subplots())
+    yield "residuals"
+    plots.plot_coverage(figure.subplots())
+    yield "coverage"
+    if record.distortion.parameters:
+        plots.plot_distortion(figure.subplots())
+        yield "distortion"
+    for known in record.projection:
+        is_infinite = math.isnan(known.distance)
+        plots.plot_uncertainty(math.inf if is_infinite else known.distance, figure.subplots())
+        yield "uncertainty-infinity" if is_infinite else "uncertainty-near"
+
+
+def calibrated_cameras(data: ReportData) -> Iterator[tuple[CameraPlots, CameraRecord]]:
+    """The plots of every calibrated camera that shows targets, from what is stored of it."""
+    stored, covariance = data.adjustment, data.covariance
+    if stored is None or covariance is None or not stored.converged:
+        return
+    by_image = residuals_by_image(data)
+    for name, record in stored.cameras.items():
+        images = stored.images_of(name)
+        rows = [row for image in images for row in by_image.get(image, []) if row.kind != "join"]
+        is_fiducial = np.array([row.kind == "fiducial" for row in rows], dtype=bool)
+        if not record.is_calibrated or is_fiducial.all():
+            continue
+        places = np.array([(row.camera_x_mm, row.camera_y_mm) for row in rows])
+        vectors = np.array([(row.camera_vx_um, row.camera_vy_um) for row in rows]) / 1e3
+        reach, pixel_um = record.lens_known, data.unit_of_camera(name).pixel_um
+        frame_mm = None if reach is None else reach.frame_mm
+        yield (
+            CameraPlots(
+                name=name,
+                lens=lens(name, record, covariance),
+                places_mm=places,
+                vectors_mm=vectors,
+                is_fiducial=is_fiducial,
+                images=len(images),
+                corners_mm=np.array(frame_mm or (places.min(axis=0), places.max(axis=0))),
+                uncertainty=partial(_stored_map, record),
+                pixel_mm=None if pixel_um is None else pixel_um / 1e3,
+            ),
+            record,
+        )
+
+
+def _stored_map(record: CameraRecord, distance: float) -> tuple[Array, Array]:
+    """Places (r, c, 2) and standard deviations (r, c) in mm. Raises AdjustmentError for a distance without a map."""
+    for known in record.projection:
+        if known.distance == distance or (math.isnan(known.distance) and math.isinf(distance)):
+            places = np.stack(np.meshgrid(known.x_mm, known.y_mm), axis=-1)
+            return places, np.array(known.sigma_um, dtype=float) / 1e3
+    raise AdjustmentError(f"adjustment.json has no uncertainty of points at the distance {distance}.")
