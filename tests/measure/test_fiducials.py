@@ -126,7 +126,7 @@ def test_a_pose_of_the_user_that_the_picture_contradicts_is_told(tmp_path: Path)
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == ("0", True)
     assert any(
-        "pose 0 is set in the project, but what is seen of this frame decides for 90m" in problem
+        "pose 0 is set in the project, but the marks of this frame show 90m" in problem
         and "identification dots" in problem
         for problem in result.problems
     )
@@ -193,7 +193,8 @@ def test_a_mark_beyond_the_edge_is_absent(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0", center=(202.3, 123.0))
     result = measured(frame_picture(six, matrix), six, tmp_path)
     upper = [given.xy_mm[1] > 0 for given in six.marks]
-    assert [mark.status for mark in result.marks] == [Status.ABSENT if up else Status.MEASURED for up in upper]
+    # Four marks of six lie as well on the other four: what is seen has no certain name.
+    assert [mark.status for mark in result.marks] == [Status.ABSENT if up else Status.WEAK for up in upper]
     assert "outside of the scan" in result.marks[upper.index(True)].reason
 
 
@@ -227,7 +228,7 @@ def test_a_mark_off_the_constellation_is_no_observation(tmp_path: Path) -> None:
     result = measured(frame_picture(moved, matrix), given, tmp_path)
     assert [mark.status for mark in result.marks[:5]] == [Status.MEASURED] * 5
     assert result.marks[5].status is Status.PREDICTED
-    assert "nothing within 6 px of its place" in result.marks[5].reason
+    assert "no candidate within 6 px of its place" in result.marks[5].reason
     assert result.marks[5].center_px == pytest.approx(matrix @ (0.0, 7.0, 1.0), abs=0.1)
 
 
@@ -256,7 +257,7 @@ def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> No
 
 
 @parametrize_with_studies(
-    ("blot_dn", "said"), [(20000.0, "nothing within"), (500.0, "the ground at its place is so dark")]
+    ("blot_dn", "said"), [(20000.0, "no candidate within"), (500.0, "the ground at its place is so dark")]
 )
 def test_a_missing_mark_is_said_to_be_hidden_only_where_its_ground_hides_it(
     blot_dn: float, said: str, tmp_path: Path

@@ -121,7 +121,7 @@ def test_a_frame_in_which_marks_lie_as_they_should_but_look_unlike_their_drawing
     refused = replace(frame, detections=tuple(unlike))
     assert not refused.accepted
     assert refused.misfit("12345678").startswith(
-        "8 of 8 marks were found where the others put them, but only 2 of them look"
+        "8 of 8 marks were found where the others put them, but only 2 of them match"
     )
 
 
