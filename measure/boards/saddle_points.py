@@ -74,7 +74,9 @@ def _line_neighbours(points: SaddlePoints, near: NDArray[np.intp]) -> Mask:
 
 def _saddle_points(picture: Bytes, strength: Strength, known_strength: float) -> SaddlePoints:
     highest = cv2.dilate(strength, np.ones((2 * _APART_PX + 1, 2 * _APART_PX + 1)))
-    rows, columns = np.nonzero((strength == highest) & (strength > _STRENGTH * known_strength))
+    is_top = (strength == highest) & (strength > _STRENGTH * known_strength)
+    # One of equal neighbours: between four pixels a crossing is as strong in all of them.
+    columns, rows = cv2.connectedComponentsWithStats(is_top.astype(np.uint8))[3][1:].T
     angles = np.arange(_RING_PLACES) * 2 * np.pi / _RING_PLACES
     smooth = cv2.GaussianBlur(picture, (0, 0), _SMOOTHING_PX)
     ring = [

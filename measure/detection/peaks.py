@@ -22,7 +22,11 @@ def local_maxima(response: Map, count: int, least: float, apart_px: int = 3) -> 
     """
     square = np.ones((2 * apart_px + 1, 2 * apart_px + 1), np.uint8)
     highest = cv2.dilate(response, square, borderType=cv2.BORDER_REPLICATE)
-    rows, cols = np.nonzero((response == highest) & (response > least))
+    is_top = (response == highest) & (response > least)
+    rows, cols = np.nonzero(is_top)
+    plateaus = cv2.connectedComponents(is_top.astype(np.uint8))[1][rows, cols]
+    first = np.unique(plateaus, return_index=True)[1]  # of equal neighbours
+    rows, cols = rows[first], cols[first]
     heights = response[rows, cols].astype(float)
     order = np.argsort(-heights, kind="stable")[:count]
     return np.column_stack([cols, rows]).astype(float)[order], heights[order]

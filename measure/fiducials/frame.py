@@ -286,14 +286,15 @@ class Frame:
         if self.agrees:
             return Reason(
                 f"{found}, but only {self._clear} of them match their drawings, where {self._least} have "
-                "to: compare the drawings with the scan, or set its tone curve (tone under [measure])"
+                "to: compare the drawings with the scan, or set its tone curve (tone under [measure])",
+                Code.NO_FRAME,
             )
         if self._unsettled and self.may_settle:
             names = ", ".join(ids[index] for index in self._unsettled)
             return Reason(
                 f"only {found}, and the fit of {names} did not converge, with whatever tone curve it began", Code.NO_FIT
             )
-        return Reason(f"the constellation does not fit: only {found}{self._marks_outside(ids)}")
+        return Reason(f"the constellation does not fit: only {found}{self._marks_outside(ids)}", Code.NO_FRAME)
 
     def _marks_outside(self, ids: Sequence[str]) -> str:
         """A part of a sentence on marks that the others put outside of the scan."""

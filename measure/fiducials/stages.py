@@ -21,7 +21,7 @@ from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch, Hypotheses, is_searched_by_windows, slightly_longer
 from measure.fiducials.significance import doubt_frame, false_frames
-from measure.flags import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE, Reason
+from measure.flags import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE, Code, Reason
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.results import Pose
@@ -31,7 +31,7 @@ from measure.scans.scan import Scan
 Result = tuple[list[Placement], list[tuple[float, Frame]]]
 
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
-_NOTHING = Reason("no two of the camera's marks were found in the scan")
+_NOTHING = Reason("no two of the camera's marks were found in the scan", Code.NO_FRAME)
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 
 
