@@ -130,6 +130,7 @@ def is_allowed(text: str) -> bool:
 
 def test_texts_of_every_kind_are_found() -> None:
     """A message, a help, a description of a key, a reason, a template, the review page, a file to start from."""
+    found = [pair for source in SOURCES for pair in texts(source)]
     for where, words in {
         "pipeline/files/project_file.py": "there are no scans and no comparator coordinates",
         "help of status": "Count scans by verdict",
@@ -140,6 +141,4 @@ def test_texts_of_every_kind_are_found() -> None:
         "pipeline/review/static/": "mark",
         "pipeline/templates/camera.toml": "standard deviation",
     }.items():
-        assert any(place.startswith(where) and words in text for source in SOURCES for place, text in texts(source)), (
-            where
-        )
+        assert any(place.startswith(where) and words in text for place, text in found), where

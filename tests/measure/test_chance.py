@@ -112,7 +112,8 @@ def test_three_marks_of_the_neighbouring_frame_are_no_frame_beside_five_of_its_o
     monkeypatch.setattr(FrameSearch, "search_scan", false_first)
     monkeypatch.setattr(measurement, "pitch_hypotheses", lambda *given: pitch_hypotheses(*given)[:1])
     result = measurement.measure_fiducials(scan_of(noisy(grey)), layout, (50.0, 50.0), replace(OPTIONS, pose="0"))
-    assert [mark.status is Status.MEASURED for mark in result.marks] == [index in own for index in range(8)]
+    # Five of the eight fit shifted by 2.5 mm, too: the problem says so, and none is more than weak.
+    assert [mark.status is Status.WEAK for mark in result.marks] == [index in own for index in range(8)]
     for index in own:
         assert result.marks[index].center_px == pytest.approx(true @ (*layout.marks[index].xy_mm, 1.0), abs=0.3)
 
@@ -125,7 +126,7 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     frame = frame_of(scan, DOTS)
     assert frame.inliers.tolist() == [False, True, True, True]
     sentence = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
-    assert "of 64 places beside them look as much like marks: chance finds as many with a probability of" in sentence
+    assert "only 3 of 4 marks were found, and 1 of 64 random places match as well (p = 0.06)" in sentence
 
 
 def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observation() -> None:
@@ -136,7 +137,7 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     scan = scan_of(grey)
     frame = frame_of(scan, DOTS)
     chance = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
-    assert "with a probability of 1.00" in chance
+    assert "(p = 1.00): the frame may lie elsewhere" in chance
     result = present_frame(scan, DOTS, frame, Pose("0", False), (50.0, 50.0), (), chance)
     assert [mark.status for mark in result.marks] == [Status.PREDICTED] * 4
     assert all(mark.reason == chance and mark.covariance is None for mark in result.marks)

@@ -483,4 +483,4 @@ def test_scans_that_fail_alike_are_told_once_and_all_scans_are_counted(tmp_path:
     assert last.startswith("reseau: 6 scans (s0, s1, s2, s3, s4, s5): pitch_um is missing in the project, and the file")
     assert said.count("pitch_um is missing") == 2  # at the first that fails, and at the end
     assert re.findall(r"measured (\d) of 6", said)[-1] == "6"
-    assert "1 of 1" not in said
+    assert "measured 1 of 1 " not in said

@@ -78,7 +78,7 @@ def test_workers_are_asked_for_their_versions_and_their_way_to_the_scans() -> No
             [("/scans/1.tif", "No such file")],
         ),
         r"b: cannot read s3://x/1.tif \(403\). Give it the extra, the credentials": (same, [("s3://x/1.tif", "403")]),
-        "b: cannot be asked .*is reseau installed": ModuleNotFoundError("pipeline"),
+        "b: does not answer .*is reseau installed": ModuleNotFoundError("pipeline"),
     }
     for words, answer in cases.items():
         with pytest.raises(InputError, match=words):

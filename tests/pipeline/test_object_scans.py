@@ -113,6 +113,8 @@ def test_init_makes_a_project_of_a_bucket(
     assert run(["init", "s3://boxes/1952/", "--out", str(tmp_path)]) == 1
     text = (tmp_path / "project.toml").read_text(encoding="utf-8")
     assert 'scans = ["s3://boxes/1952/**/*.tif"]' in text
+    assert '# camera = "camera.toml"' in text  # which there is not yet
+    (tmp_path / "project.toml").write_text(text.replace('# camera = "camera.toml"', 'camera = "camera.toml"'))
     (tmp_path / "camera.toml").write_text((local / "camera.toml").read_text(encoding="utf-8"), encoding="utf-8")
     scans = read_project(tmp_path / "project.toml").scans
     assert {name: str(path) for name, path in scans.items()} == {

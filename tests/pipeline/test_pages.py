@@ -63,7 +63,7 @@ def test_the_readme_and_the_start_have_commands() -> None:
     assert start["install"] >= 1
     assert start["board"] >= 1
     assert start["film-scan"] >= 2
-    assert start["archive"] >= 5
+    assert start["archive"] >= 4
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
 
 
@@ -110,7 +110,7 @@ def test_the_quick_commands_of_the_readme_run(desk: Path) -> None:
     codes = run_all(
         ROOT / "README.md", lambda command: "demo" in command or "calibrate" in command or "init" in command
     )
-    assert list(codes.values()) == [DONE]
+    assert list(codes.values()) == [DONE, LOOK]  # the project; a folder of scans whose camera the library lacks here
     assert (desk / "out" / "report.html").exists()
 
 
