@@ -14,6 +14,7 @@ import pytest
 
 from pipeline.cli import GROUPS
 
+pytestmark = pytest.mark.xdist_group("words")  # the texts are read once for all
 ROOT = Path(__file__).parents[1]
 SOURCES = ("measure", "adjust", "pipeline", "synthetic_images", "help", "files", "docs")
 KINDS = (ast.JoinedStr, ast.Constant, ast.Expr)
