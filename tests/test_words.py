@@ -16,7 +16,11 @@ from pipeline.cli import GROUPS
 
 pytestmark = pytest.mark.xdist_group("words")  # the texts are read once for all
 ROOT = Path(__file__).parents[1]
-SOURCES = ("measure", "adjust", "pipeline", "synthetic_images", "help", "files", "docs")
+PACKAGES = ("measure", "adjust", "pipeline", "synthetic_images")
+FOLDERS = [
+    str(path.parent.relative_to(ROOT)) for name in PACKAGES for path in sorted((ROOT / name).rglob("__init__.py"))
+]
+SOURCES = (*FOLDERS, "help", "files", "docs")
 KINDS = (ast.JoinedStr, ast.Constant, ast.Expr)
 AVOIDED = {  # a pattern, and what to write
     r"(?<![-\w.])um(?![-\w.])": "µm",
@@ -55,7 +59,7 @@ CODE = re.compile(r"\\[bdws]|\(\?")
 
 @cache
 def texts(source: str) -> tuple[tuple[str, str], ...]:
-    """Where each text of a package, of its help or of its files stands, and the text on one line."""
+    """Where each text of a folder, of its help or of its files stands, and the text on one line."""
     found = {"help": command_help, "files": other_files, "docs": pages}.get(source, partial(literals, source))()
     return tuple((where, " ".join(text.split())) for where, text in found if is_text(text))
 
@@ -65,9 +69,9 @@ def is_text(literal: str) -> bool:
     return bool(re.search(r"[A-Za-z{}] +[A-Za-zµ{}]", literal)) and not SQL.search(literal) and not CODE.search(literal)
 
 
-def literals(package: str) -> Iterator[tuple[str, str]]:
-    """Of a package, without docstrings; what is put into an f-string as {}."""
-    for file in sorted((ROOT / package).rglob("*.py")):
+def literals(folder: str) -> Iterator[tuple[str, str]]:
+    """Of the files of a folder, without docstrings; what is put into an f-string as {}."""
+    for file in sorted((ROOT / folder).glob("*.py")):
         nodes = [node for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(node, KINDS)]
         inside = {id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in node.values}
         inside |= {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
