@@ -97,7 +97,7 @@ class CpuReporter(Reporter):
     """Adds up the CPU seconds of each stage."""
 
     def __init__(self) -> None:
-        super().__init__(Console(file=open(os.devnull, "w")))  # noqa: SIM115
+        super().__init__(Console(quiet=True))
         self.cpu_s = defaultdict[str, float](float)
 
     @contextmanager

@@ -228,8 +228,8 @@ def by_opencv(chosen: BoardSet, pictures: Sequence[Corners]) -> tuple[Array, Arr
     points, places = ([np.asarray(part, np.float32) for part in each] for each in zip(
         *((each.points * [1, 1, 0], each.places_px) for each in pictures), strict=True
     ))  # fmt: skip
-    found = cv2.calibrateCameraExtended(points, places, chosen.size_px, None, None, flags=flags)  # type: ignore[call-overload]
-    matrix, distortion, deviations = found[1], np.ravel(found[2]), np.ravel(found[5])
+    found = cv2.calibrateCameraExtended(points, places, chosen.size_px, np.eye(3), np.zeros(5), flags=flags)
+    matrix, distortion, deviations = found[1], np.ravel(found[2]), np.ravel(found[5]).astype(np.float64)
     values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], distortion[0]])
     return values, deviations[:5]
 

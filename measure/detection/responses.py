@@ -46,9 +46,9 @@ class Effort:
     half_px: int
     all_orientations: bool
 
-    def scan_cache_bytes(self, scan: Scan) -> int:
-        """Of all searches in a scan: no more than many maps of a small one."""
-        return min(self.cache_bytes, max(_SMALL_MAPS * 4 * scan.width_px * scan.height_px, _LEAST_CACHED))
+    def scan_cache_bytes(self, pixels: int) -> int:
+        """What all searches of a scan of so many pixels cache together: some maps of a small one."""
+        return min(self.cache_bytes, max(_SMALL_MAPS * 4 * pixels, _LEAST_CACHED))
 
 
 _SMALL_MAPS = 32  # not reduced

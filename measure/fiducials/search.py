@@ -165,7 +165,7 @@ class FrameSearch:
         self.among: list[Placement] | None = None
         self._found: dict[tuple[PitchHypothesis, ...], list[Placement]] = {}
         # Of dilations there are two for each of the views of one pose.
-        cache_bytes = effort.scan_cache_bytes(scan)
+        cache_bytes = effort.scan_cache_bytes(scan.width_px * scan.height_px)
         self._caches = ByteCache[Map](2 * cache_bytes // 3), ByteCache[Dilation](cache_bytes // 3)
         self._effort = effort
 

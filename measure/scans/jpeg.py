@@ -24,6 +24,7 @@ import simplejpeg
 from numpy.typing import NDArray
 from tifffile import TiffFile, TiffPage
 
+from measure.errors import MeasurementError
 from measure.scans.cache import OpenedPicture, WholePicture
 from measure.scans.compression import BLOCK_PX
 from measure.scans.metadata import (
@@ -59,6 +60,7 @@ _BELOW = 2  # rows of blocks added: a picture of one block a row has further one
 _TAIL = bytes(range(64, 192)) * 2  # codes of some blocks, none of them a marker
 _DQT = 0xDB
 UNKNOWN_DN = 15.0  # where a file does not say it: as at quality 50, which no scan should be below
+_INKS = 4  # components
 _COARSE = 15  # coefficients in the order of the table: up to two periods in a block of 8 px, as blurred edges have them
 
 
@@ -211,8 +213,8 @@ def open_jpeg(path: Path, max_pixels: int | None = None) -> OpenedPicture:
     Raises
     ------
     MeasurementError
-        For a truncated file, and for one that claims more than such a file can hold. A damaged one is opened: its
-        pixels count as lost.
+        For a truncated file, for one that claims more than such a file can hold, and for one of inks. A damaged one is
+        opened: its pixels count as lost.
     """
     data = path.read_bytes()
     samples, damage = _jpeg_samples(path, data, max_pixels)
@@ -225,7 +227,12 @@ def open_jpeg(path: Path, max_pixels: int | None = None) -> OpenedPicture:
 
 def _jpeg_samples(path: Path, data: bytes, max_pixels: int | None) -> tuple[Samples, str]:
     """Grey or RGB, and why it cannot be trusted; a decoder that fills a truncated file with grey is not asked."""
-    width, height, *_ = picture_form(data) or (0, 0)
+    width, height, channels, _ = picture_form(data) or (0, 0, 0, 0)
+    if channels == _INKS:
+        raise MeasurementError(
+            f"{path} is a JPEG of four inks (CMYK), and its black ink alone may hold the marks: save it as a grey or "
+            "RGB picture, or as a CMYK TIFF"
+        )
     check_size(path, "a picture", (width, height), width * height * MOST_CHANNELS, len(data), max_pixels)
     if _END not in data[_header_bytes(data) :]:
         raise damage_error(path, "its end marker is missing")

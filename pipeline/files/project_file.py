@@ -237,6 +237,8 @@ def read_undrawn(path: Path, scans: Sequence[Path] = ()) -> Project:
 
 def _read_tables(table: Table, needs_camera: bool = True) -> Project:
     path = table.file
+    if "camera" not in table and ("fiducial" in table or "principal_distance_mm" in table):
+        raise InputError(f'{path} is a camera file. Give the project file, which names it: camera = "{path.name}".')
     given, objects = read_model(table, ProjectTable), table.table("object")
     folder = path.parent
     files = {key: getattr(given.object, key) for key in ("points", "images", "distances")}

@@ -82,6 +82,7 @@ def test_peaks_come_in_order_and_apart() -> None:
     map_ = np.zeros((50, 60), np.float32)
     for col, row, height in ((10, 20, 0.5), (40, 30, 0.9), (12, 20, 0.4)):
         map_[row, col] = height
+    map_[30:32, 40:42] = 0.9  # as high in four pixels: one peak
     places, heights = local_maxima(map_, 10, 0.1)
     assert places.tolist() == [[40, 30], [10, 20]]
     np.testing.assert_allclose(heights, [0.9, 0.5], rtol=1e-6)

@@ -7,7 +7,7 @@ from brute_marks import brute_picture
 from scipy import ndimage
 
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Map, Surroundings, correlation
-from measure.detection.responses import ByteCache, Dilation, ResponseMap, Responses, ScanMaps, TemplateSet
+from measure.detection.responses import FULL, ByteCache, Dilation, ResponseMap, Responses, ScanMaps, TemplateSet
 from measure.marks.shapes import MarkShape, cross, ring_cross
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
@@ -61,6 +61,11 @@ CHIPS = RNG.normal(size=(2, 9, 9))
 TURNED = [np.rot90(chip, turn) for turn in range(4) for chip in CHIPS]  # in one pose after another
 SET = TemplateSet(TURNED, [2.0, 3.0] * 4, (1, -1), WIDE, 100.0)
 MAP_BYTES = 4 * 90 * 110
+
+
+def test_a_small_scan_caches_a_few_maps_of_its_size_and_a_large_one_what_the_effort_allows() -> None:
+    assert FULL.scan_cache_bytes(1000**2) == 32 * 4 * 1000**2
+    assert FULL.scan_cache_bytes(20_000**2) == FULL.cache_bytes
 
 
 def maps(cache: ByteCache[Map]) -> ScanMaps:

@@ -425,3 +425,12 @@ def test_a_jpeg_2000_that_is_cut_short_or_signed_is_refused(tmp_path: Path) -> N
     (tmp_path / "s.jp2").write_bytes(imagecodecs.jpeg2k_encode(picture(np.uint8).astype(np.int8), codecformat="jp2"))
     with pytest.raises(MeasurementError, match="signed samples of 8 bits"):
         open_scan(tmp_path / "s.jp2")
+
+
+def test_a_jpeg_of_inks_is_refused(tmp_path: Path) -> None:
+    """Its first three are no RGB: what black ink alone has printed would be even."""
+    inks = np.zeros((64, 64, 4), np.uint8)
+    inks[20:40, 20:40, 3] = 255
+    (tmp_path / "a.jpg").write_bytes(imagecodecs.jpeg8_encode(inks, colorspace="CMYK", outcolorspace="CMYK"))
+    with pytest.raises(MeasurementError, match=r"JPEG of four inks.*save it as a grey or RGB"):
+        open_scan(tmp_path / "a.jpg")

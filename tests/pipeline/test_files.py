@@ -200,6 +200,12 @@ def test_a_chip_that_shows_nothing_is_no_mark(tmp_path: Path) -> None:
     assert "all its pixels are alike" in message
 
 
+def test_a_camera_file_in_place_of_a_project_is_named(tmp_path: Path) -> None:
+    (tmp_path / "camera.toml").write_text('name = "K"\nprincipal_distance_mm = 60.0\n', encoding="utf-8")
+    with pytest.raises(InputError, match=r'is a camera file\. Give the project file, which names it: camera = "camera'):
+        read_project(tmp_path / "camera.toml")
+
+
 def test_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:
     path = tmp_path / "no.toml"
     assert str(path.resolve()) in refused(read_toml, path)

@@ -265,6 +265,22 @@ def test_a_scan_in_strips_that_lies_across_is_decoded_once(scan: Path, tmp_path:
     assert not list(tmp_path.iterdir())
 
 
+def test_what_a_decoded_scan_has_lost_is_known(scan: Path, tmp_path: Path) -> None:
+    """A strip that is damaged is decoded once, and is no part of any tile."""
+    content = bytearray(scan.read_bytes())
+    with tifffile.TiffFile(scan) as file:
+        page = file.pages.first
+        begin, count = page.dataoffsets[4], page.databytecounts[4]
+    content[begin : begin + count] = b"\xff" * count
+    (tmp_path / "damaged.tif").write_bytes(content)
+    with open_scan(tmp_path / "damaged.tif") as opened, open_source(opened, 10**9, tmp_path) as decoded:
+        known = decoded.valid_mask(-10, 100, 60, 80)
+    rows = np.arange(100, 180)
+    is_lost = (rows >= 4 * 32) & (rows < 5 * 32)
+    np.testing.assert_array_equal(known[:, 10:], np.repeat(~is_lost[:, None], 50, axis=1))
+    assert known[:, :10].all()  # beyond the edge nothing is lost
+
+
 def test_a_scan_that_is_gone_is_a_result(tmp_path: Path) -> None:
     done = resampled(task(tmp_path / "gone.tif", tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])))
     assert done.path is None

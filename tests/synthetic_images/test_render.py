@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import skimage.measure
@@ -24,6 +25,7 @@ from synthetic_images.scene import (
     SceneFiducial,
     SceneImage,
     Tones,
+    UnsharpMask,
 )
 
 CENTER_PX = 0.002  # what a rendered centre must keep to
@@ -214,3 +216,14 @@ def test_light_reaches_pockets_beside_the_frame_and_nowhere_twice(tmp_path: Path
     light, dark = made.tones.background, made.tones.border
     assert along == pytest.approx({-1.5: light, -0.65: light, -0.2: light, 0.6: light, 1.0: dark}, abs=1e-3)
     assert grey[row + round(1.0 / 0.04), col + 5] == pytest.approx(dark, abs=1e-3)
+
+
+def test_a_scanner_sharpens_its_codes_by_an_unsharp_mask_across_strips(tmp_path: Path) -> None:
+    """Against OpenCV's Gaussian on the whole scan: amount times the codes less their mean under it."""
+    plain, _ = rendered(tmp_path / "plain", scene())
+    mask = UnsharpMask(amount=1.5, radius_px=1.2)
+    sharp, _ = rendered(tmp_path / "sharp", scene(scanner=replace(SCANNER, sharpen=mask)))
+    blurred = cv2.GaussianBlur(plain.astype(np.float64), (0, 0), 1.2, borderType=cv2.BORDER_REPLICATE)
+    expected = np.clip(plain + 1.5 * (plain - blurred), 0.0, 1.0)
+    assert np.abs(expected - plain).max() > 0.02
+    np.testing.assert_allclose(sharp, expected, atol=5e-4)  # Gaussians that end at other places
