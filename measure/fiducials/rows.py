@@ -32,7 +32,7 @@ def absent_frame(scan: Scan, layout: FiducialLayout, reason: Reason, rotation_de
     """Of a scan in which no frame was found; reason: why, a part of a sentence; rotation_deg: by how much turned it was
     sought."""
     also = "; parts of the scan's file are damaged" if scan.damage else ""
-    codes = (Code.NO_FRAME, *reason.codes, *([Code.DAMAGED_FILE] if scan.damage else []))
+    codes = dict.fromkeys((Code.NO_FRAME, *reason.codes, *([Code.DAMAGED_FILE] if scan.damage else [])))
     why = Reason(f"not found: {reason}{also}", *codes)
     marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, why) for mark in layout.marks)
     remedy = (

@@ -25,7 +25,7 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure.fiducials.options import FiducialOptions
-from measure.flags import Status
+from measure.flags import Code, Status
 from measure.geometry import POSES
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross
 from measure.marks.templates import cut, learn_template
@@ -157,6 +157,7 @@ def test_zero_marks_give_no_silent_identity(tmp_path: Path) -> None:
         assert result.pixel_from_camera is None
         assert {mark.status for mark in result.marks} == {Status.ABSENT}
         assert all(mark.center_px is None and mark.reason for mark in result.marks)
+        assert all(mark.reason.codes == (Code.NO_FRAME,) for mark in result.marks)
         assert "no fiducial was measured" in result.problems[0]
         assert "within 6 degrees of upright or of a quarter turn" in result.problems[0]
 
