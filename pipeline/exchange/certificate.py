@@ -32,7 +32,8 @@ from adjust.problem.camera import FiducialDistance
 from measure.marks.shapes import Point
 from pipeline.exchange.formats import Convention
 from pipeline.exchange.incoming import ImportOptions, Incoming
-from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile, GivenFiducial, read_fiducial_distances
+from pipeline.files.camera_file import CameraFile, GivenFiducial, read_fiducial_distances
+from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.text.tables import Table, read_toml
 from pipeline.types import Array
 

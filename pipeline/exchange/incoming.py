@@ -12,7 +12,8 @@ from adjust.functional_model.lens import Distortion, Prior
 from pipeline.errors import InputError
 from pipeline.exchange.formats import Convention
 from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
-from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile, GivenFiducial
+from pipeline.files.camera_file import CameraFile, GivenFiducial
+from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.types import Array
 
 

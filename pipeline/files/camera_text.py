@@ -8,7 +8,8 @@ from adjust.functional_model.families import family
 from adjust.functional_model.lens import Prior
 from adjust.problem.camera import FiducialDistance
 from measure.marks import shapes
-from pipeline.files.camera_file import NO_MARK, CameraFile, GivenFiducial, written_place_text
+from pipeline.files.camera_file import NO_MARK, CameraFile, GivenFiducial
+from pipeline.files.camera_tables import written_place_text
 from pipeline.files.mark_table import LearnedFrom, SavePicture, template_lines
 from pipeline.text.wording import numbers, quoted, sigma, sigmas, table_lines
 

@@ -7,7 +7,8 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.errors import InputError
-from pipeline.files.camera_file import CameraFile, read_camera, written_place_text
+from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.files.camera_tables import written_place_text
 from pipeline.text.wording import did_you_mean
 
 PREFIX = "library:"

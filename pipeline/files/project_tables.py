@@ -9,7 +9,7 @@ from pydantic.dataclasses import dataclass
 from measure.fiducials.options import Reads
 from measure.geometry import POSES
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
-from pipeline.files.camera_file import CameraTable, DistortionTable, FiducialTable, SigmaTable, Source
+from pipeline.files.camera_tables import CameraTable, DistortionTable, FiducialTable, SigmaTable, Source
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.target_table import TARGET_TABLES, TargetSettings, TieSettings, TieTable, read_targets, read_ties
 from pipeline.text.table_models import FLAG, PATH, PATHS, SIGMA, TABLE, TEXT, TRIPLE, Key, choice, key_rows, subtable

@@ -20,7 +20,8 @@ from measure.marks.shapes import MarkTemplate, Point
 from measure.marks.templates import cut, learn_template
 from measure.scans.scan import Scan
 from pipeline.errors import InputError
-from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile, parse_camera, read_camera
+from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
+from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.files.camera_text import camera_text
 from pipeline.files.mark_table import SavePicture, saved_in, template_lines
 from pipeline.text.atomic import write_atomically
