@@ -11,7 +11,7 @@ from measure.scans.remote import scan_path
 from pipeline.archive.results_database import Kept, Store
 from pipeline.archive.review_decisions import after_checks, asked_of, before_checks, by_image, decided, decisions_hash
 from pipeline.archive.thumbnails import ThumbnailStore
-from pipeline.files.decisions_file import About, Decision
+from pipeline.files.decision import About, Decision
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measure_file, reads_writing
 from pipeline.measuring.scan_task import ScanTask

@@ -21,7 +21,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.options import Click
 from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.files.decisions_file import KINDS, LEARNED, MEANING, OF_SCANS, Choice, Decision
+from pipeline.files.decision import KINDS, LEARNED, MEANING, OF_SCANS, Choice, Decision
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import few_of

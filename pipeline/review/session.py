@@ -13,17 +13,8 @@ from measure.geometry import POSES
 from measure.scans.remote import fetch_location
 from pipeline.archive.results_database import Store
 from pipeline.errors import InputError
-from pipeline.files.decisions_file import (
-    LEARNED,
-    About,
-    Choice,
-    Decision,
-    append_decisions,
-    decisions_bytes,
-    learned_from,
-    parse_decisions,
-    put_on,
-)
+from pipeline.files.decision import LEARNED, About, Choice, Decision
+from pipeline.files.decisions_file import append_decisions, decisions_bytes, learned_from, parse_decisions, put_on
 from pipeline.files.project_file import Project, with_decisions
 from pipeline.measuring.first_pictures import digest
 from pipeline.measuring.learn_stage import with_learned

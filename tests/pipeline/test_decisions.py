@@ -20,7 +20,8 @@ from pipeline.cli import run
 from pipeline.errors import InputError, WriteError
 from pipeline.files import decisions_file
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
+from pipeline.files.decision import Choice, Decision
+from pipeline.files.decisions_file import append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.results.comparator_file import decisions_of, decisions_told, mark_rows, read_comparator, write_comparator
 from pipeline.results.measured_record import MeasuredScan

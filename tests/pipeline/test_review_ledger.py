@@ -3,7 +3,8 @@
 import random
 from pathlib import Path
 
-from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
+from pipeline.files.decision import Choice, Decision
+from pipeline.files.decisions_file import append_decisions, read_decisions, standing
 from pipeline.review.session import Ledger
 
 
