@@ -2,13 +2,25 @@
 
 import re
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from drawn import drawn, scan_of
+from drawn_boards import (
+    HEIGHT,
+    WIDTH,
+    beside_each_other,
+    board_from_pixel,
+    chessboard_dark,
+    circles_dark,
+    errors_px,
+    mapped,
+    picture_of,
+    squares_dark,
+    truth_of,
+)
 from numpy.typing import NDArray
 from real_data import DATA, needs
 from scipy.io import loadmat
@@ -17,8 +29,7 @@ from studies import parametrize_with_studies
 
 from measure.boards.corners import one_definition
 from measure.boards.find import is_even, whole_pattern
-from measure.boards.markers import ReadMarkers, off_corners
-from measure.boards.measure import BoardMeasurement, measure_board
+from measure.boards.measure import measure_board
 from measure.boards.saddle_points import largest_lattice, saddle_strength
 from measure.boards.specs import (
     AprilGridSpec,
@@ -27,68 +38,13 @@ from measure.boards.specs import (
     CharucoSpec,
     ChessboardSpec,
     CircleGridSpec,
-    FoundCorner,
     SquareGridSpec,
-    aruco_dictionary,
 )
 from measure.flags import Status
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.opening import open_scan
 
 Array = NDArray[np.float64]
-WIDTH, HEIGHT = 320, 260
-
-
-def board_from_pixel(turn_deg: float = 7.0, tilt: float = 4e-4) -> Array:
-    """A homography from pixels to mm of the board, y up: about 1 mm a pixel, turned and seen at an angle."""
-    c, s = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
-    back: Array = np.array([[1.0, 0, WIDTH / 2], [0, 1.0, HEIGHT / 2], [0, 0, 1]])
-    tilted = np.array([[1.0, 0, 0], [0, 1.0, 0], [tilt, -tilt / 2, 1]])
-    turned = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ np.diag([1.0, -1.0, 1.0])
-    return np.asarray(np.linalg.inv(back @ tilted @ turned))
-
-
-def mapped(homography: Array, points: Array) -> Array:
-    """(n, 2) points through a homography."""
-    x, y, w = homography @ np.vstack([points.T, np.ones(len(points))])
-    return np.asarray(np.stack([x / w, y / w], axis=-1))
-
-
-def picture_of(spec: BoardSpec, homography: Array, is_dark: Any, seed: int = 1) -> Array:
-    """A board whose middle lies on the homography's origin; is_dark says so of board coordinates in mm."""
-    middle = np.mean([point[:2] for point in spec.object_points().values()], axis=0)
-
-    def light(col: Array, row: Array) -> Array:
-        x, y, w = (line[0] * col + line[1] * row + line[2] for line in homography)
-        return np.asarray(1.0 - is_dark(x / w + middle[0], y / w + middle[1]))
-
-    rng = np.random.default_rng(seed)
-    clean = drawn(light, WIDTH, HEIGHT, 0.8, fineness=6)
-    return 8000 + 30000 * clean + rng.normal(0, 300, clean.shape)
-
-
-def truth_of(spec: BoardSpec, homography: Array) -> dict[str, Array]:
-    points = spec.object_points()
-    flat = np.array([point[:2] for point in points.values()])
-    places = mapped(np.asarray(np.linalg.inv(homography)), np.asarray(flat - flat.mean(axis=0)))
-    return dict(zip(points, places, strict=True))
-
-
-def errors_px(board: BoardMeasurement, truth: dict[str, Array]) -> Array:
-    """(n, 2) of the points that were measured."""
-    seen = [mark for mark in board.marks if mark.status.is_observation]
-    return np.asarray([np.asarray(mark.center_px) - truth[mark.point] for mark in seen], float)
-
-
-def chessboard_dark(spec: ChessboardSpec) -> Any:
-    """Dark is the square whose upper left corner is r0c0, and every other one."""
-
-    def dark(x: Array, y: Array) -> Array:
-        column, row = np.floor(x / spec.square_mm), np.floor((spec.rows - 1) - y / spec.square_mm)
-        inside = (column >= -1) & (column < spec.columns) & (row >= -1) & (row < spec.rows)
-        return np.asarray(inside & ((column + row) % 2 == 0))
-
-    return dark
 
 
 @pytest.mark.parametrize(
@@ -141,18 +97,6 @@ def test_a_board_that_a_half_turn_does_not_change_is_taken_as_upright_and_says_s
     assert np.abs(errors_px(board, truth_of(spec, homography))).max() < 0.05
 
 
-def circles_dark(spec: CircleGridSpec) -> Any:
-    places = np.array([point[:2] for point in spec.object_points().values()])
-
-    def dark(x: Array, y: Array) -> Array:
-        inside = np.zeros(x.shape, bool)
-        for place in places:
-            inside |= (x - place[0]) ** 2 + (y - place[1]) ** 2 < (spec.diameter_mm / 2) ** 2
-        return inside
-
-    return dark
-
-
 @parametrize_with_studies(
     "spec",
     [
@@ -168,97 +112,6 @@ def test_circle_grids(spec: CircleGridSpec) -> None:
     errors = errors_px(board, truth_of(spec, homography))
     assert len(errors) == len(spec.places())
     assert np.abs(errors).max() < 0.06
-
-
-def printed(board: Any, spec: BoardSpec, size_mm: tuple[float, float], corner_mm: Array) -> Any:
-    """Darkness from OpenCV's own drawing of a board, 4 px a mm, whose upper left corner lies at corner_mm."""
-    drawing = board.generateImage((round(size_mm[0] * 4), round(size_mm[1] * 4)), marginSize=0, borderBits=1)
-    return dark_of(drawing, corner_mm)
-
-
-def dark_of(drawing: Any, corner_mm: Array) -> Any:
-    """Darkness from a drawing, 4 px a mm, whose upper left corner lies at corner_mm."""
-
-    def dark(x: Array, y: Array) -> Array:
-        col, row = np.floor((x - corner_mm[0]) * 4).astype(int), np.floor((corner_mm[1] - y) * 4).astype(int)
-        inside = (col >= 0) & (row >= 0) & (col < drawing.shape[1]) & (row < drawing.shape[0])
-        clipped = drawing[np.clip(row, 0, drawing.shape[0] - 1), np.clip(col, 0, drawing.shape[1] - 1)]
-        return np.asarray(inside & (clipped < 128))
-
-    return dark
-
-
-@pytest.mark.parametrize("turn_deg", [5.0, 95.0])
-def test_trap_charuco_corners_shifted_by_half_a_pixel(turn_deg: float) -> None:
-    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
-    drawing = cv2.aruco.CharucoBoard((6, 5), 32.0, 24.0, aruco_dictionary("4X4_50"))
-    homography = board_from_pixel(turn_deg, 2e-4)
-    corner = np.array([-32.0, 4 * 32.0])
-    picture = picture_of(spec, homography, printed(drawing, spec, (192, 160), corner))
-    board = measure_board(scan_of(picture), spec)
-    errors = errors_px(board, truth_of(spec, homography))
-    assert len(errors) >= 16
-    assert np.abs(errors).max() < 0.06
-    assert np.abs(errors.mean(axis=0)).max() < 0.01
-
-
-def charuco_picture(spec: CharucoSpec, homography: Array) -> Array:
-    """OpenCV's own drawing of a board, photographed."""
-    count = spec.columns * spec.rows // 2
-    numbers = np.arange(spec.first_id, spec.first_id + count)
-    size, dictionary = (spec.columns, spec.rows), aruco_dictionary(spec.dictionary)
-    drawing = cv2.aruco.CharucoBoard(size, spec.square_mm, spec.marker_mm, dictionary, numbers)
-    drawing.setLegacyPattern(bool(spec.legacy))
-    width, height = spec.columns * spec.square_mm, spec.rows * spec.square_mm
-    corner = np.array([-spec.square_mm, height - spec.square_mm])
-    return picture_of(spec, homography, printed(drawing, spec, (width, height), corner))
-
-
-OLDER = CharucoSpec("4X4_50", 6, 6, 32.0, 24.0, legacy=True)
-
-
-@pytest.mark.study
-def test_trap_charuco_corners_of_the_older_layout_have_their_neighbours_names() -> None:
-    """The markers tell the layout; one that is set against them is refused."""
-    homography = board_from_pixel(5.0, 2e-4) * np.array([[1.2], [1.2], [1.0]])
-    picture = charuco_picture(OLDER, homography)
-    board = measure_board(scan_of(picture), replace(OLDER, legacy=None))
-    errors = errors_px(board, truth_of(OLDER, homography))
-    assert len(errors) >= 20
-    assert np.abs(errors).max() < 0.06
-    refused = measure_board(scan_of(picture), replace(OLDER, legacy=False))
-    assert "but as with legacy = true" in refused.reason
-    assert {mark.status for mark in refused.marks} == {Status.ABSENT}
-    present = charuco_picture(replace(OLDER, legacy=False), homography)
-    assert "but as with legacy = false" in measure_board(scan_of(present), OLDER).reason
-
-
-def test_charuco_numbers_that_begin_later() -> None:
-    """Shifted by two rows of markers, all would lie as on a board that begins at 0."""
-    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0, first_id=6)
-    homography = board_from_pixel(4.0, 2e-4)
-    picture = charuco_picture(spec, homography)
-    board = measure_board(scan_of(picture), spec)
-    errors = errors_px(board, truth_of(spec, homography))
-    assert len(errors) >= 16
-    assert np.abs(errors).max() < 0.06
-    assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=0)).reason
-    assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=30)).reason
-
-
-def test_a_charuco_corner_is_held_against_the_markers_beside_it() -> None:
-    """One a square off, as another crossing would be, is named; where no marker beside it was read, nothing tells."""
-    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
-    homography = board_from_pixel(3.0, 1e-4)
-    points, truth = spec.object_points(), truth_of(spec, homography)
-    outline = np.array([(-12.0, 12.0), (12.0, 12.0), (12.0, -12.0), (-12.0, -12.0)])
-    middle = np.mean([point[:2] for point in points.values()], axis=0)
-    marker = outline + np.array(points["c2"][:2]) - middle + 16.0  # in the square between c2 and c3
-    read = ReadMarkers({1: mapped(np.asarray(np.linalg.inv(homography)), marker)}, {}, 1)
-    found = {name: FoundCorner(truth[name], 32 * np.eye(2)) for name in ("c2", "c3", "c19")}
-    assert off_corners(found, spec, read) == {}
-    found["c2"] = FoundCorner(truth["c7"], 32 * np.eye(2))
-    assert "1.0 squares from the place that the adjacent markers give" in off_corners(found, spec, read)["c2"]
 
 
 @parametrize_with_studies(
@@ -368,85 +221,6 @@ def test_a_pattern_grows_to_where_it_ends() -> None:
     assert not cut.is_bounded
 
 
-@parametrize_with_studies("dictionary", ["5X5_100", "APRILTAG_36h11"], quick=(1,))
-def test_aruco_and_apriltag_corners(dictionary: str) -> None:
-    spec = ArucoSpec(dictionary, 3, 2, 63.0, 21.0, first_marker=7)
-    drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary(dictionary), np.arange(7, 13))
-    homography = board_from_pixel(4.0, 1e-4)
-    picture = picture_of(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
-    board = measure_board(scan_of(picture), spec)
-    errors = errors_px(board, truth_of(spec, homography))
-    assert len(errors) == 24
-    assert np.sqrt(np.mean(errors**2)) < 0.03
-
-
-def april_grid_dark(spec: AprilGridSpec, quarter_turns: int = 0) -> Any:
-    """Kalibr's board of OpenCV's markers, each turned so often: squares at all corners, the first at the lower left."""
-    side, gap = round(4 * spec.marker_mm), round(4 * spec.gap_mm)
-    drawing = np.full((spec.rows * (side + gap) + gap, spec.columns * (side + gap) + gap), 255, np.uint8)
-    for row, column in np.ndindex(spec.rows + 1, spec.columns + 1):
-        top, left = row * (side + gap), column * (side + gap)
-        drawing[top : top + gap, left : left + gap] = 0
-        if row < spec.rows and column < spec.columns:
-            number = spec.first_marker + (spec.rows - 1 - row) * spec.columns + column
-            marker = cv2.aruco.generateImageMarker(aruco_dictionary(spec.dictionary), number, side, borderBits=2)
-            where = np.s_[top + gap : top + gap + side, left + gap : left + gap + side]
-            drawing[where] = np.rot90(marker, quarter_turns)
-    corner = np.array([-spec.gap_mm, spec.rows * (spec.marker_mm + spec.gap_mm)])
-    return dark_of(drawing, corner)
-
-
-APRIL_GRID = AprilGridSpec("APRILTAG_36h11", 3, 2, 66.0, 20.0, first_marker=5)
-
-
-@parametrize_with_studies(("turn_deg", "quarter_turns"), [(4.0, 0), (184.0, 2)], quick=(1,))
-def test_a_grid_of_april_tags_has_its_corners_at_the_junctions(turn_deg: float, quarter_turns: int) -> None:
-    """Counted from the lower left, however each tag is turned; two modules of border, squares at all corners."""
-    homography = board_from_pixel(turn_deg, 1e-4)
-    picture = picture_of(APRIL_GRID, homography, april_grid_dark(APRIL_GRID, quarter_turns))
-    board = measure_board(scan_of(picture), APRIL_GRID)
-    errors = errors_px(board, truth_of(APRIL_GRID, homography))
-    assert len(errors) == 24
-    assert np.sqrt(np.mean(errors**2)) < 0.03
-    assert np.abs(errors.mean(axis=0)).max() < 0.008
-    assert all("junction_col_px" in mark.quality for mark in board.marks)
-    other = measure_board(scan_of(picture), replace(APRIL_GRID, first_marker=0))
-    assert "but as with first_id = 5" in other.reason
-
-
-@parametrize_with_studies("kind", ["aprilgrid", "charuco", "aruco"], quick=(2,))
-def test_a_board_in_a_mirror_keeps_its_names(kind: str) -> None:
-    """As it is seen from its back; what was read in the picture as it is, of another board's number, is none of it."""
-    spec: ArucoSpec | CharucoSpec = APRIL_GRID
-    homography = board_from_pixel(5.0, 1e-4)
-    if kind == "charuco":
-        spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
-        picture = charuco_picture(spec, homography)
-    elif kind == "aruco":
-        spec = ArucoSpec("5X5_100", 3, 2, 63.0, 21.0)
-        drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary("5X5_100"))
-        picture = picture_of(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
-    else:
-        picture = picture_of(spec, homography, april_grid_dark(APRIL_GRID))
-    truth = truth_of(spec, homography)
-    board = measure_board(scan_of(picture[:, ::-1]), spec)
-    assert board.is_mirrored
-    errors = errors_px(board, {name: np.array([WIDTH - 1 - col, row]) for name, (col, row) in truth.items()})
-    assert len(errors) >= 16
-    assert np.sqrt(np.mean(errors**2)) < 0.03
-
-
-def squares_dark(spec: SquareGridSpec) -> Any:
-    """Dark where both coordinates, from the lower left square's corner, lie in a square."""
-    step = spec.square_mm + spec.gap_mm
-
-    def dark(x: Array, y: Array) -> Array:
-        inside = (x > 0) & (x < spec.columns * step) & (y > 0) & (y < spec.rows * step)
-        return np.asarray(inside & (x % step < spec.square_mm) & (y % step < spec.square_mm))
-
-    return dark
-
-
 @parametrize_with_studies(("turn_deg", "gap_mm"), [(-25.0, 18.0), (7.0, 9.0)], quick=(1,))
 def test_corners_of_separate_squares(turn_deg: float, gap_mm: float) -> None:
     """Named by row, column and corner, to some hundredths of a pixel, their standard deviations honest."""
@@ -476,52 +250,6 @@ def test_a_grid_of_squares_with_some_hidden_keeps_its_names() -> None:
     assert {mark.point for mark in hidden} == {f"r1c2.{i}" for i in range(4)}
     assert {str(mark.reason) for mark in hidden} == {"its square was not found"}
     assert np.abs(errors_px(board, truth)).max() < 0.15
-
-
-@pytest.mark.parametrize("name", ["aruco", "charuco"])
-def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> None:
-    """A stray copy of one marker is passed over; of two like boards none is measured, and the reason says why."""
-    dictionary = aruco_dictionary("4X4_50")
-    spec: ArucoSpec | CharucoSpec
-    if name == "aruco":
-        spec = ArucoSpec("4X4_50", 3, 2, 60.0, 20.0)
-        drawing = cv2.aruco.GridBoard((3, 2), 60.0, 20.0, dictionary).generateImage((260, 180), marginSize=20)
-    else:
-        spec = CharucoSpec("4X4_50", 5, 4, 48.0, 36.0)
-        drawing = cv2.aruco.CharucoBoard((5, 4), 48.0, 36.0, dictionary).generateImage((260, 212), marginSize=10)
-    height, width = drawing.shape
-    picture = np.full((height + 40, 2 * width + 60), 255.0)
-    picture[20 : 20 + height, 20 : 20 + width] = drawing
-    two = picture.copy()
-    picture[60:120, width + 100 : width + 160] = cv2.aruco.generateImageMarker(dictionary, 3, 60)
-    two[20 : 20 + height, width + 40 : 2 * width + 40] = drawing
-
-    def measured(grey: Array) -> BoardMeasurement:
-        noise = np.random.default_rng(2).normal(0, 300, grey.shape)
-        return measure_board(scan_of(8000 + 120 * cv2.GaussianBlur(grey, (0, 0), 0.8) + noise), spec)
-
-    seen = [mark.center_px for mark in measured(picture).marks if mark.status is Status.MEASURED]
-    assert len(seen) == len(spec.object_points())
-    assert max(center[0] for center in seen if center is not None) < width + 20
-    neither = measured(two)
-    assert "was read at 2 places" in neither.reason
-    assert all(mark.status is Status.ABSENT for mark in neither.marks)
-
-
-def beside_each_other(spec: BoardSpec, is_dark: Any, shown: tuple[float, ...], fineness: int = 4) -> Array:
-    """Boards of one kind side by side, upright, at 1 mm a pixel times the scale in which each is shown."""
-    extent = np.ptp([point[:2] for point in spec.object_points().values()], axis=0) + 60.0
-    width, height = int(extent[0]), int(extent[1])
-
-    def light(col: Array, row: Array) -> Array:
-        col, row = np.broadcast_arrays(col, row)
-        which = np.clip(col // width, 0, len(shown) - 1).astype(int)
-        scale = np.array(shown)[which]
-        x, y = (col - which * width - 30.0) / scale, (height - row - 30.0) / scale
-        return np.asarray(1.0 - is_dark(x, y))
-
-    clean = drawn(light, width * len(shown), height, 0.8, fineness=fineness)
-    return 8000 + 30000 * clean + np.random.default_rng(4).normal(0, 300, clean.shape)
 
 
 @parametrize_with_studies("kind", ["chessboard", "circle-grid", "squares"])
@@ -566,23 +294,6 @@ def test_a_few_spots_are_no_circle_grid() -> None:
 
     board = measure_board(scan_of(8000 + 30000 * drawn(light, 340, 250, 0.8, fineness=4)), spec)
     assert "no grid of 6 x 5 dots is whole in the scan; 5 spots are candidates for dots" in board.reason
-
-
-@pytest.mark.parametrize("gap", [60.0, 130.0])
-def test_markers_of_two_boards_are_not_those_of_one(gap: float) -> None:
-    """Of one board the right column is seen, of another one the left: together they look like a board that is squeezed,
-    and nobody knows which of them is meant."""
-    spec = ArucoSpec("4X4_50", 4, 4, 48.0, 16.0)
-    picture = np.full((296, 110 + int(gap)), 255.0)
-    for row in range(4):
-        top = 20 + 64 * row
-        for number, left in ((4 * row + 3, 10), (4 * row, 48 + int(gap))):
-            marker = cv2.aruco.generateImageMarker(aruco_dictionary("4X4_50"), number, 48)
-            picture[top : top + 48, left : left + 48] = marker
-    noise = np.random.default_rng(2).normal(0, 300, picture.shape)
-    board = measure_board(scan_of(8000 + 120 * cv2.GaussianBlur(picture, (0, 0), 0.8) + noise), spec)
-    assert "do not agree on where the board lies" in board.reason
-    assert all(mark.status is Status.ABSENT for mark in board.marks)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,190 @@
+"""Boards of markers: ChArUco, ArUco and AprilTag markers, Kalibr's AprilGrid, against their true places."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from drawn import scan_of
+from drawn_boards import (
+    WIDTH,
+    april_grid_dark,
+    board_from_pixel,
+    charuco_picture,
+    errors_px,
+    mapped,
+    picture_of,
+    printed,
+    truth_of,
+)
+from numpy.typing import NDArray
+from studies import parametrize_with_studies
+
+from measure.boards.markers import ReadMarkers, off_corners
+from measure.boards.measure import BoardMeasurement, measure_board
+from measure.boards.specs import (
+    AprilGridSpec,
+    ArucoSpec,
+    CharucoSpec,
+    FoundCorner,
+    aruco_dictionary,
+)
+from measure.flags import Status
+
+Array = NDArray[np.float64]
+OLDER = CharucoSpec("4X4_50", 6, 6, 32.0, 24.0, legacy=True)
+APRIL_GRID = AprilGridSpec("APRILTAG_36h11", 3, 2, 66.0, 20.0, first_marker=5)
+
+
+@pytest.mark.parametrize("turn_deg", [5.0, 95.0])
+def test_trap_charuco_corners_shifted_by_half_a_pixel(turn_deg: float) -> None:
+    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
+    drawing = cv2.aruco.CharucoBoard((6, 5), 32.0, 24.0, aruco_dictionary("4X4_50"))
+    homography = board_from_pixel(turn_deg, 2e-4)
+    corner = np.array([-32.0, 4 * 32.0])
+    picture = picture_of(spec, homography, printed(drawing, spec, (192, 160), corner))
+    board = measure_board(scan_of(picture), spec)
+    errors = errors_px(board, truth_of(spec, homography))
+    assert len(errors) >= 16
+    assert np.abs(errors).max() < 0.06
+    assert np.abs(errors.mean(axis=0)).max() < 0.01
+
+
+@pytest.mark.study
+def test_trap_charuco_corners_of_the_older_layout_have_their_neighbours_names() -> None:
+    """The markers tell the layout; one that is set against them is refused."""
+    homography = board_from_pixel(5.0, 2e-4) * np.array([[1.2], [1.2], [1.0]])
+    picture = charuco_picture(OLDER, homography)
+    board = measure_board(scan_of(picture), replace(OLDER, legacy=None))
+    errors = errors_px(board, truth_of(OLDER, homography))
+    assert len(errors) >= 20
+    assert np.abs(errors).max() < 0.06
+    refused = measure_board(scan_of(picture), replace(OLDER, legacy=False))
+    assert "but as with legacy = true" in refused.reason
+    assert {mark.status for mark in refused.marks} == {Status.ABSENT}
+    present = charuco_picture(replace(OLDER, legacy=False), homography)
+    assert "but as with legacy = false" in measure_board(scan_of(present), OLDER).reason
+
+
+def test_charuco_numbers_that_begin_later() -> None:
+    """Shifted by two rows of markers, all would lie as on a board that begins at 0."""
+    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0, first_id=6)
+    homography = board_from_pixel(4.0, 2e-4)
+    picture = charuco_picture(spec, homography)
+    board = measure_board(scan_of(picture), spec)
+    errors = errors_px(board, truth_of(spec, homography))
+    assert len(errors) >= 16
+    assert np.abs(errors).max() < 0.06
+    assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=0)).reason
+    assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=30)).reason
+
+
+def test_a_charuco_corner_is_held_against_the_markers_beside_it() -> None:
+    """One a square off, as another crossing would be, is named; where no marker beside it was read, nothing tells."""
+    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
+    homography = board_from_pixel(3.0, 1e-4)
+    points, truth = spec.object_points(), truth_of(spec, homography)
+    outline = np.array([(-12.0, 12.0), (12.0, 12.0), (12.0, -12.0), (-12.0, -12.0)])
+    middle = np.mean([point[:2] for point in points.values()], axis=0)
+    marker = outline + np.array(points["c2"][:2]) - middle + 16.0  # in the square between c2 and c3
+    read = ReadMarkers({1: mapped(np.asarray(np.linalg.inv(homography)), marker)}, {}, 1)
+    found = {name: FoundCorner(truth[name], 32 * np.eye(2)) for name in ("c2", "c3", "c19")}
+    assert off_corners(found, spec, read) == {}
+    found["c2"] = FoundCorner(truth["c7"], 32 * np.eye(2))
+    assert "1.0 squares from the place that the adjacent markers give" in off_corners(found, spec, read)["c2"]
+
+
+@parametrize_with_studies("dictionary", ["5X5_100", "APRILTAG_36h11"], quick=(1,))
+def test_aruco_and_apriltag_corners(dictionary: str) -> None:
+    spec = ArucoSpec(dictionary, 3, 2, 63.0, 21.0, first_marker=7)
+    drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary(dictionary), np.arange(7, 13))
+    homography = board_from_pixel(4.0, 1e-4)
+    picture = picture_of(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
+    board = measure_board(scan_of(picture), spec)
+    errors = errors_px(board, truth_of(spec, homography))
+    assert len(errors) == 24
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+
+
+@parametrize_with_studies(("turn_deg", "quarter_turns"), [(4.0, 0), (184.0, 2)], quick=(1,))
+def test_a_grid_of_april_tags_has_its_corners_at_the_junctions(turn_deg: float, quarter_turns: int) -> None:
+    """Counted from the lower left, however each tag is turned; two modules of border, squares at all corners."""
+    homography = board_from_pixel(turn_deg, 1e-4)
+    picture = picture_of(APRIL_GRID, homography, april_grid_dark(APRIL_GRID, quarter_turns))
+    board = measure_board(scan_of(picture), APRIL_GRID)
+    errors = errors_px(board, truth_of(APRIL_GRID, homography))
+    assert len(errors) == 24
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+    assert np.abs(errors.mean(axis=0)).max() < 0.008
+    assert all("junction_col_px" in mark.quality for mark in board.marks)
+    other = measure_board(scan_of(picture), replace(APRIL_GRID, first_marker=0))
+    assert "but as with first_id = 5" in other.reason
+
+
+@parametrize_with_studies("kind", ["aprilgrid", "charuco", "aruco"], quick=(2,))
+def test_a_board_in_a_mirror_keeps_its_names(kind: str) -> None:
+    """As it is seen from its back; what was read in the picture as it is, of another board's number, is none of it."""
+    spec: ArucoSpec | CharucoSpec = APRIL_GRID
+    homography = board_from_pixel(5.0, 1e-4)
+    if kind == "charuco":
+        spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
+        picture = charuco_picture(spec, homography)
+    elif kind == "aruco":
+        spec = ArucoSpec("5X5_100", 3, 2, 63.0, 21.0)
+        drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary("5X5_100"))
+        picture = picture_of(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
+    else:
+        picture = picture_of(spec, homography, april_grid_dark(APRIL_GRID))
+    truth = truth_of(spec, homography)
+    board = measure_board(scan_of(picture[:, ::-1]), spec)
+    assert board.is_mirrored
+    errors = errors_px(board, {name: np.array([WIDTH - 1 - col, row]) for name, (col, row) in truth.items()})
+    assert len(errors) >= 16
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+
+
+@pytest.mark.parametrize("name", ["aruco", "charuco"])
+def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> None:
+    """A stray copy of one marker is passed over; of two like boards none is measured, and the reason says why."""
+    dictionary = aruco_dictionary("4X4_50")
+    spec: ArucoSpec | CharucoSpec
+    if name == "aruco":
+        spec = ArucoSpec("4X4_50", 3, 2, 60.0, 20.0)
+        drawing = cv2.aruco.GridBoard((3, 2), 60.0, 20.0, dictionary).generateImage((260, 180), marginSize=20)
+    else:
+        spec = CharucoSpec("4X4_50", 5, 4, 48.0, 36.0)
+        drawing = cv2.aruco.CharucoBoard((5, 4), 48.0, 36.0, dictionary).generateImage((260, 212), marginSize=10)
+    height, width = drawing.shape
+    picture = np.full((height + 40, 2 * width + 60), 255.0)
+    picture[20 : 20 + height, 20 : 20 + width] = drawing
+    two = picture.copy()
+    picture[60:120, width + 100 : width + 160] = cv2.aruco.generateImageMarker(dictionary, 3, 60)
+    two[20 : 20 + height, width + 40 : 2 * width + 40] = drawing
+
+    def measured(grey: Array) -> BoardMeasurement:
+        noise = np.random.default_rng(2).normal(0, 300, grey.shape)
+        return measure_board(scan_of(8000 + 120 * cv2.GaussianBlur(grey, (0, 0), 0.8) + noise), spec)
+
+    seen = [mark.center_px for mark in measured(picture).marks if mark.status is Status.MEASURED]
+    assert len(seen) == len(spec.object_points())
+    assert max(center[0] for center in seen if center is not None) < width + 20
+    neither = measured(two)
+    assert "was read at 2 places" in neither.reason
+    assert all(mark.status is Status.ABSENT for mark in neither.marks)
+
+
+@pytest.mark.parametrize("gap", [60.0, 130.0])
+def test_markers_of_two_boards_are_not_those_of_one(gap: float) -> None:
+    """Of one board the right column is seen, of another one the left: together they look like a board that is squeezed,
+    and nobody knows which of them is meant."""
+    spec = ArucoSpec("4X4_50", 4, 4, 48.0, 16.0)
+    picture = np.full((296, 110 + int(gap)), 255.0)
+    for row in range(4):
+        top = 20 + 64 * row
+        for number, left in ((4 * row + 3, 10), (4 * row, 48 + int(gap))):
+            marker = cv2.aruco.generateImageMarker(aruco_dictionary("4X4_50"), number, 48)
+            picture[top : top + 48, left : left + 48] = marker
+    noise = np.random.default_rng(2).normal(0, 300, picture.shape)
+    board = measure_board(scan_of(8000 + 120 * cv2.GaussianBlur(picture, (0, 0), 0.8) + noise), spec)
+    assert "do not agree on where the board lies" in board.reason
+    assert all(mark.status is Status.ABSENT for mark in board.marks)
