@@ -64,7 +64,7 @@ def _lone(disks: Sequence[Any], _predicted: Sequence[Array]) -> list[Any]:
 Study = Callable[[int], str]
 SWITCHED: dict[str, tuple[Study, Any, str, Any]] = {
     "faint marks": (faint, frame_measurement, "detect_faint_marks", lambda frame, _reach_px: frame),
-    "dusty disks": (dusty_disks, targets, "doubts", _lone),
+    "dusty disks": (dusty_disks, targets, "dust_reasons", _lone),
     "fronts": (one_front, fronts, "FRONT_COST", 1e30),
 }
 

@@ -20,7 +20,7 @@ from measure.boards.specs import (
 )
 from measure.flags import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
-from measure.targets.sheets import robust_view
+from measure.targets.sheets import fit_view_robustly
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -70,7 +70,7 @@ def is_even(grid: Array, size_px: tuple[int, int], farthest: float = np.inf) -> 
         off = cv2.perspectiveTransform(places[:, None], plane).reshape(grid.shape) - grid
         if (np.linalg.norm(off, axis=2) < _TRUSTED * steps).all():
             return True
-    view = robust_view(places, grid.reshape(-1, 2), size_px)
+    view = fit_view_robustly(places, grid.reshape(-1, 2), size_px)
     if view is None:
         return False
     off = np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / steps

@@ -20,7 +20,7 @@ from measure.boards.specs import (
     corners_of_square,
 )
 from measure.flags import NO_REASON, Code, Reason
-from measure.targets.sheets import SheetView, robust_view
+from measure.targets.sheets import SheetView, fit_view_robustly
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -136,7 +136,7 @@ def _view(
     if len(single) < 2:
         return None
     points = np.concatenate([board[number] for number in single])
-    view = robust_view(points, np.concatenate(list(single.values())), size_px)
+    view = fit_view_robustly(points, np.concatenate(list(single.values())), size_px)
     if view is None:
         return None
     misfits = [_misfit(view, board[number], place) for number, place in single.items()]

@@ -110,7 +110,7 @@ def _dot_mark(name: str, disk: FittedDisk, is_detected: bool) -> MarkMeasurement
         status = Status.REJECTED if is_detected else Status.PREDICTED
         reason = disk.reason.reword(f"not fitted: {disk.reason}")
         return MarkMeasurement(name, "target", disk.center_px, None, status, reason)
-    weakness = disk.weakness or disk.lone_doubt
+    weakness = disk.weakness or disk.dust_reason
     status = Status.WEAK if weakness else Status.MEASURED
     return MarkMeasurement(name, "target", disk.center_px, disk.covariance, status, weakness, disk.quality)
 

@@ -1,5 +1,4 @@
-"""Detection in blocks: a scan in parts that one thread takes each, at full resolution and reduced, and the candidates
-found there."""
+"""Detection in blocks: each thread searches one part of the scan, at full resolution and reduced."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -25,13 +24,13 @@ Image = NDArray[np.float32]
 Record = TypeVar("Record", bound="DataclassInstance")
 Array = NDArray[np.float64]
 
-ROW_BYTES, BLOCK_BYTES = 1 << 14, 1 << 24  # of a block at most, but that strips are taken whole: a margin comes on top
+ROW_BYTES, BLOCK_BYTES = 1 << 14, 1 << 24  # largest block, without its margin; strips are not divided
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """place_px: column and row of the scan of its first pixel; samples (height, width, channels), margin_px of them on
-    every side being the neighbours', or repeating the scan's edge."""
+    """Part of a scan. place_px: column and row of its first pixel; samples (height, width, channels), with a border of
+    margin_px that belongs to the neighbours or repeats the scan's edge."""
 
     scan: Scan
     place_px: tuple[int, int]
@@ -40,39 +39,39 @@ class Block:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height, its margin included."""
+        """Width and height, margin included."""
         return self.samples.shape[1], self.samples.shape[0]
 
     def holds(self, places: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which columns and rows, places (n, 2, count), of the scan are not beyond its edge and in the block."""
+        """Mask of the columns and rows, places (n, 2, count), that lie within the scan and the block."""
         first = np.maximum(self.place_px, 0)
         end = np.minimum(np.add(self.place_px, self.size_px), (self.scan.width_px, self.scan.height_px))
         return np.asarray((places >= first[:, None]) & (places < end[:, None]))
 
     def grey_values(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> Image:
-        """(n, count) grey values at columns and rows (n, count) from places corners (n, 2) of the scan on; beyond the
-        block any of its values."""
+        """(n, count) grey values at columns and rows (n, count) counted from corners (n, 2) in the scan; arbitrary ones
+        outside the block."""
         width, height = self.size_px
         at = row * width + col
         at += (corners - self.place_px) @ np.array([[1], [width]])
         return weighted(self.samples.reshape(width * height, -1).take(at, axis=0, mode="clip"), self.scan.weights)
 
     def reductions(self, factors: Iterable[int]) -> dict[int, Image]:
-        """Its grey values area-averaged by each factor, from the coarsest of the others that divides it; each
-        halving of stored samples is right to half a grey value."""
+        """Area averages of the grey values by each factor, computed from the coarsest finer one that divides it. Each
+        halving of stored samples rounds to whole grey values."""
         known: dict[int, Image] = {}
         for factor in sorted(factors):
             finer = [other for other in known if factor % other == 0]
             if finer:
                 known[factor] = means(known[finer[-1]][..., None], factor // finer[-1])[..., 0]
             else:
-                known[factor] = weighted(_nearly_means(self.samples, factor), self.scan.weights)
+                known[factor] = weighted(_halved_means(self.samples, factor), self.scan.weights)
         return known
 
 
-def _nearly_means(samples: Samples, factor: int) -> Samples | Image:
-    """(height / factor, width / factor, channels) means over squares, by an even factor from means of four rounded to
-    whole grey values, again and again: in a quarter of the time, and a grey value is no matter in a search."""
+def _halved_means(samples: Samples, factor: int) -> Samples | Image:
+    """(height / factor, width / factor, channels) means over squares. An even factor is taken by repeated halving, with
+    rounded grey values: a quarter of the time, and exact enough for a search."""
     while factor % 2 == 0:
         height, width, channels = samples.shape
         half = cv2.resize(samples, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
@@ -82,14 +81,14 @@ def _nearly_means(samples: Samples, factor: int) -> Samples | Image:
 
 
 def concatenate(first: Record, *others: Record) -> Record:
-    """One record of what several of a kind hold."""
+    """Concatenate all arrays of records of one class."""
     names = [field.name for field in fields(first)]
     return type(first)(*(np.concatenate([getattr(record, name) for record in (first, *others)]) for name in names))
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A patch that may be a disk: center_px (2,), pixel_from_disk (2, 2), contrast_dn: positive where it is light."""
+    """Candidate for a target: center_px (2,), pixel_from_disk (2, 2), contrast_dn: positive if light."""
 
     center_px: Array
     pixel_from_disk: Array
@@ -97,14 +96,14 @@ class Candidate:
 
     @property
     def radius_px(self) -> float:
-        """Of the circle of the same area."""
+        """Radius of the circle of equal area."""
         (a, b), (c, d) = self.pixel_from_disk.tolist()
         return math.sqrt(abs(a * d - b * c))
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Of n candidates: centers (n, 2) px, shapes (n, 2, 2) as their pixel_from_disk, contrasts (n,)."""
+    """Arrays of n candidates: centers (n, 2) px, shapes (n, 2, 2): pixel_from_disk, contrasts (n,)."""
 
     centers: Array
     shapes: Array
@@ -126,22 +125,21 @@ class Patches:
 
     @property
     def radii(self) -> Array:
-        """(n,) of the circles of the same area."""
+        """(n,) radii of the circles of equal area."""
         return np.asarray(np.sqrt(np.abs(np.linalg.det(self.shapes))))
 
     def strongest_first(self) -> "Patches":
-        """The strongest first, whatever the order in which they were found."""
+        """Sort by contrast, the strongest first; ties by position, so that the order is reproducible."""
         return self.part(np.lexsort((*self.centers.T[::-1], -np.abs(self.contrasts))))
 
 
-Confirmed = Callable[[Block, Patches], Patches]
+PatchTest = Callable[[Block, Patches], Patches]
 
 
 @dataclass(frozen=True)
 class Octave:
-    """What is looked for in one reduction of the scan, by factor. margin: reduced px about a part that is looked at;
-    widest_px: of the scan, that a part may be at most; find: the patches in a reduced picture, in its pixels, within
-    its margin."""
+    """Search in the scan reduced by a factor. margin: border of a part, reduced px; widest_px: largest width of a part,
+    px of the scan; find: returns the patches within the margin of a reduced image, in its pixels."""
 
     factor: int
     margin: int
@@ -153,62 +151,68 @@ class Octave:
         return self.margin * self.factor
 
 
-def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | None = None) -> list[Candidate]:
-    """The patches of all octaves in pixels of the scan, the strongest first, none within another.
+def search_blocks(scan: Scan, octaves: Sequence[Octave], test_patches: PatchTest | None = None) -> list[Candidate]:
+    """Search all octaves of a scan in one pass over its blocks.
 
-    confirmed: which of them are right, and where exactly, asked while the block about them is still decoded.
+    Parameters
+    ----------
+    test_patches : tests and fits the patches of a block while it is still decoded; None: all pass.
+
+    Returns
+    -------
+    Candidates in pixels of the scan, the strongest first, none within another.
     """
     unit = lcm(*(octave.factor for octave in octaves))
-    margin = _whole(max(octave.margin_px for octave in octaves), unit)
+    margin = _round_up(max(octave.margin_px for octave in octaves), unit)
     width, height = _block_px(scan, unit, margin)
 
     rows, cols = height + 2 * margin, width + 2 * margin
-    spare: list[Samples] = []  # new memory for every block would take longer than what is done in it
+    spare: list[Samples] = []  # reused: allocating memory for every block would take longer than the search
 
     def block_patches(corner: tuple[int, int]) -> Patches:
         row0, col0 = (place - margin for place in corner)
         memory = spare.pop() if spare else np.empty((rows, cols, scan.channels), scan.samples_dtype)
         block = Block(scan, (col0, row0), margin, scan.samples(col0, row0, cols, rows, memory))
-        found = _separate(concatenate(Patches.collect(()), *_octave_patches(block, octaves)))
-        found = confirmed(block, found) if confirmed else found
+        found = _drop_overlapping(concatenate(Patches.collect(()), *_octave_patches(block, octaves)))
+        found = test_patches(block, found) if test_patches else found
         spare.append(memory)
         return found
 
     corners = product(range(0, scan.height_px, height), range(0, scan.width_px, width))
-    return _separate(concatenate(*map_in_threads(block_patches, corners))).candidates()
+    return _drop_overlapping(concatenate(*map_in_threads(block_patches, corners))).candidates()
 
 
 def _block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:
-    """Width and height of blocks, in whole units. What all threads have in work stays decoded, so that neighbours
-    decode no more than their share; strips are taken whole."""
+    """Width and height of blocks, multiples of unit. Sized so that the segments under work by all threads stay in the
+    cache and none is decoded twice; strips are not divided."""
     tall, wide = scan.segment_px
     pixel = scan.channels * np.dtype(scan.samples_dtype).itemsize
-    width = scan.width_px if wide >= scan.width_px else _even_part(scan.width_px, ROW_BYTES // pixel, unit)
+    width = scan.width_px if wide >= scan.width_px else _part_size(scan.width_px, ROW_BYTES // pixel, unit)
     tallest = max(BLOCK_BYTES // (width * pixel), 1)
-    if tall < scan.height_px:  # else all is decoded at once, and held
+    if tall < scan.height_px:  # otherwise the scan is one segment, decoded once
         kept = (scan.rows_kept * scan.width_px // width - tall) // max(cv2.getNumThreads(), 1) - 2 * margin
         tallest = min(max(kept, 2 * margin), tallest)
-    return width, _even_part(scan.height_px, tallest, unit)
+    return width, _part_size(scan.height_px, tallest, unit)
 
 
-def _even_part(size: int, most: int, unit: int) -> int:
-    """Of parts of one size, in whole units, that are hardly longer than most."""
-    return _whole(-(-size // -(-size // most)), unit)
+def _part_size(size: int, most: int, unit: int) -> int:
+    """Size of equal parts, a multiple of unit, not much above most."""
+    return _round_up(-(-size // -(-size // most)), unit)
 
 
-def _whole(size: int, unit: int) -> int:
+def _round_up(size: int, unit: int) -> int:
     return -(-size // unit) * unit
 
 
 def _octave_patches(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
-    """Those that lie in the block, in pixels of the scan."""
+    """Patches within the block, in pixels of the scan."""
     reductions = block.reductions({octave.factor for octave in octaves})
     width, height = (size - 2 * block.margin_px for size in block.size_px)
     for octave in octaves:
         factor, small = octave.factor, reductions[octave.factor]
         margin, spare = octave.margin, block.margin_px // factor - octave.margin
         rows = slice(spare, spare + height // factor + 2 * margin)
-        part = _even_part(width, octave.widest_px, factor) // factor
+        part = _part_size(width, octave.widest_px, factor) // factor
         for col0 in range(0, width // factor, part):
             first, last = spare + col0, spare + min(col0 + part, width // factor) + 2 * margin
             place = np.array(block.place_px) + factor * np.array([first, spare]) + (factor - 1) / 2
@@ -218,8 +222,8 @@ def _octave_patches(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches
             yield found.part(np.all(found.centers < edge, axis=1))
 
 
-def _separate(found: Patches) -> Patches:
-    """The strongest of candidates that lie within one another, the strongest first."""
+def _drop_overlapping(found: Patches) -> Patches:
+    """Keep the strongest of overlapping candidates, the strongest first."""
     found = found.strongest_first()
     kept: set[int] = set()
     for index, near in enumerate(cKDTree(found.centers).query_ball_point(found.centers, 0.7 * found.radii)):

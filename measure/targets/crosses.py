@@ -1,5 +1,5 @@
-"""Crosses found in the whole frame, in one pass over its blocks: what is as thin as their lines and hangs together, if
-two bars through its middle explain it."""
+"""Detection of crosses in a whole scan, in one pass over its blocks: connected thin structures that two bars through
+their centre explain."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -18,21 +18,21 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_SEARCHED_ARM_PX = 12.0  # scans are reduced until half a cross has about this length, if its lines stay...
-_THINNEST_PX = 1.5  # ...so wide
-_WIDEST_PX = 1536  # of what is compared with its own noise
-_OCTAVE = 2.0  # longest over shortest half cross that one reduction finds
-_NOISE_SIGMAS = 5.0  # above the noise of what is thin: a pixel in a million is noise then
-_STEPS_DEG = 5.0  # of the directions that bars may have
-_LEAST_ANGLE_DEG = 35.0  # between the bars, right-angled ones seen obliquely
+_SEARCHED_ARM_PX = 12.0  # half length of a cross in the reduced scan, provided that its lines stay...
+_THINNEST_PX = 1.5  # ...this wide
+_WIDEST_PX = 1536  # width of a part with one noise level, reduced px
+_OCTAVE = 2.0  # longest over shortest half cross found in one reduction
+_NOISE_SIGMAS = 5.0  # threshold above the noise of the top-hat image: one noise pixel in a million exceeds it
+_STEPS_DEG = 5.0  # step of the bar directions that are tried
+_LEAST_ANGLE_DEG = 35.0  # between the bars: a right angle in an oblique view
 _BLURRED_PX = 0.75  # by which blur widens a bar on either side
-_LEAST_FILLED, _LEAST_EXPLAINED = 0.85, 0.8  # of the bars by the patch, of the patch by the bars
+_LEAST_FILLED, _LEAST_EXPLAINED = 0.85, 0.8  # fraction of the bars covered by the patch, and the reverse
 
 
 @dataclass(frozen=True)
 class CrossSearch:
-    """half_px: shortest and longest half of a cross, px of the scan; line: width of its bars, in halves; polarity and
-    least_contrast: as for disks."""
+    """Crosses to search for. half_px: shortest and longest half length, px of the scan; line: bar width in half
+    lengths; polarity, least_contrast: as in `DiskSearch`."""
 
     half_px: tuple[float, float]
     line: float
@@ -56,8 +56,8 @@ def cross_candidates(scan: Scan, search: CrossSearch) -> list[Candidate]:
 
 
 def _octaves(search: CrossSearch, full_scale_dn: float) -> list[Octave]:
-    """Half crosses from the shortest to the longest, each in the reduction that leaves their lines wide enough. That is
-    a power of two, for blocks are whole numbers of every octave's pixels."""
+    """Octaves from the shortest half length to the longest, each reduced as far as the line width allows. Factors are
+    powers of two, since a block is a whole number of pixels in every octave."""
     octaves = []
     shortest, longest = search.half_px
     upper = 0.0
@@ -74,7 +74,7 @@ def _octaves(search: CrossSearch, full_scale_dn: float) -> list[Octave]:
 def _patches(
     half: tuple[float, float], margin: int, search: CrossSearch, full_scale_dn: float, small: Image
 ) -> Patches:
-    """Crosses with halves of these lengths in a reduced picture, within its margin."""
+    """Crosses of these half lengths in a reduced image, within its margin."""
     wide = 2 * int(np.ceil(search.line * half[1]) + 1) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
     crosses = []
@@ -99,7 +99,7 @@ def _crosses(thin: Image, level: float, half: tuple[float, float], search: Cross
             continue
         crop = slice(top, top + tall), slice(left, left + wide)
         patch = np.where(labels[crop] == label, thin[crop], 0.0)
-        # Half of what stands out: blur and noise make a patch at the lowest level wider than the cross.
+        # Threshold at half height: at the detection level, blur and noise make a patch wider than the cross.
         patch = np.where(patch > 0.5 * np.quantile(patch[patch > 0.0], 0.8), patch, 0.0)
         cross = _fit_cross(patch, search.line)
         if cross is None:
@@ -113,7 +113,7 @@ def _crosses(thin: Image, level: float, half: tuple[float, float], search: Cross
 
 
 def _fit_cross(patch: NDArray[np.floating], line: float) -> tuple[Array, Array] | None:
-    """Centre (2,) and half bars (2, 2) in columns of a cross of which a patch (rows, columns) shows the brightness."""
+    """Fit two bars to a patch (rows, columns) of grey values: centre (2,) and half bars (2, 2) as columns, or None."""
     rows, cols = np.nonzero(patch)
     if len(rows) < 12:
         return None
@@ -139,7 +139,7 @@ def _fit_cross(patch: NDArray[np.floating], line: float) -> tuple[Array, Array] 
 
 
 def _bar(off: Array, unit: Array) -> Array:
-    """Half a bar: the direction of its pixels, as long as they reach on the shorter side."""
+    """Half bar (2,): principal direction of its pixels, with the length of the shorter side."""
     values, vectors = np.linalg.eigh(off.T @ off)
     direction = vectors[:, int(np.argmax(values))]
     direction = direction * (np.sign(direction @ unit) or 1.0)
@@ -148,7 +148,7 @@ def _bar(off: Array, unit: Array) -> Array:
 
 
 def _filled(patch: NDArray[np.floating], center: Array, bar: Array) -> float:
-    """The share of an arm on which the patch lies."""
+    """Fraction of an arm that the patch covers."""
     places = np.round(center + np.linspace(0.0, 0.9, 12)[:, None] * bar).astype(int)
     places = np.clip(places, 0, np.array(patch.shape[::-1]) - 1)
     return float((patch[places[:, 1], places[:, 0]] > 0.0).mean())

@@ -1,8 +1,7 @@
-"""Disks detected in a whole scan: blobs by their Laplacian at several scales, their outlines at half height, then
-fitted in batches.
+"""Detection of disks in a whole scan: blobs by the Laplacian at several scales, outlines at half height, batch fits.
 
-A disk's picture is seen whole from its middle: each ray leaves it once. So the outlines of many patches are found at
-once, to a fraction of a pixel, and the ellipse with the moments of each is compared with it.
+A disk is convex: each ray from its centre crosses the outline once. The outlines of many patches are therefore traced
+together, to a fraction of a pixel, and each is compared with the ellipse that has the same moments.
 """
 
 import math
@@ -18,40 +17,40 @@ from measure.marks.shapes import Polarity
 from measure.noise.robust_estimation import robust_scales
 from measure.scans.scan import Scan
 from measure.targets.block_search import Block, Candidate, Octave, Patches, concatenate, search_blocks
-from measure.targets.disk_fit_batch import disks_among
+from measure.targets.disk_fit_batch import fit_disks
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-Sampled = Callable[[NDArray[np.intp], Array], Image]
+Sampler = Callable[[NDArray[np.intp], Array], Image]
 
-_RAYS, _FEW_RAYS = 32, (8, 16)  # of an outline, and of the looks before: half of the blobs do not outlast the first
-REACH = 3.0  # radii of a blob: where its patch must have ended
-_CORE, _AROUND = 0.5, (1.5, 2.5)  # radii of a blob: within, that it is as high as; between, that there is ground
-_GROUND_SHARE = 1 / 3  # of the rays, that are lower there: other things may stand about
-_LEAST_HEIGHT = 0.5  # of the blob's contrast
-_CHUNK = 1 << 18  # samples taken at a time: they take a few MiB
-# Of the scale-normalised Laplacian of a disk, in units of its contrast, at sigma = r / sqrt(2).
+_RAYS, _FEW_RAYS = 32, (8, 16)  # of an outline, and of the quick tests before it: the first rejects half of the blobs
+REACH = 3.0  # radii of a blob within which its patch must end
+_CORE, _AROUND = 0.5, (1.5, 2.5)  # radii of a blob: its height is taken within the first, background between the others
+_GROUND_SHARE = 1 / 3  # of the rays must reach the background: other objects may be near
+_LEAST_HEIGHT = 0.5  # in contrasts of the blob
+_CHUNK = 1 << 18  # samples taken at a time: a few MiB
+# Maximum of the scale-normalised Laplacian of a disk of contrast 1, at sigma = r / sqrt(2).
 _PEAK_OF_DISK = 2 / math.e
-_RESPONSE_SIGMAS = 5.0  # above the picture's own texture at that scale
-_TEXTURE_PX = 1024  # side, px of the scan: a smaller picture may be full of disks, which are no texture or noise
-_CELL_PX = 1536  # of the scan, side of what has one texture and one noise, about
-_EVERY = 8  # column and row are enough to tell these
-_WORST_MISFIT = 0.075  # rms distance of an outline from its ellipse, in radii, beside what noise makes of it
-_NOISE_SIGMAS = 1.5  # by which that may exceed its expectation: it is that of many rays
-_EDGE_PX = 2.5  # of an edge with a blur of a pixel: its whole height over its steepest slope
+_RESPONSE_SIGMAS = 5.0  # above the background texture at that scale
+_TEXTURE_PX = 1024  # side, px of the scan: a smaller one may be full of disks, which must not count as texture or noise
+_CELL_PX = 1536  # side of a cell with one texture and one noise level, px of the scan
+_EVERY = 8  # sampling step for the texture and noise estimates
+_WORST_MISFIT = 0.075  # rms distance of an outline from its ellipse, in radii, without noise
+_NOISE_SIGMAS = 1.5  # factor on the expected misfit from noise, an rms over many rays
+_EDGE_PX = 2.5  # height over steepest slope of an edge with a blur of one pixel
 LEAST_SNR = 4.0  # of a disk that is measured
-_LEAST_FLAT = 0.05  # the shorter half axis over the longer, squared
-_SCALE_STEP = 1.5  # from one radius to the next at most: between them a disk stands out by a tenth less
-_SIZE_TOLERANCE = 1.4  # of what is found, to the sizes that are looked for
-_WIDEST_PX = 12288  # of what is looked at in one piece
-_SEARCH_RADIUS_PX = 2.0  # reduced so far that the smallest disk of an octave has at least this radius
+_LEAST_FLAT = 0.05  # shorter over longer half axis, squared
+_SCALE_STEP = 1.5  # ratio of consecutive radii: between them the response falls by a tenth
+_SIZE_TOLERANCE = 1.4  # factor on the stated sizes
+_WIDEST_PX = 12288  # widest part that is searched in one piece
+_SEARCH_RADIUS_PX = 2.0  # smallest radius of an octave after reduction
 
 
 @dataclass(frozen=True, eq=False)
 class Blobs:
-    """What stands out: places (n, 2) in whole columns and rows, radius (n,) px and contrast (n,) of a disk that would
-    stand out as much."""
+    """Local maxima of the Laplacian. places (n, 2): whole columns and rows; radius (n,) px and contrast (n,) of a disk
+    with the same response."""
 
     places: NDArray[np.intp]
     radius: Array
@@ -63,8 +62,8 @@ class Blobs:
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """Of n patches: centers (n, 2), moments (n, 2, 2) of their area about them, px²; misfit (n,): rms distance of the
-    outline from the ellipse of these moments, in its radii; height (n,) above the ground."""
+    """Outlines of n patches. centers (n, 2); moments (n, 2, 2): central second moments of the area, px²; misfit (n,):
+    rms distance of the outline from the ellipse of these moments, in radii; height (n,) above the background."""
 
     centers: Array
     moments: Array
@@ -76,7 +75,7 @@ class Outlines:
 
     @property
     def radius(self) -> Array:
-        """(n,) of the circle of the same area."""
+        """(n,) of the circle of equal area."""
         return np.asarray(2.0 * np.maximum(np.linalg.det(self.moments), 0.0) ** 0.25)
 
 
@@ -84,8 +83,8 @@ _NONE = Outlines(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0)
 
 
 def blob_outlines(image: Image, blobs: Blobs) -> Outlines:
-    """Of those blobs, light ones, that end on every ray; most of what stands out of a landscape runs on along some."""
-    near, between = partial(_nearest, image), partial(_interpolated, image)
+    """Outlines of the light blobs that end on every ray; most structures of a landscape go on along some ray."""
+    near, between = partial(_nearest_values, image), partial(_interpolated_values, image)
     found = []
     for radius in np.unique(blobs.radius).tolist():
         alike = blobs.part(blobs.radius == radius)
@@ -99,16 +98,16 @@ def blob_outlines(image: Image, blobs: Blobs) -> Outlines:
 
 
 def _chunks(blobs: Blobs, samples: float) -> Iterator[Blobs]:
-    """Blobs of which each takes so many samples."""
+    """Split blobs into parts of limited size. samples: number that each blob takes."""
     count = max(int(_CHUNK / samples), 1)
     return (blobs.part(slice(first, first + count)) for first in range(0, len(blobs.radius), count))
 
 
 class _Profiles:
-    """Grey values (steps, rays, n) along rays from blobs of one radius, at steps of so many px; ends (n,): whether all
-    fall below half of the blob's height."""
+    """Grey values (steps, rays, n) along rays from blobs of one radius. ends (n,): whether every ray falls below half
+    the height of its blob."""
 
-    def __init__(self, sampled: Sampled, blobs: Blobs, radius: float, rays: int, step_px: float) -> None:
+    def __init__(self, sampled: Sampler, blobs: Blobs, radius: float, rays: int, step_px: float) -> None:
         self.step_px = step_px
         along = step_px * np.arange(int(np.ceil(REACH * radius / step_px)) + 1)
         angle = 2 * np.pi * np.arange(rays) / rays
@@ -123,7 +122,7 @@ class _Profiles:
         self.ends = (self.values[0, 0] >= self.level) & is_below & (self.height >= _LEAST_HEIGHT * blobs.contrast)
 
     def radii(self) -> Image:
-        """(rays, those that end) px to where the rays fall below half of the height."""
+        """(rays, blobs that end) distance at which a ray falls below half the height, px."""
         values, level = self.values[..., self.ends], self.level[self.ends]
         last = (values < level).argmax(axis=0)[None] - 1
         inner, outer = np.take_along_axis(values, last, axis=0)[0], np.take_along_axis(values, last + 1, axis=0)[0]
@@ -131,23 +130,23 @@ class _Profiles:
         return np.asarray(self.step_px * (last[0] + np.clip(share, 0.0, 1.0)), np.float32)
 
 
-def _nearest(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
-    """(steps, rays, n) pixels nearest to offsets (2, steps, rays) from places (n, 2), within the image."""
+def _nearest_values(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
+    """(steps, rays, n) nearest pixel values at offsets (2, steps, rays) from places (n, 2)."""
     col, row = np.rint(offsets).astype(np.intp)
     width = image.shape[1]
     at = (col + width * row)[..., None] + places @ (1, width)
     return np.asarray(image.ravel().take(at), np.float32)
 
 
-def _interpolated(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
-    """(steps, rays, n) grey values at offsets (2, steps, rays) from places (n, 2)."""
+def _interpolated_values(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
+    """(steps, rays, n) interpolated grey values at offsets (2, steps, rays) from places (n, 2)."""
     at, off = places.T.astype(np.float32), offsets.reshape(2, -1, 1).astype(np.float32)
     values = cv2.remap(image, at[0] + off[0], at[1] + off[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, np.float32).reshape(*offsets.shape[1:], len(places))
 
 
 def _outlines(places: NDArray[np.intp], profiles: _Profiles) -> Outlines:
-    """Of the patches that end: the moments of the polygons that the rays' ends make, by Green's theorem."""
+    """Outlines of the patches that end: moments of the polygons through the ends of the rays, by Green's theorem."""
     x, y = profiles.directions[..., None].astype(np.float32) * profiles.radii()
     x1, y1 = (np.roll(each, -1, axis=0) for each in (x, y))
     twice = x * y1 - x1 * y
@@ -166,10 +165,10 @@ def _outlines(places: NDArray[np.intp], profiles: _Profiles) -> Outlines:
 
 @dataclass(frozen=True)
 class DiskSearch:
-    """What is looked for.
+    """Disks to search for.
 
-    diameter_px: smallest and largest, px of the scan; polarity: whether disks are lighter or darker than what surrounds
-    them; least_contrast: as a share of the full scale.
+    diameter_px: smallest and largest, px of the scan; polarity: lighter or darker than the background; least_contrast:
+    as a fraction of the full scale.
     """
 
     diameter_px: tuple[float, float]
@@ -187,12 +186,12 @@ class DiskSearch:
 
 
 def _margin(radii: list[float]) -> int:
-    """How far beyond a part of the picture its patches are looked at."""
+    """Width of the border that the outlines at a part's edge need, px."""
     return int(np.ceil(REACH * radii[-1])) + 3
 
 
 def _patches(radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int, small: Image) -> Patches:
-    """Patches of a disk's shape in a picture reduced by a factor that lie within its margin."""
+    """Elliptical patches in a reduced image, within its margin."""
     small, scan_px2 = np.ascontiguousarray(small), small.size * factor**2
     cells = Cells.divide(small.shape[1], round(scan_px2 / _CELL_PX**2))
     is_textured = scan_px2 >= _TEXTURE_PX**2
@@ -200,36 +199,35 @@ def _patches(radii: list[float], search: DiskSearch, full_scale_dn: float, facto
     found = []
     for sign, own in _blobs(small, radii, search, full_scale_dn, cells, is_textured):
         outlines = blob_outlines(small if sign > 0 else -small, own)
-        found.append(_round_ones(outlines, noise[cells.index(outlines.centers[:, 0])], factor, sign))
+        found.append(_elliptical_patches(outlines, noise[cells.index(outlines.centers[:, 0])], factor, sign))
     return concatenate(Patches.collect(()), *found)
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Parts of a picture of about one width, which have a noise and a texture of their own; ends (n,): the columns
-    where they end."""
+    """Vertical strips of an image, each with its own noise and texture; ends (n,): columns where they end."""
 
     ends: NDArray[np.intp]
 
     @classmethod
     def divide(cls, width: int, count: int) -> "Cells":
-        """Some count of them, as far as they hold samples."""
+        """Divide a width into strips of equal width; fewer than count where they would hold too few samples."""
         count = max(min(count, width // (2 * _EVERY)), 1)
         return cls(np.linspace(0, width, count + 1).astype(np.intp)[1:])
 
     def scales(self, samples: Image) -> Array:
-        """(n,) robust standard deviations of the samples (rows, columns) in each cell, spread over all of them."""
+        """(n,) robust standard deviation in each cell of samples (rows, columns) that cover the whole image."""
         count, rows = len(self.ends), len(samples)
         wide = samples.shape[1] // count
         own = samples[:, : count * wide].reshape(rows, count, wide).swapaxes(0, 1)
         return robust_scales(own.reshape(count, -1))
 
     def index(self, columns: Array) -> NDArray[np.intp]:
-        """The cells in which columns lie."""
+        """Cell of each column."""
         return np.searchsorted(self.ends[:-1], columns, side="right")
 
     def cut(self, picture: Image, levels: Array) -> Image:
-        """The picture, which from now on is 0 where it is not above its cell's level."""
+        """Set the image to 0 where it is not above its cell's level, in place."""
         for first, last, level in zip((0, *self.ends), self.ends, levels.tolist(), strict=False):
             cv2.threshold(picture[:, first:last], level, 0.0, cv2.THRESH_TOZERO, picture[:, first:last])
         return picture
@@ -238,8 +236,8 @@ class Cells:
 def _blobs(
     small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, cells: Cells, is_textured: bool
 ) -> Iterator[tuple[int, Blobs]]:
-    """1 with the light ones and -1 with the dark ones, within the picture's margin. is_textured: whether they have to
-    stand out of their cells' texture."""
+    """Yield -1 with the dark blobs and 1 with the light ones, within the image's margin. is_textured: whether a blob
+    must exceed the texture of its cell."""
     contrasts: list[Image] = []
     levels: list[Array] = []
     smooth, blurred = small, 0.0
@@ -254,7 +252,7 @@ def _blobs(
         levels.append(np.maximum(_RESPONSE_SIGMAS * textures, search.least_contrast * full_scale_dn))
     neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * max(int(radii[0]), 1) + 1,))
     margin = _margin(radii)
-    for sign, polarity in ((-1, "dark"), (1, "light")):  # which may use the contrasts up
+    for sign, polarity in ((-1, "dark"), (1, "light")):  # the light ones last: they overwrite the contrasts
         if search.polarity in (polarity, "auto"):
             standing = [
                 cells.cut(contrast if sign > 0 else -contrast, level)
@@ -269,18 +267,18 @@ def _blobs(
 
 
 def _fine_structure(small: Image) -> Image:
-    """Samples of what is no smooth picture, with the noise's standard deviation (Immerkaer, 1996, Fast noise variance
-    estimation)."""
+    """Samples of the image's second differences, scaled to the standard deviation of white noise (Immerkaer, 1996, Fast
+    noise variance estimation)."""
     above, row, below = (small[first : len(small) - 2 + first : _EVERY] for first in range(3))
     rows = above - 2 * row + below
     left, column, right = (rows[:, first : rows.shape[1] - 2 + first : _EVERY] for first in range(3))
     return np.asarray((left - 2 * column + right) / 6)
 
 
-def _round_ones(found: Outlines, noise: Array, factor: int, sign: int) -> Patches:
-    """Those that are ellipses but for noise (n,), light ones if the sign is 1, dark ones if it is -1.
+def _elliptical_patches(found: Outlines, noise: Array, factor: int, sign: int) -> Patches:
+    """Outlines that are ellipses within their noise (n,), as patches; sign: 1 for light ones, -1 for dark ones.
 
-    A disk that stands out of the noise of the scan's own pixels stands out of their means so much the more.
+    The least SNR refers to single pixels of the scan; means over factor² pixels raise it by the factor.
     """
     share = np.minimum(noise / np.maximum(found.height, 1e-9), 1 / (LEAST_SNR * factor))
     kept = found.part(found.misfit < np.hypot(_WORST_MISFIT, _NOISE_SIGMAS * _EDGE_PX * share / found.radius))
@@ -300,8 +298,8 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
     smallest, largest = search.diameter_px[0] / _SIZE_TOLERANCE, search.diameter_px[1] * _SIZE_TOLERANCE
 
     def disks(block: Block, patches: Patches) -> Patches:
-        """Those whose diameters can be those of disks seen obliquely."""
-        found = disks_among(block, patches)
+        """Fitted disks whose axes agree with the stated diameters in an oblique view."""
+        found = fit_disks(block, patches)
         longer, shorter = 2 * np.linalg.svd(found.shapes, compute_uv=False).T
         return found.part((longer >= smallest) & (shorter <= largest))
 
@@ -309,7 +307,7 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
 
 
 def disk_octaves(search: DiskSearch, full_scale_dn: float) -> list[Octave]:
-    """Radii from the smallest to the largest, each in the reduction that leaves it a few pixels."""
+    """Octaves from the smallest radius to the largest, each reduced until its radii are a few pixels."""
     smallest, largest = search.diameter_px[0] / 2, search.diameter_px[1] / 2
     count = int(np.ceil(np.log(largest / smallest) / np.log(_SCALE_STEP))) + 1
     by_factor: dict[int, list[float]] = {}

@@ -1,9 +1,8 @@
-"""Patches of a picture tested for disks, many at once, by some steps of a fit of blurred ellipses in closed form.
+"""Batch test of image patches for disks: a few Gauss-Newton steps of a blurred ellipse in closed form.
 
-The picture of a disk is `gain * Phi(distance / blur) + offset + slopes`. A patch's outline is right to a few per cent;
-from there four steps place a disk to a tenth of a pixel, and what they leave tells disks from landscape. The edge is
-taken for straight where it is blurred, which changes a disk's size by a few hundredths of a pixel and its place by
-nothing.
+The image model is `gain * Phi(distance / blur) + offset + slopes`. The outline of a patch is right to a few per cent;
+four steps from there localise a disk to a tenth of a pixel, and the residuals tell disks from image content. The model
+takes the edge as straight within the blur, which changes the size by a few hundredths of a pixel and not the centre.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,33 +20,33 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-_GROUP_PIXELS = 1 << 16  # of the windows of disks that are fitted together: with their derivatives they take 10 MiB
-_FIRST_BLUR_PX, _BLUR_PX = 1.0, (0.5, 8.0)  # standard deviations, pixels' own width included
-_FIRST_STEPS_ROBUST = False, False, True  # in some of the pixels; one robust step in all of them comes after
-_HOPELESS = 1.5  # times the misfit that is allowed: an outline is right to a few percent
-_LONGEST_STEP = 0.3  # of the radius: beyond it the picture is not linear
-_DAMPING = 1e-4  # of the step: a disk that hardly shows has unknowns that depend on one another
+_GROUP_PIXELS = 1 << 16  # pixels of the windows that are fitted together: 10 MiB with their derivatives
+_FIRST_BLUR_PX, _BLUR_PX = 1.0, (0.5, 8.0)  # initial value and limits, standard deviations, pixel width included
+_FIRST_STEPS_ROBUST = False, False, True  # steps on a subset of pixels; one robust step on all of them follows
+_HOPELESS = 1.5  # times the allowed misfit: patches above it are dropped before the first step
+_LONGEST_STEP = 0.3  # in radii: the limit of linearisation
+_DAMPING = 1e-4  # the unknowns of a faint disk are nearly dependent
 _UNKNOWNS = 10  # place (2), size, stretch, shear, blur, gain, offset, slopes (2)
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale
-WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.23, 0.08  # residuals over contrast: texture and stains are no disks
-SMOOTH = 0.5  # correlation of neighbouring residuals, from which on they are no noise
-MARGIN, LEAST_MARGIN_PX = 0.3, 2.5  # of its radius: the ground is not plain for long, where a target's pad ends, say
-_COARSE_PX = 3.0  # radius in pixels that are enough
-_EDGE_SAMPLES = 16  # likewise, of a disk's edge, four pixels wide
-_FARTHEST, _MOST_GROWN = 0.5, float(np.log(1.5))  # radii from the outline's middle, log of its size: beyond is another
+WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.23, 0.08  # residuals over contrast; above: texture or a stain
+SMOOTH = 0.5  # correlation of neighbouring residuals above which they are not noise
+MARGIN, LEAST_MARGIN_PX = 0.3, 2.5  # background, in radii and px: a target's pad may end soon
+_COARSE_PX = 3.0  # sampled pixels per radius that suffice
+_EDGE_SAMPLES = 16  # sampled pixels on the edge, four pixels wide, that suffice
+_FARTHEST, _MOST_GROWN = 0.5, float(np.log(1.5))  # change of centre in radii, of log size; beyond: another object
 
 
-def disks_among(block: Block, patches: Patches) -> Patches:
-    """Those patches that a disk explains, the strongest first, as fitted: a place within a tenth of a pixel or so."""
+def fit_disks(block: Block, patches: Patches) -> Patches:
+    """Patches that are disks, fitted, the strongest first; centres are right to a tenth of a pixel or so."""
     first = np.full(len(patches.radii), _FIRST_BLUR_PX)
-    promising, blurs = _fitted_disks(
+    promising, blurs = _fit_patches(
         block, patches, first, _strides(patches), _FIRST_STEPS_ROBUST, (_HOPELESS, _HOPELESS)
     )
     whole = np.ones(len(blurs), np.intp)
-    return _fitted_disks(block, promising, blurs, whole, (True,), (np.inf, 1.0))[0].strongest_first()
+    return _fit_patches(block, promising, blurs, whole, (True,), (np.inf, 1.0))[0].strongest_first()
 
 
-def _fitted_disks(
+def _fit_patches(
     block: Block,
     patches: Patches,
     blurs: Array,
@@ -55,13 +54,13 @@ def _fitted_disks(
     steps_robust: Sequence[bool],
     most_misfits: tuple[float, float],
 ) -> tuple[Patches, Array]:
-    """The disks among patches, and their blurs (n,), by some steps of a fit in pixels strides (n,) apart.
-    most_misfits: before and after these."""
+    """Fitted disks among the patches and their blurs (n,). strides (n,): spacing of the sampled pixels; most_misfits:
+    allowed before and after the steps."""
     found, blurs_found = [Patches.collect(())], [np.zeros(0)]
     for group in _groups(patches, strides):
         own, fit = group, _Fit(block, patches.part(group), blurs[group], strides[group])
         is_promising = fit.misfit() < most_misfits[0]
-        if not is_promising.all():  # most of what is no disk is so by its outline already
+        if not is_promising.all():  # the outline alone rules most patches out
             own = group[is_promising]
             if not len(own):
                 continue
@@ -75,7 +74,7 @@ def _fitted_disks(
 
 
 def _groups(patches: Patches, strides: Indices) -> Iterator[Indices]:
-    """Numbers of those with windows of about one size, so few that these are not too many pixels."""
+    """Indices of patches with windows of similar size, in groups of limited pixel count."""
     sides = 2 * _half_sides(patches, strides) + 1
     rest = np.argsort(-sides, kind="stable")
     while len(rest):
@@ -86,7 +85,7 @@ def _groups(patches: Patches, strides: Indices) -> Iterator[Indices]:
 
 
 def _strides(patches: Patches) -> Indices:
-    """(n,) columns and rows from one pixel that is used to the next: large disks show enough in some of theirs."""
+    """(n,) spacing of the sampled columns and rows: large disks need only part of their pixels."""
     radius = patches.radii
     of_edge = np.sqrt(8 * np.pi * radius / _EDGE_SAMPLES)
     return np.maximum(np.minimum(radius / _COARSE_PX, of_edge), 1.0).astype(np.intp)
@@ -97,15 +96,15 @@ def _margins_px(patches: Patches) -> Array:
 
 
 def _half_sides(patches: Patches, strides: Indices) -> Indices:
-    """(n,) pixels that are used on either side of a window's middle."""
+    """(n,) sampled pixels on either side of the window's centre."""
     longest = np.linalg.norm(patches.shapes, 2, axis=(1, 2))
     return np.asarray(np.ceil((longest + _margins_px(patches) + 0.5) / strides), np.intp)
 
 
 class _Fit:
-    """n disks about patches: centers (n, 2) from the middles of their windows, shapes (n, 2, 2), blur (n,), px; greys
-    (n, 4): gain, offset, slopes. Windows have side * side pixels: col, row (n, pixels) from their middles, grey (n,
-    pixels), and used (n, pixels), those in the ellipse and its margin."""
+    """State of the fit of n disks. centers (n, 2) relative to the window centres, px; shapes (n, 2, 2); blur (n,), px;
+    greys (n, 4): gain, offset, slopes. Windows of side * side pixels: col, row (n, pixels) relative to their centres,
+    grey (n, pixels), used (n, pixels): inside the ellipse and its margin."""
 
     def __init__(self, block: Block, patches: Patches, blurs: Array, strides: Indices) -> None:
         half, stride = int(_half_sides(patches, strides).max()), strides[:, None]
@@ -126,14 +125,14 @@ class _Fit:
         self.linearise(design)
 
     def linearise(self, design: Image) -> None:
-        """Design (n, unknowns, pixels) at the present state, and residuals (n, pixels) with their scale (n,)."""
+        """Set the design matrix (n, unknowns, pixels), the residuals (n, pixels) and their robust scale (n,)."""
         self.design = design
         self.residuals = self.grey - (self.greys[:, None].astype(np.float32) @ self.design[:, 6:])[:, 0]
         self.design[:, :6] *= self.greys[:, :1, None].astype(np.float32)
-        self.scale = _masked_scales(self.residuals, self.used)
+        self.scale = _robust_scales_of_used(self.residuals, self.used)
 
     def step(self, is_robust: bool) -> None:
-        """A step of the adjustment, a robust one being little moved by dust and neighbours."""
+        """Take one Gauss-Newton step; a robust one down-weights dust and neighbours."""
         weights = self.used.astype(np.float32)
         if is_robust:
             scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.greys[:, 0]) + 1e-6)
@@ -149,8 +148,7 @@ class _Fit:
         self.linearise(_Edges.from_fit(self).design(self))
 
     def misfit(self) -> Array:
-        """(n,) what disks leave unexplained, over what is allowed; a picture of something else leaves what is alike in
-        neighbouring pixels."""
+        """(n,) residual scale over its limit, which is lower where neighbouring residuals are correlated."""
         left = (self.residuals * self.used).reshape(-1, self.side, self.side)
         neighbours = (left[:, :, 1:] * left[:, :, :-1]).sum(axis=(1, 2))
         neighbours += (left[:, 1:] * left[:, :-1]).sum(axis=(1, 2))
@@ -159,11 +157,11 @@ class _Fit:
         return np.asarray(self.scale / np.maximum(allowed * np.abs(self.greys[:, 0]), 1e-6), float)
 
     def patches(self) -> Patches:
-        """In the scan."""
+        """Fitted disks as patches, in pixels of the scan."""
         return Patches(self.middles + self.centers, self.shapes, self.greys[:, 0])
 
     def is_disk(self, starts: Patches, most_misfit: float) -> Mask:
-        """(n,) whether a disk explains them so well, and is still about what it started from."""
+        """(n,) whether the misfit is small and the disk is still the object that the fit started from."""
         found = self.patches()
         moved = np.hypot(*(found.centers - starts.centers).T) / starts.radii
         grown = np.abs(np.log(np.maximum(found.radii, 1e-6) / starts.radii))
@@ -173,8 +171,8 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Of pixels (n, pixels) about ellipses: radius: from the centre, 1 on the ellipse; col, row: its direction in the
-    unit disk; px: of a radius there, across the edge; distance: from the edge, px, positive inside."""
+    """Position of pixels (n, pixels) relative to their ellipse. radius: normalised, 1 on the ellipse; col, row:
+    direction in the unit disk; px: length of a radius across the edge; distance: to the edge, px, positive inside."""
 
     radius: Image
     col: Image
@@ -194,8 +192,8 @@ class _Edges:
         return cls(radius, direction[:, 0], direction[:, 1], px, (1 - radius) * px)
 
     def design(self, fit: _Fit) -> Image:
-        """(n, unknowns, pixels) derivatives by place, size, stretch and shear in units of the ellipse and by the blur,
-        px, all over the gain; by gain, offset and slopes."""
+        """(n, unknowns, pixels) derivatives with respect to centre, size, stretch and shear (in units of the ellipse)
+        and blur (px), all divided by the gain; then with respect to gain, offset and slopes."""
         blur, size = (one[:, None].astype(np.float32) for one in (fit.blur, fit.radius))
         place = self.distance / blur
         density = np.exp(-place * place / 2) / (np.float32(np.sqrt(2 * np.pi)) * blur)
@@ -207,10 +205,10 @@ class _Edges:
         return np.stack([*ellipse, *greys], axis=1).astype(np.float32, copy=False)
 
 
-def _masked_scales(residuals: Image, used: Mask) -> Array:
-    """(n,) the standard deviation that most of the used residuals have."""
+def _robust_scales_of_used(residuals: Image, used: Mask) -> Array:
+    """(n,) robust standard deviation of the used residuals."""
     middle, count = used.shape[1] // 2, used.sum(axis=1)
-    # Those that are not used lie half below all others and half above, so that the middle one stays the middle one.
+    # Unused pixels are put below and above all others in equal numbers, so that the median stays the median.
     beyond = np.where(np.cumsum(~used, axis=1) % 2, np.float32(np.inf), np.float32(-1))
     off = np.where(used, np.abs(residuals), beyond)
     off.partition(middle, axis=1)

@@ -1,4 +1,4 @@
-"""Round targets measured to the noise of the film: a blurred ellipse fitted by least-squares matching."""
+"""Least-squares matching of round targets: a blurred ellipse is fitted to the scan."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,33 +25,45 @@ from measure.targets.disk_fit_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORS
 Array = NDArray[np.float64]
 
 UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
-_LONGEST_MARGIN_PX = 10.0  # of ground about a disk: more only disturbs
-_NARROWEST_MARGIN_PX = 1.5  # however near a neighbour is: with less, no pixel is ground
-_LEAST_SHIFT_PX = 2.0  # from the start: a small disk may have been found so far off
-_FORM_SIGMA = 0.2  # of size and shear: as well as the start is known
-PLAIN_MARGIN_PX = 7.0  # where it is plain, for a tenth less noise than with the shortest margin
-_MARGIN_BLURS = 4.0  # in a soft scan so many standard deviations of its blur, as other marks get
-_LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
-SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
-_SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from a lone disk
-_WEAK_DAMAGE, _MOST_DAMAGE = 0.2, 0.35  # shares of the pixels about it that do not fit a disk
-_MOST_BLUR = 0.7  # of the shorter half axis
-_SURE, _MOST_FAINTER = 3.0, 0.5  # standard deviations by which a contrast may be greater, and what that may add to it
-_LARGE_PX = 0.3  # the error that a small target must not have
-_FEWEST = 8  # that tell how much targets differ
-_DUST_PX = 4.0  # the shorter half axis up to which dust may pass for a disk or hide its edge: it is seldom larger
-_SPREADS = 2.0  # of five figures that differ by what the disks show: so known are all, of disks drawn without dust
-_OUTLYING = 3.0  # standard deviations from the median, beyond which a disk has no part in the mean appearance
-_LEAST_SPREAD = 1e-4  # no frame's targets are alike to better than 1 %, nor is the linearisation of their noise
+# Background used around a disk.
+_LONGEST_MARGIN_PX = 10.0  # a wider one only adds disturbances
+_NARROWEST_MARGIN_PX = 1.5  # even beside a close neighbour: a narrower one holds no background pixel
+PLAIN_MARGIN_PX = 7.0  # on a plain background: a tenth less noise than with the narrow margin
+_MARGIN_BLURS = 4.0  # in a soft scan, standard deviations of the blur, as for other marks
+_LEAST_REACH_PX = 5.5  # from the centre: within less, the size and the blur of a small disk are not separable
+# Starting values and their uncertainty.
+_LEAST_SHIFT_PX = 2.0  # a small disk may have been detected this far off
+_FORM_SIGMA = 0.2  # standard deviation of the initial size and shear
+# Decisions.
+SMALLEST_RADIUS_PX = 1.2  # shorter half axis below which blur and size are not separable
+_SMALL_RADIUS_PX = 2.0  # shorter half axis below which a lone disk cannot be told from dust
+_WEAK_DAMAGE, _MOST_DAMAGE = 0.2, 0.35  # fraction of pixels that do not fit a disk
+_MOST_BLUR = 0.7  # in shorter half axes
+_SURE, _MOST_FAINTER = 3.0, 0.5  # upper bound of the contrast: standard deviations added, at most this share of it
+_LARGE_PX = 0.3  # a small target with a larger error must not pass
+_FEWEST = 8  # targets needed to estimate how much they differ
+_DUST_PX = 4.0  # shorter half axis up to which dust can pass for a disk or hide its edge: dust is seldom larger
+_SPREADS = 2.0  # degrees of freedom per disk of the pooled spread of five figures; from rendered disks without dust
+_OUTLYING = 3.0  # standard deviations from the median beyond which a disk is left out of the mean appearance
+_LEAST_SPREAD = 1e-4  # variance of 1 %: no frame's targets are more alike, nor is the linearisation more exact
 
 
 @dataclass(frozen=True, eq=False)
 class FittedDisk:
-    """An ellipse as fitted. center_px (2,) with its covariance; pixel_from_disk (2, 2): the unit disk's image, its
-    columns two radius vectors, px; contrast_dn: positive for a light disk; appearance_covariance (5, 5): of the
-    relative changes of its size, its stretch along the columns, its shear and its contrast, and of its blur's variance,
-    px². sloping: where it lies if its paint may slope, None where that is not told. weakness: why it is doubtful;
-    reason: why it is no disk, and then the numbers are the fit's last."""
+    """A fitted ellipse.
+
+    Attributes
+    ----------
+    center_px : (2,) column and row.
+    covariance : of the centre, by causes.
+    pixel_from_disk : (2, 2) image of the unit disk; the columns are two radius vectors, px.
+    contrast_dn : positive for a light disk.
+    appearance_covariance : (5, 5) of the relative changes in size, stretch along the columns, shear and contrast, and
+        of the blur's variance, px².
+    sloping : centre under the hypothesis that the grey value slopes across the disk; None where it was not estimated.
+    weakness : why the disk is doubtful.
+    reason : why it is not a disk; the other values are then those of the last iteration.
+    """
 
     center_px: Array
     covariance: Covariance
@@ -67,37 +79,38 @@ class FittedDisk:
 
     @property
     def covariance_px2(self) -> Array:
-        """(2, 2) of the centre, all causes together."""
+        """(2, 2) of the centre, sum of all causes."""
         return self.covariance.px2
 
     @property
     def half_axes_px(self) -> Array:
-        """(2,) the longer and the shorter."""
+        """(2,) longer and shorter half axis."""
         return np.asarray(np.linalg.svd(self.pixel_from_disk, compute_uv=False))
 
     @property
     def is_fitted(self) -> bool:
-        """Whether the fit came to an end, whatever was fitted."""
+        """Whether the fit ended with a covariance, disk or not."""
         return bool(np.all(np.isfinite(self.covariance_px2)))
 
     @property
     def is_soft(self) -> bool:
-        """Whether it was fitted, and its edge is as soft as that of a spot, which has none."""
+        """Whether the fitted edge is as soft as that of a spot without an edge."""
         return bool(self.is_fitted and self.blur_px > _MOST_BLUR * self.half_axes_px[1])
 
     @property
     def is_spoilt(self) -> bool:
-        """Whether it was fitted, and too little about it fits a disk."""
+        """Whether too few of the pixels around it fit a disk."""
         return bool(self.is_fitted and self.damaged_fraction > _MOST_DAMAGE)
 
     @property
     def contrast_sigma(self) -> float:
-        """Standard deviation of its contrast, as a share of it."""
+        """Relative standard deviation of the contrast."""
         return float(np.sqrt(self.appearance_covariance[3, 3]))
 
     @property
-    def lone_doubt(self) -> Reason:
-        """Why a disk that cannot be compared with others is doubtful: dust and spots look like it; empty otherwise."""
+    def dust_reason(self) -> Reason:
+        """Why a disk that cannot be compared with others may be dust or a spot; empty if it is neither small nor
+        soft."""
         shorter = self.half_axes_px[1]
         if shorter < _SMALL_RADIUS_PX:
             message = f"small: half axis {shorter:.1f} px, dust of its size would look the same"
@@ -109,7 +122,7 @@ class FittedDisk:
 
     @property
     def quality(self) -> dict[str, float]:
-        """Named figures for the mark's row."""
+        """Quality figures by column name of comparator.csv."""
         longer, shorter = self.half_axes_px
         return {
             "snr": abs(self.contrast_dn) / max(self.noise_dn, 1e-9),
@@ -129,11 +142,18 @@ def fit_disk(
     longest_margin_px: float = _LONGEST_MARGIN_PX,
     shape: MarkShape = UNIT_DISK,
 ) -> FittedDisk:
-    """Fit an ellipse near center_px (2,), which pixel_from_disk (2, 2) describes to some 20 %.
+    """Fit a blurred ellipse.
 
-    longest_margin_px: how far about it grey values may be used; less where a neighbour is near. shape: another drawing
-    of radius 1 that is fitted in the disk's place, with a rotation too.
-    Never raises for what the picture holds: a fit that fails, or shows that there is no disk, has a reason.
+    Parameters
+    ----------
+    center_px : (2,) approximate centre.
+    pixel_from_disk : (2, 2) approximate form, right to 20 % or so.
+    longest_margin_px : width of the background that may be used, less where a neighbour is near.
+    shape : another drawing of radius 1 to fit in place of the disk, with its rotation.
+
+    Returns
+    -------
+    The fit. Where it fails, or shows that there is no disk, it has a reason; the image content never raises an error.
     """
     start = np.column_stack([pixel_from_disk, center_px])
     radius = linear_scale(pixel_from_disk)
@@ -151,21 +171,21 @@ def fit_disk(
     )
     window = read_window(scan, mark_window(shape, start, wide + BESIDE_PX))
 
-    def fit_with_ground(margin_px: float) -> FittedDisk:
+    def fit_with_margin(margin_px: float) -> FittedDisk:
         fit = match(window, shape, start, replace(options, margin_px=margin_px))
         return _assess(fit, covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn))
 
-    disk = fit_with_ground(wide)
+    disk = fit_with_margin(wide)
     soft = min(_MARGIN_BLURS * disk.blur_px, longest_margin_px)
-    # In less ground than its blur reaches, a disk's blur, size and contrast may run away together.
+    # With less background than the blur reaches, blur, size and contrast may diverge together.
     if soft > wide and not (disk.reason and disk.is_fitted):
-        softer = fit_with_ground(soft)
+        softer = fit_with_margin(soft)
         disk = disk if softer.reason else softer
-    # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better, as
-    # it does how soft an edge is: what passes with less of it, at another place, may be the dust itself.
+    # A narrow pad or a ring around the disk is not damage; dust is. The wider margin shows dust and soft edges better:
+    # a disk that passes only with the narrow margin, and at another place, may be the dust itself.
     if not disk.reason or disk.is_soft or not sure < wide:
         return disk
-    narrow = fit_with_ground(sure)
+    narrow = fit_with_margin(sure)
     if narrow.reason or not disk.is_spoilt:
         return narrow
     agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
@@ -173,7 +193,7 @@ def fit_disk(
 
 
 def _appearance_covariance(fit: MarkFit) -> Array:
-    """(5, 5) as a fitted disk has it."""
+    """(5, 5), see `FittedDisk.appearance_covariance`."""
     assert fit.covariance is not None
     gain = len(fit.covariance) - GREY
     figures = [2, 3, 4, gain, gain - 1]
@@ -182,8 +202,8 @@ def _appearance_covariance(fit: MarkFit) -> Array:
 
 
 def _assess(fit: MarkFit, compression_px2: Array) -> FittedDisk:
-    """The disk of a fit with its reason or weakness, where the fit's figures give one; residuals of a picture of
-    something else are alike in neighbouring pixels."""
+    """Convert a fit to a disk, with a reason or weakness where its figures give one. Correlated residuals show that the
+    window holds something else."""
     disk = FittedDisk(
         center_px=fit.center_px,
         covariance=fit.place_covariance.plus(Cause.COMPRESSION, compression_px2),
@@ -200,7 +220,7 @@ def _assess(fit: MarkFit, compression_px2: Array) -> FittedDisk:
         return disk
     reason = weakness = NO_REASON
     contrast, (_, shorter) = abs(disk.contrast_dn), disk.half_axes_px
-    # White residuals are noise, which also moves a contrast: as strong as it may be, the disk counts.
+    # White residuals are pure noise, which also disturbs the contrast: its upper bound decides.
     most = contrast * (1 + min(_SURE * disk.contrast_sigma, _MOST_FAINTER)) if fit.covariance_is_white else contrast
     worst = WORST_SMOOTH_MISFIT if fit.neighbour_correlation > SMOOTH else WORST_MISFIT
     if not disk.is_fitted or most < LEAST_SNR * disk.noise_dn:
@@ -220,40 +240,42 @@ def _assess(fit: MarkFit, compression_px2: Array) -> FittedDisk:
     return replace(disk, reason=reason, weakness=weakness)
 
 
-def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[Reason]:
-    """Tests each disk of a scan for dust against the others.
+def dust_reasons(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[Reason]:
+    """Test each disk of a scan for dust, by comparison with the others.
 
     Parameters
     ----------
-    disks : as fitted. Fewer than eight do not show how much targets differ: each that dust may look like is doubted.
-    predicted : pixel_from_disk (2, 2) of each, right but for a factor common to all.
+    disks : fitted disks. Fewer than eight do not show how much targets differ: each is then judged alone.
+    predicted : (2, 2) predicted pixel_from_disk of each, right up to a common factor.
 
     Returns
     -------
-    Why each disk may be as far off as only dust is, empty where it is too large for dust and not soft, or well
-    determined and like the others.
+    Reason why each disk may be dust or disturbed by it. Empty for a disk that is too large for dust and not soft, or
+    that is precise and resembles the others.
 
     Notes
     -----
-    Dust on a small disk may leave no residual that shows it, and be taken for another size, form, contrast or blur of
-    the disk, or for paint that slopes. So each disk's appearance is compared with that of the others, by the noise that
-    its fit gives and by how much the targets differ themselves.
+    Dust on a small disk may leave no visible residual: it changes the fitted size, form, contrast, blur or grey-value
+    slope instead. Each disk's appearance is therefore tested against the others' mean, with the covariance of its fit
+    and the robustly estimated spread of the targets themselves.
     """
     if len(disks) < _FEWEST:
-        return [disk.lone_doubt for disk in disks]
+        return [disk.dust_reason for disk in disks]
     appearances = np.array([_appearance(disk, shape) for disk, shape in zip(disks, predicted, strict=True)])
     noise = np.array([disk.appearance_covariance for disk in disks])
     off, spread = _robust_deviations(appearances, np.einsum("nii->ni", noise))
     squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(noise + np.diag(spread)), off)
     return [
-        _doubt(disk, own, float(square), len(disks)) if disk.is_soft or disk.half_axes_px[1] < _DUST_PX else NO_REASON
+        _dust_reason(disk, own, float(square), len(disks))
+        if disk.is_soft or disk.half_axes_px[1] < _DUST_PX
+        else NO_REASON
         for disk, own, square in zip(disks, off, squares, strict=True)
     ]
 
 
-def _doubt(disk: FittedDisk, off: Array, squares: float, count: int) -> Reason:
-    """Of a disk that dust may look like; off (5,): its appearance less that of the others, squares: the same in its
-    standard deviations, squared; count: of all. Slopes of its paint are two more figures, independent of these."""
+def _dust_reason(disk: FittedDisk, off: Array, squares: float, count: int) -> Reason:
+    """Test one small or soft disk. off (5,): its appearance minus the mean; squares: Mahalanobis distance of off,
+    squared; count: number of disks. The slope of its grey values adds two independent degrees of freedom."""
     slopes = 0.0 if disk.sloping is None else disk.sloping.sigmas**2
     figures = len(off) + (0 if disk.sloping is None else 2)
     if fdtrc(figures, _SPREADS * MEDIAN_EFFICIENCY * count, (squares + slopes) / figures) < DISK_UNLIKE_THE_OTHERS:
@@ -271,9 +293,8 @@ def _doubt(disk: FittedDisk, off: Array, squares: float, count: int) -> Reason:
 
 
 def _robust_deviations(appearances: Array, noise: Array) -> tuple[Array, Array]:
-    """(n, figures) of appearances from what most have, and (figures,) the variance by which targets differ themselves,
-    from their median absolute deviations less the noise, variances (n, figures). Form has no direction: stretch and
-    shear vary alike."""
+    """(n, figures) deviations of appearances from their robust mean, and (figures,) variance between targets: the
+    squared median absolute deviation minus noise, variances (n, figures). Stretch and shear share one variance."""
     off = appearances - np.median(appearances, axis=0)
     variance = (SIGMA_OF_DEVIATION * np.median(np.abs(off), axis=0)) ** 2 - np.median(noise, axis=0)
     spread = np.maximum(variance, _LEAST_SPREAD)
@@ -283,8 +304,8 @@ def _robust_deviations(appearances: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def _appearance(disk: FittedDisk, predicted: Array) -> Array:
-    """(5,) logarithm of size, stretch and shear against the predicted ellipse, those of the symmetric change that makes
-    the one ellipse the other, and of contrast; the blur's variance, px²."""
+    """(5,) logarithms of size, stretch, shear and contrast, and the blur's variance, px². The first three are those of
+    the symmetric matrix that maps the predicted ellipse to the fitted one."""
     root = _root(predicted @ predicted.T)
     inverse = np.linalg.inv(root)
     change = inverse @ _root(root @ disk.pixel_from_disk @ disk.pixel_from_disk.T @ root) @ inverse
@@ -295,6 +316,6 @@ def _appearance(disk: FittedDisk, predicted: Array) -> Array:
 
 
 def _root(matrix: Array) -> Array:
-    """The square root of a symmetric, positive matrix (2, 2)."""
+    """Square root of a symmetric positive-definite matrix (2, 2)."""
     values, vectors = np.linalg.eigh(matrix)
     return np.asarray((vectors * np.sqrt(values)) @ vectors.T)

@@ -1,5 +1,4 @@
-"""Disks and crosses of a test field measured where they are predicted: searched by correlation, identified, fitted and
-checked."""
+"""Measurement of predicted targets, disks or crosses: search by NCC, fit, identification, tests."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -16,31 +15,31 @@ from measure.marks.shapes import MarkShape, Polarity, cross, thinnest_mm
 from measure.noise.robust_estimation import robust_scale
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.targets.disks import SMALLEST_RADIUS_PX, UNIT_DISK, FittedDisk, doubts, fit_disk
+from measure.targets.disks import SMALLEST_RADIUS_PX, UNIT_DISK, FittedDisk, dust_reasons, fit_disk
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-_SEARCHED_RADIUS_PX = 4.0  # windows are reduced until the shorter half axis has about this length...
-_THINNEST_PX = 1.5  # ...or the thinnest line this width
-_LEAST_CORRELATION = 0.55  # below it a spot is worth no fit, which decides what is a target
-_MOST_SPOTS = 6  # fitted near one prediction
-_EXPECTED_BLUR_PX = 1.0  # of the reduced window
-_GROUND, _GROUND_PX = 0.3, 1.5  # about the target in its predicted picture: a share of its reach, and for the blur
-_SAME_DISK = 0.5  # of the shorter half axis: spots nearer to a disk's centre are that disk
-_AFFINE_FROM = 8  # targets that agree: from so many on the shared shift may vary over the frame
-_VOTE_SHARE = 0.2  # of the farthest link: how far shifts may differ and still count as one
-_ROUNDS = 5  # of the shared shift and the gate, each by the other
-_FORBIDDEN = 1e9  # px: the cost of a link that there is not
+_SEARCHED_RADIUS_PX = 4.0  # shorter half axis in the reduced window, provided that...
+_THINNEST_PX = 1.5  # ...the thinnest line keeps this width
+_LEAST_CORRELATION = 0.55  # NCC below which a peak is not fitted; the fit decides what is a target
+_MOST_SPOTS = 6  # peaks fitted near one prediction
+_EXPECTED_BLUR_PX = 1.0  # in the reduced window
+_GROUND, _GROUND_PX = 0.3, 1.5  # background in the template: in radii, plus px for the blur
+_SAME_DISK = 0.5  # in shorter half axes: a peak this near to a fitted disk is that disk
+_AFFINE_FROM = 8  # consistent targets needed for an affine shift model
+_VOTE_SHARE = 0.2  # of the longest link: shifts within it count as equal
+_ROUNDS = 5  # of alternating between the common shift and the gate
+_FORBIDDEN = 1e9  # px: cost of a pair that is not a link
 
 
 @dataclass(frozen=True, eq=False)
 class TargetPrediction:
-    """Where a target should be, and how its shape is sheared there.
+    """Predicted place and form of a target.
 
-    center_px (2,): column and row; pixel_from_disk (2, 2): the target's circle of radius 1 to px, its columns the
-    images of two radius vectors at right angles; search_px: how far off the prediction may be. perspective (2,), per
-    px: what an affinity puts d px off the centre lies d / (1 + perspective d) off it.
+    center_px (2,): column and row; pixel_from_disk (2, 2): unit circle of the target to px, its columns the images of
+    two orthogonal radius vectors; search_px: search radius; perspective (2,), per px: a point at d px from the centre
+    in the affine image lies at d / (1 + perspective d).
     """
 
     point: str
@@ -57,17 +56,17 @@ class TargetPrediction:
 
     @property
     def half_axes_px(self) -> Array:
-        """(2,) the longer and the shorter half axis of the ellipse."""
+        """(2,) longer and shorter half axis of the ellipse."""
         return np.asarray(np.linalg.svd(self.pixel_from_disk, compute_uv=False))
 
 
 @dataclass(frozen=True)
 class TargetOptions:
-    """How targets are measured.
+    """Options of the measurement.
 
-    polarity: lighter or darker than their surroundings, "auto": what most of them are. size_tolerance: the fitted
-    radius over the predicted one, or the reverse, at most. gate_sigmas, least_gate_px: how far from its place a target
-    may lie, after the shift that all of them share was found, in robust standard deviations of all, and never less.
+    polarity: lighter or darker than the background; "auto": as most of them are. size_tolerance: largest ratio of
+    fitted and predicted radius, either way. gate_sigmas: largest distance from the predicted place after the common
+    shift, in robust standard deviations of all targets; least_gate_px: its lower bound.
     """
 
     polarity: Polarity = "auto"
@@ -87,22 +86,24 @@ class TargetOptions:
 def measure_disks(
     scan: Scan, predictions: Sequence[TargetPrediction], options: TargetOptions | None = None
 ) -> tuple[MarkMeasurement, ...]:
-    """Find, fit and identify disks.
+    """Search, fit and identify predicted disks.
+
+    A disk is identified if it is the only one of the right size near the predicted place, after the shift that all
+    targets have in common.
 
     Parameters
     ----------
-    predictions : where each target should be. A disk is a prediction's target if it is the one disk of the right size
-        near the place where the prediction and the shift that all targets share put it.
+    predictions : predicted places and forms.
     options : None: the defaults of `TargetOptions`.
 
     Returns
     -------
-    One mark for each prediction, whatever became of it.
+    One mark per prediction, with its status.
 
     Raises
     ------
     ValueError
-        Where a point is predicted twice.
+        If a point is predicted twice.
     """
     return _measure_predicted(scan, predictions, options or TargetOptions(), UNIT_DISK)
 
@@ -110,12 +111,12 @@ def measure_disks(
 def measure_crosses(
     scan: Scan, predictions: Sequence[TargetPrediction], line: float, options: TargetOptions | None = None
 ) -> tuple[MarkMeasurement, ...]:
-    """Find, fit and identify upright crosses, as `measure_disks` does disks.
+    """Search, fit and identify predicted upright crosses; see `measure_disks`.
 
     Parameters
     ----------
-    predictions : radius 1 of pixel_from_disk is half an arm-to-arm length.
-    line : the arms' width in that unit.
+    predictions : radius 1 of pixel_from_disk is half the length of a bar.
+    line : bar width in that unit.
     """
     return _measure_predicted(scan, predictions, options or TargetOptions(), MarkShape(cross(1.0, line)))
 
@@ -128,14 +129,14 @@ def _measure_predicted(
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"{scan.name}: predicted twice: {', '.join(twice)}; each point is right once")
     marks = {prediction.point: _unsearchable_mark(prediction, scan) for prediction in predictions}
-    # A disk near several places is fitted from the first: in what order they are given must not matter.
+    # A disk near several predictions is fitted from the first: sort, so that the given order does not matter.
     sought = sorted((one for one in predictions if marks[one.point] is None), key=lambda prediction: prediction.point)
     found = {mark.point: mark for mark in _identified_marks(scan, sought, options, shape)}
     return tuple(marks[name] or found[name] for name in names)
 
 
 def _unsearchable_mark(prediction: TargetPrediction, scan: Scan) -> MarkMeasurement | None:
-    """The row of a target that is not even looked for."""
+    """Mark of a target that cannot be searched for; None where it can."""
     point, (col, row), shorter = prediction.point, prediction.center_px, prediction.half_axes_px[1]
     if not (-0.5 <= col < scan.width_px - 0.5 and -0.5 <= row < scan.height_px - 0.5):
         return MarkMeasurement(point, "target", None, None, Status.ABSENT, Reason("outside of the scan", Code.OUTSIDE))
@@ -153,8 +154,7 @@ def _predicted_mark(prediction: TargetPrediction, reason: Reason) -> MarkMeasure
 def _identified_marks(
     scan: Scan, predictions: Sequence[TargetPrediction], options: TargetOptions, shape: MarkShape
 ) -> list[MarkMeasurement]:
-    """The disk of each prediction: fitted near it, of the right kind, and alone at its place. Those that are unlike the
-    others of the frame are weak."""
+    """Search, assign and test: the disk of each prediction. Disks that differ from the others of the frame are weak."""
     search = _DiskSearch(scan, options, shape)
     near = [search.find_near(prediction) for prediction in predictions]
     if options.polarity == "auto":
@@ -167,7 +167,7 @@ def _identified_marks(
         for (index, reason), prediction in zip(assigned, predictions, strict=True)
         if index is not None and not reason
     ]
-    unlike = iter(doubts([disk for disk, _ in targets], [shape for _, shape in targets]))
+    unlike = iter(dust_reasons([disk for disk, _ in targets], [shape for _, shape in targets]))
     marks = []
     for prediction, (index, refusal), (_, missing) in zip(predictions, assigned, near, strict=True):
         if index is None:
@@ -184,16 +184,16 @@ def _identified_marks(
 
 
 class _DiskSearch:
-    """The disks fitted in a scan so far, each once: what looks like the target near the predictions."""
+    """Disks fitted in a scan so far, each once."""
 
     def __init__(self, scan: Scan, options: TargetOptions, shape: MarkShape) -> None:
         self.scan, self.options, self.shape = scan, options, shape
         self.disks: list[FittedDisk] = []
 
     def find_near(self, prediction: TargetPrediction) -> tuple[list[int], Reason]:
-        """The indices of the disks that may be a prediction's target; and why there are none."""
+        """Indices of the disks that may be a prediction's target, or the reason why there is none."""
         found, why = list[int](), NO_REASON
-        for spot in _spots(self.scan, prediction, self.options.polarity, self.shape):
+        for spot in _correlation_peaks(self.scan, prediction, self.options.polarity, self.shape):
             index = self._fit_spot(spot, prediction)
             if isinstance(index, Reason):
                 why = why or index
@@ -203,12 +203,12 @@ class _DiskSearch:
         return found, NO_REASON if found else Reason.combine((none, why))
 
     def _fit_spot(self, spot: Array, prediction: TargetPrediction) -> int | Reason:
-        """The index of the disk at a spot, fitted now or before; or why there is none of the right size."""
+        """Index of the disk at a correlation peak, fitted now or before; the reason if none has the right size."""
         near = (np.hypot(*(disk.center_px - spot)) < _SAME_DISK * disk.half_axes_px[1] for disk in self.disks)
         index = next((index for index, is_near in enumerate(near) if is_near), len(self.disks))
         if index == len(self.disks):
             shape = self.shape
-            if shape is not UNIT_DISK:  # a disk is an ellipse in perspective, too
+            if shape is not UNIT_DISK:  # a disk is an ellipse also in perspective
                 x, y = (prediction.perspective @ prediction.pixel_from_disk).tolist()
                 shape = replace(shape, perspective=(x, y))
             disk = fit_disk(self.scan, spot, prediction.pixel_from_disk, shape=shape)
@@ -224,7 +224,7 @@ class _DiskSearch:
         return index
 
     def keep_common_polarity(self, near: Sequence[tuple[list[int], Reason]]) -> list[tuple[list[int], Reason]]:
-        """Leave out the disks, light or dark, of which there are fewer among the predictions that found one only."""
+        """Drop the disks of the rarer polarity; only predictions with a single disk vote."""
         lone = [found[0] for found, _ in near if len(found) == 1] or [index for found, _ in near for index in found]
         signs = [np.sign(disk.contrast_dn) for disk in self.disks]
         common = np.sign(sum(signs[index] for index in lone)) or 1.0
@@ -234,11 +234,11 @@ class _DiskSearch:
         return [(own, other if found and not own else why) for own, (found, why) in zip(kept, near, strict=True)]
 
 
-def _spots(scan: Scan, prediction: TargetPrediction, polarity: str, shape: MarkShape) -> list[Array]:
-    """(2,) places within the search distance where the predicted picture correlates best, the best first."""
+def _correlation_peaks(scan: Scan, prediction: TargetPrediction, polarity: str, shape: MarkShape) -> list[Array]:
+    """(2,) places of the NCC peaks within the search radius, the highest first."""
     shorter = prediction.half_axes_px[1]
     factor = max(1, int(shorter * min(1.0 / _SEARCHED_RADIUS_PX, thinnest_mm(shape) / _THINNEST_PX)))
-    template, compared = _predicted_picture(prediction.pixel_from_disk / factor, shape)
+    template, compared = _template(prediction.pixel_from_disk / factor, shape)
     half = np.array(template.shape[::-1]) // 2
     reach = int(np.ceil(prediction.search_px / factor)) + 1
     corner = np.round(prediction.center_px).astype(int) - (reach + half) * factor - factor // 2
@@ -247,7 +247,7 @@ def _spots(scan: Scan, prediction: TargetPrediction, polarity: str, shape: MarkS
     small = cv2.resize(window, size.tolist(), interpolation=cv2.INTER_AREA)
     if float(small.max() - small.min()) <= 0.0:
         return []
-    small = small - small.mean()  # the correlation's sums are of single precision
+    small = small - small.mean()  # matchTemplate sums in single precision
     score = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED, mask=compared)
     score = np.asarray(np.nan_to_num(score, posinf=0.0, neginf=0.0), np.float32)
     signed = np.asarray({"light": score, "dark": -score}.get(polarity, np.abs(score)), np.float32)
@@ -257,9 +257,9 @@ def _spots(scan: Scan, prediction: TargetPrediction, polarity: str, shape: MarkS
     return list(places[within][:_MOST_SPOTS])
 
 
-def _predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The target as it should look, its centre that of the middle pixel, with some of its surroundings; and 1 where
-    these count. Of a disk it is what is next to it, for a ring may begin where the picture's corners are."""
+def _template(pixel_from_disk: Array, shape: MarkShape) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Template of the target, centred on the middle pixel, with some background; and its mask. The mask of a disk
+    leaves out the corners, where a ring may begin."""
     _, greatest = extent_px(shape, np.column_stack([pixel_from_disk, (0.0, 0.0)]))
     half = np.ceil(greatest * (1 + _GROUND) + _GROUND_PX).astype(int)
     width, height = (2 * half + 1).tolist()
@@ -276,9 +276,10 @@ def _predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> tuple[NDArra
 def _assign(
     places: Array, centers: Array, near: list[list[int]], options: TargetOptions
 ) -> list[tuple[int | None, Reason]]:
-    """The disk, of centers (m, 2), at each of places (n, 2): one of those near it; with a reason where that is refused.
+    """Assign disks with centers (m, 2) to predicted places (n, 2), one to one, by least total distance.
 
-    One disk a place at most, and one place a disk; a place with two disks in its gate gets none.
+    Returns the disk's index for each place, with a reason where it is refused: outside the gate, the target of another
+    place, or not alone in the gate.
     """
     links = np.array([(place, disk) for place, disks in enumerate(near) for disk in disks], int).reshape(-1, 2)
     if not len(links):
@@ -311,8 +312,8 @@ def _assign(
 
 
 def _residuals_and_gate(places: Array, shifts: Array, place: Integers, options: TargetOptions) -> tuple[Array, float]:
-    """(n,) px of links' shifts (n, 2) from places (n, 2) less the shift that most of them share; and the gate, a few
-    robust standard deviations of those that share it. place (n,): the number of each."""
+    """(n,) residuals of the links' shifts (n, 2) from the common shift, px, and the gate: some robust standard
+    deviations of the consistent links. places (n, 2), place (n,): predicted place of each link and its number."""
     tolerance = max(options.least_gate_px, _VOTE_SHARE * float(np.hypot(*shifts.T).max()))
     residuals, gate = np.hypot(*(shifts - _most_voted(shifts, place, tolerance)).T), tolerance
     for _ in range(_ROUNDS):
@@ -331,7 +332,7 @@ def _residuals_and_gate(places: Array, shifts: Array, place: Integers, options: 
 
 
 def _most_voted(shifts: Array, place: Integers, tolerance: float) -> Array:
-    """(2,) the shift that the links of most places agree with, each place counted once; of equals the shortest."""
+    """(2,) shift with which the links of most places agree, each place counted once; the shortest one of equals."""
     best, best_votes = shifts[0], (-1, 0.0)
     for shift in shifts:
         agree = np.hypot(*(shifts - shift).T) <= tolerance
@@ -342,7 +343,7 @@ def _most_voted(shifts: Array, place: Integers, tolerance: float) -> Array:
 
 
 def _shift_model(places: Array, shifts: Array, agreeing: NDArray[np.bool_]) -> Array:
-    """(n, 2) the shared shift at all places: their median, or an affine function where there are enough."""
+    """(n, 2) common shift at all places: the median of the consistent ones, or an affine fit if there are enough."""
     if agreeing.sum() < _AFFINE_FROM:
         return np.broadcast_to(np.median(shifts[agreeing], axis=0), shifts.shape)
     middle, spread = places[agreeing].mean(axis=0), np.maximum(places[agreeing].std(axis=0), 1.0)

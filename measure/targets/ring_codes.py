@@ -1,4 +1,4 @@
-"""Ring-coded targets: a dot with a ring about it that is cut into equal segments, each of them a bit."""
+"""Ring-coded targets: a dot in a ring that is divided into equal segments, one bit each."""
 
 from dataclasses import dataclass
 
@@ -12,20 +12,20 @@ from measure.targets.block_search import Candidate
 Array = NDArray[np.float64]
 
 _SAMPLES = 16  # along each segment
-_RING_SHARES = (0.35, 0.5, 0.65)  # where across the ring it is sampled: its edges are blurred
-_CORE = 0.4  # of the dot's radius: the middle of the dot
-_GAP_LEVEL = 0.35  # of the dot's contrast: the gap between dot and ring is plain ground
-_LEAST_PLAIN = 0.97  # of the gap
-_EDGE_SAMPLES = 4  # at either end of a segment, which blur and perspective may give to its neighbour
-_SURE = 0.3  # how near to ground or dot a bit must be, in units of the dot's contrast
+_RING_SHARES = (0.35, 0.5, 0.65)  # sampled positions across the ring, away from its blurred edges
+_CORE = 0.4  # in radii of the dot: where the dot's grey value is sampled
+_GAP_LEVEL = 0.35  # in contrasts of the dot: tolerance of the background in the gap
+_LEAST_PLAIN = 0.97  # fraction of samples that must be within tolerance
+_EDGE_SAMPLES = 4  # ignored at either end of a segment, for blur and perspective
+_SURE = 0.3  # in contrasts of the dot: tolerance of a bit's grey value
 
 
 @dataclass(frozen=True)
 class RingCode:
-    """bits: the segments of the ring; ring: its inner and outer radius in units of the dot's radius.
+    """Design of a ring code. bits: number of segments; ring: inner and outer radius in radii of the dot.
 
-    The default is the common 12-bit code (Schneider, IDENT/VISION 1991), whose ring is as wide as the gap and as the
-    dot's radius. A code's number is the smallest that its segments give.
+    The default is the common 12-bit code (Schneider, IDENT/VISION 1991): ring, gap and radius of the dot are equally
+    wide. The number of a code is the smallest over all rotations of its segments.
     """
 
     bits: int = 12
@@ -38,17 +38,17 @@ class RingCode:
             raise ValueError(f"its ring is {list(self.ring)} of the dot's radius; 1.2 or more, the inner one first")
 
     def number(self, segments: NDArray[np.bool_]) -> int:
-        """The smallest number that the segments (bits,), in clockwise order, give from any start, first bit highest."""
+        """Smallest number over all rotations of the segments (bits,), clockwise, most significant bit first."""
         weights = 1 << np.arange(self.bits)[::-1]
         return min(int(weights @ np.roll(segments, turn)) for turn in range(self.bits))
 
     def mirrored(self, number: int) -> int:
-        """The number whose ring, seen from behind, reads as this one."""
+        """Number of the mirror image of a code."""
         return self.least_turn(int(f"{number:0{self.bits}b}"[::-1], 2))
 
     def published_numbers(self) -> tuple[int, ...]:
-        """The numbers of DE 197 33 466 A1, in rising order: an even number of set bits, two of them opposite one
-        another. Any other number is read too."""
+        """Numbers of DE 197 33 466 A1, ascending: an even number of set bits, two of them opposite each other. Other
+        numbers are read as well."""
         odd = range(1, 2**self.bits - 1, 2)
         return tuple(number for number in odd if self._is_published(number) and self._is_least(number))
 
@@ -61,35 +61,35 @@ class RingCode:
         return all(number <= (number << turn & whole | number >> self.bits - turn) for turn in range(1, self.bits))
 
     def least_turn(self, number: int) -> int:
-        """The number in the form in which it is read."""
+        """Smallest number over all rotations of a number's bits."""
         return self.number(np.array([number >> bit & 1 for bit in range(self.bits)[::-1]], bool))
 
 
 def read_code(scan: Scan, dot: Candidate, code: RingCode) -> int | None:
-    """Read the number in the ring about a dot.
+    """Read the code in the ring around a dot.
 
     Returns
     -------
-    None where there is no ring, or one that is not of this code.
+    The number; None where there is no ring of this code.
 
     Notes
     -----
-    The ring is sampled along the dot's own ellipse, enlarged: what perspective does to both is the same but for some
-    percent. Set bits are those that look like the dot (Schneider, IDENT/VISION 1991).
+    The ring is sampled along the enlarged ellipse of the dot: perspective changes both alike, to a few per cent. A
+    segment is a set bit if it has the grey value of the dot (Schneider, IDENT/VISION 1991).
     """
     inner, outer = code.ring
     angles = 2.0 * np.pi * np.arange(code.bits * _SAMPLES) / (code.bits * _SAMPLES)
     gap_radius = (1.0 + inner) / 2.0
     radii = np.array([_CORE, gap_radius, *(inner + share * (outer - inner) for share in _RING_SHARES)])
-    core, gap, *ring = _sampled(scan, dot, radii, angles)
+    core, gap, *ring = _sample_rings(scan, dot, radii, angles)
     ground, contrast = float(np.median(gap)), float(np.median(core) - np.median(gap))
     if contrast * dot.contrast_dn <= 0.0 or np.mean(np.abs(gap - ground) < _GAP_LEVEL * abs(contrast)) < _LEAST_PLAIN:
         return None
-    return _decoded(((np.mean(ring, axis=0) - ground) / contrast), code)
+    return _decode(((np.mean(ring, axis=0) - ground) / contrast), code)
 
 
-def _sampled(scan: Scan, dot: Candidate, radii: Array, angles: Array) -> Array:
-    """(radii, angles) grey values on ellipses like the dot's, clockwise as seen."""
+def _sample_rings(scan: Scan, dot: Candidate, radii: Array, angles: Array) -> Array:
+    """(radii, angles) grey values on ellipses similar to the dot's, clockwise in the image."""
     axes = dot.pixel_from_disk
     if np.linalg.det(axes) < 0.0:
         axes = axes * np.array([1.0, -1.0])
@@ -102,9 +102,9 @@ def _sampled(scan: Scan, dot: Candidate, radii: Array, angles: Array) -> Array:
     return np.asarray(cv2.remap(window, within[..., 0], within[..., 1], cv2.INTER_LINEAR), np.float64)
 
 
-def _decoded(levels: Array, code: RingCode) -> int | None:
-    """The number of a ring's levels (bits * _SAMPLES,), 0 the ground and 1 the dot; None where no start of the segments
-    makes all of them plain, or where they are all alike."""
+def _decode(levels: Array, code: RingCode) -> int | None:
+    """Number of a ring with levels (bits * _SAMPLES,), 0: background, 1: dot. None where no phase of the segments makes
+    each of them uniform, or where all are equal."""
     turned = np.stack([np.roll(levels, -phase).reshape(code.bits, _SAMPLES) for phase in range(_SAMPLES)])
     strays = np.minimum((turned > 0.5).sum(axis=2), (turned <= 0.5).sum(axis=2)).sum(axis=1)
     segments = turned[int(np.argmin(strays))]

@@ -1,4 +1,4 @@
-"""Flat sheets of dots: the homography and radial distortion of a picture of one, and which dot is which point."""
+"""Flat sheets of dots: homography and radial distortion of an image of a sheet, and identification of its dots."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,31 +14,31 @@ from measure.noise.robust_estimation import robust_scale
 
 Array = NDArray[np.float64]
 
-_RADIAL_FROM, _SECOND_RADIAL_FROM = 10, 30  # points, from which on the lens's radial distortion is estimated too
-_LARGEST_RADIAL = 0.6  # at the picture's corner, relative
-_SETTLING = 5  # rounds, in which a view takes in what the lens moved
-_FAR = 4.0  # medians of the distances, beyond which a point does not tell where the sheet lies
-_LEAST_FAR_PX = 1.0  # no point nearer than it is far
-_USUAL_FOCAL = 2.0  # half diagonals, where no view is oblique enough to tell it
 Indices = NDArray[np.int64]
 
-_NEIGHBOURS = 8  # of a named point on the sheet, that are looked for next
-_NEAR = 0.3  # of the distance to the next point in the picture, between where a dot is expected and where it is
-_IDLE_ROUNDS = 3  # after which names that come and go are not followed any further
-_MOST_PAIRS = 150  # of coded dots
-_GROWN = 8  # suggestions, the best ones, that are followed to their end
-_LEAST_NAMED = 8  # dots: a homography goes through any four
-_LEAST_SHARE = 0.5  # of the sheet's points in the picture
-_GATE_SIGMAS, _LEAST_GATE_PX = 6.0, 3.0  # of the dots' scatter about their places, how far off one may lie
-_SHAPE = 1.35  # radii of a dot's ellipse over those expected, in any direction, or the reverse
+_RADIAL_FROM, _SECOND_RADIAL_FROM = 10, 30  # points needed to estimate k1, and k2
+_LARGEST_RADIAL = 0.6  # at the image corner, relative
+_SETTLING = 5  # rounds of outlier rejection and refit
+_FAR = 4.0  # in median distances: a point farther off is an outlier
+_LEAST_FAR_PX = 1.0  # lower bound of that distance
+_USUAL_FOCAL = 2.0  # half diagonals; used where no view is oblique enough to determine it
+_NEIGHBOURS = 8  # of a named point on the sheet, searched next
+_NEAR = 0.3  # in spacings of the points: largest distance of a dot from its predicted place
+_IDLE_ROUNDS = 3  # rounds without a gain after which growing ends
+_MOST_PAIRS = 150  # of coded dots that are tried
+_GROWN = 8  # best hypotheses that are grown
+_LEAST_NAMED = 8  # dots: a homography fits any four
+_LEAST_SHARE = 0.5  # of the sheet's points within the image
+_GATE_SIGMAS, _LEAST_GATE_PX = 6.0, 3.0  # largest distance of a dot from its place, in robust standard deviations
+_SHAPE = 1.35  # largest ratio of measured and predicted radius, in any direction, either way
 
 
 @dataclass(frozen=True, eq=False)
 class SheetView:
-    """The sheet as a picture shows it: a homography and radial distortion about the picture's middle.
+    """View of a sheet: a homography and radial distortion about the image centre.
 
-    homography (3, 3): sheet to undistorted px about the middle, in half diagonals; radial (2,): the undistorted place
-    is (1 + k1 r² + k2 r⁴) times the distorted one.
+    homography (3, 3): sheet to undistorted image coordinates about the centre, in half diagonals; radial (2,): k1 and
+    k2 of undistorted = (1 + k1 r² + k2 r⁴) * distorted.
     """
 
     homography: Array
@@ -46,19 +46,19 @@ class SheetView:
     size_px: tuple[int, int]
 
     def undistorted(self, places_px: Array) -> Array:
-        """(n, 2) places in the picture as the homography gives them."""
+        """(n, 2) undistorted image coordinates, in half diagonals, of pixels (n, 2)."""
         place = (places_px - self._middle) / self._unit
         r2 = (place**2).sum(axis=1, keepdims=True)
         return np.asarray(place * (1.0 + self.radial[0] * r2 + self.radial[1] * r2**2))
 
     def ideal(self, sheet: Array) -> Array:
-        """(n, 2) what the homography makes of points of the sheet; nan behind the camera."""
+        """(n, 2) undistorted image coordinates, in half diagonals, of points of the sheet; nan behind the camera."""
         mapped = np.column_stack([sheet, np.ones(len(sheet))]) @ self.homography.T
         depth = np.where(mapped[:, 2:] > 1e-9, mapped[:, 2:], np.nan)
         return np.asarray(mapped[:, :2] / depth)
 
     def places_px(self, sheet: Array) -> Array:
-        """(n, 2) where points of the sheet are in the picture; nan behind the camera, or where the lens folds."""
+        """(n, 2) pixels of points of the sheet; nan behind the camera, or where the distortion is not invertible."""
         ideal = self.ideal(sheet)
         place = ideal.copy()
         for _ in range(25):
@@ -70,27 +70,27 @@ class SheetView:
         return np.where(unsettled[:, None], np.nan, places)
 
     def pixel_from_disks(self, sheet: Array, radius: float) -> Array:
-        """(n, 2, 2) the images of two radius vectors of disks about points of the sheet, px."""
+        """(n, 2, 2) images of two orthogonal radius vectors of disks centred on points of the sheet, px."""
         steps = radius * np.eye(2)
         return np.stack([self.places_px(sheet + step) - self.places_px(sheet - step) for step in steps], axis=-1) / 2.0
 
     def pixel_from_space(self, sheet: Array, focal: float, step: float) -> Array:
-        """(n, 2, 3) how far a unit along the sheet, both ways, and one above it move its points, px; focal: the lens's
-        focal length in half diagonals; step: a small length on the sheet."""
+        """(n, 2, 3) derivatives of the pixels by two coordinates in the sheet and one normal to it. focal: focal length
+        in half diagonals; step: of the numerical derivatives, in units of the sheet."""
         along = self.pixel_from_disks(sheet, step) / step
         to_camera = np.diag([1.0, 1.0, focal])
         column, row = (to_camera @ self.homography[:, :2]).T
         length = np.sqrt(np.linalg.norm(column) * np.linalg.norm(row))
         above = np.linalg.solve(to_camera, np.cross(column, row)) / length
         mapped = np.column_stack([sheet, np.ones(len(sheet))]) @ self.homography.T
-        # Of the homography, but for the depth by which all three are divided.
+        # Up to the common factor 1 / depth, which cancels in on_sheet.
         ideal = np.column_stack([self.homography[:, :2], above])
         moved = ideal[:2] - (mapped[:, :2] / mapped[:, 2:])[:, :, None] * ideal[2]
         on_sheet = np.linalg.solve(moved[..., :2], moved[..., 2:])
         return np.concatenate([along, along @ on_sheet], axis=2)
 
     def focal_terms(self) -> tuple[Array, Array]:
-        """(2,) a and b of a + b focal² = 0: the sheet's two directions are at right angles and of one scale (Zhang
+        """(2,) a and b of a + b focal² = 0: the two axes of the sheet are orthogonal and of equal scale (Zhang
         2000)."""
         column, row = (self.homography[:, :2] / np.linalg.norm(self.homography[:, :2])).T
         in_picture = np.array([column[:2] @ row[:2], column[:2] @ column[:2] - row[:2] @ row[:2]])
@@ -105,9 +105,9 @@ class SheetView:
         return float(np.hypot(*self.size_px)) / 2.0
 
 
-def fitted_view(view: SheetView, points: Array, observed_px: Array) -> SheetView | None:
-    """The view, near one given, that explains best where points (n, 2) of the sheet are observed (n, 2), single
-    wrong ones tolerated; None where no camera sees them so."""
+def fit_view(view: SheetView, points: Array, observed_px: Array) -> SheetView | None:
+    """Robust fit of a view to observations (n, 2) px of points (n, 2) of the sheet, starting with the distortion of an
+    earlier view; None where some points would lie behind the camera."""
     homography = homography_through(points, view.undistorted(observed_px))
     if homography is None:
         return None
@@ -131,11 +131,18 @@ def fitted_view(view: SheetView, points: Array, observed_px: Array) -> SheetView
     return found if np.abs(found.radial).max() < _LARGEST_RADIAL else start
 
 
-def robust_view(points: Array, observed_px: Array, size_px: tuple[int, int]) -> SheetView | None:
-    """The view that more than half of the points (n, 2), observed at (n, 2) px, agree with, wherever the others are;
-    None where no camera sees them so.
+def fit_view_robustly(points: Array, observed_px: Array, size_px: tuple[int, int]) -> SheetView | None:
+    """Fit a view to points of which up to half may be gross errors.
 
-    Least median of squares (Rousseeuw 1984) without a lens, then the lens as well, by those that do not lie far off.
+    Least median of squares for the homography (Rousseeuw 1984), then homography and distortion from the inliers.
+
+    Parameters
+    ----------
+    points, observed_px : (n, 2) on the sheet and in the image.
+
+    Returns
+    -------
+    None where some inliers would lie behind the camera.
     """
     homography = cv2.findHomography(points, observed_px, cv2.LMEDS)[0]
     if homography is None:
@@ -147,7 +154,7 @@ def robust_view(points: Array, observed_px: Array, size_px: tuple[int, int]) -> 
         if np.array_equal(near, before):
             break
         before = near
-        fitted = fitted_view(view, points[near], observed_px[near])
+        fitted = fit_view(view, points[near], observed_px[near])
         if fitted is None:
             return None
         view = fitted
@@ -156,15 +163,15 @@ def robust_view(points: Array, observed_px: Array, size_px: tuple[int, int]) -> 
 
 
 def focal_length(views: Sequence[SheetView]) -> float:
-    """Of the camera that took the views, in half diagonals, as their perspective tells it."""
+    """Focal length common to the views, in half diagonals (Zhang 2000), by least squares."""
     terms = [view.focal_terms() for view in views]
     square = -sum(float(a @ b) for a, b in terms) / max(sum(float(b @ b) for _, b in terms), 1e-12)
     return float(np.sqrt(square)) if square > 0.0 else _USUAL_FOCAL
 
 
 def homography_through(source: Array, target: Array) -> Array | None:
-    """Least squares of the normalised linear equations (Hartley 1997), its depth positive at the source's mean; None
-    where the source lies on both sides of the camera."""
+    """Homography from (n, 2) to (n, 2) by the DLT with normalised coordinates (Hartley 1997), with positive depth at
+    the mean of the source; None where the source points would lie on both sides of the camera."""
     middle, spread = source.mean(axis=0), float(np.std(source)) or 1.0
     normal = (source - middle) / spread
     x, y = target.T
@@ -180,8 +187,8 @@ def homography_through(source: Array, target: Array) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class Dots:
-    """Dots found in a picture: centers_px (m, 2), pixel_from_disk (m, 2, 2), and the points of the sheet (by index)
-    that codes say some of them are."""
+    """Dots detected in an image: centers_px (m, 2), pixel_from_disk (m, 2, 2); coded: point of the sheet (index) of
+    each dot whose code was read."""
 
     centers_px: Array
     pixel_from_disk: Array
@@ -190,9 +197,9 @@ class Dots:
 
 @dataclass(frozen=True, eq=False)
 class Naming:
-    """places_px (n, 2), pixel_from_disk (n, 2, 2): where and how the points of the sheet should be seen, nan where they
-    cannot; named: the dot of each point; gate_px: how far a dot may lie from its place; misread: coded dots (index)
-    that are not the point that their code says."""
+    """Identification of a sheet's dots. places_px (n, 2), pixel_from_disk (n, 2, 2): predicted place and form of each
+    point, nan where it is not visible; named: dot of each point; gate_px: largest distance of a dot from its place;
+    misread: coded dots (index) whose code was refuted."""
 
     places_px: Array
     pixel_from_disk: Array
@@ -202,28 +209,28 @@ class Naming:
 
 
 def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | str:
-    """Name the dots that are points of a sheet.
+    """Identify the dots of a sheet from its coded dots.
 
     Parameters
     ----------
-    sheet : (n, 2) the points' places on it, in any unit and of either hand.
-    dots : as found. Coded dots are as large as one another.
-    size_px : width and height of the picture.
+    sheet : (n, 2) coordinates of the points, in any unit, right- or left-handed.
+    dots : detected dots. All coded dots have one size.
+    size_px : width and height of the image.
 
     Returns
     -------
-    The names, of a suggestion that explains most of the points that it puts into the picture; or why there are none.
+    The identification that explains most points, or the reason why there is none.
     """
     if len(dots.coded) < 2:
         return f"{len(dots.coded)} coded targets of the sheet were recognised, and two are needed"
-    views = _suggestions(sheet, dots, size_px)
+    views = _view_hypotheses(sheet, dots, size_px)
     if not views:
         return "no two of the coded targets recognised can both be what their codes say"
     near_codes = _neighbourhood(sheet, list(dots.coded.values()))
-    support = [len(_pairs(view, sheet, dots.centers_px, near_codes)) for view in views]
+    support = [len(_pair_dots(view, sheet, dots.centers_px, near_codes)) for view in views]
     best: Naming | None = None
     for index in np.argsort(-np.array(support), kind="stable")[:_GROWN]:
-        naming = _grown(views[index], sheet, dots)
+        naming = _grow(views[index], sheet, dots)
         if naming is not None and (best is None or len(naming.named) > len(best.named)):
             best = naming
         if best is not None and not best.misread:
@@ -233,8 +240,8 @@ def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | st
     return best
 
 
-def _suggestions(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> list[SheetView]:
-    """A view for each two coded dots, for the sheet's front and for its back, whose coordinates are left-handed."""
+def _view_hypotheses(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> list[SheetView]:
+    """View hypotheses, one for each pair of coded dots and each handedness of the sheet's coordinates."""
     pairs = [(a, b) for a, b in combinations(dots.coded, 2) if dots.coded[a] != dots.coded[b]]
     tried = pairs[:: len(pairs) // _MOST_PAIRS + 1]
     views = []
@@ -248,10 +255,10 @@ def _suggestions(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> list[She
 
 
 def _two_dot_points(sheet: Array, dots: Dots, first: int, second: int, hand: Array) -> tuple[Array, Array]:
-    """Places on the sheet (10, 2) and in the picture (10, 2) that two dots give: centres and ends of radius vectors.
+    """Corresponding places on the sheet (10, 2) and in the image (10, 2) from two dots: centres and ends of radii.
 
-    Their ellipses are turned so that the line through both is that of the sheet. On this line, a projective map u(t)
-    has u'(0) u'(T) = (u(T) / T)²: that gives the radius on the sheet.
+    The ellipses are rotated so that the line through both dots corresponds to that on the sheet. On this line, a
+    projective map u(t) satisfies u'(0) u'(T) = (u(T) / T)², which gives the radius on the sheet.
     """
     steps = np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], np.float64)
     along_px, observed_px = [], []
@@ -259,7 +266,7 @@ def _two_dot_points(sheet: Array, dots: Dots, first: int, second: int, hand: Arr
         axes = _right_handed(dots.pixel_from_disk[own])
         line_px = dots.centers_px[other] - dots.centers_px[own]
         on_disk = np.linalg.solve(axes, line_px)
-        turned = axes @ _turn(hand @ (sheet[dots.coded[other]] - sheet[dots.coded[own]]), on_disk) @ hand
+        turned = axes @ _rotation(hand @ (sheet[dots.coded[other]] - sheet[dots.coded[own]]), on_disk) @ hand
         along_px.append(np.hypot(*line_px) / np.hypot(*on_disk))
         observed_px.append(dots.centers_px[own] + steps @ turned.T)
     apart = np.hypot(*(sheet[dots.coded[second]] - sheet[dots.coded[first]]))
@@ -272,21 +279,21 @@ def _right_handed(axes: Array) -> Array:
     return np.asarray(axes * np.array([1.0, np.sign(np.linalg.det(axes))]))
 
 
-def _turn(start: Array, end: Array) -> Array:
-    """The rotation (2, 2) from one direction to another."""
+def _rotation(start: Array, end: Array) -> Array:
+    """Rotation matrix (2, 2) from one direction to another."""
     angle = np.arctan2(end[1], end[0]) - np.arctan2(start[1], start[0])
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def _neighbourhood(sheet: Array, points: list[int]) -> Indices:
-    """Indices of points of the sheet and of those next to them."""
+    """Indices of points of the sheet and of their neighbours."""
     count = min(_NEIGHBOURS + 1, len(sheet))
     _, near = cKDTree(sheet).query(sheet[points], k=np.arange(1, count + 1))
     return np.unique(near)
 
 
-def _pairs(view: SheetView, sheet: Array, centers_px: Array, among: Indices) -> dict[int, int]:
-    """The dot of each of the points `among`: nearest to one another and nearer than any other point's place."""
+def _pair_dots(view: SheetView, sheet: Array, centers_px: Array, among: Indices) -> dict[int, int]:
+    """Dot of each of the points `among`: mutual nearest neighbours, much closer than the next point."""
     places = view.places_px(sheet)
     visible = among[np.isfinite(places[among]).all(axis=1)]
     if len(visible) < 2 or not len(centers_px):
@@ -299,33 +306,32 @@ def _pairs(view: SheetView, sheet: Array, centers_px: Array, among: Indices) -> 
     return {int(point): int(one) for point, one in zip(visible[mutual], dot[mutual], strict=True)}
 
 
-def _grown(view: SheetView, sheet: Array, dots: Dots) -> Naming | None:
-    """Names from the coded dots outward, the view fitted anew in every round; None where it explains too little."""
+def _grow(view: SheetView, sheet: Array, dots: Dots) -> Naming | None:
+    """Grow the identification outward from the coded dots, refitting the view in each round; None if it fails."""
     among = _neighbourhood(sheet, list(dots.coded.values()))
-    pairs = _pairs(view, sheet, dots.centers_px, among)
+    pairs = _pair_dots(view, sheet, dots.centers_px, among)
     idle, most = 0, 0
     while idle < _IDLE_ROUNDS:
         if len(pairs) < _LEAST_NAMED // 2:
             return None
-        fitted = fitted_view(view, sheet[list(pairs)], dots.centers_px[list(pairs.values())])
+        fitted = fit_view(view, sheet[list(pairs)], dots.centers_px[list(pairs.values())])
         if fitted is None:
             return None
         view = fitted
-        new = _pairs(view, sheet, dots.centers_px, _neighbourhood(sheet, list(pairs)))
+        new = _pair_dots(view, sheet, dots.centers_px, _neighbourhood(sheet, list(pairs)))
         if new == pairs:
             break
         pairs = new
         idle, most = (0, len(pairs)) if len(pairs) > most else (idle + 1, most)
-    return _tested(view, sheet, dots, pairs)
+    return _verify(view, sheet, dots, pairs)
 
 
-def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Naming | None:
-    """The names that lie where the view and their neighbours put them, each dot alone at its place; None where they are
-    too few."""
+def _verify(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Naming | None:
+    """Keep dots that agree with the view and their neighbours, in place and form, and are alone; None if too few do."""
     points = np.array(list(pairs))
     observed_px = dots.centers_px[list(pairs.values())]
     places = view.places_px(sheet)
-    places += _unevenness(sheet, points, observed_px - places[points])
+    places += _neighbour_residuals(sheet, points, observed_px - places[points])
     off = observed_px - places[points]
     gate_px = max(_GATE_SIGMAS * robust_scale(off.ravel()), _LEAST_GATE_PX)
     tree = cKDTree(dots.centers_px)
@@ -333,10 +339,10 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     def is_alone(point: int) -> bool:
         return len(tree.query_ball_point(places[point], gate_px)) == 1
 
-    shapes = _shapes(view, sheet, dots, pairs)
+    shapes = _predict_forms(view, sheet, dots, pairs)
     if shapes is None:
         return None
-    like = _alike(dots.pixel_from_disk[list(pairs.values())], shapes[points])
+    like = _have_form(dots.pixel_from_disk[list(pairs.values())], shapes[points])
     named = {
         point: dot
         for (point, dot), distance, fits in zip(pairs.items(), np.hypot(*off.T), like, strict=True)
@@ -350,9 +356,9 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     return Naming(places, shapes, named, gate_px, misread)
 
 
-def _unevenness(sheet: Array, points: Indices, residuals: Array) -> Array:
-    """(n, 2) px by which dots next to each point of the sheet lie off, the point itself not asked: a sheet that is not
-    quite flat takes its dots along."""
+def _neighbour_residuals(sheet: Array, points: Indices, residuals: Array) -> Array:
+    """(n, 2) median residual of the neighbours of each point, px, without its own: a sheet that is not quite flat
+    shifts neighbouring dots alike."""
     count = min(_NEIGHBOURS + 1, len(points))
     _, near = cKDTree(sheet[points]).query(sheet, k=np.arange(1, count + 1))
     others = np.where(points[near] == np.arange(len(sheet))[:, None], -1, near)
@@ -360,9 +366,9 @@ def _unevenness(sheet: Array, points: Indices, residuals: Array) -> Array:
     return np.asarray(np.nanmedian(of_neighbours, axis=1))
 
 
-def _shapes(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Array | None:
-    """(n, 2, 2) how the dots of all points should look, of the radius on the sheet that most have; None where the view
-    shows no surroundings of any of them."""
+def _predict_forms(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Array | None:
+    """(n, 2, 2) predicted form of all dots, with their median radius on the sheet; None where the view has no
+    derivatives at any of them."""
     step = 0.01 * float(np.ptp(sheet, axis=0).max())
     unit = view.pixel_from_disks(sheet, step) / step
     areas = _areas(dots.pixel_from_disk[list(pairs.values())]) / _areas(unit[list(pairs)])
@@ -372,12 +378,12 @@ def _shapes(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
 
 
 def _areas(shapes: Array) -> Array:
-    """(n,) of the parallelograms of (n, 2, 2); nan where a shape is nan."""
+    """(n,) areas of parallelograms (n, 2, 2); nan where a shape is nan."""
     return np.asarray(np.abs(shapes[:, 0, 0] * shapes[:, 1, 1] - shapes[:, 0, 1] * shapes[:, 1, 0]))
 
 
-def _alike(shapes: Array, expected: Array) -> NDArray[np.bool_]:
-    """(n,) whether ellipses (n, 2, 2) are of the size and the shape expected."""
+def _have_form(shapes: Array, expected: Array) -> NDArray[np.bool_]:
+    """(n,) whether ellipses (n, 2, 2) have the expected size and form."""
     known = _areas(expected) > 0.0
     radii = np.linalg.svd(np.linalg.solve(expected[known], shapes[known]), compute_uv=False)
     known[known] = np.all((radii < _SHAPE) & (radii > 1.0 / _SHAPE), axis=1)

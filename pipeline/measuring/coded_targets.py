@@ -11,7 +11,7 @@ from measure.flags import NO_REASON, Code, Reason, Status
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate
-from measure.targets.consistency import along_plane, is_flat
+from measure.targets.consistency import is_flat, plane_coordinates
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.identification import TargetOptions, TargetPrediction, measure_disks
 from measure.targets.ring_codes import read_code
@@ -65,7 +65,7 @@ class CodedPoints:
                 f"{project.path}: [object] points: {len(coordinates)} points with X, Y and Z name no coded targets; "
                 "give 4."
             )
-        along = along_plane(coordinates)
+        along = plane_coordinates(coordinates)
         return cls(tuple(xyz), coordinates, along[:, :2], is_flat(along), settings)
 
 

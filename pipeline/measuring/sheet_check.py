@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from measure.flags import SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE, Code, Reason, Status
 from measure.results import MarkMeasurement
-from measure.targets.consistency import FLAT, ImagePoints, SheetImage, along_plane, compared_together, sheet_points
+from measure.targets.consistency import (
+    FLAT,
+    ImagePoints,
+    SheetImage,
+    compare_images,
+    plane_coordinates,
+    predict_sheet_points,
+)
 from pipeline.files.project_file import Project
 from pipeline.measuring.coded_targets import CodedPoints
 from pipeline.results.measured_record import MeasuredScan
@@ -55,11 +62,11 @@ def _sheet(project: Project) -> _Sheet | None:
     settings = project.targets
     if settings is not None and settings.board is not None:
         points = settings.board.object_points()
-        return _Sheet(tuple(points), along_plane(np.array(list(points.values()))))
+        return _Sheet(tuple(points), plane_coordinates(np.array(list(points.values()))))
     if settings is None or settings.code is None:
         return None
     coded = CodedPoints.of(project, settings)
-    return _Sheet(coded.ids, along_plane(coded.xyz)) if coded.is_flat else None
+    return _Sheet(coded.ids, plane_coordinates(coded.xyz)) if coded.is_flat else None
 
 
 def _images(project: Project, scans: Sequence[MeasuredScan], sheet: _Sheet) -> dict[str, ImagePoints]:
@@ -68,7 +75,7 @@ def _images(project: Project, scans: Sequence[MeasuredScan], sheet: _Sheet) -> d
     images: dict[str, ImagePoints] = {}
     for camera in project.cameras.values():
         own = [scan for scan in scans if project.camera_of(scan.frame.image) is camera]
-        points = sheet_points([_seen(scan, row) for scan in own], sheet.places)
+        points = predict_sheet_points([_seen(scan, row) for scan in own], sheet.places)
         images |= {scan.frame.image: one for scan, one in zip(own, points, strict=True) if one is not None}
     return images
 
@@ -91,7 +98,7 @@ def _verdicts(images: Sequence[ImagePoints], sheet: _Sheet) -> list[dict[str, _V
     shown = Counter(int(point) for image in images for point in image.index)
     tests = sum(shown.values())
     verdicts: list[dict[str, _Verdict]] = []
-    for image, one in zip(images, compared_together(images, sheet.places), strict=True):
+    for image, one in zip(images, compare_images(images, sheet.places), strict=True):
         most_px = FLAT * float(np.hypot(*np.ptp(image.targets.places_px, axis=0)))
         far = np.hypot(*one.off_px.T)
         rows = zip(image.index.tolist(), far.tolist(), one.chance.tolist(), strict=True)

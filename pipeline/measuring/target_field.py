@@ -12,7 +12,7 @@ from measure.flags import TARGET_ELSEWHERE, TARGET_OFF_PLACE, Code, Reason, Stat
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate
-from measure.targets.consistency import TargetPlaces, compared
+from measure.targets.consistency import TargetPlaces, compare_targets
 from measure.targets.crosses import CrossSearch, cross_candidates
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.identification import TargetOptions, TargetPrediction, measure_crosses, measure_disks
@@ -202,7 +202,7 @@ def checked_places(
         return tuple(marks)
     row = {id: i for i, id in enumerate(field.ids)}
     targets = target_places(field.of([row[id] for id in observed]), model, scan)
-    comparison = compared(targets, places_px, covariances, (scan.width_px, scan.height_px))
+    comparison = compare_targets(targets, places_px, covariances, (scan.width_px, scan.height_px))
     far = np.linalg.norm(comparison.off_px, axis=1)
     verdicts = dict(zip(observed, zip(far.tolist(), comparison.chance.tolist(), strict=True), strict=True))
     return tuple(_judged(mark, verdicts) for mark in marks)

@@ -6,7 +6,7 @@ from drawn import drawn, ellipse, scan_of, whitened
 
 from measure.flags import Status
 from measure.results import Covariance, SecondPlace
-from measure.targets.disks import FittedDisk, doubts
+from measure.targets.disks import FittedDisk, dust_reasons
 from measure.targets.identification import TargetPrediction, measure_disks
 
 CONTRAST, GROUND = 15000.0, 25000.0
@@ -78,7 +78,7 @@ def test_targets_are_odd_by_more_than_noise_and_what_all_differ_by(share: float,
             sloping = SecondPlace(of_slope.normal(0, 0.1, 2), 0.01 * np.eye(2))
             known = Covariance.from_noise(0.001 * np.eye(2))
             disks.append(FittedDisk(np.zeros(2), known, shape, contrast, 100.0, blur, 0.0, noise, sloping))
-        weak += [bool(reason) for reason in doubts(disks, [3 * np.eye(2)] * 25)]
+        weak += [bool(reason) for reason in dust_reasons(disks, [3 * np.eye(2)] * 25)]
         odd += is_odd.tolist()
     assert np.mean(np.array(weak)[~np.array(odd)]) < doubted
     assert np.all(np.array(weak)[odd])

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from measure.targets.consistency import TargetPlaces, compared
+from measure.targets.consistency import TargetPlaces, compare_targets
 
 Array = NDArray[np.float64]
 SIZE_PX, NOISE_PX = (4000, 3000), 0.05
@@ -33,7 +33,7 @@ def test_wrong_ones_are_told_and_right_ones_as_seldom_as_said(count: int) -> Non
         wrong = rng.choice(count, count // 10, replace=False)
         angle = rng.uniform(0.0, 2.0 * np.pi, len(wrong))
         seen[wrong] += rng.uniform(1.0, 4.0, (len(wrong), 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        chance = compared(targets, seen, np.tile(1e-6 * np.eye(2), (count, 1, 1)), SIZE_PX).chance
+        chance = compare_targets(targets, seen, np.tile(1e-6 * np.eye(2), (count, 1, 1)), SIZE_PX).chance
         wrong_chances.append(chance[wrong])
         chances.append(np.delete(chance, wrong))
     right = np.concatenate(chances)
@@ -46,7 +46,7 @@ def test_wrong_ones_are_told_and_right_ones_as_seldom_as_said(count: int) -> Non
 def test_right_ones_among_few_are_doubted_as_seldom_as_said() -> None:
     """A lens whose middle is not the image's bends the corners of the image, where few targets lie beside one another:
     unless that is thought of, seven times as many right ones as should lie as far off as one of a thousand."""
-    chance = np.concatenate([compared(*few(seed), SIZE_PX).chance for seed in range(20, 40)])
+    chance = np.concatenate([compare_targets(*few(seed), SIZE_PX).chance for seed in range(20, 40)])
     assert (chance < 1e-2).mean() < 0.02
     assert chance.min() > 3e-4
 
@@ -60,10 +60,10 @@ def test_points_known_less_well_may_lie_farther_off() -> None:
     rng = np.random.default_rng(5)
     sigma = np.where(np.arange(200) < 20, 1.0, 0.02)
     targets, seen = field(rng, 200, sigma)
-    chance = compared(targets, seen, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).chance
+    chance = compare_targets(targets, seen, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).chance
     assert chance.min() > 1e-4
     targets.covariance_px2[:20] = 4e-4 * np.eye(2)
-    assert np.median(compared(targets, seen, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).chance[:20]) < 1e-6
+    assert np.median(compare_targets(targets, seen, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).chance[:20]) < 1e-6
 
 
 def test_how_far_off_right_ones_lie_is_as_well_known_as_said() -> None:
@@ -72,6 +72,6 @@ def test_how_far_off_right_ones_lie_is_as_well_known_as_said() -> None:
     rng, squares = np.random.default_rng(6), []
     for _ in range(14):
         targets, seen = field(rng, 80, np.zeros(80))
-        told = compared(targets, seen, np.tile(NOISE_PX**2 * np.eye(2), (80, 1, 1)), SIZE_PX)
+        told = compare_targets(targets, seen, np.tile(NOISE_PX**2 * np.eye(2), (80, 1, 1)), SIZE_PX)
         squares.append(np.einsum("ni,nij,nj->n", told.off_px, np.linalg.inv(told.covariance_px2), told.off_px))
     assert 1.6 < np.mean(squares) < 2.0
