@@ -1,4 +1,4 @@
-"""Scans in which tie points are sought, their natural features (SIFT), and which of them two scans share."""
+"""Scans for tie points: detection of SIFT features and matching between two scans."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
@@ -23,23 +23,27 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-_LONGEST_PX = 3000  # side of the reduced scan in which features are sought
-_TILE_PX, _OVERLAP_PX = 1024, 96  # SIFT takes some 130 bytes a pixel: a tile at a time
+_LONGEST_PX = 3000  # longer side of the reduced scan
+_TILE_PX, _OVERLAP_PX = 1024, 96  # SIFT needs some 130 bytes per pixel: one tile at a time
 _CONTRAST = 0.02  # half of OpenCV's default: fields and water have weak texture
-_RATIO = 0.8  # Lowe's: nine false matches in ten have a second neighbour nearer than that, one right in twenty
-_CELLS = 12  # a side, over which the features kept are spread
-_SURPLUS = 3  # so many times the features wanted are found: some are not usable, and the strongest lie together
-_STRETCH = (0.5, 99.5)  # percentiles of the grey values that become black and white
+_RATIO = 0.8  # ratio test of Lowe: rejects nine false matches in ten, and one right match in twenty
+_CELLS = 12  # per side, over which the kept features are spread
+_SURPLUS = 3  # detected features per wanted one: some are unusable, and the strongest are clustered
+_STRETCH = (0.5, 99.5)  # percentiles of the grey values that are mapped to black and white
 
 
 @dataclass(frozen=True, eq=False)
 class TieFrame:
-    """A scan in which natural points are sought.
+    """A scan for tie points.
 
-    pixel_from_camera: (2, 3), camera mm (x', y', 1) to column and row. frame_mm: width and height of the exposed frame
-    about the camera frame's origin, None where the whole scan is one. taken_px (n, 3): column, row and radius of the
-    marks in it, which are no natural points. max_pixels: of the scan, if the user says it. part_of: the name of the
-    exposed frame where that was scanned in parts, of which this is one.
+    Attributes
+    ----------
+    image, scan : name and file.
+    pixel_from_camera : (2, 3) from camera coordinates (x', y', 1), mm, to column and row.
+    frame_mm : width and height of the exposed frame about the origin; None if the whole scan is exposed.
+    taken_px : (n, 3) column, row and radius of marks, which are excluded.
+    max_pixels : limit for the scan, if the user states one.
+    part_of : name of the exposed frame if this scan is one part of it.
     """
 
     image: str
@@ -52,11 +56,11 @@ class TieFrame:
 
     @property
     def frame(self) -> str:
-        """The name of the exposed frame."""
+        """Name of the exposed frame."""
         return self.part_of or self.image
 
     def open(self) -> Scan:
-        """The scan. Raises MeasurementError where it cannot be read."""
+        """Open the scan; raises MeasurementError where it cannot be read."""
         return open_scan(self.scan, self.max_pixels)
 
     @property
@@ -65,16 +69,17 @@ class TieFrame:
 
     @property
     def mirrored(self) -> bool:
-        """Rows count downwards, y' upwards: a scan that is not mirrored changes the sense of rotation."""
+        """Whether the scan is mirrored. Rows count downward and y' upward: an ordinary scan has a negative
+        determinant."""
         return bool(np.linalg.det(self.pixel_from_camera[:, :2]) > 0.0)
 
     def camera_px(self, places_px: Array) -> Array:
-        """(n, 2) places in the camera frame, in units of a pixel."""
+        """(n, 2) camera coordinates of places, in pixels."""
         linear, shift = self.pixel_from_camera[:, :2], self.pixel_from_camera[:, 2]
         return np.asarray((places_px - shift) @ np.linalg.inv(linear).T * self.px_per_mm)
 
     def usable(self, places_px: Array, size_px: tuple[int, int], radius_px: int = RADIUS_PX) -> Mask:
-        """Where a whole patch lies in the exposed frame and beside the marks."""
+        """Mask of the places whose whole patch lies within the exposed frame and clear of marks."""
         rim = radius_px + SPARE_PX
         inside = np.all((places_px >= rim) & (places_px <= np.array(size_px) - 1 - rim), axis=1)
         if self.frame_mm is not None:
@@ -88,9 +93,9 @@ class TieFrame:
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """places_px (n, 2): column and row in the scan; descriptors (n, 128); strengths (n,): SIFT's contrast.
-    textures (n,): how well the picture about them fixes a place, in any unit. size_px: width and height of the scan;
-    reduction: by which it was reduced before they were sought."""
+    """SIFT features of a scan. places_px (n, 2): column and row; descriptors (n, 128); strengths (n,): contrast;
+    textures (n,): smaller eigenvalue of the gradient matrix over a patch; size_px: width and height of the scan;
+    reduction: factor by which it was reduced."""
 
     places_px: Array
     descriptors: NDArray[np.float32]
@@ -107,14 +112,17 @@ class Features:
 def find_all_features(
     frames: Sequence[TieFrame], count: int, are_alike: bool, what_fails: str, workers: Executor | None
 ) -> Iterator[Features | Reason]:
-    """The features of every scan, so many at most; or why it has none, after the words for what fails so. are_alike:
-    whether the scans show one film, so that none is mirrored against another."""
+    """Detect at most count features in every scan.
+
+    are_alike: the scans show one film, so that none is mirrored against another; what_fails: start of the reason that
+    an unreadable scan gets.
+    """
     find = partial(_features_or_reason, count, are_alike, what_fails)
     return map_or_replace(workers, find, frames, lambda _, why: unreachable(what_fails, why))
 
 
 def unreachable(what_fails: str, why: str) -> Reason:
-    """Of a scan that cannot be read."""
+    """Reason of a scan that cannot be read."""
     return Reason(f"{what_fails}: {why}", Code.UNREACHABLE)
 
 
@@ -126,8 +134,8 @@ def _features_or_reason(count: int, are_alike: bool, what_fails: str, frame: Tie
 
 
 def _features(frame: TieFrame, count: int, mirrored: bool) -> Features:
-    """Features evenly over the scan, the strongest first in every part of it. mirrored: whether it is to be seen as in
-    a mirror; a turn needs no word, for descriptors turn with the picture."""
+    """Features spread evenly over the scan, the strongest of each cell first. mirrored: detect in the mirror image
+    (SIFT descriptors are invariant to rotation, not to reflection)."""
     with frame.open() as scan:
         size_px = scan.width_px, scan.height_px
         factor = -(-max(size_px) // _LONGEST_PX)
@@ -136,7 +144,7 @@ def _features(frame: TieFrame, count: int, mirrored: bool) -> Features:
     picture = np.clip((grey - black) * (255.0 / max(white - black, 1e-9)), 0.0, 255.0).astype(np.uint8)
     if mirrored:
         picture = np.ascontiguousarray(picture[:, ::-1])
-    found = _tiled(picture, _SURPLUS * count, 2 * (RADIUS_PX // factor) + 1)
+    found = _detect_in_tiles(picture, _SURPLUS * count, 2 * (RADIUS_PX // factor) + 1)
     places = found.places_px
     if mirrored:
         places = np.array([picture.shape[1] - 1, 0]) + places * np.array([-1, 1])
@@ -147,8 +155,8 @@ def _features(frame: TieFrame, count: int, mirrored: bool) -> Features:
 
 
 def read_pieces(frame: TieFrame, patches: Sequence[tuple[Array, int]]) -> list[Piece]:
-    """The pictures about places in one scan, by their maps (2, 3) from the patch and its radius, read from the top.
-    Raises MeasurementError where the scan cannot be read."""
+    """Read the windows of patches, given as map (2, 3) and radius, from top to bottom of a scan. Raises
+    MeasurementError where it cannot be read."""
     pieces: dict[int, Piece] = {}
     with frame.open() as scan:
         for k, (matrix, radius_px) in sorted(enumerate(patches), key=lambda patch: float(patch[1][0][1, 2])):
@@ -159,28 +167,26 @@ def read_pieces(frame: TieFrame, patches: Sequence[tuple[Array, int]]) -> list[P
 
 
 def shared_features(first: Features, second: Features) -> Indices:
-    """(n, 2) indices of features that are each other's nearest by far."""
+    """(n, 2) indices of mutual nearest neighbours that pass the ratio test."""
     if min(len(first.places_px), len(second.places_px)) < 2:
         return np.zeros((0, 2), np.intp)
-    there, back = _nearest(first, second), _nearest(second, first)
+    there, back = _nearest_features(first, second), _nearest_features(second, first)
     mutual = np.flatnonzero((there >= 0) & (back[there] == np.arange(len(there))))
     return np.column_stack([mutual, there[mutual]])
 
 
-def _nearest(first: Features, second: Features) -> Indices:
-    """For each feature the nearest of the second scan, -1 where another is nearly as near."""
+def _nearest_features(first: Features, second: Features) -> Indices:
+    """Nearest feature of the second scan for each of the first; -1 where the ratio test fails."""
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
     return np.array(
         [best.trainIdx if best.distance < _RATIO * other.distance else -1 for best, other in pairs], np.intp
     )
 
 
-def _tiled(picture: NDArray[np.uint8], count: int, patch_px: int) -> Features:
-    """About `count` features of a picture, found tile by tile, the strongest of each; one where there are two
-    directions at a place.
+def _detect_in_tiles(picture: NDArray[np.uint8], count: int, patch_px: int) -> Features:
+    """Detect about `count` features tile by tile; features at one place with two directions count once.
 
-    Texture is what the matching of a patch has to go by: the lesser eigenvalue of the grey values' gradients over it
-    (Förstner and Gülch 1987).
+    Texture is the smaller eigenvalue of the gradient matrix over a patch (Förstner and Gülch 1987).
     """
     tiles = [(np.empty((0, 2)), np.empty((0, 128), np.float32), np.empty(0), np.empty(0))]
     for row0, col0 in product(*(range(0, side, _TILE_PX) for side in picture.shape)):
@@ -205,7 +211,7 @@ def _tiled(picture: NDArray[np.uint8], count: int, patch_px: int) -> Features:
 
 
 def interleave_groups(group: Indices, strengths: Array) -> Indices:
-    """The order that takes the strongest of every group, then the second of every group, and so on."""
+    """Order that takes the strongest of every group first, then the second of every group, and so on."""
     order = np.lexsort((-strengths, group))
     _, starts = np.unique(group[order], return_index=True)
     rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))

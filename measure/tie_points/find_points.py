@@ -1,7 +1,7 @@
-"""Natural points measured in all scans that show them, and what speaks against them.
+"""Tie points: natural points measured by multi-image matching and tested against each other.
 
-Candidates are measured batch by batch, patches that do not overlap, until enough have come out well. A point is judged
-by its own pictures and by comparison with all others.
+Candidates are measured in batches of patches that do not overlap, until enough are precise. Each point is tested by its
+own images and by comparison with all other points.
 """
 
 from collections import defaultdict
@@ -34,15 +34,15 @@ from measure.tie_points.verification import FEWEST_PAIRS, epipolar_outliers, nei
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Pieces = dict[int, Piece | Reason]  # by frame; or why there is none
+Pieces = dict[int, Piece | Reason]  # by frame; a reason where there is none
 
-_RADII_PX = (RADIUS_PX, 21, 30)  # of patches: where the texture is too weak for one, of twice its area
-_FEATURES = 25  # a scan, for every point wanted; one in five or so has a partner in all frames
-_LEAST_FEATURES = 3000  # a scan: few are wanted of a small project, and its pairs need enough to be verified
+_RADII_PX = (RADIUS_PX, 21, 30)  # of patches: the next one, of twice the area, where the texture is too weak
+_FEATURES = 25  # per scan and point wanted; about one in five is shared by all frames
+_LEAST_FEATURES = 3000  # per scan: enough to verify the pairs of a small project
 _NONE_HERE = "No natural points are sought here"
-_LEAST_BATCH = 4  # part of the points wanted: every batch goes through all scans
-_FINE_PX = 1.0  # how far measured points may lie off their epipolar lines for the lens
-_CHUNK = 16  # points that a worker gets at a time
+_LEAST_BATCH = 4  # smallest batch, one part in so many of the points wanted: each batch reads all scans
+_FINE_PX = 1.0  # tolerance to the epipolar line, for lens distortion
+_CHUNK = 16  # points per task of a worker
 _OFF_LINES = Reason(
     "the point lies off the epipolar lines of the other scans, and its neighbours do not", Code.OTHER_SCANS
 )
@@ -52,7 +52,7 @@ _UNLIKE_NEIGHBOURS = Reason(
 )
 _UNEVEN = Reason("parts of the picture about the point move differently: its surface is not plane", Code.OTHER_SCANS)
 _OTHER_PICTURE = Reason("the picture about the point differs from that in the other scans", Code.OTHER_SCANS)
-_PRECISE_PX = 0.125  # rms length of the error of the weakest measured point: half a pixel is four times as much
+_PRECISE_PX = 0.125  # largest rms position error of a `measured` point
 Progress = Callable[[str, int, int], None]
 
 _FEWEST_IMAGES = 3  # two frames cannot contradict each other along the line of sight
@@ -60,7 +60,7 @@ _FEWEST_IMAGES = 3  # two frames cannot contradict each other along the line of 
 
 @dataclass(eq=False)
 class TiePoint:
-    """A candidate as measured: what was matched, by frame, and what speaks against it."""
+    """A measured candidate. matched, unmatched, refused: by frame, the fit or the reason against it."""
 
     candidate: TieCandidate
     matched: dict[int, Matched]
@@ -68,22 +68,22 @@ class TiePoint:
     refused: dict[int, Reason] = field(default_factory=dict)
 
     def separation(self, frame: int) -> Array:
-        """(2, 2) covariance of the point in a frame if it is the reference's point exactly, px."""
+        """(2, 2) covariance of the point in a frame relative to the reference frame, px²."""
         linear = self.matched[frame].scan_from_patch[:, :2]
         own, reference = self.matched[frame].covariance_px2, self.matched[self.candidate.reference].covariance_px2
         return np.asarray(own + linear @ reference @ linear.T)
 
     def error_px(self, frame: int) -> float:
-        """The rms length of its error in a frame, against the place that defines it."""
+        """Rms position error in a frame, relative to the reference frame."""
         return float(np.sqrt(np.trace(self.separation(frame))))
 
     def is_sharp(self, frame: int) -> bool:
-        """Whether the texture fixes it as well as a measured point is to be."""
+        """Whether it is precise enough for the status `measured`."""
         return self.error_px(frame) <= _PRECISE_PX
 
     @property
-    def standing(self) -> list[int]:
-        """The frames in which nothing speaks against it."""
+    def accepted_frames(self) -> list[int]:
+        """Frames in which it passed all tests."""
         return [frame for frame in self.matched if frame not in self.refused and frame not in self.unmatched]
 
 
@@ -95,13 +95,21 @@ def measure_points(
     fewest: int,
     workers: Executor | None,
 ) -> list[TiePoint]:
-    """Candidates measured in scans of these sizes, the first of them first, until so many stand sharply in at least
-    `fewest` scans; none behind the last one wanted. Where too few do, those that are not sharp make room for wider
-    patches.
+    """Measure candidates in their order until enough are precise in at least `fewest` scans.
 
-    No two patches overlap: the errors of neighbours would be correlated, and the adjustment takes them for independent.
-    A candidate beside one that could not be matched still has its chance; not one beside a point that is refused by
-    comparison with others, for with more of these it may stand again.
+    Patches never overlap, since the adjustment assumes uncorrelated errors. Where too few points are precise, the
+    imprecise ones are measured again with larger patches. A candidate that overlaps an unmatched one is still tried;
+    one that overlaps a point refused by comparison is not, since that point may pass once more points are known.
+
+    Parameters
+    ----------
+    sizes_px : width and height of each scan.
+    wanted : number of points.
+    fewest : scans in which each must be precise.
+
+    Returns
+    -------
+    The points, up to the last one wanted.
     """
     points, matched, sharp = list[TiePoint](), list[TiePoint](), np.zeros(0, dtype=bool)
     for radius_px in _RADII_PX:
@@ -112,21 +120,23 @@ def measure_points(
         matched, points, sharp = list(compress(matched, settled)), list(compress(points, settled)), sharp[settled]
         while left and sharp.sum() < wanted:
             missing = max(wanted - int(sharp.sum()), wanted // _LEAST_BATCH)
-            chosen, left = _apart(left, [point.candidate for point in matched if point.matched], missing)
+            chosen, left = _select_disjoint(left, [point.candidate for point in matched if point.matched], missing)
             pieces_by_frame = _all_pieces(frames, chosen, workers)
             with_pieces = list(zip(chosen, pieces_by_frame, strict=True))
-            matched += map_or_replace(workers, partial(_point, fewest), with_pieces, _lost_point, _CHUNK)
-            points = _straightened(matched)
-            _judge(frames, points)
-            sharp = np.array([sum(map(point.is_sharp, point.standing)) >= fewest for point in points], dtype=bool)
+            matched += map_or_replace(workers, partial(_match_candidate, fewest), with_pieces, _lost_point, _CHUNK)
+            points = _correct_bending(matched)
+            _test_points(frames, points)
+            sharp = np.array(
+                [sum(map(point.is_sharp, point.accepted_frames)) >= fewest for point in points], dtype=bool
+            )
     return points[: int(np.searchsorted(np.cumsum(sharp), wanted)) + 1]
 
 
-def _apart(
+def _select_disjoint(
     candidates: Sequence[TieCandidate], measured: Sequence[TieCandidate], most: int
 ) -> tuple[list[TieCandidate], list[TieCandidate]]:
-    """The first candidates whose patches overlap in no frame, neither with each other nor with those that
-    are measured; and the candidates left that may come later."""
+    """Split candidates: the first ones whose patches overlap neither each other nor measured ones in any frame, and
+    those that may be tried later."""
     overlapping = _overlapping([*measured, *candidates])
     taken, chosen = set(range(len(measured))), set[int]()
     near, left = list[TieCandidate](), list[TieCandidate]()
@@ -142,7 +152,7 @@ def _apart(
 
 
 def _overlapping(candidates: Sequence[TieCandidate]) -> list[set[int]]:
-    """For each candidate the numbers of those whose patches overlap its own in some frame."""
+    """Indices of the candidates that each one overlaps in some frame."""
     overlapping = [set[int]() for _ in candidates]
     for frame in set(chain.from_iterable(candidate.maps for candidate in candidates)):
         own = np.array([k for k, candidate in enumerate(candidates) if frame in candidate.maps])
@@ -159,7 +169,7 @@ def _overlapping(candidates: Sequence[TieCandidate]) -> list[set[int]]:
 def _all_pieces(
     frames: Sequence[TieFrame], candidates: Sequence[TieCandidate], workers: Executor | None
 ) -> list[Pieces]:
-    """The pieces of every candidate by frame; each scan is opened once, by one worker."""
+    """Image pieces of every candidate by frame; each scan is opened once, by one worker."""
     pieces_by_frame: list[Pieces] = [{} for _ in candidates]
     shown = [[k for k, candidate in enumerate(candidates) if i in candidate.maps] for i in range(len(frames))]
     task = [
@@ -183,8 +193,8 @@ def _lost_point(task: tuple[TieCandidate, Pieces], why: str) -> TiePoint:
     return TiePoint(task[0], {}, {i: unreachable(_NONE_HERE, why) for i in task[0].maps})
 
 
-def _point(fewest: int, task: tuple[TieCandidate, Pieces]) -> TiePoint:
-    """The candidate measured; a frame that cannot be matched is left out where enough others remain."""
+def _match_candidate(fewest: int, task: tuple[TieCandidate, Pieces]) -> TiePoint:
+    """Match a candidate; frames that cannot be matched are left out as long as enough others remain."""
     candidate, pieces_by_frame = task
     failed = {i: piece for i, piece in pieces_by_frame.items() if isinstance(piece, Reason)}
     shown = {i: piece for i, piece in pieces_by_frame.items() if not isinstance(piece, Reason)}
@@ -205,8 +215,8 @@ def _point(fewest: int, task: tuple[TieCandidate, Pieces]) -> TiePoint:
         members, failed = left, {}
 
 
-def _straightened(points: Sequence[TiePoint]) -> list[TiePoint]:
-    """The points with their places freed of the ground's bending, as far as all points together tell of it."""
+def _correct_bending(points: Sequence[TiePoint]) -> list[TiePoint]:
+    """Correct the points for the curvature of the ground, whose variance is estimated from all points."""
     known: dict[tuple[int, int], list[Bending]] = defaultdict(list)
     for point in points:
         for frame, piece in point.matched.items():
@@ -218,7 +228,7 @@ def _straightened(points: Sequence[TiePoint]) -> list[TiePoint]:
         replace(
             point,
             matched={
-                frame: _straight(piece, variances.get((point.candidate.reference, frame), nothing))
+                frame: _correct_piece(piece, variances.get((point.candidate.reference, frame), nothing))
                 for frame, piece in point.matched.items()
             },
             refused={},
@@ -227,7 +237,7 @@ def _straightened(points: Sequence[TiePoint]) -> list[TiePoint]:
     ]
 
 
-def _straight(piece: Matched, variance: Array) -> Matched:
+def _correct_piece(piece: Matched, variance: Array) -> Matched:
     if piece.bending is None:
         return piece
     shift, covariance = piece.bending.estimated(variance)
@@ -239,21 +249,23 @@ def _straight(piece: Matched, variance: Array) -> Matched:
     )
 
 
-def _judge(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
-    """What speaks against the points, each compared with all others."""
+def _test_points(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
+    """Test each point against all others and note the reasons for refusal."""
     for point in points:
-        point.refused = {frame: _UNEVEN for frame in point.standing if point.matched[frame].unevenness < POINT_REFUSED}
+        point.refused = {
+            frame: _UNEVEN for frame in point.accepted_frames if point.matched[frame].unevenness < POINT_REFUSED
+        }
     _refuse_strange_pictures(points)
     _refuse_contradictions(frames, points, partial(epipolar_outliers, tolerance=_FINE_PX), _OFF_LINES)
     _refuse_contradictions(frames, points, neighbour_outliers, _UNLIKE_NEIGHBOURS)
 
 
 def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
-    """Where a frame differs from the others' common picture as it does in hardly any other point of it."""
+    """Refuse a point in a frame whose image differs from the others unusually much for that frame."""
     strangeness: dict[int, list[tuple[TiePoint, float]]] = defaultdict(list)
     for point in points:
-        for frame in point.standing:
-            others = [point.matched[other].variance for other in point.standing if other != frame]
+        for frame in point.accepted_frames:
+            others = [point.matched[other].variance for other in point.accepted_frames if other != frame]
             if others:
                 strangeness[frame].append((point, float(np.log(point.matched[frame].variance / np.mean(others)))))
     for frame, rows in strangeness.items():
@@ -267,12 +279,14 @@ def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
 def _refuse_contradictions(
     frames: Sequence[TieFrame], points: Sequence[TiePoint], differ: Callable[[Array, Array], Mask], reason: Reason
 ) -> None:
-    """Where two frames contradict each other in a point, unlike the points about it: differ tells which do of the
-    places (n, 2) of points in both. It is then wrong in the frame that all its contradictions have in common, or, where
-    it cannot be told, in all."""
+    """Refuse points in which two frames contradict each other, unlike their neighbours.
+
+    differ: returns the contradictory ones of points (n, 2) in two frames. The point is refused in the frame that all
+    its contradictions share, or in all frames where there is none.
+    """
     against: dict[int, list[set[int]]] = defaultdict(list)
     for i, j in combinations(range(len(frames)), 2):
-        both = [k for k, point in enumerate(points) if i in point.standing and j in point.standing]
+        both = [k for k, point in enumerate(points) if i in point.accepted_frames and j in point.accepted_frames]
         first, second = (
             frames[frame].camera_px(np.array([points[k].matched[frame].center_px for k in both]).reshape(-1, 2))
             for frame in (i, j)
@@ -281,14 +295,14 @@ def _refuse_contradictions(
             against[int(k)].append({i, j})
     for k, pairs in against.items():
         common = set.intersection(*pairs)
-        wrong = common if len(pairs) > 1 and len(common) == 1 else set(points[k].standing)
+        wrong = common if len(pairs) > 1 and len(common) == 1 else set(points[k].accepted_frames)
         for frame in wrong:
             points[k].refused[frame] = reason
 
 
 @dataclass(frozen=True)
 class TieOptions:
-    """wanted: how many points. images: the fewest that must show a point."""
+    """wanted: number of points; images: least number of scans that show each."""
 
     wanted: int = 300
     images: int = _FEWEST_IMAGES
@@ -302,8 +316,7 @@ class TieOptions:
 
 @dataclass(frozen=True, eq=False)
 class Ties:
-    """The natural points by image, and by image what the user should know, a sentence each: of all scans together with
-    the first of them."""
+    """Tie points by image, and problems by image, a sentence each; those of all scans stand with the first one."""
 
     marks: Mapping[str, tuple[MarkMeasurement, ...]]
     problems: Mapping[str, tuple[Reason, ...]]
@@ -315,11 +328,15 @@ def measure_ties(
     progress: Progress | None = None,
     workers: Executor | None = None,
 ) -> Ties:
-    """Find and measure natural points. Raises nothing for what the pictures show, nor for a scan that cannot be read or
-    whose worker is ended: that one has none, and a problem says why.
+    """Find and measure tie points.
 
-    progress: called with what has been done, the steps done and their number. workers: processes that share the work;
-    the result does not depend on their number.
+    An unreadable scan, or one whose worker was killed, has no points and a problem that says why; image content never
+    raises an error.
+
+    Parameters
+    ----------
+    progress : called with the name of the step, the steps done and their number.
+    workers : processes that share the work; the result does not depend on their number.
     """
     options, tell = options or TieOptions(), progress or (lambda *_: None)
     steps = len(frames) + 2
@@ -343,7 +360,7 @@ def measure_ties(
     for number, point in enumerate(points, 1):
         for i in point.candidate.maps:
             marks[frames[i].image].append(_mark(f"tie{number:04d}", point, i, options))
-    found = sum(len(point.standing) >= options.images for point in points)
+    found = sum(len(point.accepted_frames) >= options.images for point in points)
     if frames and found < options.wanted:
         problems[frames[0].image] = (_few_points(frames, found, len(candidates), shared, options),)
     return Ties({image: tuple(own) for image, own in marks.items()}, problems)
@@ -361,14 +378,14 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
         "unevenness": piece.unevenness,
         "sigma_to_reference_px": sigma,
         "reference": float(frame == point.candidate.reference),
-        "images": float(len(point.standing)),
+        "images": float(len(point.accepted_frames)),
         "size_px": 2.0 * point.candidate.radius_px + 1.0,
     }
     status, reason = Status.MEASURED, NO_REASON
     if frame in point.refused:
         status, reason = Status.REJECTED, point.refused[frame]
-    elif len(point.standing) < options.images:
-        message = f"only {len(point.standing)} scans agree on the point, {options.images} are to"
+    elif len(point.accepted_frames) < options.images:
+        message = f"only {len(point.accepted_frames)} scans agree on the point, {options.images} are to"
         status, reason = Status.REJECTED, Reason(message, Code.FEW_SCANS)
     elif not point.is_sharp(frame):
         message = f"the texture fixes it to {point.error_px(frame):.2f} px only"
@@ -380,7 +397,7 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
 def _few_points(
     frames: Sequence[TieFrame], found: int, candidate_count: int, shared: Shared, options: TieOptions
 ) -> Reason:
-    """Why fewer points than wanted were found."""
+    """Problem: fewer points than wanted were found."""
     message = (
         f"Of {options.wanted} natural points wanted, {found} were found: {candidate_count} features are in "
         f"{options.images} scans or more."

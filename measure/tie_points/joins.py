@@ -1,8 +1,8 @@
-"""What joins the scans of one frame that overlap: the same places of the film in two of them.
+"""Joins between overlapping scans of one frame: the same places of the film measured in two scans.
 
-Both scans show the same photograph, so that one similarity puts all of the overlap from scan to scan but for what film
-and scanner bend. It is found by features; then places with good texture, spread over the overlap, are matched at full
-resolution. No relief is between them, and what moves unlike its neighbours is dust on the scanner's glass, or chance.
+Both scans show the same photograph: one similarity maps the overlap, up to film and scanner deformation. It is found by
+features; places with good texture, spread over the overlap, are then matched at full resolution. There is no parallax:
+what moves unlike its neighbours is dust on the scanner's glass or a false match.
 """
 
 from collections import Counter
@@ -32,17 +32,17 @@ from measure.tie_points.verification import neighbour_outliers
 
 Array = NDArray[np.float64]
 
-WANTED = 60  # joins of two scans
-_FEW = 12  # joins: fewer are a problem
-_FEATURES = 6000  # of a scan: the overlap may be a tenth of it
-_TRIED = 3  # places, for every join that is wanted
-_AGREE_PX = 3.0  # in the reduced scan: what a feature's place, film and scanner leave
-_FEWEST = 12  # features that one similarity explains: chance makes three or four of some hundreds
+WANTED = 60  # joins per pair of scans
+_FEW = 12  # fewer joins are reported as a problem
+_FEATURES = 6000  # per scan: the overlap may be a tenth of it
+_TRIED = 3  # places tried per join wanted
+_AGREE_PX = 3.0  # tolerance in the reduced scan, for localisation, film and scanner
+_FEWEST = 12  # inliers of the similarity: three or four of some hundreds occur by chance
 _TRIALS, _CONFIDENCE = 5000, 0.9999  # of RANSAC
-_APART_PX = 2 * RADIUS_PX + 2  # of joins: patches that overlap have correlated errors
-_SHARP_PX = 0.5  # rms length of an error: with less texture a join is weak
-_INTERPOLATION_PX = 0.01  # that sharp pictures without noise are off by, between pixels; aerial ones at most
-_CHUNK = 16  # places that a worker gets at a time
+_APART_PX = 2 * RADIUS_PX + 2  # between joins: overlapping patches have correlated errors
+_SHARP_PX = 0.5  # rms position error above which a join is weak
+_INTERPOLATION_PX = 0.01  # interpolation error of sharp images without noise; aerial images have at most this
+_CHUNK = 16  # places per task of a worker
 _UNEVEN = Reason("parts of the picture about the place move differently", Code.OTHER_SCANS)
 _LOST = Reason("the process that matched it was ended", Code.UNREACHABLE)
 _UNLIKE = Reason(
@@ -55,17 +55,21 @@ _MatchedPair = tuple[Matched, ...]
 
 @dataclass(frozen=True, eq=False)
 class Joins:
-    """The joins by image; and by image, of a scan that few or none join to the others, why."""
+    """Joins by image, and the problem of each scan with few or none."""
 
     marks: Mapping[str, tuple[MarkMeasurement, ...]]
     problems: Mapping[str, Reason]
 
 
 def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Executor | None = None) -> Joins:
-    """The joins of one frame's scans, so many wanted of every two that overlap.
+    """Measure the joins of one frame's scans.
 
-    Raises nothing for what the pictures show, nor for a scan that cannot be read: a problem says why it has none. The
-    result does not depend on the number of workers.
+    An unreadable scan has no joins and a problem that says why; image content never raises an error. The result does
+    not depend on the number of workers.
+
+    Parameters
+    ----------
+    wanted : joins per pair of overlapping scans.
     """
     found = list(find_all_features(parts, _FEATURES, True, _UNJOINED, workers))
     readable = [(part, each) for part, each in zip(parts, found, strict=True) if isinstance(each, Features)]
@@ -79,24 +83,24 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
             agreements[part.image].append(f"with {other.image} {agreement}")
         if second_from_first is None:
             continue
-        places = _places(second, first_features, second_features, second_from_first, wanted)
+        places = _patch_maps(second, first_features, second_features, second_from_first, wanted)
         pairs, refused = _measure_pair(both, places, wanted, workers)
         for pair in pairs:
             number += 1
             for part, matched in zip(both, pair, strict=True):
                 marks[part.image].append(_mark(f"join{number:04d}", matched))
         if len(pairs) < _FEW:
-            problems |= {part.image: _few(both, len(pairs), refused) for part in both}
+            problems |= {part.image: _few_joins_problem(both, len(pairs), refused) for part in both}
     for image, own in marks.items():
         if not any(mark.status.is_observation for mark in own):
-            problems[image] = _none(agreements[image])
+            problems[image] = _no_joins_problem(agreements[image])
     problems |= {part.image: each for part, each in zip(parts, found, strict=True) if isinstance(each, Reason)}
     return Joins({image: tuple(own) for image, own in marks.items()}, problems)
 
 
 def _match_features(first: Features, second: Features) -> tuple[Array | None, str]:
-    """(2, 3) affine map of pixels from the first scan to the second, through the features that one similarity explains;
-    None where too few agree. And how many agree, a part of a sentence."""
+    """(2, 3) affine map of pixels from the first scan to the second, fitted to the inliers of one similarity, or None;
+    and the number of inliers as a part of a sentence."""
     pairs = shared_features(first, second)
     here, there = first.places_px[pairs[:, 0]], second.places_px[pairs[:, 1]]
     agree = np.zeros(len(pairs), dtype=bool)
@@ -114,11 +118,10 @@ def _match_features(first: Features, second: Features) -> tuple[Array | None, st
     return np.asarray(np.linalg.lstsq(design, there[agree], rcond=None)[0].T), agreement
 
 
-def _places(
+def _patch_maps(
     other: TieFrame, first: Features, second: Features, second_from_first: Array, wanted: int
 ) -> list[tuple[Array, Array]]:
-    """Maps (2, 3) from patches to both scans: the best textured of every part of the overlap first, none touching
-    another."""
+    """Maps (2, 3) from patches to both scans, the best textured of each part of the overlap first, without overlap."""
     there = first.places_px @ second_from_first[:, :2].T + second_from_first[:, 2]
     common = np.flatnonzero(other.usable(there, second.size_px))
     if not len(common):
@@ -139,7 +142,7 @@ def _places(
 def _measure_pair(
     both: tuple[TieFrame, TieFrame], places: Sequence[tuple[Array, Array]], wanted: int, workers: Executor | None
 ) -> tuple[list[_MatchedPair], Counter[str]]:
-    """Both places of every join, so many at most, and why other places are none."""
+    """Matched pairs, at most as many as wanted, and the counted reasons of the refused ones."""
     try:
         read = (read_pieces(part, [(maps[k], RADIUS_PX) for maps in places]) for k, part in enumerate(both))
         pieces = list(zip(*read, strict=True))
@@ -160,7 +163,7 @@ def _match(pieces: tuple[Piece, Piece]) -> _MatchedPair:
 
 
 def _refusal(pair: _MatchedPair) -> Reason:
-    """Why its own pictures are no join; empty where they are."""
+    """Reason why a matched pair is not a join; empty where it is."""
     if not pair:
         return _LOST
     uneven = _UNEVEN if pair[1].unevenness < POINT_REFUSED else NO_REASON
@@ -179,7 +182,7 @@ def _mark(name: str, matched: Matched) -> MarkMeasurement:
     return MarkMeasurement(name, "join", matched.center_px, covariance, status, reason, quality)
 
 
-def _few(both: tuple[TieFrame, TieFrame], found: int, refused: Counter[str]) -> Reason:
+def _few_joins_problem(both: tuple[TieFrame, TieFrame], found: int, refused: Counter[str]) -> Reason:
     most = refused.most_common(1)
     why = f", most of the others because {most[0][0]}" if most else ""
     return Reason(
@@ -190,8 +193,8 @@ def _few(both: tuple[TieFrame, TieFrame], found: int, refused: Counter[str]) -> 
     )
 
 
-def _none(agreements: Sequence[str]) -> Reason:
-    """Of a scan that nothing joins to the others."""
+def _no_joins_problem(agreements: Sequence[str]) -> Reason:
+    """Problem of a scan without any join."""
     return Reason(
         f"Nothing joins it to the other scans of its frame: {'; '.join(agreements)}; at least {_FEWEST} are needed. "
         "Check whether it is a scan of that frame, and whether the scans overlap.",

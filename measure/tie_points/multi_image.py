@@ -1,14 +1,13 @@
-"""Multi-image least-squares matching: one natural point in all frames that show it, none of them a perfect original.
+"""Multi-image least-squares matching of one natural point in all frames that show it.
 
-The same small piece of ground is resampled from every frame onto one grid. All frames' pieces are one unknown common
-patch, each with an offset and a gain of its own and with an affine geometry; the grid of one frame, the reference, says
-which point is meant. The patch being unknown too, its best estimate is the pieces' mean, and a frame's geometry follows
-from the difference of its piece and the reference's (the object-based matching of Gruen and Baltsavias 1988 and of
-Rosenholm 1987, the patch eliminated).
+The same small patch of ground is resampled from every frame onto one grid. Each frame's piece is the unknown common
+patch with its own offset, gain and affine geometry; the reference frame defines the point. The best estimate of the
+patch is the mean of the pieces, and a frame's geometry follows from the difference between its piece and the
+reference's (object-based matching of Gruen and Baltsavias 1988 and Rosenholm 1987, with the patch eliminated).
 
-Covariance: a frame's own noise alone moves its own point, the reference's as much as another's. The definition of the
-point is free of error, for the unknown object point takes it up: so frames are uncorrelated, each with the covariance
-of its own noise, and what separates two frames has the sum of both."""
+Covariance: each frame's point depends only on its own noise. The definition of the point is free of error, since the
+unknown object point absorbs it. Frames are therefore uncorrelated, and the difference between two frames has the sum of
+their covariances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,33 +24,33 @@ from measure.noise.noise_model import NoiseModel, correlated, noise_model
 
 Array = NDArray[np.float64]
 
-# Of the coefficients of u², uv and v² of a surface whose curvature has no preferred direction, but for their scale.
+# Covariance, up to scale, of the coefficients of u², uv and v² of a surface with isotropic curvature.
 _ISOTROPIC = np.array([[0.75, 0.0, 0.25], [0.0, 1.0, 0.0], [0.25, 0.0, 0.75]])
 _DIRECTIONS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
-_ROUNDS = 8  # of scoring
-_LEAST_NOISE_EIGENVALUE = 1e-9  # of a covariance, over its largest
-_FEWEST = 20  # patches whose bendings have a variance worth the name
+_ROUNDS = 8  # of Fisher scoring
+_LEAST_NOISE_EIGENVALUE = 1e-9  # of a covariance, relative to its largest
+_FEWEST = 20  # patches needed to estimate the variance of their bendings
 Mask = NDArray[np.bool_]
 
-RADIUS_PX = 15  # of a round patch: texture enough nearly everywhere, and small enough for the ground to be plane
-SPARE_PX = 12  # about the patch in a window: room to move, to be stretched and to be smoothed
-_UNKNOWNS = 8  # of a frame: six of the affine geometry, gain and offset
-_SMOOTHING_PX = (2.0, 1.0, 0.0)  # first a smoothed picture, which draws from farther, at last the picture itself
-_FINEST_START_PX = 1.0  # where grain is strong, a little smoothing leaves the smaller errors
-_EVEN = 1e-6  # of the grey values: what rounding makes of an even picture
+RADIUS_PX = 15  # of a round patch: enough texture nearly everywhere, and small enough for plane ground
+SPARE_PX = 12  # border of the window: room for shifts, deformation and smoothing
+_UNKNOWNS = 8  # per frame: six affine parameters, gain and offset
+_SMOOTHING_PX = (2.0, 1.0, 0.0)  # from coarse, with a large radius of convergence, to the image itself
+_FINEST_START_PX = 1.0  # with strong grain, a little smoothing gives the smaller errors
+_EVEN = 1e-6  # relative contrast of rounding errors in a uniform image
 _LEAST_EIGENVALUE = 1e-4  # of the normal equations scaled to unit diagonal
-_ITERATIONS = 30  # under each smoothing, at most
-_STILL_PX = 0.005  # a last step well below the precision
-_FARTHEST_STEP_PX = 3.0  # beyond it the matching has run away
+_ITERATIONS = 30  # at most, per smoothing
+_STILL_PX = 0.005  # last step, well below the precision
+_FARTHEST_STEP_PX = 3.0  # a longer step means divergence
 
 
 @dataclass(frozen=True, eq=False)
 class Bending:
-    """What a piece shows of its bending q (6,) against the reference's: coefficients of u², uv and v² in units of the
-    usual patch's radius, whatever the size of this one, of the columns' shift and then of the rows', px of the patch.
+    """Estimate of a piece's second-order deformation q (6,) relative to the reference: coefficients of u², uv and v² of
+    the column shift, then of the row shift, px of the patch, with u and v in units of RADIUS_PX.
 
-    observed (6,) is response (6, 6) @ q and noise of covariance noise (6, 6); on_place (2, 6) @ q is its effect on the
-    place, px of the patch.
+    observed (6,) = response (6, 6) @ q + noise, with covariance noise (6, 6); on_place (2, 6) @ q is the effect on the
+    position, px of the patch.
     """
 
     observed: Array
@@ -61,23 +60,23 @@ class Bending:
 
     @property
     def has_noise(self) -> bool:
-        """Whether the noise is a covariance that can be weighed by: pictures copied from one another have none."""
+        """Whether the noise covariance is regular; it is not for images copied from each other."""
         values = np.linalg.eigvalsh(self.noise)
         return bool(values[0] > _LEAST_NOISE_EIGENVALUE * values[-1])
 
     def estimated(self, variance: Array) -> tuple[Array, Array]:
-        """The shift (2,) of the place, px of the patch, and the covariance (2, 2) that stays, where bendings have that
-        covariance (6, 6)."""
+        """Predicted shift (2,) of the position, px of the patch, and its remaining covariance (2, 2), given the
+        covariance (6, 6) of bendings."""
         gain = variance @ self.response.T @ np.linalg.inv(self.response @ variance @ self.response.T + self.noise)
         left = variance - gain @ self.response @ variance
         return self.on_place @ gain @ self.observed, self.on_place @ left @ self.on_place.T
 
 
 def bending_variance(bendings: Sequence[Bending]) -> Array:
-    """The covariance (6, 6) of the bendings of one scan's patches against another's; zero where too few are known.
+    """Covariance (6, 6) of the bendings between the patches of two scans; zero where too few are known.
 
-    Relief bends along the epipolar lines, and curves in all directions alike: unknown are the variances of a shift's
-    two components and their covariance.
+    Relief shifts along the epipolar lines and is isotropic in curvature: the unknown variance components are those of
+    the two components of a shift and their covariance.
     """
     if len(bendings) < _FEWEST:
         return np.zeros((6, 6))
@@ -93,12 +92,12 @@ def bending_variance(bendings: Sequence[Bending]) -> Array:
         normal = np.einsum("knij,lnji->kl", weighted, weighted)
         squares = np.einsum("ni,knij,nj->k", free, parts, free)
         expected = np.einsum("knij,nji->k", weighted, np.einsum("nij,njl->nil", inverse, noise))
-        components = _valid(np.linalg.solve(normal, squares - expected))
+        components = _project_to_psd(np.linalg.solve(normal, squares - expected))
     return np.asarray(np.tensordot(components, shapes, 1))
 
 
-def _valid(components: Array) -> Array:
-    """The nearest components that some shift can have."""
+def _project_to_psd(components: Array) -> Array:
+    """Project the components onto positive semidefinite covariances."""
     values, vectors = np.linalg.eigh(np.tensordot(components, _DIRECTIONS, 1))
     matrix = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.array([matrix[0, 0], matrix[0, 1], matrix[1, 1]])
@@ -106,8 +105,8 @@ def _valid(components: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """What a frame shows about a point: grey values (height, width) whose top-left pixel is origin_px (col, row) of the
-    scan, and the approximate affine map (2, 3) from the grid of the patch to the scan."""
+    """Image of a point in one frame. grey (height, width), with its top-left pixel at origin_px (col, row) of the scan;
+    scan_from_patch (2, 3): approximate affine map from the patch grid to the scan."""
 
     grey: NDArray[np.floating]
     origin_px: tuple[int, int]
@@ -116,13 +115,17 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """A piece as matched. center_px (2,), covariance_px2 (2, 2), scan_from_patch (2, 3) in the scan.
+    """A matched piece.
 
-    correlation: of the piece with the mean of the others; gain: its contrast over the mean one; variance: of its noise,
-    in units of its own contrast; unevenness: the probability that quarters of the patch differ as much in their shifts
-    by chance. bending: of the ground within the patch, None for the reference, which has none against itself, and
-    where nothing but the ground differs, so that it cannot be weighed.
-    reason: why the point could not be matched, and then its pieces have no covariance.
+    Attributes
+    ----------
+    center_px, covariance_px2, scan_from_patch : (2,), (2, 2) and (2, 3), in the scan.
+    correlation : with the mean of the other pieces.
+    gain : contrast relative to the mean.
+    variance : of its noise, in units of its own contrast.
+    unevenness : p-value of the shifts of the quarters of the patch being equal.
+    bending : second-order deformation; None for the reference, and where its noise covariance is singular.
+    reason : why the point could not be matched; there is then no covariance.
     """
 
     center_px: Array
@@ -141,13 +144,13 @@ def match_pieces(pieces: Sequence[Piece], reference: int, radius_px: int = RADIU
 
     Parameters
     ----------
-    pieces : what each frame shows of the point.
-    reference : the number of the piece whose point stays where it is.
+    pieces : images of the point.
+    reference : index of the piece that defines the point.
     radius_px : of the patch.
 
     Returns
     -------
-    The pieces as matched, in their order; with reasons where they could not be.
+    The matched pieces in their order, with reasons where matching failed.
     """
     fit = _Fit(pieces, reference, radius_px)
     best: tuple[Matched, ...] = ()
@@ -162,12 +165,12 @@ def match_pieces(pieces: Sequence[Piece], reference: int, radius_px: int = RADIU
 
 
 def _area(matched: Sequence[Matched]) -> float:
-    """Mean variance of the points, by which results of one point are compared."""
+    """Mean position variance over the frames, the criterion between results of one point."""
     return float(np.mean([np.trace(each.covariance_px2) for each in matched]))
 
 
 class _Fit:
-    """The pieces' geometries in progress."""
+    """State of the joint matching: the geometry of every piece."""
 
     def __init__(self, pieces: Sequence[Piece], reference: int, radius_px: int) -> None:
         self.pieces, self.reference = pieces, reference
@@ -183,13 +186,14 @@ class _Fit:
         self.normal = np.eye(6)
 
     def run(self, smoothing_px: float) -> None:
-        """Gauss-Newton steps until no point moves any more."""
+        """Iterate Gauss-Newton steps to convergence."""
         self.splines = [_spline(piece.grey, smoothing_px) for piece in self.pieces]
         if gauss_newton(self, _STILL_PX, _ITERATIONS).reason == UNSETTLED:
             self.reasons = [Reason("the matching does not come to rest", Code.NO_FIT)] * len(self.pieces)
 
     def solve(self) -> Array | None:
-        """(frames, 6) how the grid is to be bent for each piece to lie on the reference's; None with reasons."""
+        """(frames, 6) affine corrections that align each piece with the reference; None where it fails, with
+        reasons."""
         self._resample()
         if any(self.reasons) or not self._linearise():
             return None
@@ -197,17 +201,17 @@ class _Fit:
         return np.asarray(np.linalg.solve(self.normal, self.design[:, self.used] @ differences.T).T)
 
     def step(self, step: Array) -> float:
-        """Bend the grid by (frames, 6); how far the farthest point moved, px."""
+        """Apply affine corrections (frames, 6); returns the largest shift, px."""
         for index, of_piece in enumerate(step):
             self._move(index, of_piece)
         return float(np.abs(step[:, :2]).max())
 
     def failure(self) -> Reason:
-        """The first piece's that failed, empty where none did."""
+        """Reason of the first piece that failed, if any."""
         return next((reason for reason in self.reasons if reason), NO_REASON)
 
     def _resample(self) -> None:
-        """All pieces on the grid of the patch, less their means, in units of their own contrast."""
+        """Resample all pieces onto the grid of the patch, centred and scaled to unit contrast."""
         for index, (piece, spline) in enumerate(zip(self.pieces, self.splines, strict=True)):
             places = self.grid @ self.maps[index][:, :2].T + self.maps[index][:, 2] - piece.origin_px
             if places.min() < 0.0 or (places.max(axis=(0, 1)) > np.array(spline.shape)[::-1] - 1).any():
@@ -221,10 +225,10 @@ class _Fit:
             self.values[index] = (grey - grey[self.used].mean()) / self.gains[index]
 
     def _linearise(self) -> bool:
-        """Derivatives of the common patch by shift, and by the four of the linear part; freed of gain and offset.
+        """Set the derivatives of the common patch by shift and linear part, orthogonal to gain and offset.
 
-        The normal equations come from products of different pieces: in those of a piece with itself its noise would
-        count as texture, which slows the steps and makes the covariance too small.
+        The normal equations use products of different pieces: products of a piece with itself would count noise as
+        texture, which slows convergence and makes the covariance too small.
         """
         single = self._derivatives(self.values)
         self.normal = _products(single, single)
@@ -238,26 +242,28 @@ class _Fit:
         return True
 
     def _derivatives(self, patches: Array) -> Array:
-        """(frames, pixels used, 6) of each patch, less what a gain and an offset would explain."""
+        """(frames, pixels used, 6) affine derivatives of each patch, orthogonal to gain and offset."""
         by_col, by_row = (_slope(patches, axis)[:, self.used] for axis in (2, 1))
         u, v = self.grid[self.used].T
         columns = [by_col, by_row, by_col * u, by_col * v, by_row * u, by_row * v]
-        return self._freed(np.stack(columns, axis=2), patches)
+        return self._without_gain_and_offset(np.stack(columns, axis=2), patches)
 
-    def _bent(self, patches: Array) -> Array:
-        """The same by the six coefficients of a bending."""
+    def _bending_derivatives(self, patches: Array) -> Array:
+        """(frames, pixels used, 6) derivatives by the coefficients of a bending, orthogonal to gain and offset."""
         u, v = self.grid[self.used].T / RADIUS_PX
         slopes = [_slope(patches, axis)[:, self.used] for axis in (2, 1)]
-        return self._freed(np.stack([slope * form for slope in slopes for form in (u * u, u * v, v * v)], 2), patches)
+        return self._without_gain_and_offset(
+            np.stack([slope * form for slope in slopes for form in (u * u, u * v, v * v)], 2), patches
+        )
 
-    def _freed(self, design: Array, patches: Array) -> Array:
-        """Columns less what a gain and an offset would explain."""
+    def _without_gain_and_offset(self, design: Array, patches: Array) -> Array:
+        """Remove the components that a gain and an offset explain."""
         patch = patches.mean(axis=0)[self.used]
         grey = np.linalg.qr(np.stack([np.ones_like(patch), patch], axis=1))[0]
         return np.asarray(design - grey @ (grey.T @ design))
 
     def _move(self, index: int, step: Array) -> None:
-        """Where a piece looks as the patch does at u + d(u), the patch at u is found at u - d(u)."""
+        """Apply an affine correction d(u) to a piece: patch coordinate u then maps to u - d(u)."""
         if not np.isfinite(step).all() or np.hypot(*step[:2]) > _FARTHEST_STEP_PX or np.abs(step[2:]).max() > 0.5:
             self.reasons[index] = Reason("the matching runs away from the approximate place", Code.NO_FIT)
             return
@@ -266,7 +272,7 @@ class _Fit:
         self.maps[index] = np.column_stack([before[:, :2] @ linear, before[:, :2] @ shift + before[:, 2]])
 
     def unmatched(self) -> tuple[Matched, ...]:
-        """The pieces with the reasons why they could not be matched, which is a reason against the others too."""
+        """Results without covariance, with the reasons of the pieces that failed."""
         nothing = np.full((2, 2), np.inf)
         return tuple(
             Matched(matrix[:, 2].copy(), nothing, matrix, 0.0, 0.0, np.inf, 0.0, reason=reason)
@@ -274,10 +280,10 @@ class _Fit:
         )
 
     def result(self) -> tuple[Matched, ...]:
-        """The pieces with covariances from the noise that is left between them."""
+        """Results with covariances from the residuals between the pieces."""
         count = len(self.pieces)
         residuals = (self.values - self.values.mean(axis=0)) * self.used
-        # Of a piece's own noise the mean has taken its share.
+        # The mean contains 1 / count of a piece's own noise.
         residuals *= np.sqrt(count / (count - 1))
         noises = [self._noise(each) for each in residuals]
         bendings = self._bendings(noises)
@@ -301,8 +307,8 @@ class _Fit:
         return tuple(matched)
 
     def _noise(self, residuals: Array) -> NoiseModel:
-        """The noise behind residuals, of which the unknowns have taken most where it is smoothest: tr(P C), P being the
-        projection on what they explain, and not one pixel's variance for each."""
+        """Noise model of a piece from its residuals. The unknowns absorb tr(P C) of the noise, with P the projection on
+        their columns: more than one pixel's variance each, since they absorb smooth noise most."""
         noise = noise_model(residuals, self.used, _UNKNOWNS)
         explained = np.zeros((_UNKNOWNS, *self.used.shape))
         columns = [self.used[self.used], self.values.mean(axis=0)[self.used], *self.design[:, self.used]]
@@ -313,14 +319,14 @@ class _Fit:
         return NoiseModel(factor * noise.variance_dn2, factor * noise.autocovariance_dn2, noise.neighbour_correlation)
 
     def _covariance(self, noise: NoiseModel) -> Array:
-        """(6, 6) of the geometry, for noise of that autocovariance."""
+        """(6, 6) covariance of the affine parameters for correlated noise."""
         inverse = np.linalg.inv(self.normal)
         spread = np.tensordot(correlated(self.design, noise), self.design, axes=([1, 2], [1, 2]))
         return np.asarray(inverse @ spread @ inverse)
 
     def _bendings(self, noises: Sequence[NoiseModel]) -> list[Bending | None]:
-        """What the differences from the reference's piece show, the affine geometry taken off."""
-        single, bent = self._derivatives(self.values), self._bent(self.values)
+        """Bending of each piece relative to the reference, after elimination of the affine parameters."""
+        single, bent = self._derivatives(self.values), self._bending_derivatives(self.values)
         through = np.asarray(np.linalg.solve(self.normal, _products(single, bent)), np.float64)
         response = _products(bent, bent) - _products(single, bent).T @ through
         columns = np.zeros((bent.shape[2], *self.used.shape))
@@ -335,11 +341,11 @@ class _Fit:
         return bendings
 
     def _unevenness(self, residuals: Array, noise: NoiseModel) -> float:
-        """Each quarter of the patch has a shift of its own: chi-squared of the four, which sum to nothing."""
+        """P-value (chi-square) of four separate shifts of the quarters of the patch."""
         u, v = self.grid[..., 0], self.grid[..., 1]
         quarters = [(u > 0) & (v >= 0), (u <= 0) & (v > 0), (u < 0) & (v <= 0), (u >= 0) & (v < 0)]
         moves = np.concatenate([self.design[:2] * quarter for quarter in quarters])
-        # What the six unknowns of the whole patch have taken is taken off the quarters, too.
+        # Remove what the six affine parameters of the whole patch absorb.
         flat, whole = moves[:, self.used].T, self.design[:, self.used].T
         free = flat - whole @ np.linalg.solve(self.normal, whole.T @ flat)
         moves = np.zeros_like(moves)
@@ -354,14 +360,15 @@ class _Fit:
 
 
 def _products(first: Array, second: Array) -> Array:
-    """Mean products (j, k) of derivatives (frames, pixels, j) and (frames, pixels, k) of different frames."""
+    """(j, k) mean products of derivatives (frames, pixels, j) and (frames, pixels, k) over pairs of different
+    frames."""
     count = len(first)
     own = np.einsum("nij,nik->jk", first, second)
     return np.asarray((first.sum(axis=0).T @ second.sum(axis=0) - own) / (count * (count - 1)))
 
 
 def _spline(grey: NDArray[np.floating], smoothing_px: float) -> Array:
-    """Coefficients of the cubic spline through the grey values."""
+    """Coefficients of the interpolating cubic spline of the smoothed grey values."""
     picture = np.asarray(grey, dtype=float)
     if smoothing_px > 0.0:
         picture = cv2.GaussianBlur(picture, (0, 0), smoothing_px)
@@ -369,6 +376,6 @@ def _spline(grey: NDArray[np.floating], smoothing_px: float) -> Array:
 
 
 def _slope(patches: Array, axis: int) -> Array:
-    """The derivative of the cubic spline through the patches along an axis."""
+    """Derivative of the interpolating cubic spline of the patches along an axis."""
     coefficients = ndimage.spline_filter1d(patches, order=3, axis=axis, mode="mirror")
     return np.asarray(ndimage.correlate1d(coefficients, [-0.5, 0.0, 0.5], axis=axis, mode="mirror"))

@@ -1,8 +1,7 @@
-"""Which natural points are worth measuring: features that three scans or more share, and how the ground about them
-maps from scan to scan.
+"""Candidates for tie points: feature tracks over three or more scans, with local affine maps between the scans.
 
-Features of all scans are compared in pairs; what one epipolar geometry explains is joined to tracks, and the tracks are
-ordered so that the first of them, however many, spread evenly over the frames."""
+Features are matched pair by pair, verified by the epipolar geometry and linked to tracks. The tracks are ordered so
+that any number of the first ones is spread evenly over the frames."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -26,19 +25,19 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-_PLACE_PX, _LOCAL = 5.0, 0.1  # how far places depart from an affine map, and that from the whole pair's
-_REWEIGHTINGS = 6  # of least distances
-_STRETCH = 2.0  # the most by which a small piece of ground can differ in scale between photographs to be matched
-_NEIGHBOURS = 12  # that tell the map about a point: four times its unknowns, for some of them may be false
-Shared = Mapping[tuple[int, int], Indices]
-Track = dict[int, int]  # the feature in every frame
+_PLACE_PX, _LOCAL = 5.0, 0.1  # deviation of places from a local affine map, and of that from the pair's global one
+_REWEIGHTINGS = 6  # of the least absolute deviations
+_STRETCH = 2.0  # largest ratio of local scales between photographs that can be matched
+_NEIGHBOURS = 12  # used for a local map: four times its parameters, since some may be false
+_AGREE_PX = 2.0  # epipolar tolerance in the reduced scan, for localisation and lens distortion
+_CELLS = 8  # per side of a frame, over which points are spread
 
-_AGREE_PX = 2.0  # in the reduced scan: what a feature's place and a lens leave
-_CELLS = 8  # a side of a frame, over which points are spread
+Shared = Mapping[tuple[int, int], Indices]
+Track = dict[int, int]  # feature by frame
 
 
 class LocalMaps:
-    """Affine maps about a place from one scan to another."""
+    """Local affine maps from one scan to another."""
 
     def __init__(self, features: Sequence[Features], shared: Shared) -> None:
         self._places: dict[tuple[int, int], tuple[Array, Array]] = {}
@@ -49,15 +48,15 @@ class LocalMaps:
         self._trees = {pair: cKDTree(here) for pair, (here, _) in self._places.items()}
         self._whole = {pair: _affine_map(*places, np.zeros((2, 2)), 0.0) for pair, places in self._places.items()}
 
-    def reached(self, start: int) -> list[int]:
-        """The scans that share features with this one."""
+    def linked_scans(self, start: int) -> list[int]:
+        """Scans that share features with this one."""
         return sorted(end for begin, end in self._places if begin == start)
 
     def map(self, start: int, end: int, place_px: Array) -> Array | None:
-        """(2, 3) map of offsets from a place (2,) of one scan to places of another; None where the scans differ too
-        much in scale there.
+        """(2, 3) map of offsets from a place (2,) in one scan to places in another; None where the scales differ too
+        much.
 
-        It is that of the nearest matches, held by those of the whole pair where they lie close together.
+        Fitted to the nearest matches, with the pair's global map as a prior.
         """
         here, there = self._places[start, end]
         near = np.atleast_1d(self._trees[start, end].query(place_px, min(_NEIGHBOURS, len(here)))[1])
@@ -68,8 +67,7 @@ class LocalMaps:
 
 
 def _affine_map(here: Array, there: Array, usual: Array, weight: float) -> Array:
-    """(2, 3) from places (n, 2) to places, a few of which may be false; with a weight on what its linear part is
-    usually."""
+    """(2, 3) robust affine map between places (n, 2). usual (2, 2): prior of its linear part, with a weight."""
     middle = here.mean(axis=0)
     design = np.column_stack([np.ones(len(here)), here - middle])
     prior, of_usual = weight * np.diag([0.0, 1.0, 1.0]), np.vstack([np.zeros(2), usual.T])
@@ -80,8 +78,8 @@ def _affine_map(here: Array, there: Array, usual: Array, weight: float) -> Array
 
 @dataclass(frozen=True, eq=False)
 class TieCandidate:
-    """A track: the approximate affine maps (2, 3) from its patch, of radius_px, to the scans, by frame; which frame
-    defines it."""
+    """Candidate for a tie point. reference: frame that defines the point; maps: approximate affine maps (2, 3) from the
+    patch to the scan, by frame; radius_px: of the patch."""
 
     reference: int
     maps: dict[int, Array]
@@ -91,8 +89,8 @@ class TieCandidate:
 def verify_pairs(
     frames: Sequence[TieFrame], features: Sequence[Features], workers: Executor | None
 ) -> dict[tuple[int, int], Indices]:
-    """By pair of frames the features that they share, as far as one epipolar geometry explains them; none of a pair
-    over which its process was ended. Two scans of one exposed frame have no such geometry, and are no pair."""
+    """Matched features of each pair of frames that satisfy one epipolar geometry; none where a worker was killed. Two
+    scans of one exposed frame have no epipolar geometry and are not paired."""
     shared = {}
     both = [(i, j) for i, j in combinations(range(len(frames)), 2) if frames[i].frame != frames[j].frame]
     pairs_of = [(features[i], features[j]) for i, j in both]
@@ -112,17 +110,17 @@ def _match_pair(pair: tuple[Features, Features]) -> Indices:
 def find_candidates(
     frames: Sequence[TieFrame], features: Sequence[Features], shared: Shared, fewest: int
 ) -> list[TieCandidate]:
-    """The tracks that at least `fewest` frames may show, the best textured of every part of a frame before its others.
+    """Candidates in at least `fewest` frames, the best textured one of each part of a frame first.
 
-    Where a track has no feature in a frame, but the matches about it put it there, it is sought there too: grain hides
-    many a feature that the matching of the whole patch still finds.
+    A frame without a feature of the track is included if neighbouring matches predict the point in it: matching the
+    whole patch often succeeds where grain hides the feature.
     """
     maps = LocalMaps(features, shared)
     found, cells, textures = [], [], []
     for track in tracks_of_pairs(shared):
         reference = _most_central(frames, features, track)
         reached = _maps(frames, features, maps, track, reference)
-        candidate = TieCandidate(reference, _one_an_exposure(frames, features, reached, reference))
+        candidate = TieCandidate(reference, _one_per_exposure(frames, features, reached, reference))
         if len(candidate.maps) < fewest:
             continue
         place = frames[reference].camera_px(candidate.maps[reference][None, :, 2])[0]
@@ -140,8 +138,7 @@ def candidates_with_radius(
     sizes_px: Sequence[tuple[int, int]],
     fewest: int,
 ) -> list[TieCandidate]:
-    """The candidates with patches of that radius, as far as at least `fewest` frames, the defining one among them, show
-    these whole."""
+    """Candidates whose patch of that radius is complete in at least `fewest` frames, the reference among them."""
     shown: list[dict[int, Array]] = [{} for _ in candidates]
     for i, frame in enumerate(frames):
         own = [k for k, candidate in enumerate(candidates) if i in candidate.maps]
@@ -162,10 +159,10 @@ def _maps(
     track: Track,
     reference: int,
 ) -> dict[int, Array]:
-    """Maps (2, 3) by frame from a grid about the reference's feature to the feature there, or to where it should be."""
+    """Maps (2, 3) by frame from the patch around the reference's feature to the feature, measured or predicted."""
     middle = features[reference].places_px[track[reference]]
     found = {reference: np.column_stack([np.eye(2), middle])}
-    for frame in maps.reached(reference):
+    for frame in maps.linked_scans(reference):
         local = maps.map(reference, frame, middle)
         if local is None:
             continue
@@ -176,10 +173,10 @@ def _maps(
     return found
 
 
-def _one_an_exposure(
+def _one_per_exposure(
     frames: Sequence[TieFrame], features: Sequence[Features], maps: dict[int, Array], reference: int
 ) -> dict[int, Array]:
-    """The maps to one scan of every exposed frame: the defining one, or that which shows the place farthest inside."""
+    """Keep one scan of each exposed frame: the reference, or the one that shows the place farthest from its edges."""
     inside = {
         i: (i == reference, float(np.minimum(maps[i][:, 2], np.array(features[i].size_px) - 1 - maps[i][:, 2]).min()))
         for i in maps
@@ -195,22 +192,22 @@ def _width_px(frame: TieFrame, size_px: tuple[int, int]) -> float:
 
 
 def _most_central(frames: Sequence[TieFrame], features: Sequence[Features], track: Track) -> int:
-    """The frame that sees the point most nearly along its axis: from there the others' views are least distorted."""
+    """The frame with the point nearest to its axis: relative to it, the other views are least distorted."""
     off = {i: np.linalg.norm(frames[i].camera_px(features[i].places_px[k][None])) for i, k in track.items()}
     return min(off, key=lambda i: (off[i], i))
 
 
 def tracks_of_pairs(shared: Shared) -> list[Track]:
-    """Join features that pairs of frames share to tracks.
+    """Link matched features to tracks.
 
     Parameters
     ----------
-    shared : by pair of frames, (n, 2) features that they share.
+    shared : (n, 2) matched features of each pair of frames.
 
     Returns
     -------
-    The tracks in the order of their features. A track that has two features in a frame is none; and a feature stays in
-    one of three frames or more only where two others share it. What one pair alone has is a track of two.
+    The tracks, sorted by their features. Tracks with two features in one frame are dropped. In a track of three or more
+    frames, a feature needs matches in two others; a match of a single pair makes a track of two.
     """
     links = [np.zeros((0, 4), np.intp)]
     links += [np.column_stack([np.full_like(own, pair), own])[:, [0, 2, 1, 3]] for pair, own in shared.items()]

@@ -1,4 +1,4 @@
-"""Geometric verification of point pairs: the epipolar geometry of two frames, and the neighbours of each point."""
+"""Geometric verification of point pairs: by the epipolar geometry of two frames and by neighbouring points."""
 
 import cv2
 import numpy as np
@@ -13,19 +13,18 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-FEWEST_PAIRS = 16  # twice what the geometry is computed from
-_CONFIDENCE, _TRIALS = 0.9999, 10000  # of MAGSAC: that it finds the geometry, and how often it tries at most
-_NEIGHBOURS = 8  # whose median distance is what lens and film bend
-_MAP_NEIGHBOURS = 12  # that tell the map about a point: four times its unknowns, for some of them may be false
-_ROUNDS = 2  # a false point may draw its neighbours' maps: in the second it is none of theirs
-_REWEIGHTINGS = 10  # of least distances
-_LEAST_PX = 0.1  # distances below it weigh alike, and what neighbours scatter at least
+FEWEST_PAIRS = 16  # twice the minimal number for a fundamental matrix
+_CONFIDENCE, _TRIALS = 0.9999, 10000  # of MAGSAC: probability of success, and largest number of trials
+_NEIGHBOURS = 8  # their median distance estimates lens distortion and film deformation
+_MAP_NEIGHBOURS = 12  # used for a local map: four times its parameters, since some may be false
+_ROUNDS = 2  # a false point may distort its neighbours' maps; in the second round it is left out of them
+_REWEIGHTINGS = 10  # of the least absolute deviations
+_LEAST_PX = 0.1  # lower bound of distances in the weights, and of the neighbours' scatter
 
 
 def epipolar_inliers(first: Array, second: Array, tolerance: float) -> Mask:
-    """Which pairs of points (n, 2) in two frames one epipolar geometry explains within a tolerance; none, where it
-    explains too few to be believed. Units as the points'.
-    """
+    """Mask of the pairs of points (n, 2) that satisfy one epipolar geometry within a tolerance, in the points' unit. No
+    pair passes where there are too few inliers."""
     if len(first) < FEWEST_PAIRS:
         return np.zeros(len(first), dtype=bool)
     _, inside = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, tolerance, _CONFIDENCE, _TRIALS)
@@ -34,10 +33,10 @@ def epipolar_inliers(first: Array, second: Array, tolerance: float) -> Mask:
 
 
 def epipolar_outliers(first: Array, second: Array, tolerance: float) -> Mask:
-    """Which pairs (n, 2) lie off the epipolar geometry unlike the pairs about them.
+    """Mask of the pairs (n, 2) that deviate from the epipolar geometry unlike their neighbours.
 
-    A lens and a film bend the geometry, but alike in a neighbourhood: what counts is a pair's distance less the median
-    of its neighbours'.
+    Lens distortion and film deformation shift neighbouring pairs alike: the test uses the distance of a pair minus the
+    median of its neighbours.
     """
     if len(first) < FEWEST_PAIRS:
         return np.zeros(len(first), dtype=bool)
@@ -52,7 +51,7 @@ def epipolar_outliers(first: Array, second: Array, tolerance: float) -> Mask:
 
 
 def _sampson(matrix: Array, first: Array, second: Array) -> Array:
-    """(n,) signed distance of pairs from the geometry, to first order (Sampson 1982)."""
+    """(n,) signed first-order distance of pairs from the epipolar geometry (Sampson 1982)."""
     a = np.column_stack([first, np.ones(len(first))])
     b = np.column_stack([second, np.ones(len(second))])
     there, back = a @ matrix.T, b @ matrix
@@ -61,10 +60,10 @@ def _sampson(matrix: Array, first: Array, second: Array) -> Array:
 
 
 def neighbour_outliers(first: Array, second: Array) -> Mask:
-    """Which points (n, 2) of two frames, in px, lie elsewhere in the second than their neighbours in the first put
-    them, farther in units of the neighbours' scatter than relief does it to any others; none where points are too few.
+    """Mask of the points (n, 2), px, that deviate in the second frame from the map of their neighbours.
 
-    Above their median these ratios are taken as lognormal: relief makes their tail longer than that of normal errors.
+    The deviation is taken in units of the neighbours' scatter. Above their median these ratios are modelled as
+    lognormal, since relief makes their tail longer than that of normal errors. None deviates where points are too few.
     """
     off = np.zeros(len(first), dtype=bool)
     for _ in range(_ROUNDS):
@@ -77,17 +76,16 @@ def neighbour_outliers(first: Array, second: Array) -> Mask:
 
 
 def _ratios(first: Array, second: Array, trusted: Indices) -> Array:
-    """(n,) logarithms of how far each point lies from where its neighbours among the trusted put it, in units of their
-    scatter."""
+    """(n,) logarithm of each point's deviation from the map of its trusted neighbours, in units of their scatter."""
     near = trusted[cKDTree(first[trusted]).query(first, _MAP_NEIGHBOURS + 1)[1]]
-    # Itself, where it is trusted, is the first of them; else the farthest is one too many.
+    # Drop the point itself where it is trusted, else the farthest neighbour.
     itself = near == np.arange(len(first))[:, None]
     itself[~itself.any(axis=1), -1] = True
     near = near[~itself].reshape(len(first), _MAP_NEIGHBOURS)
     design = np.concatenate([np.ones((*near.shape, 1)), first[near] - first[:, None]], axis=2)
     maps = least_distances(design, second[near], _LEAST_PX, _REWEIGHTINGS)
     scatter = np.median(_lengths(second[near] - design @ maps), axis=1)
-    # Few neighbours may lie well by chance: what is usual counts beside them. Outside of them a map is known worse.
+    # A few neighbours may agree by chance: add the median scatter. Extrapolated maps are less certain: the factor.
     spread = 1.0 + np.linalg.inv(np.swapaxes(design, 1, 2) @ design)[:, 0, 0]
     variance = (scatter**2 + np.median(scatter) ** 2 + _LEAST_PX**2) * spread
     return np.asarray(np.log(np.maximum(_lengths(second - maps[:, 0]), 1e-9)) - np.log(variance) / 2)
