@@ -1,6 +1,6 @@
 """What a command says when it is done: the verdict, the problems, the main numbers, where the files are."""
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -16,12 +16,14 @@ from rich.text import Text
 from measure.flags import Status
 from measure.results import Pose
 from pipeline.archive.status import NAMED, ArchiveStatus, archive_status, worst_named
-from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts, scan_verdict
+from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
 from pipeline.files.project_file import Project
 from pipeline.report.camera_values import CameraValue, camera_values
 from pipeline.report.data import Problem, ReportData
 from pipeline.report.fiducials import Figure, correction_sentences, figure
+from pipeline.report.many_frames import frame_counts
 from pipeline.report.marks import current_scans
+from pipeline.report.marks import frames as report_frames
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.verdict import Level, ReportVerdict, judge
 from pipeline.results.adjustment_record import AdjustmentRecord
@@ -79,9 +81,7 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
         frames = {name: {str(s): counts.get(s, 0) for s in Status} for name, counts in data.totals.marks.items()}
     scans = current_scans(data)
     poses = {name: scan.frame.pose for name, scan in scans.items() if scan.frame.pose}
-    verdicts = Counter(map(scan_verdict, scans.values()))
-    if data.totals:
-        verdicts = Counter({each: data.totals.count(each) for each in Verdict})
+    verdicts = frame_counts(data, report_frames(data)) if data.measurement is not None else {}
     cameras = data.adjustment.cameras if data.adjustment else {}
     values = {name: camera_values(data, name) for name, camera in cameras.items() if camera.is_calibrated}
     unit = next(iter(data.image_units.values()), FILM_UNIT)

@@ -18,6 +18,7 @@ from pipeline.archive.scan_groups import CANDIDATES, GroupedScans, ScanGroup, na
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import PREFIX, camera_words, library_path, read_library
+from pipeline.measuring.camera_identification import is_solid
 from pipeline.progress import Reporter
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
@@ -99,6 +100,11 @@ class NewProject:
                 for camera, folders in self._alike_cameras().items()
                 for line in (f"{', '.join(folders)}: {camera[0]}", *_candidate_lines(camera[1:]))
             ],
+        )
+        yield (
+            "are named by the form of solid marks alone, which a camera that the library lacks may share: compare the "
+            "drawing with a scan",
+            [f"{_place(group)}: {group.camera}" for group in self.named if _rests_on_form(group)],
         )
         yield (
             "are no scans of film, and are left out",
@@ -251,14 +257,14 @@ def images_text(new: NewProject) -> str:
 
 
 def print_new_project(new: NewProject, console: Console) -> None:
-    """Totals by camera and kind; what needs a look; what to do next."""
+    """Totals by camera; what needs a look; what to do next."""
 
     def say(text: str, style: str = "") -> None:
         console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)
 
     say(f"{counted(new.found.files, 'file')} examined: {new.sentence}.")
-    for (camera, form), (scans, folders) in sorted(_totals(new).items()):
-        say(f"{camera}: {counted(scans, 'scan')} in {counted(folders, 'folder')}, {form}", "bold")
+    for camera, (scans, folders) in sorted(_totals(new).items()):
+        say(f"{camera}: {counted(scans, 'scan')} in {counted(folders, 'folder')}", "bold")
     for what, cases in new.remarks():
         if cases:
             say(f"Needs a look: {what}:", "yellow")
@@ -351,18 +357,26 @@ def _relative_name(folder: Path, path: Path) -> str:
     return path.location if isinstance(path, Address) else Path(os.path.relpath(path, folder)).as_posix()
 
 
-def _totals(new: NewProject) -> dict[tuple[str, str], tuple[int, int]]:
-    """Scans and folders by camera and form."""
-    scans, folders = defaultdict[tuple[str, str], int](int), defaultdict[tuple[str, str], set[Path]](set)
+def _totals(new: NewProject) -> dict[str, tuple[int, int]]:
+    """Scans and folders by camera."""
+    scans, folders = defaultdict[str, int](int), defaultdict[str, set[Path]](set)
     for group in new.found.groups:
-        key = (group.camera or ("digital camera" if group.digital else "camera unknown"), _form(group.head))
+        key = group.camera or ("digital camera" if group.digital else "camera unknown")
         scans[key] += len(group.paths)
         folders[key].add(group.folder)
     return {key: (count, len(folders[key])) for key, count in scans.items()}
 
 
 def _place(group: ScanGroup) -> str:
+    if len(group.paths) == 1:
+        return str(group.paths[0])
     return f"{group.folder}, {counted(len(group.paths), 'scan')}, {_form(group.head)}"
+
+
+def _rests_on_form(group: ScanGroup) -> bool:
+    """Whether nothing but wings, notches or arrows names the camera."""
+    marks = read_camera(library_path(group.camera)).layout().marks
+    return not group.has_telling_plate and all(map(is_solid, marks))
 
 
 def _candidate_lines(names: Sequence[str]) -> list[str]:

@@ -96,10 +96,15 @@ class ScanGroup:
     @property
     def much_alike(self) -> tuple[str, ...]:
         """Other cameras whose solid marks are drawn much like those that are named, where no plate says which."""
-        if any(_TELLING & sample.plate.keys() for sample in self.samples):
+        if self.has_telling_plate:
             return ()
         others = dict.fromkeys(name for sample in self.samples for name in sample.much_alike())
         return tuple(others) if self.cameras else ()
+
+    @property
+    def has_telling_plate(self) -> bool:
+        """Whether a plate in a sample tells cameras apart."""
+        return any(_TELLING & sample.plate.keys() for sample in self.samples)
 
     @property
     def numbers(self) -> tuple[str, ...]:

@@ -64,19 +64,25 @@ def scan_verdict(scan: MeasuredScan) -> Verdict:
     frame, marks = scan.frame, [(mark.kind, mark.status, mark.reason.codes) for mark in scan.frame.marks]
     if scan.failure:
         return Verdict.FAILED
-    has_problem = bool(frame.problems) or (frame.pose is not None and not frame.pose.decided)
-    return frame_verdict(marks, frame.pixel_from_camera is not None, has_problem, bool(scan.decided_by))
+    return frame_verdict(marks, frame.pixel_from_camera is not None, has_problem(scan), bool(scan.decided_by))
 
 
-def frame_verdict(marks: Sequence[MarkState], has_frame: bool, has_problem: bool, has_decisions: bool) -> Verdict:
-    """The verdict of a frame that was measured. has_frame: whether its fiducials tell where it lies."""
+def has_problem(scan: MeasuredScan) -> bool:
+    """Whether something of the frame as a whole needs a look, as an orientation that nothing decides."""
+    frame = scan.frame
+    return bool(frame.problems) or (frame.pose is not None and not frame.pose.decided)
+
+
+def frame_verdict(marks: Sequence[MarkState], has_frame: bool, is_doubtful: bool, has_decisions: bool) -> Verdict:
+    """The verdict of a frame that was measured. has_frame: whether its fiducials tell where it lies; is_doubtful: what
+    `has_problem` says."""
     fiducials = [mark for mark in marks if mark[0] == "fiducial" and Code.OTHER_PART not in mark[2]]
     observed = [kind for kind, status, _ in marks if status.is_observation]
     too_few = observed.count("fiducial") < min(_LEAST_FIDUCIALS, len(fiducials))
     if not observed or too_few or (fiducials and not has_frame):
         return Verdict.POOR
     worst = max((_mark_verdict(*mark) for mark in marks), key=list(Verdict).index)
-    if has_problem or worst is Verdict.LOOK:
+    if is_doubtful or worst is Verdict.LOOK:
         return Verdict.LOOK
     return Verdict.DECIDED if has_decisions else worst
 

@@ -183,8 +183,9 @@ def identify(
     layouts = {names: _as_seen(cameras[names[0]].layout()) for names in _alike(cameras)}
     pitch = None if given is None else (times * given[0], times * given[1])
     with reporter.stage("trying") as count:
-        trials = _first_that_stand_out(search, layouts, pitch, count)
-    del search  # and the correlations that it holds
+        trials, tries = _first_that_stand_out(search, layouts, pitch, count)
+    alike = _alike_in_scan(search, trials, tries, drawn_alike(layouts))
+    del search, tries  # and the correlations that they hold
     sources = {name: camera.source for name, camera in cameras.items()}
     unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
     reports = {name: source.reports for name, source in sources.items() if source}
@@ -193,7 +194,7 @@ def identify(
     plate = _plate(picture) if any(trial.stands_out for trial in trials) else {}
     against_plate = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in against_plate.items() if against}
-    return Identification(path, ranked, unreported, given, plate, contradicted, drawn_alike(layouts), reports)
+    return Identification(path, ranked, unreported, given, plate, contradicted, alike, reports)
 
 
 def _picture(path: Path, max_pixels: int | None) -> tuple[Scan, float, tuple[float, float] | None]:
@@ -219,22 +220,39 @@ def _plate(picture: Scan) -> dict[str, str]:
     return {} if reader is None else plate_of(read_writing(picture, reader, enough=is_whole_plate))
 
 
+def _alike_in_scan(
+    search: LayoutSearch, trials: Sequence[Trial], tries: Mapping[Names, Tried], drawn: Mapping[str, Names]
+) -> dict[str, Names]:
+    """By name, of cameras that stand out, those drawn much like them whose marks look nearly as well at the same places
+    of the scan: forms of wings that differ by little in a drawing may differ clearly in a scan.
+    """
+    own = {name: names for names in tries for name in names}
+    found = dict[str, Names]()
+    for trial in trials:
+        others = dict.fromkeys(own[name] for name in drawn.get(trial.cameras[0], ())) if trial.stands_out else {}
+        frames = {names: search.seen(replace(tries[trial.cameras], layout=tries[names].layout)) for names in others}
+        near = [names for names, frame in frames.items() if frame and likeness(frame) >= CLOSE * trial.score]
+        found |= dict.fromkeys(trial.cameras, tuple(names[0] for names in near)) if near else {}
+    return found
+
+
 def _first_that_stand_out(
     search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float] | None, count: Count
-) -> list[Trial]:
-    """The trials at the given pitch, where marks answer there that chance does not put so; where none of them stands
-    out, with pixels that may be longer one way; where still none does, at any pitch."""
+) -> tuple[list[Trial], Mapping[Names, Tried]]:
+    """The trials, and how the scan answered to each, at the given pitch, where marks answer there that chance does not
+    put so; where none of them stands out, with pixels that may be longer one way; where still none does, at any pitch.
+    """
     if pitch_um is not None:
         given = _each(layouts, partial(search.at_pitch, pitch_um=pitch_um), count)
         if any(each.answer.expected <= CAMERA_BY_CHANCE for each in given.values()):
             trials = _trials(search, given, count)
             if any(trial.stands_out for trial in trials):
-                return trials
+                return trials, given
         longer = _each(layouts, partial(search.longer_one_way, pitch_um=pitch_um), count)
         likelier = {names: min(each, longer[names], key=_expected) for names, each in given.items()}
         trials = _trials(search, likelier, count)
         if any(trial.stands_out for trial in trials):
-            return trials
+            return trials, likelier
     return _at_any_pitch(search, layouts, count)
 
 
@@ -252,13 +270,15 @@ def _each(
     return tries
 
 
-def _at_any_pitch(search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count) -> list[Trial]:
+def _at_any_pitch(
+    search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count
+) -> tuple[list[Trial], Mapping[Names, Tried]]:
     """The trials of a scan that the frame may fill: what its pixels then measure each layout says for itself, and those
     that answer best are tried at that pitch."""
     tries = _each(layouts, search.at_any_pitch, count)
     least = sorted({each.answer.expected for each in tries.values()})[:_FEW]
     best = {names: search.refined(each) for names, each in tries.items() if each.answer.expected in least}
-    return _trials(search, tries | best, count)
+    return _trials(search, tries | best, count), tries | best
 
 
 def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) -> list[Trial]:

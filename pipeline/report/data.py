@@ -38,21 +38,16 @@ class Problem:
 class FrameTotals:
     """What a report says of more frames than it shows one by one.
 
-    needs_look: how many of them need a look. marks: their number by image and status; of_targets: of those that are no
+    marks: their number by image and status; of_targets: of those that are no
     fiducials, by kind and status. verdicts: number of frames by camera and kind of file, and then by verdict. problems:
     what the frames have to say. places_px: of all marks observed, by axis; as `fractions.places_px` has them.
     """
 
-    needs_look: int
     marks: Mapping[str, Mapping[str, int]]
     of_targets: Mapping[tuple[str, str], int]
     verdicts: Mapping[tuple[str, str], Mapping[str, int]]
     problems: tuple[Problem, ...]
     places_px: Mapping[str, NDArray[np.float64]]
-
-    def count(self, verdict: str) -> int:
-        """The number of frames with a verdict."""
-        return sum(counts.get(verdict, 0) for counts in self.verdicts.values())
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ _ONE_ANSWER = (
 Sentence = TypeVar("Sentence", Problem, str)
 
 
-def single_frame_problems(frame: Frame, with_pose: bool) -> Iterator[Problem]:
-    """What one frame has to say. with_pose: also of a pose that nothing decides."""
-    yield from _assumed_pose(frame) if with_pose else ()
+def single_frame_problems(frame: Frame) -> Iterator[Problem]:
+    """What one frame has to say, of a pose that nothing decides first."""
+    yield from _assumed_pose(frame)
     yield from _measurement_problems(frame)
 
 
@@ -34,18 +34,10 @@ def masked_text(sentence: str) -> str:
 
 
 def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
-    """What the frames have to say, said once where several frames say the same."""
-    return _together(shots, _measurement_problems)
-
-
-def assumed_poses(shots: list[Frame]) -> Iterator[Problem]:
-    """The poses that nothing decides, said once where several frames say the same."""
-    return _together(shots, _assumed_pose)
-
-
-def _together(shots: list[Frame], evidence: Callable[[Frame], Iterable[Problem]]) -> Iterator[Problem]:
-    for problem, images in images_by_sentence(shots, evidence).items():
-        yield replace(problem, what=f"{listed(images)}: {problem.what}", images=tuple(images))
+    """What the frames have to say, said once where several frames say the same; of their poses first."""
+    for evidence in (_assumed_pose, _measurement_problems):
+        for problem, images in images_by_sentence(shots, evidence).items():
+            yield replace(problem, what=f"{listed(images)}: {problem.what}", images=tuple(images))
 
 
 def images_by_sentence(

@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from heapq import nsmallest
 from operator import itemgetter
-from typing import Any
 
 import numpy as np
 
 from measure.flags import Status
 from pipeline.archive.measurement import MarkColumns, StoredFrame, StoredMarks
-from pipeline.archive.verdicts import Verdict, frame_verdict
+from pipeline.archive.verdicts import Verdict, frame_verdict, has_problem, scan_counts
 from pipeline.report.data import FrameTotals, Problem, ReportData
 from pipeline.report.fractions import centers_px, places_apart
 from pipeline.report.frame_problems import masked_text, single_frame_problems
@@ -67,9 +66,8 @@ class _Totals:
         is_known = np.isfinite(columns.center_px).all(axis=1)
         self.centers_px.frombytes(columns.center_px[used & is_known].tobytes())
 
-    def result(self, needs_look: int) -> FrameTotals:
+    def result(self) -> FrameTotals:
         return FrameTotals(
-            needs_look=needs_look,
             marks=self.marks,
             of_targets=self.of_targets,
             verdicts={kind: {v: counts[v] for v in _BEST_FIRST} for kind, counts in sorted(self.verdicts.items())},
@@ -89,22 +87,19 @@ def reduced(
     scans: of the images of data.comparator, read once, one after the other. stored: of whose plain frames only columns
     are read, the images of data.comparator being all others.
     """
-    totals, needs_look = _Totals(), 0
+    totals = _Totals()
     if stored is not None:
         totals.add_plain(stored.plain, stored.columns(), camera_of)
-    with_pose = not data.is_film_alone
     suspect = {row.image for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
 
     def frames_to_show() -> Iterator[tuple[tuple[float, float], ReportData]]:
         """Those that need a look, with a key that puts the worst first; all are counted on the way."""
-        nonlocal needs_look
         for one in _one_by_one(data, scans):
             (frame,) = frames(one)
-            verdict, problems = _verdict(frame, with_pose), list(single_frame_problems(frame, with_pose))
+            verdict, problems = _verdict(frame), list(single_frame_problems(frame))
             kind = camera_of(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
             totals.add(frame, kind, verdict, problems)
             if problems or verdict.needs_look or frame.image in suspect:
-                needs_look += 1
                 largest_w = max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)
                 yield (-_BEST_FIRST.index(verdict), -largest_w), one
 
@@ -113,7 +108,7 @@ def reduced(
         data,
         comparator=[row for one in shown for row in one.comparator],
         measurement={name: scan for one in shown for name, scan in (one.measurement or {}).items()},
-        totals=totals.result(needs_look),
+        totals=totals.result(),
     )
 
 
@@ -145,16 +140,14 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
         yield frame_data(image, None)
 
 
-def _verdict(frame: Frame, with_pose: bool) -> Verdict:
+def _verdict(frame: Frame) -> Verdict:
     """As `reseau status` has it, of the marks as the comparator file has them now."""
     scan, marks = frame.scan, [(mark.kind, mark.status, mark.codes) for mark in frame.marks]
     if scan is None:
         return frame_verdict(marks, True, False, False)
     if scan.failure:
         return Verdict.FAILED
-    pose = scan.frame.pose if with_pose else None
-    has_problem = bool(scan.frame.problems) or (pose is not None and not pose.decided)
-    return frame_verdict(marks, scan.frame.pixel_from_camera is not None, has_problem, bool(scan.decided_by))
+    return frame_verdict(marks, scan.frame.pixel_from_camera is not None, has_problem(scan), bool(scan.decided_by))
 
 
 def _listed(problems: dict[tuple[str, str], tuple[Problem, list[str]]]) -> Iterator[Problem]:
@@ -174,11 +167,11 @@ def _listed(problems: dict[tuple[str, str], tuple[Problem, list[str]]]) -> Itera
 
 @dataclass(frozen=True)
 class TotalsView:
-    """Numbers of frames. verdicts: those that occur; rows: by camera and kind of file, with a number for each verdict;
-    left_out: further rows; all: of all frames; shown: those that the report shows, None where it shows all."""
+    """Numbers of frames. sentence: of all; verdicts: those that occur; rows: by camera and kind of file, with a number
+    for each verdict; left_out: further rows; all: of all frames; shown: those that the report shows, None where it
+    shows all."""
 
-    frames: int
-    needs_look: int
+    sentence: str
     shown: int | None
     verdicts: tuple[str, ...]
     rows: tuple[tuple[str, str, tuple[int, ...]], ...]
@@ -190,16 +183,11 @@ def totals_view(data: ReportData, shots: Sequence[Frame]) -> TotalsView | None:
     """Of more frames than are shown, and of an archive; else None."""
     if data.totals is None and not data.is_film_alone:
         return None
-    counts = dict[tuple[str, str], Mapping[Any, int]](
-        _verdicts(data, shots) if data.totals is None else data.totals.verdicts
-    )
-    verdicts = tuple(each for each in _BEST_FIRST if any(row.get(each) for row in counts.values()))
+    counts, total = _verdicts(data, shots), frame_counts(data, shots)
+    verdicts = tuple(each for each in _BEST_FIRST if total[each])
     rows = tuple((*kind, tuple(row.get(each, 0) for each in verdicts)) for kind, row in sorted(counts.items()))
-    total = {each: sum(row.get(each, 0) for row in counts.values()) for each in _BEST_FIRST}
-    needs_look = sum(count for each, count in total.items() if each.needs_look)
     return TotalsView(
-        frames=sum(total.values()),
-        needs_look=data.totals.needs_look if data.totals else needs_look,
+        sentence=f"{scan_counts(total)}.",
         shown=len({*(data.measurement or {}), *(row.image for row in data.comparator)}) if data.totals else None,
         verdicts=tuple(map(str, verdicts)),
         rows=rows[:_ROWS],
@@ -208,12 +196,21 @@ def totals_view(data: ReportData, shots: Sequence[Frame]) -> TotalsView | None:
     )
 
 
-def _verdicts(data: ReportData, shots: Sequence[Frame]) -> Mapping[tuple[str, str], Counter[Verdict]]:
-    """Numbers of an archive's frames."""
-    stored, counts = data.adjustment, defaultdict[tuple[str, str], Counter[Verdict]](Counter)
-    assert stored is not None
+def frame_counts(data: ReportData, shots: Sequence[Frame]) -> Counter[Verdict]:
+    """Numbers of all frames by verdict: what report and terminal count by. shots: the frames that are shown."""
+    total = Counter[Verdict]()
+    for row in _verdicts(data, shots).values():
+        total.update({Verdict(verdict): count for verdict, count in row.items()})
+    return total
+
+
+def _verdicts(data: ReportData, shots: Sequence[Frame]) -> Mapping[tuple[str, str], Mapping[str, int]]:
+    """The same by camera and kind of file."""
+    if data.totals is not None:
+        return data.totals.verdicts
+    stored, counts = data.adjustment, defaultdict[tuple[str, str], Counter[str]](Counter)
     for frame in shots:
-        camera = stored.camera_of(frame.image) if frame.image in stored.images else "none"
+        camera = stored.camera_of(frame.image) if stored and frame.image in stored.images else "none"
         kind = camera, _ending(frame.scan.scan) if frame.scan else "given"
-        counts[kind][_verdict(frame, with_pose=False)] += 1
+        counts[kind][_verdict(frame)] += 1
     return counts

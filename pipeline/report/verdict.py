@@ -13,7 +13,7 @@ from measure.flags import Status
 from pipeline.report.camera_values import LARGER, camera_values, cluster_ratio
 from pipeline.report.data import MarkKey, Problem, ReportData
 from pipeline.report.fractions import places_px
-from pipeline.report.frame_problems import assumed_poses, frame_problems, images_by_sentence, pixel_locking
+from pipeline.report.frame_problems import frame_problems, images_by_sentence, pixel_locking
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import spoken_name
@@ -305,8 +305,6 @@ def _frame_check(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
     if data.totals:
         yield from data.totals.problems
         return
-    if not data.is_film_alone:
-        yield from assumed_poses(shots)
     yield from frame_problems(shots)
 
 
@@ -351,8 +349,6 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         elif _is_solved(data):
             yield A_PRIORI
     if data.is_film_alone:
-        for problem in assumed_poses(shots):
-            yield f"{problem.what} {problem.next_step}"
         yield (
             "Fiducial marks are the same in every frame: if two scans bear each other's names, nothing here shows it."
         )

@@ -116,6 +116,11 @@ def test_a_camera_is_told_by_most_samples_and_by_what_its_plate_does_not_contrad
     assert "compare the drawings" in kind(group, form).sentence()
     plate = {"camera_type": "Zeiss"}
     assert kind(group, replace(form, plate=plate)).camera == "zeiss-rmk-a-153"
+    solid, lines = (
+        new_project._rests_on_form(kind(group, of_camera(path, name))) for name in ("arrow-153", "park-153")
+    )
+    assert (solid, lines) == (True, False)
+    assert not new_project._rests_on_form(kind(group, replace(of_camera(path, "arrow-153"), plate=plate)))
     both = kind(group, of_camera(path, "wild-rc30-153", "wild-rc10-153"))
     assert both.camera == "wild-rc10-153"  # by far the more reports
 

@@ -205,7 +205,7 @@ def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras
     be read costs no other, and the project's camera, which the library has not, is named beside its twins. No other
     pitch than the files' is tried."""
     monkeypatch.setattr(LayoutSearch, "longer_one_way", LayoutSearch.at_pitch)
-    monkeypatch.setattr(camera_trials, "_at_any_pitch", lambda *_: [])
+    monkeypatch.setattr(camera_trials, "_at_any_pitch", lambda *_: ([], {}))
     (scan,) = (frame.parent / "scans").glob("*.tif")
     folder = tmp_path / "scans"
     (folder / "b").mkdir(parents=True)
@@ -336,6 +336,32 @@ def test_cameras_that_come_close_are_all_named() -> None:
     assert "c comes close with 0.85" in found.sentence()
     without_report = replace(found, unreported={"c": "made from one frame", "d": "nobody knows"})
     assert without_report.sentence().endswith("c rests on no calibration report: made from one frame.")
+
+
+@pytest.mark.parametrize(("score", "alike"), [(0.75, {"a": ("b",), "A": ("b",)}), (0.6, {})])
+def test_a_form_that_fits_the_scan_clearly_worse_is_not_told_beside_a_name(
+    score: float, alike: dict[str, tuple[str, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """a was found with 0.85. b, drawn much like it, is looked at where a lies; c, as much alike, has no mark there."""
+
+    class Search:
+        def seen(self, tried: Tried) -> str | None:
+            assert (tried.answer, tried.bold) == (of_a.answer, of_a.bold)
+            return "frame" if tried.layout.marks[0].id == "b" else None
+
+    picture: Any = None
+
+    def of(id: str) -> Tried:
+        layout = FiducialLayout((replace(LIBRARY[RENDERED].layout().marks[0], id=id),), (10.0, 10.0))
+        return Tried(layout, layout, picture, [], 0, Answer(0.1, ()))
+
+    of_a = of("a")
+    monkeypatch.setattr(camera_trials, "likeness", lambda _: score)
+    tries: Any = {("a", "A"): of_a, ("b", "B"): of("b"), ("c",): of("c")}
+    drawn = {"a": ("b", "c"), "b": ("a",)}
+    search: Any = Search()
+    found = camera_trials._alike_in_scan(search, [trial(("a", "A"), 0.85), trial(("b", "B"), 0.0)], tries, drawn)
+    assert found == alike
 
 
 def test_wings_of_much_the_same_form_are_told_beside_a_name_that_rests_on_them() -> None:

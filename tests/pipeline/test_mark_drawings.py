@@ -12,6 +12,7 @@ from studies import parametrize_with_studies
 
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import Mark, MarkShape, Polygon
+from pipeline.archive.scan_groups import group_scans, name_cameras, trial_of_cameras
 from pipeline.files.library import read_library
 from pipeline.measuring.camera_trials import _alike, identify
 from pipeline.progress import Reporter
@@ -111,6 +112,18 @@ def scene_of(name: str) -> str:
         assert old in scene
         scene = scene.replace(old, new)
     return scene[: scene.rindex("[[image]]")]
+
+
+@pytest.mark.study
+def test_scans_of_wings_are_named_where_the_scan_tells_their_form(tmp_path: Path) -> None:
+    """Of three forms that are drawn much alike."""
+    name = "fairchild-k17-tall-flat-153"
+    (tmp_path / "scene.toml").write_text(scene_of(name), encoding="utf-8")
+    render_project(tmp_path / "scene.toml", tmp_path)
+    forms = {each: camera for each, camera in LIBRARY.items() if "k17" in each or each == "zeiss-rmk-a-153"}
+    grouped = group_scans(sorted((tmp_path / "scans").iterdir()), lambda *_: None)
+    (group,) = name_cameras(grouped, trial_of_cameras(forms, None, None), Reporter(), None).groups
+    assert group.camera == name, group.sentence()
 
 
 @pytest.mark.study

@@ -154,7 +154,7 @@ def test_an_archive_has_totals_first_and_corrections_in_words() -> None:
     assert [id for id in document.ids if not id.startswith("frame-")] == [
         "verdict", "totals", "problems", "frames", "marks", "fiducials", "reliability", "notes",
     ]  # fmt: skip
-    assert "Of 5 frames 0 need a look." in document.text
+    assert "5 of 5 scans measured (5 good)." in document.text
     assert "corrections to the certificate" in document.text
     assert re.search(r"The marks lie where the camera file has them but for \d+\.\d µm", document.text)
     assert "Residuals of all frames" not in document.text
