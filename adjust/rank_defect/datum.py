@@ -1,4 +1,4 @@
-"""The datum of the object space: the similarity transformations that no observation sees, and how they are fixed."""
+"""The datum of the object space: free similarity transformations, minimum constraints and inner constraints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,19 +14,19 @@ from adjust.problem.parameter import Parameter, object_coordinate
 from adjust.problem.problem import Problem, State
 from adjust.rank_defect.named_directions import DATUM_DIRECTIONS
 
-EXACT = 1e-9  # what a generator may move of a given quantity and still be unhindered: rounding
-FLAT = 1e-3  # the same where relief, in parts of the field's extent, is too little to carry a datum
-DEPENDENT = 1e-6  # part of a coordinate's motion that those before it must leave open, or it is theirs already
-CENTERINGS = 10  # the transformation is all but linear: two or three do
-LEVERAGES = (0.4, 0.1)  # part of a coordinate's motion that other datum values must leave open: at first, at the least
+EXACT = 1e-9  # relative motion of given quantities below which a direction is free: rounding
+FLAT = 1e-3  # the same, where relief below this fraction of the field's extent must not define a datum
+DEPENDENT = 1e-6  # fraction of a coordinate's motion that must be independent of the coordinates chosen before
+CENTERINGS = 10  # iterations at most; two or three suffice, since the transformation is nearly linear
+LEVERAGES = (0.4, 0.1)  # independent fraction of a coordinate's motion: preferred, least
 
 
 @dataclass(frozen=True)
 class ObjectDatum:
-    """The similarity transformations of the object space about a centre (3,).
+    """Similarity transformations of the object space about a centre (3,).
 
-    generators (n, 7): how every unknown moves with three shifts, three rotations and a scale, such that a point at the
-    distance `extent` from the centre moves by one unit. free (7, d): the combinations that nothing given hinders.
+    generators (n, 7): derivatives of all unknowns by three shifts, three rotations and a scale, normalised to a unit
+    motion at the distance `extent` from the centre. free (7, d): combinations that no given quantity fixes.
     """
 
     center: Array
@@ -35,18 +35,18 @@ class ObjectDatum:
     free: Array
 
     def motions(self, positions: Indices) -> Array:
-        """How some unknowns move (k, d) with what is free."""
+        """(k, d) motions of some unknowns in the free directions."""
         return np.asarray(self.generators[positions] @ self.free)
 
 
 def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> ObjectDatum:
-    """The similarity transformations that change nothing given: coordinates, stations, attitudes and distances."""
+    """Find the similarity transformations that leave all given coordinates, stations, attitudes and distances alone."""
     placed = _point_positions(problem) if problem.unknowns.point else problem.exterior[:, :3]
     center = state.values[placed].mean(axis=0)
     extent = float(np.sqrt(((state.values[placed] - center) ** 2).sum(axis=1).mean())) or 1.0
     generators = _generators(problem, state, center, extent)
     moved = generators.copy()
-    moved[problem.exterior[:, 3:]] *= extent  # an angle's motion as that of a point
+    moved[problem.exterior[:, 3:]] *= extent  # angles to lengths
     hindered = moved[np.isfinite(problem.unknowns.sigma)]
     rows = np.vstack([hindered / np.sqrt(max(len(hindered), 1)), _further_motions(problem, state, generators)])
     _, singular, right = np.linalg.svd(rows, full_matrices=False)
@@ -54,7 +54,7 @@ def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> Ob
 
 
 def _further_motions(problem: Problem, state: State, generators: Array) -> Array:
-    """How further observations change (m, 7), each by one unit at most, however short a distance may be."""
+    """(m, 7) changes of the further observations, normalised, so that short distances count like long ones."""
     rows = [np.zeros((7, 7))]
     for further in problem.further:
         by_unknowns = further.jacobian(state.values)
@@ -78,7 +78,7 @@ def _generators(problem: Problem, state: State, center: Array, extent: float) ->
     for axis in range(3):
         generators[placed, 3 + axis] = np.cross(np.eye(3)[axis], lever)
     generators[placed, 6] = lever
-    # A rotation R of the object turns M into M R', which is the rotation vector -M r on top of M.
+    # A rotation R of the object changes M to M R', that is by the rotation vector -M r.
     turned = np.linalg.solve(problem.attitude_by_unknowns(state), -state.rotations) / extent
     generators[problem.exterior[:, 3:], 3:6] = turned
     for name in problem.network.unoriented:
@@ -87,10 +87,10 @@ def _generators(problem: Problem, state: State, center: Array, extent: float) ->
 
 
 def minimal_datum(problem: Problem) -> Indices:
-    """Positions of the coordinates that fix what is free of the datum, without strain.
+    """Choose minimum constraints: positions of the coordinates that fix the free part of the datum.
 
-    Planimetry of two points far apart and the heights of these and of a third one off their line, as far as other
-    things do not fix them. A field flatter than a thousandth of its extent gives no scale by its heights alone.
+    These are the planimetric coordinates of two distant points and the heights of these and a third point off their
+    line, where nothing else fixes them. Heights define no scale in a field flatter than a thousandth of its extent.
     """
     state = problem.start()
     datum = object_datum(problem, state, FLAT)
@@ -104,8 +104,8 @@ def minimal_datum(problem: Problem) -> Indices:
 
 
 def _independent(motions: Array, least: Array | float, basis: Array) -> tuple[list[int], Array]:
-    """Of motions (m, d), one after the other, those of which a basis (k, d) and those before leave more open than their
-    least; and the basis that they make with it."""
+    """Select motions (m, d) one by one whose component outside the basis (k, d) exceeds least. Returns their indices
+    and the extended orthonormal basis."""
     chosen = []
     for i, (motion, enough) in enumerate(zip(motions, np.broadcast_to(least, len(motions)), strict=True)):
         rest = motion - basis.T @ (basis @ motion)
@@ -116,7 +116,7 @@ def _independent(motions: Array, least: Array | float, basis: Array) -> tuple[li
 
 
 def _candidates(problem: Problem, state: State) -> Indices:
-    """Free coordinates, of points that two images show at least, in the order in which they are to be fixed."""
+    """Free coordinates of points in at least two images, in the order in which they are to be fixed."""
     positions = _point_positions(problem)
     free = np.isinf(problem.unknowns.sigma[positions[:, :2]]).all(axis=1)
     rays = np.bincount(problem.places[~problem.is_fiducial, 0], minlength=len(problem.unknowns))
@@ -133,9 +133,8 @@ def _candidates(problem: Problem, state: State) -> Indices:
 
 
 def centered(problem: Problem, state: State, members: Indices) -> State:
-    """The state after the similarity transformation that brings some coordinates nearest to those given of them; what
-    these leave open brings the others nearest to their approximations.
-    """
+    """Transform the state by the free similarity that brings some coordinates nearest to their given values, and, as
+    far as these leave it open, the others nearest to their approximate values."""
     given = problem.unknowns.given[members]
     is_given = ~np.isnan(given)
     wanted = np.where(is_given, given, problem.unknowns.start[members])
@@ -149,7 +148,8 @@ def centered(problem: Problem, state: State, members: Indices) -> State:
 
 
 def _nearest(motion: Array, off: Array, first: Mask) -> Array:
-    """Amounts (d,) of motions (n, d) nearest to off (n,): by the rows `first`, then as far as these leave it open."""
+    """(d,) least-squares amounts of motions (n, d) that produce off (n,): by the rows `first`, then, in their null
+    space, by the others."""
     count = motion.shape[1]
     _, strength, right = np.linalg.svd(np.vstack([motion[first], np.zeros((count, count))]), full_matrices=False)
     left_open = right[strength <= FLAT * strength.max(initial=0.0)].T
@@ -159,7 +159,7 @@ def _nearest(motion: Array, off: Array, first: Mask) -> Array:
 
 
 def free_coordinates(problem: Problem, points: Sequence[str] = ()) -> Indices:
-    """Positions of the object coordinates, of some points or of all, of which nothing is given."""
+    """Positions of the object coordinates without a prior, of some points or of all."""
     of = problem.unknowns.point
     positions = np.concatenate([of[point] for point in points]) if points else _point_positions(problem).ravel()
     return np.asarray(positions[np.isinf(problem.unknowns.sigma[positions])])
@@ -167,7 +167,7 @@ def free_coordinates(problem: Problem, points: Sequence[str] = ()) -> Indices:
 
 def _transformed(problem: Problem, state: State, datum: ObjectDatum, amounts: Array) -> State:
     shift, turn, scale = amounts[:3], amounts[3:6] / datum.extent, 1.0 + amounts[6] / datum.extent
-    if datum.free.shape[1] == len(amounts):  # all free: a large turn is not mistaken for one with a loss of scale
+    if datum.free.shape[1] == len(amounts):  # all free: separate a large rotation from a change of scale
         sine = float(np.linalg.norm(turn))
         turn, scale = turn * (np.arctan2(sine, scale) / sine if sine else 1.0), float(np.hypot(sine, scale))
     rotation = rotation_from_vector(turn)
@@ -184,12 +184,12 @@ def _transformed(problem: Problem, state: State, datum: ObjectDatum, amounts: Ar
 
 
 def free_motion(problem: Problem, state: State) -> Array:
-    """How all quantities move (n, d) with what is free of the datum."""
+    """(n, d) motions of all quantities in the free directions of the datum."""
     return object_datum(problem, state, FLAT).motions(np.arange(len(problem.unknowns)))
 
 
 def held_as_known(network: Network, coordinates: Sequence[str]) -> Network:
-    """The network for approximations: coordinates that are to be held, and have a value, count as known."""
+    """Network for initial values: coordinates that are to be held, and have a value, count as known."""
     held = {object_coordinate(text) for text in coordinates}
     points = []
     for point in network.points:
@@ -200,10 +200,10 @@ def held_as_known(network: Network, coordinates: Sequence[str]) -> Network:
 
 
 def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
-    """Positions of the coordinates, "point.X" and so on, that a minimal datum is to hold.
+    """Positions of the coordinates, "point.X" and so on, chosen by the user as minimum constraints.
 
-    Raises DatumError where one is unknown or given already, where they hold less than is free of the datum, or
-    more: that would strain the network.
+    Raises DatumError where one is unknown or has a prior, and where they fix less than the free datum or over-constrain
+    it.
     """
     positions = np.array([_position(problem, text) for text in coordinates], dtype=np.intp)
     datum = object_datum(problem, problem.start(), FLAT)
@@ -237,9 +237,9 @@ def _position(problem: Problem, coordinate: str) -> int:
 
 
 def chosen_points(problem: Problem, points: Sequence[str]) -> Indices:
-    """Positions of the free coordinates of the points (all points if none is named) that carry the inner constraints.
+    """Positions of the free coordinates of the points (of all points if none is named) in the inner constraints.
 
-    Raises DatumError where one is unknown, or where they do not carry all that is free of the datum.
+    Raises DatumError where a point is unknown, or where they do not determine the whole free datum.
     """
     _check_points(problem, points)
     members = free_coordinates(problem, points)
@@ -260,12 +260,12 @@ def _check_points(problem: Problem, points: Sequence[str]) -> None:
 
 
 def _check_complete(datum: ObjectDatum, motions: Array, what: str) -> None:
-    """Refuse a choice whose motions (k, d), orthonormal rows, leave some of the free directions (7, d) open."""
+    """Raise DatumError where motions (k, d), orthonormal rows, leave some free directions (7, d) open."""
     _, _, right = np.linalg.svd(np.vstack([motions, np.zeros((motions.shape[1], motions.shape[1]))]))
     open_directions = datum.free @ right[len(motions) :].T
     if open_directions.shape[1] == 0:
         return
-    order = [3, 4, 5, 6, 0, 1, 2]  # turns and scale first, which move along with shifts
+    order = [3, 4, 5, 6, 0, 1, 2]  # rotations and scale first, since they imply shifts
     named, _ = _independent(open_directions[order], FLAT, np.zeros((0, open_directions.shape[1])))
     moving, remedies = zip(*(DATUM_DIRECTIONS[i] for i in sorted(order[k] for k in named)), strict=True)
     raise DatumError(

@@ -1,4 +1,4 @@
-"""What the observations do not determine: null directions of the equations, named with cause and remedy."""
+"""Rank defects: null directions of the observation equations, named, with cause and remedy."""
 
 from collections.abc import Iterable, Sequence
 
@@ -16,19 +16,19 @@ from adjust.rank_defect.null_space import SINGULAR, BlindBlock, blind_blocks, nu
 from adjust.rank_defect.scanner_directions import scanner_directions
 from adjust.rank_defect.unnamed_directions import many_sentence, own_sentence, unnamed_sentence
 
-WEAK = 1e-4  # singular values of the scaled rows, over the largest, below which noise makes the solution
-INVOLVED = 0.01  # part of a null vector's largest component that is worth a name
-PURE = 1e-5  # part that a name must have in an exact null direction, beyond what earlier names took
-MIXED = 0.05  # the same in a direction that is seen just a little, where everything plays a small part
-SETTLED = 3.0  # how much more than observations priors must weigh to make a weak direction theirs
-INSIDE = 1e-6  # what a known direction may stick out of the null space: rounding
-OBJECT_AXES = ("X", "Y", "Z", "X0", "Y0", "Z0")  # quantities that place points and stations
-NAMES_SHOWN = 3  # more names of one kind than this are shown as one, with a star
-UNDETERMINED = 0.99  # posterior over prior standard deviation above which the observations say nothing
+WEAK = 1e-4  # relative singular value of the scaled rows below which a direction is weak
+INVOLVED = 0.01  # components of a null vector that are named, relative to the largest
+PURE = 1e-5  # least share of a named direction in an exact null direction, beyond the names before it
+MIXED = 0.05  # the same in a weak direction, where everything has a small share
+SETTLED = 3.0  # ratio of the weights of priors and observations above which the priors settle a weak direction
+INSIDE = 1e-6  # tolerance for a known direction to lie in the null space: rounding
+OBJECT_AXES = ("X", "Y", "Z", "X0", "Y0", "Z0")  # positions of points and stations
+NAMES_SHOWN = 3  # more names of one kind are collapsed to one with a star
+UNDETERMINED = 0.99  # ratio of posterior and prior standard deviation above which a quantity is undetermined
 
 
 def singular_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
-    """The null directions of the factor of a state, at its computed observations; none where it is regular."""
+    """Null directions of the factor at a state; none where it is regular."""
     if factor.steady:
         return ()
     blind = blind_blocks(factor)
@@ -40,13 +40,17 @@ def singular_directions(problem: Problem, state: State, free: Indices, factor: F
 def weak_directions(
     problem: Problem, state: State, free: Indices, factor: Factor, singular: Sequence[NullDirection] = ()
 ) -> tuple[NullDirection, ...]:
-    """What the observations hardly see, and priors do not settle: there the solution is made by noise.
+    """Weak directions: hardly determined by the observations and not settled by priors, so that noise decides.
 
-    The factor is to be that without the priors of cameras and scanners. Of all directions below WEAK those are given
-    in which these priors weigh less than SETTLED times what the observations do. Directions that move fiducials with
-    priors are no cause for alarm: their priors are meant to place them; nor are those of lenses whose parameters trade
-    off, which notes are about. singular: the null directions, which are left out. Many directions without a name are
-    given as one: the longer a strip is, the more ways there are in which it can bend.
+    Reported are the directions below WEAK in which the priors of cameras and scanners weigh less than SETTLED times the
+    observations. Directions of fiducials with priors are left out, since these priors are meant to place them, and so
+    are those of lenses with inseparable parameters, which have notes of their own. Many unnamed directions are
+    collapsed to one: a long strip can bend in many ways.
+
+    Parameters
+    ----------
+    factor : without the priors of cameras and scanners.
+    singular : null directions, which are not repeated.
     """
     blind = blind_blocks(factor)
     hardly, visibility = null_space(factor, blind, WEAK)
@@ -75,15 +79,15 @@ def weak_directions(
 
 
 def _motion(direction: NullDirection) -> str:
-    """What moves first of all, without what follows it."""
+    """The leading motion of a direction, without its followers."""
     return direction.cause.split(", followed by")[0]
 
 
 def undetermined(problem: Problem, state: State, variances: Array) -> str:
-    """What the observations say nothing about among cameras and images, and why; empty where there is nothing.
+    """Sentence on quantities of cameras and images that the observations do not determine; empty if there are none.
 
-    The priors alone place these quantities: their variances (n,) are still the given ones. A fiducial that no image
-    shows is not among them: nobody expects otherwise.
+    Only their priors place them: their posterior variances, of variances (n,), equal the prior ones. Fiducials that no
+    image shows are left out.
     """
     unknowns = problem.unknowns
     observed = np.zeros(len(unknowns), dtype=bool)
@@ -103,7 +107,7 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
 
 
 def _collapsed(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    """Unknowns, those of one kind shown as one where they are many."""
+    """Collapse unknowns of one kind to one where there are many."""
     kinds: dict[Parameter, list[Parameter]] = {}
     for each in parameters:
         kinds.setdefault(each.any_owner, []).append(each)
@@ -116,7 +120,7 @@ def _collapsed(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
 def _block_directions(
     problem: Problem, state: State, free: Indices, blind: Sequence[BlindBlock]
 ) -> Iterable[NullDirection]:
-    """Null directions of an image's or a point's own unknowns, which the shared ones have no part in."""
+    """Null directions within the unknowns of one image or point."""
     for block in blind:
         for vector in block.right.T:
             moved = tuple(problem.unknowns.parameters[free[block.own[i]]] for i in _largest(vector))
@@ -132,13 +136,13 @@ def _named_directions(
     null: Array,
     part: float,
 ) -> tuple[Sequence[NullDirection], Sequence[NullDirection]]:
-    """The vectors (n, d) of a null space as directions: those with a name, the object datum first, then the camera's;
-    and those that are described by what moves most in them."""
+    """Describe the vectors (n, d) of a null space: named directions, the object datum first and then those of cameras;
+    and unnamed ones, described by the unknown that moves most."""
     if null.shape[1] == 0:
         return (), ()
     parameters = [problem.unknowns.parameters[i] for i in free]
     datum, sentences, rest = _datum_part(problem, state, free, factor, blind, null)
-    # As much of the free datum added to the rest as leaves the object points where they are.
+    # Add as much of the free datum as keeps the object points in place.
     points = np.isin(free, free_coordinates(problem))
     still = np.asarray(rest - datum @ np.linalg.lstsq(datum[points], rest[points])[0])
     leads = [*scanner_directions(problem, state), *camera_directions(problem, state)]
@@ -152,7 +156,7 @@ def _named_directions(
     left = still @ _complement(visibility[chosen], PURE)
     moved = [[parameters[i] for i in _largest(vector)] for vector in np.hstack([datum, vectors, left]).T]
     of_leads = moved[datum.shape[1] : len(moved) - left.shape[1]]
-    for own, i in zip(of_leads, chosen, strict=True):  # small as they may be, what it is named after moves
+    for own, i in zip(of_leads, chosen, strict=True):  # always list the unknowns that give the name, however small
         own += [parameters[k] for k in np.flatnonzero(functionals[i]) if parameters[k] not in own]
     sentences += [leads[i].sentence(own) for i, own in zip(chosen, of_leads, strict=True)]
     for vector, own in zip(left.T, moved[len(moved) - left.shape[1] :], strict=True):
@@ -166,7 +170,7 @@ def _named_directions(
 def _sentence_without_name(
     problem: Problem, state: State, most: Parameter, moved: Sequence[Parameter]
 ) -> tuple[str, str]:
-    """Cause and remedy of a direction without a lead, of what moves most in it: of one point or image, or of many."""
+    """Cause and remedy of an unnamed direction, by the unknown that moves most: of one point or image, or of many."""
     owners = {(each.owner, each.id) for each in moved}
     if len(owners) == 1 and most.kind in ("point", "exterior", "film"):
         return own_sentence(problem, state, most)
@@ -176,9 +180,9 @@ def _sentence_without_name(
 def _datum_part(
     problem: Problem, state: State, free: Indices, factor: Factor, blind: Sequence[BlindBlock], null: Array
 ) -> tuple[Array, list[tuple[str, str]], Array]:
-    """The vectors (n, k) of the object datum in a null space, their sentences, and the rest (n, d - k) of the space.
+    """Split off the object datum: its vectors (n, k) in a null space, their sentences, and the rest (n, d - k).
 
-    Without what a block moves in its own null directions, as in all these vectors.
+    All vectors are free of the blocks' own null directions.
     """
     datum = object_datum(problem, state)
     motion = (datum.generators @ datum.free)[free] * factor.scale[:, None]
@@ -195,9 +199,9 @@ def _datum_part(
 
 
 def _object_fixed(parameters: Sequence[Parameter], vectors: Array, ranks: Indices) -> Array:
-    """Vectors (n, d) with as much of the others added to those of rank 0 as leaves stations and points where they are.
+    """Combine vectors (n, d) of rank 0 with the others such that stations and points stay in place.
 
-    A common shift of fiducials and principal point, which no object takes part in, is then told as just that.
+    A common shift of fiducials and principal point, which does not involve the object, is then reported as such.
     """
     placed = np.array([each.quantity in OBJECT_AXES for each in parameters], dtype=bool)
     first, others = vectors[:, ranks == 0], vectors[:, ranks > 0]
@@ -207,9 +211,10 @@ def _object_fixed(parameters: Sequence[Parameter], vectors: Array, ranks: Indice
 
 
 def _axes_projector(motions: Array, vectors: Array, part: float) -> Array:
-    """A projector (d, d) on what of orthonormal vectors (n, d) moves the unknowns of motions (n, m) by these alone.
+    """Projector (d, d) onto combinations of orthonormal vectors (n, d) that move the unknowns of motions (n, m) only by
+    these motions.
 
-    An affinity that leaves two fiducial marks in their places shifts their mean, and yet it is no shift.
+    An affinity that keeps two fiducial marks in place shifts their mean, but it is not a shift.
     """
     moved = np.any(motions != 0.0, axis=1)
     basis = np.linalg.qr(motions[moved])[0]
@@ -218,9 +223,9 @@ def _axes_projector(motions: Array, vectors: Array, part: float) -> Array:
 
 
 def _independent_rows(rows: Array, part: float, ranks: Indices, axes: Array | None = None) -> list[int]:
-    """Independent rows (m, d), up to d: those of the lowest rank first, of equals that which sticks out most.
+    """Select up to d independent rows of (m, d): by rank, then by the size of the independent component.
 
-    axes: a projector (d, d) that rows of rank 0 have to pass.
+    axes: projector (d, d) that is applied to rows of rank 0.
     """
     chosen: list[int] = []
     rest = rows.copy()
@@ -240,13 +245,13 @@ def _independent_rows(rows: Array, part: float, ranks: Indices, axes: Array | No
 
 
 def _complement(rows: Array, part: float) -> Array:
-    """Orthonormal vectors (d, k) of which rows (m, d) see no more than a part."""
+    """Orthonormal vectors (d, k) of the approximate null space of rows (m, d), with singular values up to part."""
     square = np.zeros((rows.shape[1], rows.shape[1]))
     _, visibility, right = np.linalg.svd(np.vstack([rows, square]), full_matrices=False)
     return np.asarray(right[visibility <= part].T)
 
 
 def _largest(vector: Array) -> list[int]:
-    """The components that matter, in order."""
+    """Indices of the components that are named."""
     size = np.abs(vector)
     return [int(i) for i in np.flatnonzero(size > INVOLVED * size.max())]

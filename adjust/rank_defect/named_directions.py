@@ -1,4 +1,4 @@
-"""The directions in which a network's unknowns are known to move together: a table with the words for each."""
+"""Named null directions: known joint motions of a network's unknowns, with cause and remedy."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -13,15 +13,14 @@ from adjust.functional_model.transformation import follows_tilts
 from adjust.problem.parameter import Kind, Parameter, enumeration
 from adjust.problem.problem import Problem, State
 
-FLAT = 0.01  # least over largest extent of the field, below which there is no relief to speak of
-PARALLEL_RAD = np.radians(1.0)  # axes within this of each other are parallel
-FIELD = 4  # points from which something is known of the field, and not just of its datum
-LEAST_BEND = 1e-6  # of squares of the fiducials' places beyond affinities: three marks have none
+FLAT = 0.01  # ratio of smallest and largest extent below which the field is flat
+PARALLEL_RAD = np.radians(1.0)  # largest angle between parallel axes
+FIELD = 4  # known points needed to determine more than the datum
+LEAST_BEND = 1e-6  # second-order part of a tilt, relative, below which it is an affinity (three marks)
 
 
 class Reason(NamedTuple):
-    """Why nothing hinders a motion, where that is more than what follows it; what given prior would end it; what else
-    to do."""
+    """Why a motion is free; the prior that would fix it; other remedies."""
 
     because: str
     given: str
@@ -30,11 +29,16 @@ class Reason(NamedTuple):
 
 @dataclass(frozen=True)
 class NamedDirection:
-    """What a null direction is called after: a functional (n,) of the unknowns that it changes, and the words for it.
+    """Name of a null direction.
 
-    rank: of several that would do, that of the lowest rank gives the name. motion: what moves. reason: why, and
-    by_companion, where a lens or fiducial marks move along ("lens", "marks"). partner: another unknown (its key, and in
-    words) whose prior would end it, where it moves too.
+    Attributes
+    ----------
+    rank : the lowest one that applies gives the name.
+    functional : (n,) function of the unknowns that the direction changes.
+    motion : what moves, in words.
+    reason : why, and the remedy.
+    partner : another unknown, with its words, whose prior would fix the direction if it moves too.
+    by_companion : reasons where a lens ("lens") or fiducial marks ("marks") move along.
     """
 
     rank: int
@@ -45,7 +49,7 @@ class NamedDirection:
     by_companion: Mapping[str, Reason] = field(default_factory=dict)
 
     def sentence(self, moved: Iterable[Parameter]) -> tuple[str, str]:
-        """Cause and remedy of a direction that moves some unknowns."""
+        """Cause and remedy, given the unknowns that move."""
         moved = set(moved)
         lens = any(each.kind == "interior" and each.quantity not in INTERIOR_NAMES for each in moved)
         companion = "lens" if lens else "marks" if any(each.kind == "fiducial" for each in moved) else ""
@@ -56,7 +60,7 @@ class NamedDirection:
         return cause, f"Give a standard deviation to {given}{otherwise and f', or {otherwise}'}."
 
 
-# What follows a motion: the unknowns' kind, quantities (all where empty), words, a word of motions that name it.
+# Followers of a motion: kind, quantities (empty: all), words; not mentioned if the motion contains the last text.
 FOLLOWERS: tuple[tuple[Kind, tuple[str, ...], str, str], ...] = (
     ("fiducial", (), "the fiducial marks", "fiducial mark"),
     ("film", (), "the film transformations", ""),
@@ -72,7 +76,7 @@ FOLLOWERS: tuple[tuple[Kind, tuple[str, ...], str, str], ...] = (
 
 
 def followers(moved: Iterable[Parameter], motion: str = "") -> str:
-    """What moves along, in words."""
+    """Words for the unknowns that move along."""
     kinds = {(each.kind, each.quantity) for each in moved}
     words = [
         word
@@ -82,7 +86,7 @@ def followers(moved: Iterable[Parameter], motion: str = "") -> str:
     return f", followed by {enumeration(words)}" if words else ""
 
 
-# The free directions of the object space: motion, and what known coordinates end it.
+# Free directions of the object space: motion, and the known coordinates that would fix it.
 DATUM_DIRECTIONS = (
     ("can shift in X", "X of one point"),
     ("can shift in Y", "Y of one point"),
@@ -107,8 +111,8 @@ _X0, _Y0, _C = ("x0", "x0' (F7)"), ("y0", "y0' (F8)"), ("c", "the principal dist
 _LEVER = "one coordinate of a fiducial mark that has a lever arm (F5, F6)"
 _TWO, _THREE = (f"x' and y' of {number} fiducial marks (F5, F6)" for number in ("two", "three"))
 _TURNED = "add images turned by 90 degrees about their axes or tilted in other directions"
-# Common motions of all fiducial marks of a camera: rank, dx' and dy' by 1, x and y about the marks' mean, motion, what
-# given prior ends it, the interior quantity that would, too, where it moves along, what else to do.
+# Joint motions of all fiducial marks of a camera: rank; coefficients of dx' and dy' for 1, x and y about the mean;
+# motion; prior that fixes it; interior quantity whose prior would fix it too, if it moves along; other remedies.
 FIDUCIAL_MOTIONS = (
     (0, (1, 0, 0), (0, 0, 0), "Shift x: {} shift together in x'", "x' of one fiducial mark (F5)", _X0, ""),
     (0, (0, 0, 0), (1, 0, 0), "Shift y: {} shift together in y'", "y' of one fiducial mark (F6)", _Y0, ""),
@@ -120,11 +124,10 @@ FIDUCIAL_MOTIONS = (
 
 
 def camera_directions(problem: Problem, state: State) -> list[NamedDirection]:
-    """The named directions of all cameras.
+    """Named directions of all cameras.
 
-    Ranks: -1 a tilt, which moves much else along, 0 what is a change of the camera's own axes, 1 other changes of its
-    fiducials, 2 interior orientation, 3 distortion; -2 of a scanner's bend, which moves still more (see
-    `scanner_directions`).
+    Ranks: -2 bend of a scanner (see `scanner_directions`), -1 tilt, 0 change of the camera's axes, 1 other changes of
+    its fiducials, 2 interior orientation, 3 distortion. The more a direction moves along, the lower its rank.
     """
     directions: list[NamedDirection] = []
     for name, positions in problem.unknowns.camera.items():
@@ -145,18 +148,17 @@ def camera_directions(problem: Problem, state: State) -> list[NamedDirection]:
 
 
 def changed(problem: Problem, positions: Indices | int, values: Array | float) -> Array:
-    """The functional (n,) of some unknowns' changes."""
+    """(n,) functional with given values at some positions."""
     functional = np.zeros(len(problem.unknowns))
     functional[positions] = values
     return functional
 
 
 def _fiducial_directions(problem: Problem, state: State, camera: str) -> Iterator[NamedDirection]:
-    """Shift, rotation, scale, affinity and shear of all fiducials of a camera and of what joins the scans of its
-    frames, which moves with them; and a tilt of all cameras about x' or y', where every film transformation of the
-    camera can undo it.
+    """Shift, rotation, scale, affinity and shear of all fiducials of a camera, with the joins of its frames; and a tilt
+    of all images about x' or y', where every film transformation of the camera can compensate it.
 
-    A tilt moves the fiducials by t (x'², x'y'), of which the functional takes what no affinity of theirs can be.
+    A tilt moves the fiducials by t (x'², x'y'); the functional takes the part that is not an affinity.
     """
     images = [image for image in problem.network.images if image.camera == camera]
     places = [positions for (owner, _), positions in problem.unknowns.fiducial.items() if owner == camera]
@@ -187,7 +189,7 @@ def _fiducial_directions(problem: Problem, state: State, camera: str) -> Iterato
 
 
 def _distortion_directions(problem: Problem, camera: str, positions: Indices) -> Iterator[NamedDirection]:
-    """The distortion parameters of a camera."""
+    """Directions named after the distortion parameters of a camera."""
     own_family = family(problem.network.camera_by_name[camera].distortion.family)
     named = dict(zip(own_family.parameters, positions, strict=True))
     free = [each for each in own_family.alike_at_zero if np.isinf(problem.unknowns.sigma[named[each]])]
@@ -203,9 +205,9 @@ def _distortion_directions(problem: Problem, camera: str, positions: Indices) ->
 
 @dataclass(frozen=True)
 class FieldGeometry:
-    """What decides whether images tell the interior orientation from the exterior.
+    """Geometry that decides whether interior and exterior orientation are separable.
 
-    known: coordinates of object points that are known beforehand, and not just as a datum.
+    known: object coordinates with priors, beyond a datum.
     """
 
     flat: bool
@@ -224,13 +226,13 @@ class FieldGeometry:
 
     @property
     def remedy(self) -> str:
-        """What tells a principal distance from the stations' distance in any field."""
+        """Remedy that separates the principal distance from the object distance in any field."""
         relief = "points at other heights" if self.known == "points" else "known points (X, Y, Z) at different heights"
         return f"add images tilted in different directions, or {relief}"
 
 
 def field_geometry(problem: Problem, state: State, camera: str) -> FieldGeometry:
-    """The field that the observed points make, and the axes of a camera's images."""
+    """Geometry of the observed points and of the axes of a camera's images."""
     positions = np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
     xyz = state.values[positions]
     extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False) if len(xyz) > 2 else np.zeros(3)

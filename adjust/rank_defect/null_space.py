@@ -1,4 +1,4 @@
-"""Changes of the unknowns that the rows of an adjustment do not see, or hardly: the null space of its factor."""
+"""Null space of an adjustment's factor: changes of the unknowns that the observations do not, or hardly, determine."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,20 +10,20 @@ from adjust.linear_algebra.factor import Factor
 from adjust.linear_algebra.multifrontal import append_rows
 from adjust.linear_algebra.sparse_factor import Triangle
 
-SINGULAR = 1e-8  # singular values of the scaled rows, over the largest, below which there is no solution
-DENSE = 100  # shared unknowns up to which all singular values are computed
-FIRST_COUNT = 24  # vectors that are iterated at a time where there are more
+SINGULAR = 1e-8  # relative singular value of the scaled rows below which the system is singular
+DENSE = 100  # shared unknowns up to which a dense SVD is used
+FIRST_COUNT = 24  # vectors of the first inverse iteration where there are more
 ITERATIONS = 50
-STANDSTILL = 1e-3  # change of small singular values that is none, in parts of what counts as small
-ROUNDING = 1e-14  # what rounding adds to a singular value, in parts of the largest
+STANDSTILL = 1e-3  # change of small singular values at convergence, relative to the limit
+ROUNDING = 1e-14  # rounding error of a singular value, relative to the largest
 
 
 @dataclass(frozen=True)
 class BlindBlock:
-    """A block whose own unknowns have null vectors of their own, which the shared unknowns have no part in.
+    """Block with null vectors within its own unknowns, independent of the shared ones.
 
-    own (o,), shared (s,), triangle (o, o), border (o, s): as in its factor. left, right (o, d): the triangle's null
-    vectors.
+    own (o,), shared (s,), triangle (o, o), border (o, s): as in the factor. left, right (o, d): null vectors of the
+    triangle.
     """
 
     own: Indices
@@ -35,7 +35,7 @@ class BlindBlock:
 
 
 def blind_blocks(factor: Factor) -> list[BlindBlock]:
-    """The blocks that do not determine their own unknowns, in the order of these."""
+    """Find the blocks with a singular triangle, sorted by their unknowns."""
     found = []
     for blocks in factor.blocks:
         left, singular, right = np.linalg.svd(blocks.triangle)
@@ -47,7 +47,7 @@ def blind_blocks(factor: Factor) -> list[BlindBlock]:
 
 
 def null_vectors(factor: Factor) -> Array:
-    """Orthonormal vectors (n, d) of the scaled unknowns that no row sees."""
+    """Orthonormal null vectors (n, d) of the scaled unknowns."""
     blind = blind_blocks(factor)
     within = []
     for block in blind:
@@ -58,15 +58,15 @@ def null_vectors(factor: Factor) -> Array:
 
 
 def null_space(factor: Factor, blind: Sequence[BlindBlock], below: float) -> tuple[Array, Array]:
-    """Orthonormal vectors (n, d) of all scaled unknowns that are hardly seen, and how much they are seen (d,).
+    """Orthonormal vectors (n, d) of the scaled unknowns with small singular values, and these values (d,).
 
-    These are the vectors whose singular values are below a part of the largest of all. They involve the shared unknowns
-    and what follows these in the blocks; null vectors within blocks are not among them.
+    below: limit relative to the largest singular value. The vectors involve the shared unknowns and the unknowns of
+    blocks that follow them; null vectors within blocks are not included.
     """
     count = factor.shared_count
     if count == 0:
         return np.zeros((len(factor.scale), 0)), np.zeros(0)
-    # Of blocks with null vectors of their own the rows that these leave over count as well.
+    # Blocks with null vectors of their own leave rows for the shared unknowns.
     rows = [(block.shared, block.left.T @ block.border) for block in blind]
     singular, shared = _smallest(append_rows(factor.triangle, rows) if rows else factor.triangle, below)
     vectors = np.zeros((len(factor.scale), len(singular)))
@@ -82,10 +82,10 @@ def null_space(factor: Factor, blind: Sequence[BlindBlock], below: float) -> tup
 
 
 def _smallest(triangle: Triangle, below: float) -> tuple[Array, Array]:
-    """The singular values (d,) of a triangle below a part of the largest, and their right vectors (s, d)."""
+    """Small singular values (d,) of a triangle, relative to the largest, and their right vectors (s, d)."""
     if len(triangle) <= DENSE:
         _, singular, right = np.linalg.svd(triangle.toarray())
-        hardly = singular <= max(below * singular[0], ROUNDING)  # of all columns of length one the largest is 1 or more
+        hardly = singular <= max(below * singular[0], ROUNDING)  # the largest is at least 1: columns have length 1
         return singular[hardly], right[hardly].T
     largest = triangle.largest_singular
     count = FIRST_COUNT
@@ -98,10 +98,10 @@ def _smallest(triangle: Triangle, below: float) -> tuple[Array, Array]:
 
 
 def _inverse_iteration(triangle: Triangle, count: int, limit: float) -> tuple[Array, Array]:
-    """The smallest singular values (count,) and right vectors (s, count) by orthogonal iteration with the inverse.
+    """Smallest singular values (count,) and right vectors (s, count) by inverse orthogonal iteration.
 
-    Those above the limit need not have converged; nor any where all are below it, so that there are more. Source: Golub
-    and Van Loan, Matrix Computations, section 8.2.
+    Values above the limit need not have converged, and none if all are below it, since more vectors are then needed.
+    Source: Golub and Van Loan, Matrix Computations, section 8.2.
     """
     vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(len(triangle), count)))[0]
     before = np.full(count, np.inf)
@@ -110,7 +110,7 @@ def _inverse_iteration(triangle: Triangle, count: int, limit: float) -> tuple[Ar
         vectors = np.linalg.qr(triangle.solve(half))[0]
         _, singular, right = np.linalg.svd(triangle.times(vectors), full_matrices=False)
         vectors, singular = vectors @ right[::-1].T, singular[::-1]
-        small = singular <= limit  # no singular value is larger than what is found for it in these vectors
+        small = singular <= limit  # Ritz values are upper bounds of the singular values
         if small.all() or (np.abs(before - singular)[small] <= STANDSTILL * limit).all():
             break
         before = singular

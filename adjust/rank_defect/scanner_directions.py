@@ -1,4 +1,4 @@
-"""Bends of a scanner that the observations do not tell from what the films and the fiducial marks do, in words."""
+"""Scanner deformations that are not separable from film, fiducial marks or lens, in words."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
@@ -11,15 +11,15 @@ from adjust.problem.estimates import Cofactor
 from adjust.problem.problem import Problem, State
 from adjust.rank_defect.named_directions import NamedDirection, Reason, changed
 
-Pose = tuple[int, bool]  # how a frame is turned in its scan, degrees, and whether it is mirrored
+Pose = tuple[int, bool]  # rotation of a frame in its scan, degrees, and whether it is mirrored
 
 SCANNER_RANK = -2
-ALIKE_DEG = 20.0  # two frames whose turns in the scanner differ by less lie alike in it
-HARDLY = 20.0  # times as uncertain as with all else known: from there on the observations hardly determine a term
+ALIKE_DEG = 20.0  # rotations that differ by less count as equal
+HARDLY = 20.0  # ratio of a term's standard deviation to that with all else known, above which it is weak
 
 
 def scanner_directions(problem: Problem, state: State) -> list[NamedDirection]:
-    """The directions that are called after the terms of every scanner's bend."""
+    """Directions named after the terms of every scanner's deformation."""
     directions = []
     for name, positions in problem.unknowns.scanner.items():
         poses = _scanner_poses(problem, state, name)
@@ -39,10 +39,10 @@ def scanner_directions(problem: Problem, state: State) -> list[NamedDirection]:
 
 
 def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
-    """Why a term of a bend is not determined, and the remedies.
+    """Why a term of the deformation is not determined, and the remedies.
 
-    poses: in which the scanner's frames lie. confused_with: what does the same, "lens" or "marks"; empty where the
-    term does nothing that the marks show.
+    poses: of the scanner's frames. confused_with: what it is not separable from, "lens" or "marks"; empty where the
+    marks do not show the term at all.
     """
     is_odd, one_pose = term_degree(term) % 2 == 1, len(poses) == 1
     given = "x' and y' of the fiducial marks (F5, F6), or to the term itself"
@@ -72,10 +72,10 @@ def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
 def weak_term_sentences(
     problem: Problem, state: State, free: Indices, factor: Factor, cofactor: Cofactor
 ) -> Iterator[str]:
-    """Sentences on the terms that a regular network hardly tells from what films, marks and lenses do.
+    """Sentences on terms that a regular network hardly separates from films, marks and lenses.
 
-    Frames never lie quite alike, and given fiducial marks have some standard deviation: a bend is then determined, but
-    by next to nothing. factor, cofactor: of the free unknowns, and of all.
+    Frames never lie exactly alike, and given fiducial marks have a standard deviation: a deformation is then
+    determined, but weakly. factor: of the free unknowns; cofactor: of all.
     """
     unknowns = problem.unknowns
     places = {int(position): i for i, position in enumerate(free)}
@@ -94,7 +94,7 @@ def weak_term_sentences(
 
 
 def held_variances(cofactor: Array, count: int) -> Array:
-    """The variances of the first quantities of a cofactor matrix (n, n), with all others known."""
+    """Conditional variances of the first quantities of a cofactor matrix (n, n), given all others."""
     own, by_others, others = cofactor[:count, :count], cofactor[:count, count:], cofactor[count:, count:]
     scale = np.sqrt(np.diag(others))
     reduced = by_others / scale
@@ -105,9 +105,9 @@ def held_variances(cofactor: Array, count: int) -> Array:
 def undetermined_term_sentences(
     scanner: str, terms: Sequence[str], by_lens: Collection[str], poses: Sequence[Pose]
 ) -> Iterator[str]:
-    """Sentences on some terms of a scanner's bend that are not, or hardly, told from other unknowns.
+    """Sentences on terms of a scanner's deformation that are not, or hardly, separable from other unknowns.
 
-    by_lens: those that would be told if the lenses' distortion were known.
+    by_lens: terms that would be determined if the distortion were known.
     """
     by_reason: dict[Reason, list[str]] = {}
     for term in terms:
@@ -121,7 +121,7 @@ def undetermined_term_sentences(
 
 
 def _are_half_turns(poses: Sequence[Pose]) -> bool:
-    """Whether no frame is turned by anything but half a turn against the first, nor mirrored against it."""
+    """Whether all frames are equal to the first up to half turns."""
     first, mirrored = poses[0]
     return all(abs((turn - first + 90) % 180 - 90) < ALIKE_DEG and m == mirrored for turn, m in poses)
 
@@ -136,7 +136,7 @@ def _scanner_poses(problem: Problem, state: State, scanner: str) -> list[Pose]:
 
 
 def scan_poses(gradients: Iterable[Array]) -> list[Pose]:
-    """The ways in which frames lie in their scans, from the derivatives (2, 2) of camera by comparator coordinates."""
+    """Distinct poses of frames in their scans, from derivatives (2, 2) of camera by comparator coordinates."""
     poses: list[Pose] = []
     for gradient in gradients:
         mirrored = bool(np.linalg.det(gradient) < 0.0)

@@ -1,4 +1,4 @@
-"""What to say of an image or a point that its own observations do not determine, and of directions without a name."""
+"""Cause and remedy for undetermined images and points, and for unnamed null directions."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,10 +9,10 @@ from adjust.problem.network import Image
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, State
 
-IN_LINE = 1e-3  # width over length of marks in an image, and base over distance of stations, that are next to none
-SHOWN = 3  # names that are listed one by one
+IN_LINE = 1e-3  # width over length of collinear marks, and base over distance of coincident stations
+SHOWN = 3  # names listed one by one
 
-# By kind of the unknown that moves most: cause and remedy.
+# Cause and remedy by the kind of the unknown that moves most.
 UNNAMED: Mapping[str, tuple[str, str]] = {
     "exterior": (
         "The exterior orientation of image {owner} can change ({quantity} most){followers}: too few known points, or "
@@ -52,14 +52,14 @@ UNNAMED: Mapping[str, tuple[str, str]] = {
 
 
 def unnamed_sentence(most: Parameter, followers: str) -> tuple[str, str]:
-    """Cause and remedy of a direction that has no name, after the unknown that moves most in it."""
+    """Cause and remedy of an unnamed direction, by the unknown that moves most."""
     words = most._asdict() | {"followers": followers}
     cause, remedy = UNNAMED[most.kind]
     return cause.format(**words), remedy.format(**words)
 
 
 def many_sentence(count: int, followers: str) -> tuple[str, str]:
-    """Cause and remedy of many directions that have no name."""
+    """Cause and remedy of many unnamed directions."""
     return (
         f"The network can drift and bend in {count} ways{followers}: what is known of the object is too little for it, "
         "or too far apart.",
@@ -69,7 +69,7 @@ def many_sentence(count: int, followers: str) -> tuple[str, str]:
 
 
 def own_sentence(problem: Problem, state: State, parameter: Parameter) -> tuple[str, str]:
-    """Cause and remedy where the observations do not determine the image or the point that an unknown belongs to."""
+    """Cause and remedy of an undetermined image or point; parameter: one of its unknowns."""
     if parameter.kind == "point":
         return _point_sentence(problem, state, parameter.id)
     parts = _parts(problem, parameter.owner)
@@ -77,7 +77,7 @@ def own_sentence(problem: Problem, state: State, parameter: Parameter) -> tuple[
 
 
 def _parts(problem: Problem, frame: str) -> list[Image]:
-    """The scans of a frame of several; frame: its name, or that of one of its scans."""
+    """Scans of a frame that was scanned in parts; frame: its name or that of one of its scans."""
     image = problem.network.image_by_name.get(frame)
     frame = image.part_of if image is not None else frame
     return [image for image in problem.network.images if image.part_of and image.part_of == frame]
