@@ -1,1 +1,1 @@
-"""What the result says of itself: residuals, tests, reliability, significance."""
+"""Quality of an adjustment: residuals, cofactors, tests, reliability, significance, correlations."""

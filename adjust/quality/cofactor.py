@@ -1,4 +1,4 @@
-"""The cofactor matrix of a result, the covariance at sigma0 = 1: computed from the factor where it is asked for."""
+"""Cofactor matrix of a result (covariance at sigma0 = 1), computed on demand from the factor."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +16,7 @@ from adjust.rank_defect.datum import free_motion
 
 @dataclass(frozen=True)
 class NoCofactor:
-    """What stands for the cofactor matrix where there is no solution: zeros, which mean nothing."""
+    """Placeholder for the cofactor matrix where there is no solution: zeros without meaning."""
 
     count: int
 
@@ -35,7 +35,7 @@ class NoCofactor:
 class InnerDatum:
     """Baarda's S-transformation of cofactors: with V = Q P', Q becomes Q - M V' - V M' + M P V M'.
 
-    motion M (n, d): how the quantities move with the free datum; through V (n, d); inner P V (d, d).
+    motion M (n, d): motions of the quantities in the free directions of the datum; through V (n, d); inner P V (d, d).
     """
 
     motion: Array
@@ -43,23 +43,23 @@ class InnerDatum:
     inner: Array
 
     def part(self, at: Indices) -> Array:
-        """What is added (k, k) to the cofactors of some quantities."""
+        """(k, k) term added to the cofactors of some quantities."""
         motion, through = self.motion[at], self.through[at]
         crossed = motion @ through.T
         return np.asarray(motion @ self.inner @ motion.T - crossed - crossed.T)
 
     @property
     def variances(self) -> Array:
-        """What is added (n,) to the variances."""
+        """(n,) term added to the variances."""
         return np.asarray(((self.motion @ self.inner - 2.0 * self.through) * self.motion).sum(axis=1))
 
 
 @dataclass(frozen=True)
 class FactorCofactor:
-    """The cofactor matrix of all quantities (n, n) from the factor of the free unknowns (f).
+    """Cofactor matrix of all quantities (n, n) from the factor of the free unknowns (f).
 
-    by_free (n, f): the quantities as they are reported by the unknowns: omega, phi, kappa by rotation vectors, film
-    parameters by centred ones, rows without an entry for what is fixed.
+    by_free (n, f): derivatives of the reported quantities by the free unknowns: omega, phi, kappa by rotation vectors,
+    film parameters by centred ones; empty rows for fixed quantities.
     """
 
     factor: Factor
@@ -67,16 +67,16 @@ class FactorCofactor:
     datum: InnerDatum | None = None
 
     def part(self, at: Indices) -> Array:
-        """The cofactor matrix (k, k) of some quantities, by their positions in the result."""
+        """Cofactor matrix (k, k) of some quantities, by their positions in the result."""
         cofactor = self.factor.function_cofactor(self.by_free[at])
         return cofactor if self.datum is None else cofactor + self.datum.part(at)
 
     def parts(self, groups: Indices) -> Array:
-        """The cofactor matrices (g, k, k) of groups of quantities (g, k), each of one point's or of one image's."""
+        """Cofactor matrices (g, k, k) of groups of quantities (g, k), each of one point or one image."""
         functions = self.by_free[groups.ravel()]
         (count, width), free = groups.shape, self.by_free.shape[1]
         row = np.repeat(np.arange(groups.size), np.diff(functions.indptr))
-        # Every pair of a group and an unknown that it depends on, group by group.
+        # All pairs of a group and an unknown that it depends on, sorted by group.
         pairs, place = np.unique(row // width * free + functions.indices, return_inverse=True)
         first = np.searchsorted(pairs, np.arange(count) * free)
         widths = np.diff(first, append=len(pairs))
@@ -91,11 +91,11 @@ class FactorCofactor:
 
     @cached_property
     def variances(self) -> Array:
-        """The diagonal (n,)."""
+        """(n,) diagonal."""
         plain = self.factor.variances()
         entries = np.diff(self.by_free.indptr)
         variances = self.by_free.multiply(self.by_free) @ plain
-        for count in np.unique(entries[entries > 1]):  # functions of so many unknowns, all of one image
+        for count in np.unique(entries[entries > 1]):  # functions of `count` unknowns, all of one image
             rows = np.flatnonzero(entries == count)
             functions = self.by_free[rows]
             by_unknowns = functions.data.reshape(-1, 1, count)
@@ -105,14 +105,14 @@ class FactorCofactor:
 
 
 def free_cofactor(numbering: Numbering, state: State, factor: Factor) -> FactorCofactor:
-    """The cofactor matrix of a network solved in the datum of its numbering."""
+    """Cofactor matrix in the datum of the numbering."""
     return FactorCofactor(factor, _reported(numbering.problem, state)[:, numbering.free])
 
 
 def inner_cofactor(
     problem: Problem, numbering: Numbering, state: State, factor: Factor, members: Indices
 ) -> FactorCofactor:
-    """That of a minimal datum, the numbering's, transformed to inner constraints over some coordinates.
+    """Cofactor matrix transformed from the numbering's minimum constraints to inner constraints over some coordinates.
 
     With G the motions of the free datum and G_p their rows of these coordinates, P = (G_p' G_p)^-1 G_p'.
     """
@@ -127,10 +127,10 @@ def inner_cofactor(
 
 
 def _reported(problem: Problem, state: State) -> csr_array:
-    """The quantities as they are reported by those that are moved (n, n).
+    """(n, n) derivatives of the reported quantities by the unknowns of the iteration.
 
-    That is omega, phi, kappa by rotation vectors, and film parameters by centred ones. Where phi is +-90
-    degrees, omega and kappa are told by their sum or difference alone (the pseudo-inverse).
+    These are omega, phi, kappa by rotation vectors, and film parameters by centred ones. Where phi is +-90 degrees,
+    only the sum or difference of omega and kappa is determined (pseudo-inverse).
     """
     count = len(problem.unknowns)
     angles = np.unique(problem.exterior[~problem.keeps_angles, 3:], axis=0)  # scans of one frame have one attitude

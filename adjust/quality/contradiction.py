@@ -1,9 +1,9 @@
-"""Whether the images contradict what was observed together beside them, an earlier calibration say, and in what.
+"""Compatibility test of the images against correlated prior observations, such as an earlier calibration.
 
-Its quantities are correlated, and each by itself may pass where all together do not. With C = L L' their covariance,
-v their residuals and S = I - H (see `adjust.quality.residuals`), the others put them at observed + d, d = L S^+ L^-1 v,
-with the covariance L S^+ L'; and u' S^+ u, u = L^-1 v, is chi-square with as many degrees of freedom as S has rank:
-the test of a block of errors (Baarda 1968; Förstner and Wrobel, Photogrammetric Computer Vision, 4.6.4).
+Each quantity may pass by itself where all together do not. With C = L L' their covariance, v their residuals and
+S = I - H (see `adjust.quality.residuals`), the other observations determine them as observed + d, d = L S^+ L^-1 v,
+with the covariance L S^+ L'. The statistic u' S^+ u, u = L^-1 v, is chi-square with the rank of S as its degrees of
+freedom: the test of a block of errors (Baarda 1968; Förstner and Wrobel, Photogrammetric Computer Vision, 4.6.4).
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,16 +18,20 @@ from adjust.problem.parameter import Parameter
 from adjust.quality.residuals import surplus
 from adjust.quality.run import Run
 
-UNSEEN = 1e-6  # part of a direction's variance: where the others say so little, they say nothing
+UNSEEN = 1e-6  # least redundancy of a direction that the other observations determine
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationTest:
-    """What the images say against observations that are correlated, as an earlier calibration's quantities are.
+    """Compatibility test of the images with correlated observations.
 
-    parameters (m,); difference (m,): where the images put each less where it was observed, with the a-posteriori sigma
-    (m,) of that; nan and inf where the images do not tell it. statistic: of all together, F with freedom and the other
-    observations' redundancy; probability: of as much where they do not contradict each other.
+    Attributes
+    ----------
+    parameters : (m,).
+    difference, sigma : (m,) value from the images minus observed value, and its a-posteriori standard deviation; nan
+        and inf where the images do not determine it.
+    statistic : of all together, F with `freedom` and the redundancy of the other observations.
+    probability : p-value.
     """
 
     group: str
@@ -40,13 +44,13 @@ class CalibrationTest:
 
     @property
     def direction(self) -> tuple[int, ...]:
-        """The quantities by number, those first in which both differ most in standard deviations of their own."""
+        """Indices of the quantities, sorted by the difference in standard deviations, the largest first."""
         size = np.where(np.isfinite(self.difference), np.abs(self.difference) / self.sigma, 0.0)
         return tuple(np.argsort(-size, kind="stable").tolist())
 
 
 def calibration_tests(run: Run, sigma0: float, redundancy: float) -> Iterator[CalibrationTest]:
-    """Of every earlier calibration of several quantities; sigma0, redundancy: of the whole adjustment."""
+    """Test every earlier calibration of several quantities; sigma0, redundancy: of the whole adjustment."""
     vpv = sigma0**2 * redundancy
     for each, block in zip(run.problem.further, run.end.rows.further, strict=True):
         if not isinstance(each, ObservedCalibration) or len(each.observed) < 2:
@@ -78,10 +82,10 @@ def calibration_tests(run: Run, sigma0: float, redundancy: float) -> Iterator[Ca
 
 
 def _as_marks_show(along: Array, unseen: Mask, parameters: Sequence[Parameter]) -> Array:
-    """Changes (n, m) of the quantities, each with so much of the unseen ones that the fiducial marks move least.
+    """Combine changes (n, m) of the quantities with undetermined ones such that the fiducial marks move least.
 
-    The frame of the marks can shift, turn and grow, and the camera with it: as where two calibrations are compared,
-    what is told of c is then what changes beside the marks. What marks do not show of the unseen changes stays.
+    The frame of the marks can shift, rotate and scale together with the camera. As in a comparison of two calibrations,
+    the reported change of c is then the one relative to the marks.
     """
     is_mark = np.array([each.kind == "fiducial" for each in parameters])
     by_marks = np.linalg.pinv(along[:, unseen] * is_mark[:, None], rcond=UNSEEN)

@@ -1,8 +1,8 @@
-"""High correlations in words: which of a camera's parameters trade off, with each other and with the orientations.
+"""High correlations of a camera's parameters with each other and with exterior orientations, in words.
 
-The datum of the fiducial marks is taken out first: where priors of 1 mm hold it, the interior orientation and the marks
-are uncertain together by what the datum is vague, and the correlations that matter drown in that. What is correlated
-with an exterior orientation is told in the axes of the camera: along its axis, across it, and tilts.
+The datum of the fiducial marks is held first: where only priors of 1 mm define it, interior orientation and marks share
+its uncertainty, which hides the correlations that matter. Exterior orientations are described in the axes of the
+camera: along its axis, across it, and tilts.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,10 +21,10 @@ from adjust.problem.parameter import MANY, Parameter
 
 HIGH = 0.95
 IMAGES_AT_ONCE = 16
-SHARE = 0.3  # of an element of the exterior orientation in a direction, from which on it is named
-SHOWN = 3  # images that are named one by one
-FIELD = 4  # known points from which the field is known
-DIRECTIONS = (  # of an exterior orientation: its kind, and it in words
+SHARE = 0.3  # least share in a direction of an element of the exterior orientation that is named
+SHOWN = 3  # images named one by one
+FIELD = 4  # known points needed for a known field
+DIRECTIONS = (  # of an exterior orientation: kind, and words
     ("across", "the station's place across its axis in x'"),
     ("across", "the station's place across its axis in y'"),
     ("along", "the station's distance along its axis"),
@@ -35,7 +35,7 @@ DIRECTIONS = (  # of an exterior orientation: its kind, and it in words
 WIDER = "Targets out to the corners of the frame would tell them apart, in a wider field of view."
 OUTWARD = "Targets from the centre to the corners of the frame would tell them apart."
 APART, TILTED = "apart", "tilted"  # remedies that depend on whether the field is known
-CAUSES = {  # of correlations between two kinds of parameters, and what would tell these apart
+CAUSES = {  # of correlations between two kinds of parameters, and the remedy
     frozenset(("c", "along")): ("flying height and principal distance are correlated", TILTED),
     frozenset(("point", "across")): ("the principal point and a shift of the camera are correlated", APART),
     frozenset(("point", "tilt")): (
@@ -69,7 +69,7 @@ OTHERS = (
 
 @dataclass(frozen=True)
 class Correlation:
-    """What trades off (owner MANY: in many images), the largest correlation, cause and remedy."""
+    """Correlated parameters (owner MANY: in many images), their largest correlation, cause and remedy."""
 
     parameters: tuple[Parameter, ...]
     rho: float
@@ -78,9 +78,9 @@ class Correlation:
 
 
 def correlations(estimates: Estimates, above: float = HIGH) -> tuple[Correlation, ...]:
-    """The correlations above a limit between parameters of one camera, and between these and orientations of images.
+    """Correlations above a limit between parameters of one camera, and between them and exterior orientations.
 
-    The highest first; none where there is no solution.
+    Sorted, the highest first; none where there is no solution.
     """
     if not estimates.converged:
         return ()
@@ -121,7 +121,7 @@ def _camera_correlations(estimates: Estimates, camera: Camera, above: float) -> 
 
 
 def _parameter_kinds(camera: Camera) -> dict[str, str]:
-    """A camera's parameters by name, and what each is: c, point, a group of the distortion family, other."""
+    """Kind of each parameter of a camera: c, point, a group of the distortion family, other."""
     lens = family(camera.distortion.family)
     kinds = {"c": "c", "x0": "point", "y0": "point"} | dict.fromkeys(lens.parameters, "other")
     for group, names in reversed(lens.groups):
@@ -134,13 +134,13 @@ def _is_free(estimates: Estimates, parameter: Parameter) -> bool:
 
 
 def _free_marks(estimates: Estimates, camera: Camera) -> list[Parameter]:
-    """x and y of every fiducial that was estimated, x before y."""
+    """x and y of every estimated fiducial, x before y."""
     pairs = [[Parameter.fiducial(camera.name, id_, axis) for axis in "xy"] for id_ in camera.fiducials]
     return [each for pair in pairs if all(_is_free(estimates, one) for one in pair) for each in pair]
 
 
 def _figure(estimates: Estimates, marks: Sequence[Parameter]) -> Array:
-    """Shift, rotation and scale (k, m) of fiducial coordinates (m,)."""
+    """(k, m) shift, rotation and scale of fiducial coordinates (m,)."""
     xy = estimates.values_of(marks).reshape(-1, 2)
     if len(xy) < 2:
         return np.zeros((0, len(marks)))
@@ -151,9 +151,9 @@ def _figure(estimates: Estimates, marks: Sequence[Parameter]) -> Array:
 
 
 def _hold_figure(cofactor: Array, count: int, figure: Array) -> Array:
-    """The cofactor matrix of the first quantities, for the figure (k, m) of the last m in its place.
+    """Conditional cofactor matrix of the quantities, given the figure (k, m) of the m that follow the first `count`.
 
-    Holding functions f x: Q - Q f' (f Q f')^-1 f Q, of a vague datum Baarda's S-transformation.
+    For functions f x that are held: Q - Q f' (f Q f')^-1 f Q; for a vague datum this is Baarda's S-transformation.
     """
     size = figure.shape[1]
     keep = np.r_[:count, count + size : len(cofactor)]
@@ -172,7 +172,7 @@ def _correlation(cofactor: Array) -> Array:
 def _exterior_correlations(
     estimates: Estimates, own: list[Parameter], marks: list[Parameter], images: list[str]
 ) -> Array:
-    """Correlations (images, k, 6) of k parameters with the six directions of every exterior orientation."""
+    """(images, k, 6) correlations of k parameters with the six directions of every exterior orientation."""
     exterior = [Parameter.exterior(image, element) for image in images for element in EXTERIOR_NAMES]
     cofactor = _hold_figure(estimates.cofactor_of([*own, *marks, *exterior]), len(own), _figure(estimates, marks))
     turn = np.eye(len(cofactor))
@@ -184,7 +184,7 @@ def _exterior_correlations(
 
 
 def _camera_axes(estimates: Estimates, image: str) -> Array:
-    """The derivative (6, 6) of the six directions by the elements of an exterior orientation."""
+    """(6, 6) derivatives of the six directions by the elements of an exterior orientation."""
     angles = estimates.values_of(Parameter.exterior(image, element) for element in EXTERIOR_NAMES[3:])
     turn = np.zeros((6, 6))
     turn[:3, :3] = rotation_from_angles(angles)
@@ -195,7 +195,7 @@ def _camera_axes(estimates: Estimates, image: str) -> Array:
 def _exterior_words(
     estimates: Estimates, frames: list[str], high: list[int], direction: int
 ) -> tuple[list[str], str, str]:
-    """The elements of some exterior orientations that have a share in a direction, these in words, and their owner."""
+    """Elements of exterior orientations with a share in a direction, their words, and their owner."""
     images = [frames[row] for row in high]
     shares = np.array([np.abs(_camera_axes(estimates, image)[direction]) for image in images]).max(axis=0)
     elements = [name for name, share in zip(EXTERIOR_NAMES, shares, strict=True) if share > SHARE]
@@ -208,7 +208,7 @@ def _exterior_words(
 
 
 def _cause(first: str, second: str, known: bool) -> tuple[str, str]:
-    """What makes two kinds of parameters alike, and what would tell them apart; known: whether the field is."""
+    """Cause of a correlation between two kinds of parameters, and the remedy; known: whether the field is known."""
     why, remedy = CAUSES.get(frozenset((first, second)), OTHERS)
     if remedy == APART and not known:
         return why, "Images turned by 90 and 180 degrees about their axes, and tilted ones, would tell them apart."

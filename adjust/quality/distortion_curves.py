@@ -1,4 +1,4 @@
-"""The distortion of a lens over the radius, with standard deviations from the full covariance."""
+"""Distortion curves of a lens over the radius, with standard deviations from the full covariance."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,10 @@ DIRECTIONS = 36
 
 @dataclass(frozen=True)
 class Curves:
-    """Over the radius (n,) in mm, in um.
+    """Distortion, in µm, over the radius (n,), in mm.
 
-    radial: the mean over all directions of the outward displacement; asymmetric: the largest displacement, over all
-    directions, that is left when the radial part is taken out (decentering and affinity); each with its sigma.
+    radial: outward displacement, mean over all directions; asymmetric: largest displacement over all directions after
+    removal of the radial part (decentering and affinity); each with its standard deviation.
     """
 
     radius_mm: Array
@@ -28,12 +28,12 @@ class Curves:
 
 
 def is_defined_over_frame(lens: Lens) -> bool:
-    """Whether the family is defined over the frame, and not over the radius."""
+    """Whether the family is defined over the frame instead of the radius."""
     return family(lens.distortion.family).needs == "half_mm"
 
 
 def distortion_curves(lens: Lens, largest_radius_mm: float) -> Curves:
-    """The curves from the principal point out to a radius, or as far as the lens makes an image."""
+    """Compute the curves from the principal point to a radius, or as far as the lens forms an image."""
     radius = np.linspace(0.0, largest_radius_mm, RADII)[1:]
     outward = directions()
     imaged = lens.displacement((radius[:, None, None] * outward).reshape(-1, 2)).imaged.reshape(len(radius), -1)
@@ -49,8 +49,8 @@ def distortion_curves(lens: Lens, largest_radius_mm: float) -> Curves:
 
 
 def radial_part(lens: Lens, radius_mm: Array) -> tuple[Array, Array, Array, Array]:
-    """The mean outward displacement (r,) in um at radii with its derivatives (r, 1 + k) by c and the parameters, and
-    what is left (r, DIRECTIONS, 2) in each direction, with its derivatives."""
+    """Mean outward displacement (r,), µm, at radii and its derivatives (r, 1 + k) by c and the parameters; remaining
+    displacement (r, DIRECTIONS, 2) and its derivatives."""
     outward = directions()
     moved = lens.displacement((radius_mm[:, None, None] * outward).reshape(-1, 2))
     value = moved.value_um.reshape(len(radius_mm), DIRECTIONS, 2)
@@ -62,12 +62,12 @@ def radial_part(lens: Lens, radius_mm: Array) -> tuple[Array, Array, Array, Arra
 
 
 def displacement_cofactor(lens: Lens) -> Array:
-    """(1 + k, 1 + k) of c and the parameters, on which a displacement about the principal point depends."""
+    """(1 + k, 1 + k) covariance of c and the parameters, on which a displacement about the principal point depends."""
     return np.delete(np.delete(lens.covariance, [1, 2], axis=0), [1, 2], axis=1)
 
 
 def function_sigmas(lens: Lens, by: Array) -> Array:
-    """Standard deviations (n,) of what has these derivatives (n, 1 + k)."""
+    """(n,) standard deviations of functions with derivatives (n, 1 + k)."""
     variance: Array = np.einsum("rk,kl,rl->r", by, displacement_cofactor(lens), by)
     return np.sqrt(np.maximum(variance, 0.0))
 

@@ -1,8 +1,8 @@
-"""Corrections to given fiducial coordinates where films alone hold the marks' figure.
+"""Corrections to given fiducial coordinates where only films determine the marks.
 
-Fiducials alone tell the figure up to what every film transformation takes up: a shift, a turn and a scale, of affine
-films affinity and shear besides. What is estimable are the residuals of the film model's own transformation to the
-given coordinates. Distances are estimable of congruent films alone.
+Fiducials alone determine the marks up to the film model: shift, rotation and scale, for affine films also affinity and
+shear. Estimable are the residuals after the film model's own transformation to the given coordinates. Distances are
+estimable only for congruent films.
 """
 
 from collections.abc import Collection, Sequence
@@ -15,16 +15,16 @@ from adjust.functional_model.transformation import Film, film_kind, film_paramet
 from adjust.initial_values.fiducial_fit import fit_transformation
 
 KEEPS_DISTANCES = ("none", "congruent")
-STEPS = 10  # of Gauss and Newton; formulas that are linear in their parameters take one
+STEPS = 10  # Gauss-Newton steps at most; models that are linear in their parameters need one
 STILL_MM = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Corrections:
-    """What is left of a transformation to the given coordinates, of the kind that the films have in common.
+    """Residuals after the transformation to the given coordinates that all films have in common.
 
-    corrections_mm (n, 2): estimated less given after it. by_unknowns (2n, 2n + k): their derivatives by the estimated
-    places and by the k parameters of the first film; k is 0 where the transformation does not begin in its comparator.
+    corrections_mm (n, 2): estimated minus given, after it. by_unknowns (2n, 2n + k): derivatives by the estimated
+    places and the k parameters of the first film; k is 0 where the transformation does not start from its comparator.
     """
 
     transformation: str
@@ -33,7 +33,7 @@ class Corrections:
 
 
 def common_transformation(kinds: Collection[str]) -> str:
-    """What films of all these kinds take up: the transformation that each of them contains."""
+    """The transformation that all these film models contain."""
     for least in (*KEEPS_DISTANCES, *(kinds if len(set(kinds)) == 1 else ())):
         if least in kinds:
             return least
@@ -49,14 +49,18 @@ def _parameters(kind: str) -> int:
 
 
 def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Array) -> Corrections | None:
-    """Fit what the films have in common to the given coordinates; None where it takes up all that the marks tell.
+    """Fit the common transformation of the films to the given coordinates; None if it has no redundancy.
 
-    places_mm, given_mm (n, 2): of the same marks, estimated and given. The transformation goes from the comparator of
-    the first film, if that is of the common kind: only there is the figure what such a film makes of it.
+    Parameters
+    ----------
+    places_mm, given_mm : (n, 2) estimated and given places of the same marks.
 
-    With x the places in the comparator, T the film with the design matrix D, and T* the transformation with the design
-    matrix G that fits the given places best, corrections are T*(x) - given. They change by (I - G (G'G)^-1 G') T*' dx,
-    where dx = T'^-1 (dX - D dp) for changes dX of the places and dp of the film: what moves both alike changes nothing.
+    Notes
+    -----
+    The transformation starts from the comparator of the first film if that is of the common kind, else from the
+    estimated places. With x the places in the comparator, T the film with the design matrix D, and T* the
+    transformation with the design matrix G that fits the given places best, corrections are T*(x) - given. They change
+    by (I - G (G'G)^-1 G') T*' dx, where dx = T'^-1 (dX - D dp) for changes dX of the places and dp of the film.
     """
     common = common_transformation([film.transformation for film in films])
     if 2 * len(places_mm) <= _parameters(common):
@@ -68,7 +72,7 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
         if not regular.all():
             return None
         by_unknowns = _comparator_by_unknowns(films[0], source)
-    parameters, mirrored = fit_transformation(common, source, places_mm)  # which agree, as marks hardly do
+    parameters, mirrored = fit_transformation(common, source, places_mm)  # initial values
     kind = film_kind(common, mirrored)
     center, half = source.mean(axis=0), np.array(0.5 * np.ptp(source, axis=0).max())
     for _ in range(STEPS):
@@ -84,7 +88,7 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
 
 
 def _comparator_by_unknowns(film: Film, xy_mm: Array) -> Array:
-    """The derivatives (2n, 2n + k) of comparator coordinates by the camera's and by the film's parameters."""
+    """(2n, 2n + k) derivatives of comparator coordinates by camera coordinates and film parameters."""
     kind, half = film_kind(film.transformation, film.mirrored), np.array(0.5 * np.ptp(xy_mm, axis=0).max())
     center = xy_mm.mean(axis=0)
     by_film = kind.design(film.parameters, xy_mm, center, half).reshape(2 * len(xy_mm), -1)
@@ -94,6 +98,6 @@ def _comparator_by_unknowns(film: Film, xy_mm: Array) -> Array:
 
 
 def _block_product(matrix: Array, by_place: Array) -> Array:
-    """A matrix (m, 2n) times that with the blocks (n, 2, 2) on its diagonal."""
+    """Product of a matrix (m, 2n) and a block-diagonal one with blocks (n, 2, 2)."""
     by_pairs = matrix.reshape(len(matrix), -1, 2)
     return np.asarray(np.einsum("inj,njk->ink", by_pairs, by_place).reshape(len(matrix), -1))

@@ -1,4 +1,4 @@
-"""A covariance of the cameras that does not trust residuals of one image to be independent: images are its clusters."""
+"""Cluster-robust covariance of the cameras: residuals within an image may be correlated; images are the clusters."""
 
 from dataclasses import dataclass
 
@@ -8,25 +8,25 @@ from adjust.array_types import Array, Indices
 from adjust.least_squares.iteration import Linearised
 from adjust.least_squares.numbering import Numbering
 
-FEWEST_IMAGES = 5  # from which on the scatter over images tells a standard deviation, to about a third of it
-MOST_SHARED = 300  # quantities that images share: unknown points make them many, and the matrix is of all of them
-LARGEST_SHARE = 0.999  # of one image in what is known of some combination of unknowns: more rests on that image alone
+FEWEST_IMAGES = 5  # needed to estimate standard deviations, then to about a third
+MOST_SHARED = 300  # shared quantities: with many unknown points the dense matrix would be too large
+LARGEST_SHARE = 0.999  # of one image in the information on some combination of unknowns; above, it rests on that image
 
 
 def shared_positions(numbering: Numbering) -> Indices:
-    """Positions of the free quantities that are not of single images."""
+    """Positions of the free quantities shared by images."""
     unknowns = numbering.problem.unknowns
     return np.flatnonzero(unknowns.sigma[: unknowns.shared_count] > 0.0)
 
 
 def cluster_covariance(numbering: Numbering, end: Linearised, cofactor: Array) -> Array | None:
-    """The covariance (k, k) of the quantities at `shared_positions` by a delete-one-image jackknife.
+    """Covariance (k, k) of the quantities at `shared_positions` by a delete-one-image jackknife.
 
     Each image is left out of the normal equations in turn. With N the normal matrix of the shared unknowns, N_i the
-    part of image i, its own unknowns eliminated, and g_i its share of the right side, the shared unknowns move by
+    part of image i, its own unknowns eliminated, and g_i its share of the right side, the shared unknowns change by
     d_i = -(N - N_i)^-1 g_i. The covariance is (m - 1) / m times the sum of (d_i - d)(d_i - d)' (Efron 1982; MacKinnon
-    and White 1985, with images as clusters). It holds however errors within an image are correlated, as those of a lens
-    that the model lacks are.
+    and White 1985, with images as clusters). It holds for any correlation of errors within an image, such as unmodelled
+    distortion causes.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def cluster_covariance(numbering: Numbering, end: Linearised, cofactor: Array) -
 
     Returns
     -------
-    None with fewer than FEWEST_IMAGES images, or where something rests on one image alone.
+    None with fewer than FEWEST_IMAGES images, or where some quantity rests on one image.
     """
     shares = _shares(numbering, end, cofactor)
     if len(shares) < FEWEST_IMAGES:
@@ -49,20 +49,20 @@ def cluster_covariance(numbering: Numbering, end: Linearised, cofactor: Array) -
 
 
 def prediction_errors(numbering: Numbering, end: Linearised, cofactor: Array, folds: int) -> Array | None:
-    """How well images are predicted by others: the mean square (m,) of the lengths of each image's residuals.
+    """Cross-validation over images: mean square (m,) of the normalised lengths of each image's residuals.
 
-    Every so many images are left out together, and oriented by the camera of the others. Without them the shared
-    unknowns move by d, as `cluster_covariance` has it, and their residuals r become r - B d (Allen 1974, with images in
-    place of observations). Lengths are over the standard deviations of coordinates.
+    One fold of images at a time is left out and oriented by the camera from the others. Without them the shared
+    unknowns change by d, as in `cluster_covariance`, and their residuals r become r - B d (PRESS: Allen 1974, with
+    images in place of observations).
 
     Parameters
     ----------
     numbering, end, cofactor : as for `cluster_covariance`
-    folds : how often images are left out
+    folds : number of folds
 
     Returns
     -------
-    None where something rests on images that are left out together.
+    None where some quantity rests on the images of one fold.
     """
     shares = _shares(numbering, end, cofactor)
     errors = np.zeros(len(shares))
@@ -78,19 +78,19 @@ def prediction_errors(numbering: Numbering, end: Linearised, cofactor: Array, fo
 
 @dataclass(frozen=True, eq=False)
 class _Share:
-    """The equations of an image after elimination of their own unknowns: derivatives (n, k) by the shared ones, in
-    units of the root of their cofactor matrix, by which N becomes the unit matrix; and right sides (n,)."""
+    """Reduced equations of an image: derivatives (n, k) by the shared unknowns, in units of the root of their cofactor
+    matrix, in which N is the unit matrix; right sides (n,)."""
 
     by_shared: Array
     right: Array
 
 
 def _shares(numbering: Numbering, end: Linearised, cofactor: Array) -> list[_Share]:
-    """Those of each image that has marks, in the network's order."""
+    """Reduced equations of each image with marks, in the network's order."""
     problem = numbering.problem
     images, shared = problem.network.frame_numbers[problem.image_numbers], shared_positions(numbering)
     root = np.asarray(np.linalg.cholesky(cofactor), dtype=np.float64)
-    free = np.append(numbering.problem.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
+    free = np.append(numbering.problem.unknowns.sigma > 0.0, False)  # the last entry is ABSENT
     shares = []
     for image in np.unique(images):
         rows = images == image
@@ -104,7 +104,8 @@ def _shares(numbering: Numbering, end: Linearised, cofactor: Array) -> list[_Sha
 
 
 def _move(by_shared: Array, right: Array) -> Array | None:
-    """By how much the shared unknowns move without the equations of some images, in units of the root."""
+    """Change of the shared unknowns without the equations of some images, in units of the root; None if
+    undetermined."""
     parts, axes = np.linalg.eigh(by_shared.T @ by_shared)
     if parts.max(initial=0.0) > LARGEST_SHARE:
         return None
@@ -112,7 +113,7 @@ def _move(by_shared: Array, right: Array) -> Array | None:
 
 
 def _by_unknowns(columns: Indices, matrix: Array, positions: Indices, count: int) -> Array:
-    """The derivatives (2 n, k) by the quantities at some positions, from those (n, 2, j) at columns (n, j)."""
+    """Scatter derivatives (n, 2, j) at columns (n, j) to a matrix (2 n, k) of the quantities at some positions."""
     place = np.full(count, len(positions), dtype=np.intp)
     place[positions] = np.arange(len(positions))
     dense = np.zeros((len(columns), len(positions) + 1, 2))

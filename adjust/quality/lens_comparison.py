@@ -1,9 +1,9 @@
-"""Calibrations of one camera compared: what changed in the way from a place on the film to its ray.
+"""Comparison of calibrations of one camera, as a field of differences over the frame.
 
-A calibration says of every camera point which ray it belongs to, and where the fiducial marks are. Two calibrations say
-the same where some change that no user of them can see takes one to the other: a similarity of the fiducial frame,
-which the next interior orientation takes up, and a turn of the rays, which the next exterior orientation takes up.
-What is left is a field over the frame, and its covariance is known.
+A calibration maps every camera point to a ray and places the fiducial marks. Two calibrations are equivalent if they
+differ only by changes without effect: a similarity of the fiducial frame, which the interior orientation of a scan
+absorbs, and a rotation of the rays, which the exterior orientation absorbs. The remaining difference is a field over
+the frame with a known covariance.
 """
 
 from collections.abc import Sequence
@@ -22,19 +22,19 @@ from adjust.functional_model.projection import ray_by_orientation
 
 Use = Literal["space", "flat"]
 
-_GRID = 7  # points a side of the field
-_UNSEEN_UM = 0.01  # what no photograph shows: differences below it, and directions known better, count as nothing
+_GRID = 7  # points per side of the field
+_UNSEEN_UM = 0.01  # negligible in any photograph: smaller differences and standard deviations count as zero
 _RANK = 1e-9
-_SIMILARITY = 4  # shift, turn and scale of a plane
+_SIMILARITY = 4  # parameters: shift, rotation and scale of a plane
 
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """What an adjustment found of a camera.
+    """Calibration of a camera by one adjustment.
 
-    fiducials: camera coordinates (2,) in mm by id. covariance (3 + k + 2 f, 3 + k + 2 f): of the lens's quantities and
-    of these in this order, fiducials x before y, zero where something was held. redundancy: of the observations that
-    its sigma0 comes from, 0 of a priori standard deviations.
+    fiducials: camera coordinates (2,), mm, by id. covariance (3 + k + 2 f, 3 + k + 2 f): of the lens's quantities, then
+    of the fiducials, x before y; zero for fixed values. redundancy: of the observations that determine sigma0; 0 if
+    standard deviations are a priori.
     """
 
     name: str
@@ -46,7 +46,7 @@ class CameraCalibration:
 
 @dataclass(frozen=True)
 class Test:
-    """A hypothesis tested: its chi-square, the degrees of freedom, how probable so much is where it holds."""
+    """Test of a hypothesis: chi-square, degrees of freedom, p-value."""
 
     chi_square: float
     freedom: int
@@ -55,14 +55,19 @@ class Test:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Calibrations as differences from the first of them, one entry a calibration after it.
+    """Differences of n later calibrations from the first one.
 
-    places_mm (m, 2) of the field, in the first one's frame. field_um (n, m, 2): how far apart both see a place, along
-    the film at the first one's c, after what orientation and datum take up; field_covariance_um2 (n, m, 2, 2).
-    fiducials: those that all have; fiducials_um (n, f, 2), fiducials_covariance_um2 (n, f, 2, 2) after a similarity.
-    same: whether all are one calibration. trend: whether they change with time beyond being the same; None for two.
-    trend_um (m, 2), trend_covariance_um2 (m, 2, 2): the steady change of the field from the first time to the last one.
-    times (n + 1,).
+    Attributes
+    ----------
+    times : (n + 1,).
+    places_mm : (m, 2) of the field, in the frame of the first calibration.
+    field_um, field_covariance_um2 : (n, m, 2) and (n, m, 2, 2) difference at each place, on the film at the c of the
+        first calibration, after removal of orientation and datum.
+    fiducials : common to all calibrations.
+    fiducials_um, fiducials_covariance_um2 : (n, f, 2) and (n, f, 2, 2) differences after a similarity.
+    same : test of the hypothesis that all calibrations are equal.
+    trend : test of a linear change with time against equality; None for two calibrations.
+    trend_um, trend_covariance_um2 : (m, 2) and (m, 2, 2) linear change of the field from the first time to the last.
     """
 
     calibrations: tuple[CameraCalibration, ...]
@@ -81,7 +86,7 @@ class Comparison:
 
     @property
     def probability(self) -> float:
-        """How probable so much is for an unchanged camera: of a series, which has two tests, twice the smaller one."""
+        """P-value for an unchanged camera; for a series, which has two tests, the Bonferroni bound."""
         if self.trend is None:
             return self.same.probability
         return min(1.0, 2.0 * min(self.same.probability, self.trend.probability))
@@ -93,12 +98,19 @@ def compare(
     times: Sequence[float] | Array | None = None,
     use: Use = "space",
 ) -> Comparison:
-    """Compare calibrations of a camera, two or more, in the order of time.
+    """Compare two or more calibrations of a camera, in the order of time.
 
-    half_mm: half the frame in x' and y', over which the field is taken. times: of the calibrations, years say; by
-    default 0, 1, 2, ... use: what the exterior orientation takes up of a change, "space": the camera's attitude;
-    "flat": its station as well, as over flat ground, where a change of c or of the principal point is a change of
-    height and place. Raises AdjustmentError for fewer than two calibrations, or for times that do not fit them.
+    Parameters
+    ----------
+    half_mm : half the frame in x' and y', over which the field is taken.
+    times : of the calibrations, such as years; by default 0, 1, 2, ...
+    use : changes that the exterior orientation absorbs. "space": rotations; "flat": also shifts, as over flat ground,
+        where a change of c or of the principal point is a change of the station.
+
+    Raises
+    ------
+    AdjustmentError
+        For fewer than two calibrations, or times that do not match them.
     """
     if len(calibrations) < 2:
         raise AdjustmentError("a comparison needs two calibrations or more.")
@@ -143,8 +155,8 @@ def _grid(half_mm: tuple[float, float]) -> Array:
 
 
 class _View:
-    """What one calibration says of the places and of the shared fiducials, in um (m + f, 2), with the square root of
-    its covariance, and what nobody would see of a change."""
+    """Rays of the places and positions of the shared fiducials by one calibration, as a value (m + f, 2) in µm, with
+    the square root of its covariance and the changes without effect."""
 
     def __init__(
         self, own: CameraCalibration, first: CameraCalibration, places_mm: Array, shared: tuple[str, ...]
@@ -161,7 +173,7 @@ class _View:
                 "Compare over a smaller frame."
             )
         self.equations = own.lens.equations(self.points_mm, ray)
-        # In the first one's axes: what is left of a turn is small, and taken out with the orientation.
+        # In the axes of the first calibration; the small remaining rotation is removed with the orientation.
         self.turn = turn / np.sqrt(np.linalg.det(turn))
         self.ray = ray @ self.turn
         self.marks_mm = marks
@@ -169,7 +181,7 @@ class _View:
         self.jacobian = self._jacobian(shared)
 
     def _jacobian(self, shared: tuple[str, ...]) -> Array:
-        """(2 (m + f), n): of the value by all that the calibration knows, turns and scale of its frame left out."""
+        """(2 (m + f), n) derivatives of the value by the calibration's quantities, at fixed rotation and scale."""
         own, fields = self.own, 2 * len(self.ray)
         by = np.concatenate([self.equations.interior_jacobian, self.equations.parameter_jacobian], axis=2)
         rows = np.zeros((fields + 2 * len(shared), len(own.covariance)))
@@ -181,33 +193,33 @@ class _View:
         return rows
 
     def _field_change(self, by: Array) -> Array:
-        """The change of the field (m, 2, n) in um that goes with a change of the equations (m, 2, n)."""
+        """(m, 2, n) changes of the field, µm, from changes of the equations (m, 2, n)."""
         return np.asarray(-self.c_um * self.turn.T @ np.linalg.solve(self.equations.ray_jacobian, by))
 
     @property
     def root(self) -> Array:
-        """A square root (2 (m + f), n) of the covariance of the value."""
+        """(2 (m + f), n) square root of the covariance of the value."""
         sigmas = np.sqrt(np.diag(self.own.covariance))
-        divisors = np.where(sigmas > 0.0, sigmas, 1.0)  # k5 in mm**-4 stands beside c in mm
+        divisors = np.where(sigmas > 0.0, sigmas, 1.0)  # scale: k5 is in mm**-4, c in mm
         values, vectors = np.linalg.eigh(self.own.covariance / np.outer(divisors, divisors))
         return np.asarray(self.jacobian @ (sigmas[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))))
 
     def unseen(self, use: Use) -> Array:
-        """(2 (m + f), q): how the first one's value changes with the similarity of its frame, and its orientation."""
+        """(2 (m + f), q) changes of the value with the similarity of the frame and with the orientation."""
         points = np.concatenate([self.points_mm, self.marks_mm])
         ones, zeros = np.ones(len(points)), np.zeros(len(points))
         x, y = points.T
         moves = np.array([(ones, zeros), (zeros, ones), (-y, x), (x, y)]).transpose(2, 1, 0)
         field_moves = self._field_change(self.equations.xy_jacobian @ moves[: len(self.ray)])
         frame = np.concatenate([field_moves, -1e3 * moves[len(self.ray) :]])
-        changes = ray_by_orientation(self.ray, np.ones(len(self.ray)))  # turns, then shifts over flat ground
+        changes = ray_by_orientation(self.ray, np.ones(len(self.ray)))  # rotations, then shifts over flat ground
         bundle = self.c_um * (changes if use == "flat" else changes[:, :, :3])
         orientation = np.concatenate([bundle, np.zeros((len(self.marks_mm), *bundle.shape[1:]))])
         return np.concatenate([frame, orientation], axis=2).reshape(2 * len(points), -1)
 
 
 def _similarity(first: Array, second: Array) -> tuple[Array, Array]:
-    """The similarity (2, 2), (2,) that takes points of the first frame to those of the second; none for one point."""
+    """Similarity (2, 2), (2,) from points of the first frame to those of the second; the identity for one point."""
     if len(first) < 2:
         return np.eye(2), np.zeros(2)
     middle, there = first.mean(axis=0), second.mean(axis=0)
@@ -218,7 +230,7 @@ def _similarity(first: Array, second: Array) -> tuple[Array, Array]:
 
 
 def _range(columns: Array) -> Array:
-    """Orthonormal vectors (n, r) that span columns (n, k) of whatever size, or none."""
+    """Orthonormal basis (n, r) of the range of columns (n, k)."""
     sizes = np.linalg.norm(columns, axis=0)
     vectors, triangle, _ = qr(columns / np.where(sizes > 0, sizes, 1.0), mode="economic", pivoting=True)
     diagonal = np.abs(np.diag(triangle))
@@ -226,8 +238,8 @@ def _range(columns: Array) -> Array:
 
 
 def _freeing(unseen: Array, marks: int) -> Array:
-    """(2 (m + f), 2 (m + f)): takes out of a change the similarity that its marks show, then the orientation that its
-    field shows, both by plain least squares: what is left is the smallest field there can be."""
+    """(2 (m + f), 2 (m + f)) projector that removes the similarity fitted to the marks, then the orientation fitted to
+    the field, both by unweighted least squares: the remaining field is the smallest possible."""
     of_marks, everything = np.arange(len(unseen)) >= len(unseen) - 2 * marks, np.eye(len(unseen))
     frame = unseen[:, :_SIMILARITY] if marks > 1 else unseen[:, :0]
     by_marks = everything - frame @ np.linalg.pinv(frame * of_marks[:, None], rcond=_RANK)
@@ -237,9 +249,9 @@ def _freeing(unseen: Array, marks: int) -> Array:
 
 
 class _System:
-    """All views in the directions in which anything is uncertain, whitened: each y = a (+ b t) + what is not seen.
+    """Linear model of all views, whitened, in the directions with uncertainty: y = a (+ b t) + changes without effect.
 
-    What is not seen is the first one's for all, in whose axes they all are: a steady change along it is none then, too.
+    The changes without effect are those of the first view, in whose axes all views are given.
     """
 
     def __init__(self, views: Sequence[_View], times: Array, use: Use) -> None:
@@ -250,7 +262,7 @@ class _System:
             raise AdjustmentError("none of the calibrations has standard deviations: there is nothing to compare with.")
         basis, unseen = left[:, known], views[0].unseen(use)
         inside = basis.T @ unseen
-        # Without those of which nothing is in the basis, as a turn of the whole field.
+        # Drop those outside the basis, such as a rotation of the whole field.
         self.unseen = inside * (np.linalg.norm(inside, axis=0) > _RANK * np.linalg.norm(unseen, axis=0))
         self.freeing = _freeing(unseen, len(views[0].marks_mm))
         self.changes = [(view.value - views[0].value).ravel() for view in views]
@@ -260,14 +272,14 @@ class _System:
         self.redundancy = min(view.own.redundancy for view in views)
 
     def _left_over(self, powers: Sequence[int]) -> tuple[float, int]:
-        """v'Pv for a value that is a polynomial of time, and the rank of its rows."""
+        """v'Pv for a value that is a polynomial in time, and the rank of the design matrix."""
         (size, width), count = self.unseen.shape, len(self.values)
         rows = np.zeros((count * size, len(powers) * size + count * width))
         for k, whitening in enumerate(self.whitening):
             at = slice(k * size, (k + 1) * size)
             for p, power in enumerate(powers):
                 rows[at, p * size : (p + 1) * size] = whitening * (self.times[k] - self.times[0]) ** power
-            if k:  # the first one's frame and attitude are everybody's
+            if k:  # the frame and attitude of the first view are the reference
                 start = len(powers) * size + k * width
                 rows[at, start : start + width] = whitening @ self.unseen
         right = np.concatenate([w @ value for w, value in zip(self.whitening, self.values, strict=True)])
@@ -286,24 +298,24 @@ class _System:
         return self._test(still - moving, more - fewer)
 
     def _test(self, chi: float, freedom: int) -> Test:
-        """The calibrations' own sigma0 come from few observations now and then: F and not chi-square."""
+        """F-test instead of chi-square, since the sigma0 of a calibration may come from few observations."""
         probability = float(fdtrc(freedom, self.redundancy, chi / freedom)) if freedom and self.redundancy else 1.0
         return Test(chi, freedom, probability)
 
     def difference(self, k: int) -> tuple[Array, Array]:
-        """View k less the first one."""
+        """Difference of view k and the first one."""
         return self._freed(np.eye(len(self.changes))[k] - np.eye(len(self.changes))[0])
 
     def trend_field(self) -> tuple[Array, Array]:
-        """The change from the first time to the last one along straight lines through all views, each weighed by how
-        well it is known."""
+        """Linear change from the first time to the last, by weighted regression over all views."""
         variances = np.array([np.square(self.freeing @ root).sum(axis=1).mean() for root in self.roots])
         weights = 1.0 / (variances + _UNSEEN_UM**2)
         along = self.times - np.average(self.times, weights=weights)
         return self._freed(weights * along * np.ptp(self.times) / np.sum(weights * along**2))
 
     def _freed(self, factors: Array) -> tuple[Array, Array]:
-        """The sum of the views times factors, freed of what is not seen, (m + f, 2), and its covariance by place."""
+        """Linear combination (m + f, 2) of the views without the changes without effect, and its covariance by
+        place."""
         change = np.sum([factor * each for factor, each in zip(factors, self.changes, strict=True)], axis=0)
         root = np.hstack([factor * (self.freeing @ each) for factor, each in zip(factors, self.roots, strict=True)])
         by_place = root.reshape(-1, 2, root.shape[1])

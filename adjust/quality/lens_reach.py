@@ -1,5 +1,4 @@
-"""How far out a lens is known: as far as targets were observed, against the corner of the frame, to which it is
-extrapolated."""
+"""Radius within which a lens is determined: the outermost observed target, against the corner of the frame."""
 
 from dataclasses import dataclass
 
@@ -11,15 +10,20 @@ from adjust.problem.images import adjusted_image, adjusted_lens
 from adjust.problem.parameter import Parameter
 
 DIRECTIONS = 12
-RADII = 8  # at which the distortion's standard deviation is taken, out to the outermost target
+RADII = 8  # at which the standard deviation of the distortion is evaluated, out to the outermost target
 
 
 @dataclass(frozen=True)
 class LensReach:
-    """radius_mm: from the principal point to the outermost target; corner_mm: to the farthest corner of the frame, nan
-    where its size is not known. sigma_um, corner_sigma_um: the largest standard deviations of the distortion within the
-    radius and at that of the corner; nan where the lens shows nothing there.
-    frame_mm: two opposite corners of the frame, the lower left one first; None where its size is not known.
+    """Extent of the observations of a lens.
+
+    Attributes
+    ----------
+    radius_mm : from the principal point to the outermost target.
+    corner_mm : from the principal point to the farthest corner of the frame; nan if the frame is unknown.
+    sigma_um, corner_sigma_um : largest standard deviation of the distortion within the radius, and at the corner; nan
+        where the lens forms no image.
+    frame_mm : lower left and upper right corner of the frame; None if unknown.
     """
 
     radius_mm: float
@@ -34,8 +38,8 @@ class LensReach:
 
 
 def lens_reach(estimates: Estimates, camera: Camera, frame_mm: tuple[float, float] | None) -> LensReach | None:
-    """None where nothing was observed. frame_mm: width and height; about 0 with fiducial marks, else from the top left
-    corner of the scan.
+    """Find the extent of the observations of a lens; None without observations. frame_mm: width and height, centred on
+    the origin if there are fiducial marks, else from the top left corner of the scan.
     """
     network = estimates.network
     observations = network.observations

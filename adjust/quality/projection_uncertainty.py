@@ -1,16 +1,16 @@
-"""How well a camera projects: the covariance of the image of a point that stands fixed in the scene.
+"""Projection uncertainty: the covariance of the image of a point that is fixed in the scene.
 
-A change of the lens that a turn and a shift of the camera make good is none: no picture shows it. So the change dl of
-interior orientation and distortion is taken together with the turn t and the shift s of the camera that fit it best
-over all targets that were observed, at their distances:
+A change of the lens that a rotation and a shift of the camera compensate has no effect. The change dl of interior
+orientation and distortion is therefore combined with the rotation t and the shift s of the camera that compensate it
+best over all observed targets, at their distances:
 
     dq = B dl + P (t, s),    (t, s) = -(sum P' W P)^-1 sum P' W B dl
 
 B and P are the derivatives of the camera point of a fixed ray by the calibration and by the orientation, W the weights.
-The covariance is that of dq, and that of the common orientation beside it, sigma0² P (sum P' W P)^-1 P'. Both together
-are mrcal's cross-reprojection uncertainty (mrcal.secretsauce.net, "Projection uncertainty"). At infinity a shift shows
-nothing. On film the camera frame is that of the marks: what the interior orientation of a scan makes of a change of the
-marks' coordinates is taken out, and t and s fit what dl leaves beside the changes of the images' film transformations.
+The covariance is that of dq plus that of the common orientation, sigma0² P (sum P' W P)^-1 P'. The sum is mrcal's
+cross-reprojection uncertainty (mrcal.secretsauce.net, "Projection uncertainty"). At infinity a shift has no effect. On
+film, the marks define the camera frame: the effect of their changes on the interior orientation of a scan is removed,
+and t and s compensate the rest together with the changes of the images' film transformations.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,14 +29,14 @@ from adjust.problem.estimates import Estimates
 from adjust.problem.images import adjusted_image, adjusted_lens, adjusted_places
 from adjust.problem.parameter import Parameter
 
-MOST_IMAGES = 100  # evenly over all, over which an orientation is fitted
-GRID = 33  # places along the longer side of a picture
-RANK = 1e-9  # of the normal matrix of an orientation, in equal columns: below it a direction is left alone
+MOST_IMAGES = 100  # used for the fit of the orientation, evenly chosen
+GRID = 33  # places along the longer side of an image
+RANK = 1e-9  # relative eigenvalue of the scaled normal matrix of an orientation, below which a direction is not fitted
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectionUncertainty:
-    """Standard deviations of projected points over the picture of a camera.
+    """Standard deviations of projected points over the image of a camera.
 
     Attributes
     ----------
@@ -48,9 +48,9 @@ class ProjectionUncertainty:
     places_mm : Array (..., 2)
         Of the points, in the camera frame.
     covariance_mm2 : Array (..., 2, 2)
-        By the model; nan where the lens shows nothing.
+        By the model; nan where the lens forms no image.
     cluster_covariance_mm2 : Array (..., 2, 2) or None
-        By leaving out one image at a time; None where images are too few.
+        By the delete-one-image jackknife; None where images are too few.
     """
 
     camera: str
@@ -62,17 +62,17 @@ class ProjectionUncertainty:
 
     @property
     def sigma_model_mm(self) -> Array:
-        """(...) by the model, in the direction that is known worst."""
+        """(...) by the model, in the least precise direction."""
         return _largest_sigma(self.covariance_mm2)
 
     @property
     def sigma_clusters_mm(self) -> Array | None:
-        """(...) by leaving out images."""
+        """(...) by the jackknife over images."""
         return None if self.cluster_covariance_mm2 is None else _largest_sigma(self.cluster_covariance_mm2)
 
     @property
     def sigma_mm(self) -> Array:
-        """(...) the one to use: the larger."""
+        """(...) the larger of both, which is the one to use."""
         clusters = self.sigma_clusters_mm
         return self.sigma_model_mm if clusters is None else np.maximum(self.sigma_model_mm, clusters)
 
@@ -84,7 +84,7 @@ def projection_uncertainty(
     distance: float = np.inf,
     places_mm: Array | None = None,
 ) -> ProjectionUncertainty:
-    """See `Adjustment.projection_uncertainty`; clusters: the covariance of some quantities by leaving out images."""
+    """See `Adjustment.projection_uncertainty`. clusters: returns the jackknife covariance of some quantities."""
     if not distance > 0.0:
         raise AdjustmentError(f"The distance of projected points must be positive, in object units, not {distance}.")
     field = ProjectionField(estimates, only_camera(estimates, camera))
@@ -100,7 +100,7 @@ def projection_uncertainty(
 
 
 def only_camera(estimates: Estimates, name: str = "") -> Camera:
-    """The camera of a name, or the only one. Raises AdjustmentError where no such camera was calibrated."""
+    """Camera by name, or the only one. Raises AdjustmentError where no such camera was calibrated."""
     network = estimates.network
     cameras = {each.name: each for each in network.cameras if each.name not in network.idle_cameras}
     if not estimates.converged or not cameras:
@@ -113,11 +113,14 @@ def only_camera(estimates: Estimates, name: str = "") -> Camera:
 
 
 class ProjectionField:
-    """The change of a camera's projection with all that its calibration knows, freed of the orientation.
+    """Derivatives of a camera's projection by its calibration, with the orientation eliminated.
 
-    calibration: the keys of lens and marks. films: those of the film transformations of MOST_IMAGES, whose targets say
-    which orientation fits best. corners_mm: of the picture, or of what was observed where its size is not known.
-    median_distance: of the targets, object units.
+    Attributes
+    ----------
+    calibration : keys of lens and marks.
+    films : keys of the film transformations of up to MOST_IMAGES images, to whose targets the orientation is fitted.
+    corners_mm : of the image, or of the observations if its size is unknown.
+    median_distance : of the targets, object units.
     """
 
     def __init__(self, estimates: Estimates, camera: Camera) -> None:
@@ -131,13 +134,13 @@ class ProjectionField:
         self._align(estimates)
 
     def _align(self, estimates: Estimates) -> None:
-        """The orientation (6, 6) by its observations, and how it follows the calibration and the films (6, k)."""
+        """Set the cofactor matrix (6, 6) of the orientation, and its derivatives (6, k) by calibration and films."""
         observations = estimates.network.observations
         of_image, is_target = np.array(observations.image), ~observations.is_fiducial
         shown = [each for each in estimates.network.images if each.camera == self.camera.name]
         shown = [each for each in shown if (is_target & (of_image == each.name)).any()]
         normal, right, by_films, distances, places = np.zeros((6, 6)), 0.0, list[Array](), list[Array](), list[Array]()
-        for image in shown[:: -(-len(shown) // MOST_IMAGES)]:  # evenly over all
+        for image in shown[:: -(-len(shown) // MOST_IMAGES)]:
             rows = np.flatnonzero(is_target & (of_image == image.name))
             model = adjusted_image(estimates, image.name)
             ray, depth = _targets(model, adjusted_places(estimates, [observations.point[row] for row in rows]))
@@ -161,9 +164,9 @@ class ProjectionField:
         self.corners_mm = self.camera.frame_corners() or np.array([observed.min(axis=0), observed.max(axis=0)])
 
     def covariance_mm2(self, covariance: Array, places_mm: Array, distance: float) -> Array:
-        """(n, 2, 2) of points at places (n, 2); nan where there is no image.
+        """(n, 2, 2) covariance of points at places (n, 2); nan where there is no image.
 
-        covariance: of calibration and films, or of the calibration alone: films then follow the marks.
+        covariance: of calibration and films, or of the calibration alone; the films then follow the marks.
         """
         ray, found = self._lens.ray_from_observed(places_mm)
         found &= ~self._lens.folded_over(places_mm)
@@ -182,7 +185,8 @@ class ProjectionField:
         return result
 
     def _derivatives(self, xy_mm: Array, ray: Array, inverse_depth: Array) -> tuple[Array, Array]:
-        """Of the camera points of fixed points, by the calibration (n, 2, k) and by a turn and shift (n, 2, 6)."""
+        """Derivatives of the images of fixed points by the calibration (n, 2, k) and by rotation and shift (n, 2,
+        6)."""
         at = self._lens.equations(xy_mm, ray)
         calibration = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
         by: Array = -np.linalg.solve(at.xy_jacobian, calibration)
@@ -194,9 +198,9 @@ class ProjectionField:
 
 @dataclass(frozen=True)
 class _MarkFrame:
-    """What the interior orientation of a scan makes of a change of the fiducial marks' coordinates.
+    """Effect of changed fiducial coordinates on the interior orientation of a scan.
 
-    by_marks (q, 2 f): the q parameters of the film transformation by the coordinates, by least squares.
+    by_marks (q, 2 f): derivatives of the q film parameters by the coordinates, by least squares.
     """
 
     model: ImageModel
@@ -204,7 +208,7 @@ class _MarkFrame:
 
     @classmethod
     def of(cls, estimates: Estimates, camera: Camera) -> "_MarkFrame | None":
-        """By the first image of a camera on film; None for a digital camera."""
+        """From the first image of a camera on film; None for a digital camera."""
         images = (image for image in estimates.network.images if image.camera == camera.name)
         image = next((image for image in images if image.transformation != "none"), None)
         if image is None or not camera.fiducials:
@@ -217,18 +221,18 @@ class _MarkFrame:
         return cls(model, np.linalg.pinv(design / sizes).astype(np.float64) / sizes[:, None])
 
     def design(self, xy_mm: Array) -> Array:
-        """(n, 2, q) how camera points move with the parameters."""
+        """(n, 2, q) derivatives of camera points by the film parameters."""
         return _by_film(self.model, xy_mm)
 
     def reduced(self, covariance: Array, lens: int) -> Array:
-        """With q parameters of the film transformation in place of the marks, which stand behind those of the lens."""
+        """Replace the marks, which follow the lens in the covariance, by the q film parameters."""
         others = len(covariance) - lens - self.by_marks.shape[1]
         reduction = block_diag(np.eye(lens), self.by_marks, np.eye(others))
         return np.asarray(reduction @ covariance @ reduction.T)
 
 
 def frame_grid(corners_mm: Sequence[Sequence[float]] | Array, longer: int) -> Array:
-    """(rows, columns, 2) places over a frame between its lower left and upper right corner, the upper row first."""
+    """(rows, columns, 2) grid over a frame given by its lower left and upper right corner, the upper row first."""
     low, high = np.asarray(corners_mm, float)
     counts = np.maximum(np.rint(longer * (high - low) / (high - low).max()), 3).astype(int)
     x, y = np.linspace(low[0], high[0], counts[0]), np.linspace(high[1], low[1], counts[1])
@@ -236,7 +240,7 @@ def frame_grid(corners_mm: Sequence[Sequence[float]] | Array, longer: int) -> Ar
 
 
 def _by_film(model: ImageModel, xy_mm: Array) -> Array:
-    """(n, 2, q) how camera points move with the parameters of an image's film transformation."""
+    """(n, 2, q) derivatives of camera points by the parameters of an image's film transformation."""
     film = model.film
     kind = film_kind(film.transformation, film.mirrored)
     comparator_mm, _ = film.comparator_from_camera(xy_mm)
@@ -246,13 +250,13 @@ def _by_film(model: ImageModel, xy_mm: Array) -> Array:
 
 
 def _targets(model: ImageModel, xyz: Array) -> tuple[Array, Array]:
-    """The rays (n, 2) of object points, and how far before the camera (n,) these are."""
+    """Rays (n, 2) and depths (n,) of object points."""
     ray, in_camera = rays(model.rotation, sight_vectors(model.line_of_sight, model.station, xyz).vector)
     return ray, np.abs(in_camera[:, 2])
 
 
 def _largest_sigma(covariance: Array) -> Array:
-    """(...) the standard deviation in the worst direction of covariances (..., 2, 2); nan stays."""
+    """(...) largest standard deviation over all directions of covariances (..., 2, 2); nan stays."""
     half_sum = 0.5 * (covariance[..., 0, 0] + covariance[..., 1, 1])
     half_difference = 0.5 * (covariance[..., 0, 0] - covariance[..., 1, 1])
     return np.asarray(np.sqrt(half_sum + np.hypot(half_difference, covariance[..., 0, 1])))

@@ -1,6 +1,6 @@
-"""Redundancy, test statistics, smallest detectable errors and their effect (Baarda's inner and outer reliability).
+"""Inner and outer reliability (Baarda): redundancy numbers, test statistics, smallest detectable errors, their effect.
 
-The tests are those of a run in unit weight: see `adjust.quality.run`.
+The tests are those of a run in unit weight, see `adjust.quality.run`.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,17 +15,17 @@ from adjust.problem.probabilities import Probabilities
 from adjust.problem.tested import Tested
 from adjust.quality.run import UNCHECKED, Run
 
-Effects = tuple[Array, Callable[[int], str]]  # of errors on the cameras' parameters (k, c), and the errors' names
+Effects = tuple[Array, Callable[[int], str]]  # effects (k, c) of errors on the cameras' parameters, and their names
 
-UNCONTROLLED = 1e-4  # below this an error must be hundreds of standard deviations to show: counted apart
+UNCONTROLLED = 1e-4  # redundancy number below which only errors of hundreds of standard deviations are detectable
 
 
 @dataclass(frozen=True)
 class OuterEffect:
-    """What the worst undetected error does to a camera parameter.
+    """Largest effect of an undetected error on a camera parameter (outer reliability).
 
-    effect: in the parameter's unit, of an error of the smallest detectable size in `cause`; in_sigmas: over the
-    parameter's a-priori standard deviation.
+    effect: of a smallest detectable error in `cause`, in the parameter's unit; in_sigmas: in a-priori standard
+    deviations of the parameter.
     """
 
     parameter: Parameter
@@ -36,20 +36,30 @@ class OuterEffect:
 
 @dataclass(frozen=True, repr=False)
 class Reliability:
-    """How well the observations check each other: one row for everything that is tested.
+    """Inner and outer reliability of all N tested units (Baarda).
 
-    All (N, 2) by coordinate; a quantity of one coordinate has zeros in the place of a second, and inf for errors. With
-    C the covariance given, Q_v the cofactor matrix of v, P the inverse of C, h one coordinate:
-    v: adjusted less given, sigma: the a-priori standard deviation, in mm, object units or rad. redundancy: diagonal of
-    Q_v P, with the weights that were used. w: h'P v / root(h'P Q_v P h), v / sigma_v where P is diagonal; 0 where
-    nothing checks the coordinate. tau: w / sigma0. smallest: the gross error that the test of the coordinate detects
-    with the probability `power`, delta0 / root(h'P Q_v P h); inf where nothing checks it. effect: how far an undetected
-    one moves any function of the unknowns at most, in its standard deviations. (Baarda's inner and outer reliability.)
-    statistic (N,): v'P (P Q_v P)^- P v of all coordinates together, chi-square of `sizes` (N,); smallest_together (N,):
-    the gross error of a pair in its least favourable direction.
-    An observation that has lost weight is tested as it was given, against all the others with the weights that these
-    have left.
-    outer: one entry a free camera parameter; unchecked: what no other observation checks, left out there.
+    Arrays (N, 2) are by coordinate; the missing second coordinate of a single quantity is 0, or inf for errors. With C
+    the given covariance, P its inverse, Q_v the cofactor matrix of v, and h the unit vector of a coordinate:
+
+    Attributes
+    ----------
+    v : (N, 2) adjusted minus given, in mm, object units or rad.
+    sigma : (N, 2) a-priori standard deviation.
+    redundancy : (N, 2) diagonal of Q_v P, with the weights used.
+    w : (N, 2) h'P v / root(h'P Q_v P h), that is v / sigma_v where P is diagonal; 0 for an unchecked coordinate.
+    tau : (N, 2) w / sigma0.
+    smallest : (N, 2) smallest error detectable with the probability `power`, delta0 / root(h'P Q_v P h); inf if
+        unchecked.
+    effect : (N, 2) largest effect of an undetected error on any function of the unknowns, in its standard deviations.
+    statistic : (N,) v'P (P Q_v P)^- P v of all coordinates together, chi-square with `sizes` degrees of freedom.
+    sizes : (N,) number of tested coordinates.
+    smallest_together : (N,) smallest detectable error of a pair in its least favourable direction.
+    outer : one entry for each free camera parameter.
+    unchecked : coordinates without redundancy, which `outer` leaves out.
+
+    Notes
+    -----
+    A down-weighted observation is tested with its given weight, against the others with their used weights.
     """
 
     probabilities: Probabilities
@@ -74,7 +84,7 @@ class Reliability:
 
 
 def reliability(run: Run, sigma0: float, redundancy: int, probabilities: Probabilities) -> Reliability:
-    """Tests of all observations and given quantities, and what they would not show."""
+    """Compute the reliability of all observations and given quantities."""
     units, found, tests, own_weights = run.units, run.misfits, run.statistics, run.own_weights
     tested, shift = units.named(), probabilities.noncentrality(1)
     variance = np.einsum("nii->ni", tests.discrepancy_weight)
@@ -113,9 +123,9 @@ def _over(shift: float, variance: Array, checked: Mask) -> Array:
 
 
 def _outer_effects(run: Run, errors: Array, tested: tuple[Tested, ...], shift: float) -> tuple[OuterEffect, ...]:
-    """The largest effect of any of the errors (N, 2), one at a time, on every free camera parameter.
+    """Largest effect of single errors on every free camera parameter.
 
-    And of any error in a further observation that shifts its test by `shift`.
+    The errors are those of units (N, 2), and those of further observations that shift their test by `shift`.
     """
     unknowns, factor = run.numbering.problem.unknowns, run.factor
     cameras = np.concatenate([*unknowns.camera.values(), *unknowns.fiducial.values()]).astype(np.intp)
@@ -143,7 +153,7 @@ def _outer_effects(run: Run, errors: Array, tested: tuple[Tested, ...], shift: f
 
 
 def _unit_effects(run: Run, errors: Array, by_shared: Array, tested: tuple[Tested, ...]) -> Iterator[Effects]:
-    """dx = C_xx B' T' T h times the error; what a block has for itself is not correlated with the cameras."""
+    """dx = C_xx B' T' T h times the error; the own unknowns of a block are eliminated."""
     turned = np.append(run.misfits.transform * errors[:, None, :], np.zeros((1, 2, 2)), axis=0)  # last is of ABSENT
     for rows in run.unit_rows():
         units: Indices = rows.units.ravel()
@@ -156,7 +166,7 @@ def _unit_effects(run: Run, errors: Array, by_shared: Array, tested: tuple[Teste
 
 
 def _further_effects(run: Run, by_shared: Array, shift: float) -> Iterator[Effects]:
-    """The same of further observations, whose whitened rows are L^-1 J: dx = C_xx J' L^-T L^-1 h times the error."""
+    """Effects of errors in further observations with whitened rows L^-1 J: dx = C_xx J' L^-T L^-1 h times the error."""
     for each, block in zip(run.numbering.problem.further, run.end.rows.further, strict=True):
         inward = np.linalg.inv(np.linalg.cholesky(each.covariance))
         through = block.matrix[0] / run.factor.scale[block.shared[0]]

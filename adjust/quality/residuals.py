@@ -1,4 +1,4 @@
-"""Residuals of the observations, and their sums by group."""
+"""Residuals of the observations, and statistics of their groups."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from adjust.problem.problem import ABSENT
 from adjust.quality.run import UNCHECKED, Run
 
 UM_PER_MM = 1000.0
-NEARLY_ONE = 0.99  # redundancy of a group, below which its residuals say nothing of its standard deviations
+NEARLY_ONE = 0.99  # least redundancy of a group with a sigma0 of its own
 
 
 @dataclass(frozen=True, repr=False)
 class Residuals:
-    """One row an observation of the network, in its order.
+    """Residuals of the n observations of the network, in its order.
 
-    v_mm (n, 2): adjusted less observed comparator coordinates; redundancy (n, 2): redundancy numbers of x and y;
-    w (n, 2): standardised residuals, v / sigma_v where the two coordinates are not correlated (see `Reliability`).
+    v_mm (n, 2): adjusted minus observed comparator coordinates; redundancy (n, 2): redundancy numbers of x and y;
+    w (n, 2): standardised residuals, v / sigma_v where the coordinates are uncorrelated (see `Reliability`).
     """
 
     v_mm: Array
@@ -35,10 +35,10 @@ class Residuals:
 
 @dataclass(frozen=True)
 class FurtherResidual:
-    """One observation beside image points and single unknowns, a distance say, in the unit of what is observed.
+    """Residual of a further observation, such as a distance, in its own unit.
 
-    group and name as in `FurtherObservation`; v: adjusted less observed; sigma: its a-priori standard deviation;
-    redundancy number; w: v / sigma_v; detectable: the smallest error that its own test finds (Baarda), inf unchecked.
+    group, name: see `FurtherObservation`; v: adjusted minus observed; sigma: a-priori standard deviation; redundancy:
+    redundancy number; w: v / sigma_v; detectable: smallest detectable error (Baarda), inf if unchecked.
     """
 
     group: str
@@ -53,12 +53,11 @@ class FurtherResidual:
 
 @dataclass(frozen=True)
 class Group:
-    """A kind of observation: its share of v'Pv over its redundancy (sigma0), rms in um per axis, redundancy.
+    """Statistics of a group of observations: sigma0 (root of v'Pv over redundancy), rms per axis, redundancy.
 
-    sigma0 is 0 and means nothing where the redundancy is below 1: there is no check. `target`, `fiducial`: in the
-    comparator; `control`: given object coordinates, rms in millionths of the object unit; `datum`: given places of
-    fiducials (F5, F6); `interior`, `exterior`: given values of mixed units, rms 0; `distance`, `fiducial distance`: rms
-    0. The first three are always there.
+    sigma0 is 0, without meaning, where the redundancy is below 1. The rms is in µm for `target`, `fiducial`
+    (comparator) and `datum` (given fiducial places, F5 and F6), in millionths of the object unit for `control`, and 0
+    for groups of mixed units. `target`, `fiducial` and `control` always exist.
     """
 
     sigma0: float
@@ -68,7 +67,7 @@ class Group:
 
 
 def residuals(run: Run) -> Residuals:
-    """The residuals of the observations with their redundancy numbers and standardised; these 0 without a solution."""
+    """Residuals with redundancy numbers and standardised residuals; the latter two are 0 without a solution."""
     v_mm = run.end.v_mm
     if not (run.has_solution and run.is_tested):
         return Residuals(v_mm, np.zeros_like(v_mm), np.zeros_like(v_mm))
@@ -76,9 +75,9 @@ def residuals(run: Run) -> Residuals:
 
 
 def further_residuals(run: Run, noncentrality: float) -> Iterator[FurtherResidual]:
-    """The residuals of further observations; without a solution nothing is said of their check.
+    """Residuals of further observations; unchecked without a solution.
 
-    With C = L L' and H the cofactor matrix of the adjusted rows, which are of unit weight: Q_vv = L (I - H) L'.
+    With C = L L' and H the cofactor matrix of the adjusted rows in unit weight, Q_vv = L (I - H) L'.
     """
     for each, block in zip(run.problem.further, run.end.rows.further, strict=True):
         v = each.computed(run.end.state.values) - each.observed
@@ -96,17 +95,15 @@ def further_residuals(run: Run, noncentrality: float) -> Iterator[FurtherResidua
 
 
 def surplus(block: Blocks, factor: Factor) -> Array:
-    """I - H (m, m) of a block without own unknowns."""
+    """(m, m) matrix I - H of a block without own unknowns."""
     roots = (block.matrix / factor.scale[block.shared][:, None, :] @ factor.triangle.group_roots(block.shared))[0]
     return np.asarray(np.eye(len(roots)) - roots @ roots.T)
 
 
 def groups(run: Run, further: Sequence[FurtherResidual]) -> dict[str, Group]:
-    """The groups of observations: target, tie, fiducial and join in the comparator, and the priors.
+    """Statistics by group: marks in the comparator (target, tie, fiducial, join), priors, and further observations.
 
-    control: object coordinates, whose rms is in millionths of the object unit; datum: the fiducials' given places
-    (F5, F6); interior: c, x0', y0' and distortion; exterior; and those of further observations. All behind datum have
-    no rms. target, fiducial and control are always there. What the adjustment does without is in none of them.
+    See `Group` for units. Rejected observations belong to no group.
     """
     problem, result = run.problem, {}
     for name in ("target", "tie", "fiducial", "join", "control", "datum", "interior", "scanner", "board", "exterior"):
@@ -127,7 +124,7 @@ def _group(vpv: float, redundancy: float, rms_x_um: float, rms_y_um: float) -> G
 
 
 def _rms_um(run: Run, group: str, members: Mask) -> tuple[float, float]:
-    """The rms of a group by axis, in um or in millionths of the object unit; 0 where units are mixed."""
+    """Rms of a group by axis, in µm or in millionths of the object unit; 0 for mixed units."""
     problem, v_mm = run.problem, run.end.v_mm
     if group in problem.network.observations.kind or group in ("target", "fiducial"):
         v_um = UM_PER_MM * v_mm[members[: len(v_mm)]]

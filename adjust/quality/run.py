@@ -1,9 +1,9 @@
-"""One adjustment with given weights, and everything that is tested in it, brought to unit weight.
+"""One adjustment with given weights, with all tested units in unit weight.
 
-With C the covariance that the adjustment used, T'T = C^-1 and H = T B C_xx B' T' (the hat matrix), residuals T v have
-the cofactor matrix I - H. What a unit contradicts the others by is d = -(I - H)^-1 T v, and the cofactor matrix of d is
-(I - H)^-1 = I + H (I - H)^-1: its own and that of the others' prediction. Where the adjustment used a weight p times
-that given, its own is p I in the given weight.
+With C the covariance used, T'T = C^-1 and H = T B C_xx B' T' (hat matrix), the residuals T v have the cofactor matrix
+I - H. The discrepancy between a unit and the prediction from the others is d = -(I - H)^-1 T v, with the cofactor
+matrix (I - H)^-1 = I + H (I - H)^-1: its own plus that of the prediction. Where the adjustment used p times the given
+weight, the unit's own part is p I in the given weight.
 """
 
 from collections.abc import Iterator
@@ -24,14 +24,14 @@ from adjust.problem.tested import TestedUnits
 from adjust.quality.weighting import Weighting
 from adjust.rank_defect.flat_valleys import pseudo_square_sum
 
-UNCHECKED = 1e-9  # an observation of a smaller redundancy is not checked by any other
+UNCHECKED = 1e-9  # redundancy below which an observation is unchecked
 
 
 @dataclass(frozen=True)
 class GrossError:
-    """A unit that contradicts the others, the other such units left out: its statistic, and what chance lets it reach.
+    """A gross error: a unit whose statistic exceeds its critical value, the other gross errors left out.
 
-    error (2,): the gross error as the others see it. alike: units that explain the contradiction as well.
+    error (2,): estimated gross error. alike: units that would explain the contradiction as well.
     """
 
     unit: int
@@ -43,7 +43,8 @@ class GrossError:
 
 @dataclass(frozen=True)
 class Misfits:
-    """All that is tested, in unit weight: T, H (N, 2, 2), T v (N, 2); behind a single coordinate H is 1, T and v 0.
+    """Tested units in unit weight: T and H (N, 2, 2), T v (N, 2). For a missing second coordinate H is 1, T and v are
+    0.
 
     back (N, 2, 2): from unit weight to the coordinates, the inverse of T where that is regular.
     """
@@ -56,10 +57,10 @@ class Misfits:
 
 @dataclass(frozen=True)
 class Statistics:
-    """The tests of all units as they were given: see `Reliability`.
+    """Test statistics of all units with their given weights, see `Reliability`.
 
-    discrepancy_weight (N, 2, 2): P Q_v P, the inverse of the cofactor matrix of what a unit contradicts the others by;
-    error (N, 2): that contradiction, the gross error as the others see it.
+    discrepancy_weight (N, 2, 2): P Q_v P, inverse of the cofactor matrix of the discrepancy between a unit and the
+    others; error (N, 2): that discrepancy, the estimated gross error.
     """
 
     w: Array
@@ -72,10 +73,10 @@ class Statistics:
 
 @dataclass(frozen=True)
 class UnitRows:
-    """The rows T B of what is tested, in b blocks of equal shape, reduced to the shared unknowns (see `ReducedRows`).
+    """Rows T B of tested units in b blocks of equal shape, reduced to the shared unknowns (see `ReducedRows`).
 
-    units (b, u): their numbers, ABSENT for rows that are none. own (b, u, 2, o), through (b, u, 2, s): a pair of rows
-    each, zeros behind a single one. shared (b, s).
+    units (b, u): unit numbers, ABSENT for padding. own (b, u, 2, o), through (b, u, 2, s): one pair of rows for each
+    unit, the second zero for a single coordinate. shared (b, s).
     """
 
     units: Indices
@@ -86,11 +87,14 @@ class UnitRows:
 
 @dataclass(frozen=True)
 class Run:
-    """One adjustment with given weights, and where it ended.
+    """One adjustment with given weights, and its end.
 
-    problem: as it was given, `numbering` holds it with the priors' weights. singular: what is not determined at the
-    end, be that a solution or not. settled: whether the residuals ask for no other weights. removed: what data snooping
-    has taken out.
+    Attributes
+    ----------
+    problem : as given; `numbering` holds it with the weights applied to the priors.
+    singular : null directions at the end, with or without a solution.
+    settled : whether reweighting has converged.
+    removed : gross errors removed by data snooping.
     """
 
     problem: Problem
@@ -108,7 +112,7 @@ class Run:
 
     @property
     def vpv(self) -> float:
-        """v'Pv of all that is observed or given."""
+        """v'Pv of all observations and given values, without pseudo-observations."""
         return self.end.vpv - pseudo_square_sum(self.problem, self.end.state)
 
     @property
@@ -121,7 +125,7 @@ class Run:
 
     @property
     def is_tested(self) -> bool:
-        """Whether everything is determined, so that residuals can be tested."""
+        """Whether the system is regular, so that residuals can be tested."""
         return not self.singular
 
     @cached_property
@@ -130,10 +134,10 @@ class Run:
 
     @cached_property
     def misfits(self) -> Misfits:
-        """Residuals and hat matrices of everything that is tested."""
+        """Residuals and hat matrices of all tested units."""
         units, observed = self.units, len(self.end.v_mm)
         transform, back = self._transforms
-        hat = np.zeros((len(units) + 1, 2, 2))  # the last stands for ABSENT
+        hat = np.zeros((len(units) + 1, 2, 2))  # the last entry is ABSENT
         for rows in self.unit_rows():
             through = rows.through @ self.factor.triangle.group_roots(rows.shared)[:, None]
             roots = np.concatenate([rows.own, through], axis=3)
@@ -148,7 +152,7 @@ class Run:
 
     @property
     def _transforms(self) -> tuple[Array, Array]:
-        """T and what leads back (N, 2, 2); of a prior both are diagonal."""
+        """T and its inverse (N, 2, 2); both are diagonal for priors."""
         transform, back = np.zeros((2, len(self.units), 2, 2))
         count, root, a = len(self.end.v_mm), self.end.rows.root, self.end.by_observation
         transform[:count], back[:count] = product(inverse(root), a), product(inverse(a), root)
@@ -159,7 +163,7 @@ class Run:
 
     @cached_property
     def statistics(self) -> Statistics:
-        """The test statistics of all units."""
+        """Test statistics of all units."""
         found, weights = self.misfits, self.weighting.weights
         adjusted, axes = eigen(found.hat)
         free = np.clip(1.0 - adjusted, 0.0, None)
@@ -179,33 +183,33 @@ class Run:
 
     @property
     def own_weights(self) -> Array:
-        """(N, 2) the diagonal of P as it was given."""
+        """(N, 2) diagonal of the given P."""
         return np.asarray((self.misfits.transform**2).sum(axis=1) / self.weighting.weights[:, None])
 
     @property
     def redundancies(self) -> Array:
-        """The diagonal (N, 2) of Q_v P; its sum is the redundancy of the adjustment."""
+        """(N, 2) diagonal of Q_v P; its sum is the redundancy of the adjustment."""
         free = product(self.misfits.back, np.eye(2) - self.misfits.hat)
         return np.asarray((free * self.misfits.transform.transpose(0, 2, 1)).sum(axis=2))
 
     def group_sums(self, members: Mask) -> tuple[float, float]:
-        """v'Pv and redundancy of some of what is tested."""
+        """v'Pv and redundancy of some units."""
         vpv = float((self.misfits.residual[members] ** 2).sum())
-        # Behind a single coordinate stands a 1 in the hat matrix.
+        # A missing second coordinate has a 1 in the hat matrix and so adds no redundancy.
         return vpv, float(2 * members.sum() - np.trace(self.misfits.hat[members], axis1=1, axis2=2).sum())
 
     def unit_rows(self) -> Iterator[UnitRows]:
-        """The rows of everything that is tested: block by block, its own unknowns' priors behind; then the shared
-        ones'."""
+        """Yield the rows of all tested units: block by block, each with the priors of its own unknowns; then the priors
+        of the shared unknowns."""
         numbering, units, factor, observed = self.numbering, self.units, self.factor, len(self.end.v_mm)
         alone = np.flatnonzero(units.positions[:, 1] == ABSENT)
-        unit_of = np.full(len(numbering.free), ABSENT, dtype=np.intp)  # that tests the prior of a free unknown alone
+        unit_of = np.full(len(numbering.free), ABSENT, dtype=np.intp)  # unit of the single prior of each free unknown
         unit_of[numbering.numbers[units.positions[alone, 0]]] = observed + alone
         touched = numbering.touched
         with_priors = (
             self._append_priors(block) if i < len(touched) else block for i, block in enumerate(self.end.rows)
         )
-        for block, rows in zip(touched, factor.reduced_rows(with_priors), strict=False):  # behind: further observations
+        for block, rows in zip(touched, factor.reduced_rows(with_priors), strict=False):  # further observations follow
             own_units = np.concatenate([block.rows, unit_of[block.own]], axis=1)
             pairs = (*own_units.shape, 2)
             own = rows.own.reshape(*pairs, rows.own.shape[2])
@@ -218,7 +222,7 @@ class Run:
         yield UnitRows(observed + given[:, None], np.zeros((len(given), 1, 2, 0)), shared, through[:, None])
 
     def _append_priors(self, blocks: Blocks) -> Blocks:
-        """Blocks with the priors of their own unknowns behind: a pair of rows each, of which the second is zero."""
+        """Append the priors of their own unknowns to blocks: a pair of rows each, the second zero."""
         count, width = blocks.own.shape
         weights = self._prior_root_weights[self.numbering.free]
         rows = np.zeros((count, width, 2, blocks.matrix.shape[2]))
@@ -228,10 +232,10 @@ class Run:
 
     @property
     def _prior_root_weights(self) -> Array:
-        """One over the standard deviation of every prior (n,), 0 where there is none."""
+        """(n,) inverse standard deviations of the priors, 0 without one."""
         unknowns = self.numbering.problem.unknowns
         return np.where(unknowns.has_prior, 1.0 / np.where(unknowns.has_prior, unknowns.sigma, 1.0), 0.0)
 
     def prior_pairs(self, values: Array) -> Array:
-        """Values (n,) of unknowns as (m, 2) of the priors that are tested, 0 for what is absent."""
+        """Arrange values (n,) of unknowns as the pairs (m, 2) of tested priors, 0 where absent."""
         return np.append(values, 0.0)[self.units.positions]

@@ -1,12 +1,12 @@
-"""Whether the data need a parameter: of distortion, interior orientation and scanner, one by one and in groups.
+"""Significance tests of parameters of distortion, interior orientation, scanner and board, single and in groups.
 
-A parameter, or a group of k, is compared with a value x0 that would make it superfluous: 0 for distortion, the given
-value for c, x0' and y0'. With d = x - x0 and Q the cofactor matrix of d,
+A parameter, or a group of k, is tested against the value x0 of the null hypothesis: 0 for distortion, the given value
+for c, x0' and y0'. With d = x - x0 and Q the cofactor matrix of d,
 
     t = d / (sigma0 √Q)  ~  Student's t with the redundancy r,       F = d' Q⁻¹ d / (k sigma0²)  ~  F(k, r),
 
-where sigma0 and r are those of the variance factor; without redundancy sigma0 is 1 and t normal. What has a prior is no
-free quantity: the difference from its given value, -v of that observation, has the cofactor sigma² - q (Koch, Parameter
+where sigma0 and r are those of the variance factor; without redundancy sigma0 is 1 and t is normal. For a quantity with
+a prior, the difference from the given value, -v of that observation, has the cofactor sigma² - q (Koch, Parameter
 estimation and hypothesis testing in linear models, 1999, chapters 4.2 and 4.3).
 """
 
@@ -23,16 +23,16 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.estimates import Estimates, GivenGroup
 from adjust.problem.parameter import Kind, Parameter
 
-LEVEL = 0.01  # probability of calling a superfluous parameter significant
+LEVEL = 0.01  # significance level: probability of calling a superfluous parameter significant
 FIXED = Prior(0.0)
-UNCHECKED = 1e-6  # redundancy of a prior below which the data say nothing against it
+UNCHECKED = 1e-6  # redundancy of a prior below which it cannot be tested
 
 
 @dataclass(frozen=True)
 class SignificanceTest:
-    """A test of some parameters of a camera, by their names in the family or c, x0, y0.
+    """Significance test of parameters, by their names in the family or c, x0, y0.
 
-    statistic: t of one parameter, F of a group. p: the probability of a larger one, in size, by chance alone.
+    statistic: t of one parameter, F of a group. p: p-value.
     """
 
     name: str
@@ -50,11 +50,11 @@ class SignificanceTest:
 
 
 def significance_tests(estimates: Estimates) -> dict[tuple[str, str], tuple[SignificanceTest, ...]]:
-    """Tests of every parameter that was estimated, then of groups of at least two.
+    """Test every estimated parameter, then groups of at least two.
 
     Parameters
     ----------
-    estimates : of a network; without a solution nothing is tested
+    estimates : of a network; nothing is tested without a solution
 
     Returns
     -------
@@ -88,7 +88,7 @@ def _against_zero(
     priors: Mapping[str, Prior],
     groups: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[SignificanceTest, ...]:
-    """Tests of what is not fixed of some quantities, one by one, in groups, and all together if no group is all."""
+    """Tests of the quantities that are not fixed: single, in groups, and all together if no group holds all."""
     estimated = tuple(name for name, prior in priors.items() if prior.sigma > 0.0)
     several = {name: tuple(each for each in members if each in estimated) for name, members in (groups or {}).items()}
     several = {name: members for name, members in several.items() if len(members) > 1}

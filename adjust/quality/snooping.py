@@ -1,10 +1,9 @@
-"""Data snooping: which observations and given quantities contradict the others.
+"""Data snooping: detection of gross errors in observations and given quantities.
 
-One after the other, the worst first, each tested as if those before it were not there; and every one of these anew as
-if the later ones were not there, so that two errors neither hide each other nor make good observations suspect. This is
-done in the linear model of one adjustment, whose residuals T v and cofactor matrix V = I - T B C_xx B' T', all of unit
-weight, tell what any of them would be without some of the observations (Baarda's data snooping, with the forward and
-backward steps of a regression).
+Gross errors are found one after the other, the largest first, each tested without those found before; all of these are
+then tested again without the later ones, so that two errors neither mask each other nor make good observations suspect
+(Baarda's data snooping with forward and backward steps). The linear model of one adjustment suffices: its residuals T v
+and cofactor matrix V = I - T B C_xx B' T', in unit weight, give the residuals without any subset of observations.
 """
 
 from collections.abc import Sequence
@@ -22,25 +21,30 @@ from adjust.quality.reliability import Reliability
 from adjust.quality.run import UNCHECKED, GrossError, Run
 from adjust.quality.weighting import robust_scale
 
-TOLD_APART = 7.0  # difference of two statistics from which on one explanation is clearly the better: odds of 30 to 1
+TOLD_APART = 7.0  # difference of two statistics that decides between explanations: odds of 30 to 1
 ALIKE_SHOWN = 3
-PAIRED = 300  # units among which pairs are looked for that hide each other
-MOST_PAIRED = 2000  # what is tested in a network where they are looked for at all
-AT_ONCE = 20  # columns of the residuals' cofactor matrix that are made in one pass
-MOST_SUSPECT = 0.25  # part of all that is tested: where more contradicts the rest, who is to say which
-MOST_AT_ONCE = 60  # in one adjustment; the next one goes on
-MANY = 500  # image points: the median of so many is not moved by some gross errors
-RAISED = 1.02  # a scale that is larger by less is no other
+PAIRED = 300  # worst units searched for pairs that mask each other
+MOST_PAIRED = 2000  # largest number of tested units for which such pairs are searched
+AT_ONCE = 20  # columns of V computed in one pass
+MOST_SUSPECT = 0.25  # largest fraction of gross errors; beyond it, right and wrong cannot be distinguished
+MOST_AT_ONCE = 60  # gross errors in one adjustment; the next one continues
+MANY = 500  # image points whose median is robust against some gross errors
+RAISED = 1.02  # least ratio of a scale that counts as larger
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """An observation or given quantity that contradicts the others beyond chance, given the other suspects left out.
+    """A suspected gross error in an observation or given quantity, tested without the other suspects.
 
-    size: its coordinates that were tested together; statistic: chi-square with so many degrees of freedom; critical:
-    what chance reaches in 1 of 100 adjustments (`Probabilities.family`). w, tau: of its worst coordinate in the
-    adjustment as it stands; critical_tau: of tau. error: the gross error as the others see it, by coordinate, in mm,
-    object units or rad. alike: what could as well be wrong in its place. removed: the adjustment does without it.
+    Attributes
+    ----------
+    size : number of coordinates tested together.
+    statistic : chi-square with `size` degrees of freedom.
+    critical : critical value at the family-wise level `Probabilities.family`.
+    w, tau, critical_tau : of its worst coordinate in the adjustment as it stands.
+    error : estimated gross error by coordinate, in mm, object units or rad.
+    alike : units that could be wrong in its place.
+    removed : whether the adjustment rejects it.
     """
 
     tested: Tested
@@ -56,9 +60,9 @@ class Suspect:
 
 
 class Snooping:
-    """The search for gross errors in one adjustment.
+    """Search for gross errors in one adjustment.
 
-    Columns of V are made when they are used and many at a time, for each costs a pass over all blocks.
+    Columns of V are computed on demand, many at a time, since each pass goes over all blocks.
     """
 
     def __init__(self, run: Run, probabilities: Probabilities) -> None:
@@ -67,7 +71,7 @@ class Snooping:
 
     @cached_property
     def critical(self) -> Array:
-        """What chance lets the statistics (N,) reach; inf where nothing is tested."""
+        """(N,) critical values of the statistics; inf for untested units."""
         tests = self.run.statistics
         is_tested = tests.sizes > 0
         critical = self.probabilities.critical(tests.sizes, int(is_tested.sum()))
@@ -75,12 +79,10 @@ class Snooping:
 
     @property
     def _impossible(self) -> Mask:
-        """Which units (N,) cannot have the gross errors (N, 2) that the others see in them: a given principal distance
-        is not wrong by more than itself.
+        """(N,) mask of units whose estimated gross error is impossible: a principal distance wrong by more than itself.
 
-        Over flat ground v'Pv hardly changes with the principal distance, and what change there is need not come from
-        it: nearer stations let errors of given heights explain more of the image residuals. In the linear model that
-        small slope looks like a gross error of metres.
+        Over flat ground v'Pv hardly depends on the principal distance. Its small slope may come from elsewhere, such as
+        errors of given heights, and looks like a gross error of metres in the linear model.
         """
         run, observed = self.run, len(self.run.end.v_mm)
         positions = run.units.positions[:, 0]
@@ -91,30 +93,29 @@ class Snooping:
 
     @property
     def limits(self) -> Array:
-        """What the statistics (N,) may reach in an adjustment that does without what contradicts the others."""
+        """(N,) limits of the statistics in an adjustment without the gross errors."""
         return np.asarray(self._significant_scale([]) ** 2 * self.critical)
 
     @cached_property
     def contradictions(self) -> list[GrossError]:
-        """What contradicts the others beyond its limit, in the order in which it was found.
+        """Gross errors in the order in which they were found.
 
-        Where the observations are worse than given, so that everything contradicts everything, limits are raised by
-        their scale. That is learnt without what contradicts the others, for in a small network one gross error spoils
-        all.
+        Where all observations are less precise than given, the limits are raised by their scale. The scale is estimated
+        without the gross errors, since in a small network one of them affects all residuals.
         """
         most = min(int(MOST_SUSPECT * len(self.critical)), MOST_AT_ONCE)
         scale = self._median_scale([]) if len(self.run.end.v_mm) > MANY else 1.0
         while True:
             limits = scale**2 * self.critical
             chosen = self._chosen(limits, most)
-            # Where there may be more, the sum of squares would take these for a bad scale.
+            # If there may be more gross errors, the sum of squares would include them: use the median.
             learnt = self._significant_scale(chosen) if len(chosen) < most else self._median_scale(chosen)
             if learnt <= RAISED * scale:
                 return [self._contradiction(chosen, unit, limits) for unit in chosen]
             scale = learnt
 
     def rest(self, units: Sequence[int]) -> tuple[float, float]:
-        """v'Pv and redundancy of an adjustment that would do without some units."""
+        """v'Pv and redundancy of the adjustment without some units."""
         found = self.run.misfits
         residual, hat = found.residual, found.hat[self.run.weighting.used]
         vpv = float((residual**2).sum())
@@ -127,7 +128,7 @@ class Snooping:
         return max(vpv - float(explained), 0.0), redundancy - rank
 
     def suspects(self, result: Reliability, redundancy: int) -> tuple[Suspect, ...]:
-        """What contradicts the others and what weighs less for that reason, with names, the worst first."""
+        """Gross errors and down-weighted units, with names, the worst first."""
         tests, weighting = self.run.statistics, self.run.weighting
         entries = {each.unit: each for each in self.contradictions}
         alike = {each.unit: each.alike for each in self.run.removed}
@@ -156,13 +157,13 @@ class Snooping:
         )
 
     def _significant_scale(self, units: Sequence[int]) -> float:
-        """Root of v'Pv over the redundancy without some units, where that is larger than chance makes it, else 1."""
+        """Root of v'Pv over redundancy without some units if it is significantly above 1, else 1."""
         vpv, redundancy = self.rest(units)
         chance = redundancy < 1.0 or special.chdtrc(redundancy, vpv) > self.probabilities.family
         return 1.0 if chance else float(np.sqrt(vpv / redundancy))
 
     def _median_scale(self, units: Sequence[int]) -> float:
-        """What the median of the other image points' statistics tells, no less than 1."""
+        """Robust scale from the median of the other image points' statistics, at least 1."""
         points = np.setdiff1d(np.arange(len(self.run.end.v_mm)), units)
         sizes = np.where(np.isfinite(self.critical[points]), 2, 0)
         return max(1.0, robust_scale(self._reduced_statistics(units)[points], sizes))
@@ -181,10 +182,10 @@ class Snooping:
         return chosen
 
     def _hidden_pair(self, chosen: Sequence[int], limits: Array) -> list[int]:
-        """Two units that hide each other: each contradicts the others without the other one, and both do together.
+        """Two units that mask each other: each is significant without the other, and both are together.
 
-        Looked for where all that is left contradicts itself (the test of v'Pv), and among the PAIRED worst units alone.
-        In large networks, where no unit bears on so much of another's residual, they are not.
+        Searched only if the test of v'Pv still fails, among the PAIRED worst units. In large networks no unit has such
+        an influence on another's residual, and the search is left out.
         """
         if len(limits) > MOST_PAIRED:
             return []
@@ -216,7 +217,7 @@ class Snooping:
         return GrossError(unit, float(joint[at]), float(limits[unit]), error, tuple(alike))
 
     def _reduced_statistics(self, left_out: Sequence[int]) -> Array:
-        """The statistics (N,) as they would be without some units; 0 for these."""
+        """(N,) statistics without some units; 0 for these."""
         residual, cofactor = self.run.misfits.residual, np.eye(2) - self.run.misfits.hat
         if left_out:
             columns = self._cofactor_columns(left_out)
@@ -229,7 +230,7 @@ class Snooping:
         return statistic
 
     def _joint_errors(self, chosen: Sequence[int]) -> tuple[Array, Array]:
-        """The gross errors (k, 2) of all chosen units together, in unit weight, and their statistics (k,)."""
+        """Joint estimate of the gross errors (k, 2) of all chosen units, in unit weight, and their statistics (k,)."""
         inverse = _inverse(self._joint_cofactor(chosen))
         errors = -(inverse @ self.run.misfits.residual[chosen].ravel()).reshape(-1, 2)
         own = inverse.reshape(len(chosen), 2, len(chosen), 2)
@@ -237,30 +238,31 @@ class Snooping:
         return errors, _square_sums(variance, (axes.transpose(0, 2, 1) @ errors[..., None])[..., 0])
 
     def _joint_cofactor(self, units: Sequence[int]) -> Array:
-        """(2 k, 2 k) of some units."""
+        """(2 k, 2 k) block of V of some units."""
         return self._cofactor_columns(units)[units].reshape(2 * len(units), -1)
 
     def _cofactor_columns(self, units: Sequence[int]) -> Array:
-        """The columns (N, 2, 2 k) of V of some units."""
+        """(N, 2, 2 k) columns of V of some units."""
         missing = [unit for unit in units if unit not in self._columns]
         if missing:
-            worst = np.argsort(-self.run.statistics.statistic / self.critical)[:AT_ONCE]  # that are likely to follow
+            worst = np.argsort(-self.run.statistics.statistic / self.critical)[:AT_ONCE]  # likely to be needed next
             self._prepare([*missing, *(int(unit) for unit in worst if unit not in missing)])
         nothing = np.zeros((len(self.critical), 2, 0))
         return np.concatenate([nothing, *(self._columns[unit] for unit in units)], axis=2)
 
     def _prepare(self, units: list[int]) -> None:
-        """Make the columns (N, 2, 2) of some units in one pass."""
+        """Compute the columns (N, 2, 2) of some units in one pass."""
         units = [unit for unit in units if unit not in self._columns]
-        homes: dict[int, tuple[int, int, Array, Array]] = {}  # what holds the unit's block, which it is there, own
-        triangle = self.run.factor.triangle  # rows, and the covariances of its rows with the shared unknowns
+        # By unit: number of the rows and of the block that hold it, its own rows, its covariances with the shared.
+        homes: dict[int, tuple[int, int, Array, Array]] = {}
+        triangle = self.run.factor.triangle
         for part, rows in enumerate(self.run.unit_rows()):
             for block, place in np.argwhere(np.isin(rows.units, units)):
                 through = np.zeros((len(triangle), 2))
                 np.add.at(through, rows.shared[block], rows.through[block, place].T)
                 by_shared = triangle.cofactor_times(through)
                 homes[int(rows.units[block, place])] = (part, int(block), rows.own[block, place], by_shared)
-        columns = {unit: np.zeros((len(self.critical) + 1, 2, 2)) for unit in units}  # the last stands for ABSENT
+        columns = {unit: np.zeros((len(self.critical) + 1, 2, 2)) for unit in units}  # the last entry is ABSENT
         for part, rows in enumerate(self.run.unit_rows()):
             for unit, (home, block, own, by_shared) in homes.items():
                 columns[unit][rows.units] = -(rows.through @ by_shared[rows.shared][:, None])
@@ -272,13 +274,13 @@ class Snooping:
 
 
 def _square_sums(variance: Array, along: Array) -> Array:
-    """Sums (n,) of squares over variances (n, 2), what nothing checks left out."""
+    """(n,) sums of squares over variances (n, 2), without unchecked components."""
     visible = variance > UNCHECKED
     return np.asarray(np.where(visible, along**2 / np.where(visible, variance, 1.0), 0.0).sum(axis=1))
 
 
 def _inverse(cofactor: Array) -> Array:
-    """The inverse, what nothing checks left out."""
+    """Pseudo-inverse without unchecked components."""
     variance, axes = np.linalg.eigh(cofactor)
     visible = variance > UNCHECKED
     return np.asarray((axes[:, visible] / variance[visible]) @ axes[:, visible].T)

@@ -1,4 +1,4 @@
-"""Variance components: how much the variances given for groups of observations are to be multiplied by."""
+"""Variance components: factors on the given variances of groups of observations."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -12,15 +12,15 @@ from adjust.linear_algebra.schur_complement import spread_squares
 from adjust.quality.run import Run
 from adjust.quality.weighting import Weighting
 
-COLUMNS_AT_ONCE = 500  # of the cofactor matrix of the shared unknowns
+COLUMNS_AT_ONCE = 500  # columns of the cofactor matrix of the shared unknowns held at a time
 LEAST_REDUNDANCY = 1.0  # a group with less redundancy keeps its variance
 
 
 def refined_factors(run: Run) -> Weighting:
-    """The weighting with every factor multiplied by its group's v'Pv over redundancy.
+    """Multiply every factor by its group's v'Pv over redundancy.
 
-    Repeated until nothing changes this is Helmert's estimate, and the restricted maximum likelihood of normally
-    distributed errors. Source: W. Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten, 1979.
+    Iterated to convergence, this is Helmert's estimate and the restricted maximum likelihood of normally distributed
+    errors. Source: W. Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten, 1979.
     """
     factors = {}
     for group, factor in run.weighting.factors.items():
@@ -31,11 +31,11 @@ def refined_factors(run: Run) -> Weighting:
 
 
 def factor_sigmas(run: Run) -> dict[str, float]:
-    """The standard deviations of the settled factors.
+    """Standard deviations of the converged factors.
 
-    Twice the inverse of Helmert's matrix, S_gh = trace of (P Q_v)_gh (P Q_v)_hg, over all groups that were estimated
-    together; their correlations are in it. 0 for a group that has kept its variance. Source: K.-R. Koch, Parameter
-    Estimation and Hypothesis Testing in Linear Models, section 36.
+    From twice the inverse of Helmert's matrix, S_gh = trace of (P Q_v)_gh (P Q_v)_hg, over all jointly estimated
+    groups, so that their correlations are included. 0 for a group that keeps its variance. Source: K.-R. Koch,
+    Parameter Estimation and Hypothesis Testing in Linear Models, section 36.
     """
     units, factors = run.units, run.weighting.factors
     names = list(factors)
@@ -52,10 +52,10 @@ def factor_sigmas(run: Run) -> dict[str, float]:
 
 
 def _traces(run: Run, members: Sequence[Mask]) -> Array:
-    """The squared norms (g, g) of the parts of the hat matrix between groups.
+    """(g, g) squared norms of the parts of the hat matrix between groups.
 
-    Rows of one block share its own columns; between blocks only the shared unknowns meet, and what the groups tell of
-    these is summed up first.
+    Rows of one block share the block's own unknowns. Different blocks are connected only by the shared unknowns, for
+    which the normal matrices of the groups are summed first.
     """
     factor = run.factor
     within = np.zeros((len(members), len(members)))
@@ -81,10 +81,8 @@ def _traces(run: Run, members: Sequence[Mask]) -> Array:
 
 
 def _shared_traces(factor: Factor, normals: Sequence[csr_array]) -> Array:
-    """The traces (g, g) of N_i Q N_j Q, with N (s, s) what a group tells of the shared unknowns and Q their cofactors.
-
-    Some columns of Q at a time: all of it would be too large in a large network.
-    """
+    """(g, g) traces of N_i Q N_j Q, with N (s, s) the reduced normal matrix of a group and Q the cofactor matrix of the
+    shared unknowns. Computed in blocks of columns of Q, which is too large as a whole in a large network."""
     traces = np.zeros((len(normals), len(normals)))
     for first in range(0, factor.shared_count, COLUMNS_AT_ONCE):
         unit = np.eye(factor.shared_count, COLUMNS_AT_ONCE, -first)

@@ -1,8 +1,8 @@
-"""The variance factor: by how much the given variances are too small, from observations that tell it.
+"""The variance factor sigma0², estimated from observations with redundancy of their own.
 
-Torlegård's sigma0² = v'Pv / r takes every observation for one of the same kind of error. What a camera's file gives
-with a standard deviation of 1 mm to place the datum (F5 to F9) is an observation of another kind: it contradicts
-nothing, and counts as redundancy. Such given values take no part in sigma0, and sigma0 does not multiply them.
+Torlegård's sigma0² = v'Pv / r treats all observations alike. Given values of a camera file (F5 to F9) with a standard
+deviation of 1 mm, which only place the datum, are different: they contradict nothing but count as redundancy. Such
+values are left out of sigma0, and sigma0 does not scale them.
 """
 
 from collections.abc import Iterator
@@ -18,18 +18,18 @@ from adjust.problem.estimates import GivenGroup, VarianceFactor
 from adjust.problem.problem import ABSENT, Problem
 from adjust.quality.run import Run
 
-UNCHECKED = 0.01  # redundancy of given values that place something alone, and contradict nothing
-LEAST_REDUNDANCY = 1.0  # of observations that are to tell sigma0
-TOO_GOOD = 1e-3  # probability of given values that agree so well with the others if their sigma were right
-NO_EVIDENCE = 0.01  # part that the other observations' errors have in residuals, below which these show nothing of them
-ERROR_FREE = 1e-4  # v'Pv over redundancy of observations that were computed, not made
-APART = 3.0  # ratio of standard deviations of one camera's marks that belong to two sources
+UNCHECKED = 0.01  # redundancy below which given values only place something
+LEAST_REDUNDANCY = 1.0  # of the observations that determine sigma0
+TOO_GOOD = 1e-3  # p-value below which given values agree too well for their standard deviations
+NO_EVIDENCE = 0.01  # least share of the other observations' errors in residuals that are evidence of them
+ERROR_FREE = 1e-4  # v'Pv over redundancy of simulated observations without errors
+APART = 3.0  # ratio of standard deviations that separates two sources of one camera's marks
 
 
 @dataclass(frozen=True)
 class _Given:
-    """Values that a file gives of one owner: positions of the unknowns, v'Pv, redundancy, and the least part that the
-    other observations' errors have in any combination of the residuals."""
+    """Given values of one owner: positions of the unknowns, v'Pv, redundancy, and the smallest share of the other
+    observations' errors in any combination of the residuals."""
 
     group: GivenGroup
     positions: Indices
@@ -41,23 +41,22 @@ class _Given:
 def variance_factor(run: Run, redundancy: int) -> VarianceFactor:
     """Estimate sigma0 from the observations that have redundancy of their own.
 
-    The given values of fiducials (F5, F6), of interior orientations and distortion (F7 to F9), of scanners and of
-    boards are left out where they agree with the other observations better than their standard deviations allow
-    (F-test, `TOO_GOOD`); those of fiducials also where a camera shows nothing but fiducials and some combination of
-    their residuals holds nothing of the measuring error (`NO_EVIDENCE`): nothing else would then tell how good they
-    are. Where all that is not given by these files has a redundancy below 1, sigma0 is not estimated but 1, and
-    standard deviations are a priori ones.
+    Given values of fiducials (F5, F6), interior orientation and distortion (F7 to F9), scanners and boards are left out
+    if they agree with the other observations better than their standard deviations allow (F-test, `TOO_GOOD`). Those of
+    fiducials are also left out if a camera shows only fiducials and some combination of their residuals contains no
+    measuring error (`NO_EVIDENCE`). If the remaining observations have a redundancy below 1, sigma0 is 1 and standard
+    deviations are a priori.
 
     Parameters
     ----------
-    run : the adjustment; without a solution sigma0 is that of all
+    run : the adjustment; without a solution, sigma0 is that of all observations
     redundancy : of the whole adjustment
 
     Notes
     -----
     With P^½ v the residuals of given values in their standard deviations and Q their cofactor matrix, the redundancy of
-    a group is the trace of M = I - P^½ Q P^½. Along an eigenvector of M with the eigenvalue m the others' errors are
-    1 - m of the residual's variance; m is 0 along what the group alone determines.
+    a group is the trace of M = I - P^½ Q P^½. Along an eigenvector of M with the eigenvalue m, the errors of the other
+    observations are 1 - m of the residual's variance; m is 0 where the group alone determines a quantity.
     """
     problem, vpv = run.numbering.problem, run.vpv
     if not run.has_solution:
@@ -77,11 +76,11 @@ def variance_factor(run: Run, redundancy: int) -> VarianceFactor:
 
 
 def _places_only(problem: Problem, given: _Given, variance: float, redundancy: float) -> bool:
-    """Whether given values place the datum and say nothing of the noise, whose variance factor the others tell."""
+    """Whether given values only place the datum and are no evidence of the noise."""
     alone = given.group.group == "datum" and given.group.owner in problem.network.idle_cameras
     if alone and given.evidence < NO_EVIDENCE:
         return True
-    # Where the others hold gross errors, what is given is not too good for being better than these.
+    # If the others contain gross errors, given values must not count as too good for being better than these.
     return bool(fdtr(given.redundancy, redundancy, given.vpv / given.redundancy / min(variance, 1.0)) < TOO_GOOD)
 
 
@@ -102,7 +101,7 @@ def _given_groups(run: Run) -> Iterator[_Given]:
 
 
 def _given_positions(run: Run) -> Iterator[tuple[GivenGroup, Indices]]:
-    """The given values that take part, by what they are of; those of fiducials by the size of their sigma, too."""
+    """Given values with weight, by owner; those of fiducials also by the size of their standard deviations."""
     unknowns = run.problem.unknowns
     used = run.units.positions[run.weighting.used[len(run.end.v_mm) :]]
     takes_part = np.zeros(len(unknowns), dtype=bool)
@@ -121,7 +120,7 @@ def _given_positions(run: Run) -> Iterator[tuple[GivenGroup, Indices]]:
 
 
 def _split_sources(positions: Indices, sigma: Array) -> list[Indices]:
-    """Positions apart where their standard deviations, in order, leap."""
+    """Split positions where their sorted standard deviations jump."""
     order = np.argsort(sigma, kind="stable")
     leaps = np.flatnonzero(sigma[order][1:] > APART * sigma[order][:-1]) + 1
     return [part for part in np.split(positions[order], leaps) if len(part)]

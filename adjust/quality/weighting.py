@@ -1,4 +1,4 @@
-"""What changes the weights between adjustments: robust estimation, variance components, observations taken out."""
+"""Weights between adjustments: robust estimation, variance components, rejected observations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -13,22 +13,22 @@ from adjust.problem.tested import TestedUnits
 
 WeightFunction = Literal["huber", "igg3"]
 
-STANDARD = 2.0  # standardised length of a contradiction, per coordinate, from which on an observation loses weight
-LOST = 4.5  # ... and from which on the redescending function leaves it none
-MEDIAN_LENGTH = np.sqrt(np.log(2.0))  # the median of that length for a pair of normally distributed errors
-STANDSTILL = 1e-3  # change of a weight, or relative change of a variance, that is none
-NO_WEIGHT = 1e-12  # stands for none: what has no more than this has no influence and is no observation
+STANDARD = 2.0  # standardised length, per coordinate, above which an observation is down-weighted
+LOST = 4.5  # the same, above which the redescending function gives no weight
+MEDIAN_LENGTH = np.sqrt(np.log(2.0))  # median of that length for a pair of normally distributed errors
+STANDSTILL = 1e-3  # change of a weight, or relative change of a variance, at convergence
+NO_WEIGHT = 1e-12  # stands for zero weight: not an observation
 
 
 @dataclass(frozen=True)
 class Weighting:
-    """Factors on what is given: weights (N,) of everything that is tested, variance factors by group."""
+    """Factors on the given precision: weights (N,) of all tested units, variance factors by group."""
 
     weights: Array
     factors: Mapping[str, float] = field(default_factory=dict)
 
     def applied(self, problem: Problem) -> tuple[Problem, Array]:
-        """The problem with the standard deviations of its priors, and the covariances (n, 2, 2) in mm², to be used."""
+        """Apply the factors: the problem with new standard deviations of priors, and covariances (n, 2, 2), mm²."""
         units = TestedUnits(problem)
         count = len(problem.network.observations)
         variance = self.variances(units)
@@ -41,14 +41,14 @@ class Weighting:
         return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma)), covariance
 
     def variances(self, units: TestedUnits) -> Array:
-        """(N,) the factors on the given variances."""
+        """(N,) factors on the given variances."""
         by_group = np.ones(len(units))
         for group, factor in self.factors.items():
             by_group[units.groups == group] = factor
         return by_group / self.weights
 
     def differs(self, other: "Weighting") -> bool:
-        """Whether another weighting is another one."""
+        """Whether two weightings differ beyond the convergence limit."""
         here, there = (np.array(list(each.factors.values())) for each in (self, other))
         if (np.abs(self.weights - other.weights) > STANDSTILL).any() or len(here) != len(there):
             return True
@@ -56,25 +56,24 @@ class Weighting:
 
     @property
     def used(self) -> Mask:
-        """(N,) what takes part."""
+        """(N,) mask of the units with weight."""
         return np.asarray(self.weights > NO_WEIGHT)
 
 
 def robust_weights(statistic: Array, sizes: Indices, observed: int, function: WeightFunction) -> Array:
-    """Weights (N,) by what everything contradicts the others by.
+    """Robust weights (N,) from the test statistics.
 
-    t² = statistic / sizes is the square of a standardised length per coordinate, 1 on the average: the statistic is
-    that of the observation as it was given, redundancy and all, so that one with leverage is not spared. t is over the
-    scale that the median of the image points, the first `observed` ones, gives; that of priors over no less than 1.
-    With k = 2 and K = 4.5:
+    t² = statistic / sizes is a squared standardised length per coordinate with the mean 1. It refers to the given
+    weights and includes the redundancy, so that leverage points are not spared. t is divided by the robust scale of the
+    image points, the first `observed` units; for priors by at least 1. With k = 2 and K = 4.5:
 
-    huber: 1, and k / t from k on. A gross error keeps the influence of one of k sigma. (P. J. Huber, Robust
-    Statistics, 1981.)
-    igg3: the same times ((K - t) / (K - k))² from k on, and nothing from K on: gross errors have no influence at all,
-    good observations keep their whole weight. (Y. Yang, L. Song, T. Xu, Robust estimator for correlated observations
-    based on bifactor equivalent weights, Journal of Geodesy 76, 2002.)
+    huber: 1 up to k, then k / t. A gross error has the influence of an error of k sigma (P. J. Huber, Robust
+    Statistics, 1981).
+    igg3: 1 up to k, then k / t times ((K - t) / (K - k))², and 0 from K on: gross errors have no influence, good
+    observations keep their weight (Y. Yang, L. Song, T. Xu, Robust estimator for correlated observations based on
+    bifactor equivalent weights, Journal of Geodesy 76, 2002).
 
-    What nothing checks keeps its weight.
+    Unchecked units keep their weight.
     """
     checked = sizes > 0
     t = np.sqrt(statistic / np.maximum(sizes, 1))
@@ -88,7 +87,7 @@ def robust_weights(statistic: Array, sizes: Indices, observed: int, function: We
 
 
 def robust_scale(statistic: Array, sizes: Indices) -> float:
-    """The standard deviation of unit weight that the median of pairs' statistics gives; 1 where there is none."""
+    """Robust standard deviation of unit weight from the median statistic of pairs; 1 without pairs."""
     t = np.sqrt(statistic[sizes == 2] / 2.0)
     scale = float(np.median(t)) / MEDIAN_LENGTH if len(t) else 0.0
     return scale if scale > 0.0 else 1.0
