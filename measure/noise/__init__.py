@@ -1,1 +1,1 @@
-"""The noise of film and scanner: its scale, its grain, and least squares that hold in spite of damage."""
+"""Noise of film and scanner: scale, grain, damage, and robust least squares."""

@@ -1,4 +1,4 @@
-"""Damage of the film in what a fit leaves: dust, hairs and scratches, as regions of the picture."""
+"""Detection of film damage (dust, hairs, scratches) in the residuals of a fit."""
 
 import cv2
 import numpy as np
@@ -6,25 +6,24 @@ import numpy as np
 from measure.array_types import Array, Mask
 from measure.noise.robust_estimation import robust_scale
 
-_SMOOTHING_PX = 0.8  # of residuals: hardly more than a pixel, so that the finest specks stand out too
+_SMOOTHING_PX = 0.8  # of the residuals: little more than a pixel, for the finest specks
 
 
 def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float, is_lossy: bool = False) -> Mask:
-    """Find pixels of dust and scratches: regions where smoothed residuals stand out, wider than a pixel somewhere.
+    """Find pixels of dust and scratches: regions of large smoothed residuals that are wider than a pixel somewhere.
 
-    The smoothing already reaches as far beyond a speck as its blurred edge does. To grow the regions by another pixel
-    costs more of a small mark's edge than what is left of the specks spoils.
+    The smoothing reaches as far beyond a speck as its blurred edge. Growing the regions by another pixel would cost
+    more of a small mark's edge than the rest of the specks disturbs.
 
     Parameters
     ----------
     residuals, area : (height, width)
-        What a fit leaves, and where it counts.
+        Residuals of a fit, and the pixels used.
     sigmas, floor_dn : float
-        How many standard deviations stand out; under these, for clean data have none.
+        Threshold in standard deviations; lower bound of the standard deviation, for data without noise.
     is_lossy : bool
-        Whether lossy compression rounded the picture. It gives residuals long tails, which are no fainter dust, and
-        thin patterns of its own, which hang together with a speck but are none; and beside a speck it rings, in the
-        pixels next to it.
+        Whether the image was compressed with loss. The residuals then have long tails, which are not faint dust, thin
+        patterns that may touch a speck, and ringing in the pixels beside it.
 
     Returns
     -------
@@ -36,7 +35,7 @@ def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float, is_loss
     limit = sigmas * max(robust_scale(smooth[area]), floor_dn)
     if is_lossy:
         return grown(_opened(np.abs(smooth) > limit))
-    # Much dust widens even that scale, and hides the fainter specks: what it shows at once is left out of it.
+    # Much dust inflates even the robust scale and hides fainter specks: estimate it again without the obvious ones.
     limit = sigmas * max(robust_scale(smooth[area & (np.abs(smooth) <= limit)]), floor_dn)
     large = np.abs(smooth) > limit
     count, regions = cv2.connectedComponents(large.astype(np.uint8), connectivity=4)
@@ -46,14 +45,14 @@ def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float, is_loss
 
 
 def _opened(mask: Mask) -> Mask:
-    """What of the mask is wider than a pixel."""
-    # An even square lies off its middle: where it erodes to the left it has to dilate to the right.
+    """Morphological opening: keep what is wider than a pixel."""
+    # An even structuring element is off-centre: the anchors of erosion and dilation must be opposite.
     speck = np.ones((2, 2), np.uint8)
     eroded = cv2.erode(mask.astype(np.uint8), speck, anchor=(0, 0))
     return np.asarray(cv2.dilate(eroded, speck, anchor=(1, 1)) > 0)
 
 
 def grown(mask: Mask) -> Mask:
-    """The mask and the pixels that touch it along an edge."""
+    """Dilate a mask by the pixels that touch it along an edge."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), cross) > 0)

@@ -1,13 +1,12 @@
-"""Film grain behind the residuals of a fit: white scanner noise and grain of several sizes, by their shares.
+"""Noise model of the residuals of a fit: white scanner noise plus film grain of several sizes.
 
-Any noise that is alike in all directions, and the more the nearer, is about a sum of grains of Gaussian correlation: a
-film's needs one or two sizes, a landscape, which has detail of every size, many.
+Isotropic noise whose correlation falls with distance is well described by a sum of grains with Gaussian correlation:
+film needs one or two sizes, a landscape, with detail of all sizes, many.
 
-The residuals alone mislead. Each unknown takes noise out of them, most of it where noise is strongest, at low
-frequencies; in a small window little of that is left, and a covariance from the residuals' own autocovariance comes out
-too small. So what a model of noise would leave after the very same fit is compared with what is left, lag by lag; in
-the mark's own window, and in patches of blank film beside it, where there are any: what these show is grain and noise
-alone, and more of it than the window holds.
+The autocovariance of the residuals is biased: each unknown absorbs noise, mostly at the low frequencies where it is
+strongest, and in a small window the covariance comes out too small. The model therefore predicts the autocovariance
+after the same fit and is fitted to the observed one, lag by lag, in the mark's window and, where there are any, in
+patches of blank film beside it, which show grain and noise alone.
 """
 
 from collections.abc import Sequence
@@ -23,27 +22,27 @@ from measure.noise.noise_model import NoiseModel, padded, to_orthonormal
 
 Lags = NDArray[np.intp]  # (n, 2) rows and columns between pixels, all of one length
 
-PATCH_PX = 15  # a side: thrice as far as film's grain reaches
-BESIDE_PX = 2 * PATCH_PX + 4.0  # how much of the film beside a mark is asked
-# Standard deviations of the Gaussian that smears white noise into grain, and the coarsest that is still film's.
+PATCH_PX = 15  # side of a patch: three times the reach of film grain
+BESIDE_PX = 2 * PATCH_PX + 4.0  # width of the surroundings of a mark that are searched for blank film
+# Standard deviations of the Gaussians that turn white noise into grain, and the coarsest that is still film grain.
 GRAIN_PX = (0.4, 0.5, 0.6, 0.7, 0.8, 0.95, 1.1, 1.3, 1.5, 1.8, 2.2)
 _COARSEST_PX = 1.8
-_AS_NOISY = 3.0  # times the variance of the mark's own residuals, or a part of it: beyond it is a picture, text or dust
-_FEWEST = 6  # patches that tell more than the mark's own window
-_REACH_PX = 8  # grain of 1.5 px is correlated by one in a thousand there
-_FARTHEST_PX = 3.0  # lags that are compared: beyond it the residuals hold the fit's marks rather than the noise's
-_FARTHEST_BLANK_PX = 5.0  # the same of blank film, which has no marks in it
+_AS_NOISY = 3.0  # largest ratio of a patch's variance and that of the residuals; beyond: image, text or dust
+_FEWEST = 6  # patches needed to improve on the mark's own window
+_REACH_PX = 8  # lag at which grain of 1.5 px has a correlation of 0.001
+_FARTHEST_PX = 3.0  # largest lag compared; beyond it the residuals show the fit rather than the noise
+_FARTHEST_BLANK_PX = 5.0  # the same for blank film
 
 
 def _plane() -> Array:
-    """(pixels, 3) an orthonormal base of the planes over a patch."""
+    """(pixels, 3) orthonormal basis of planes over a patch."""
     row, col = np.mgrid[:PATCH_PX, :PATCH_PX].reshape(2, -1) - (PATCH_PX - 1) / 2
     base, _ = np.linalg.qr(np.stack([np.ones(PATCH_PX**2), col, row], axis=1))
     return np.asarray(base, dtype=np.float64)
 
 
 def _kernels() -> Array:
-    """(1 + grains, lags, lags) autocorrelations of white noise, and of it smeared by Gaussians, up to the reach."""
+    """(1 + grains, lags, lags) autocorrelations of white noise and of white noise under Gaussians."""
     index = np.arange(-_REACH_PX, _REACH_PX + 1)
     squared = index[:, None] ** 2 + index**2
     return np.stack([squared == 0.0, *(np.exp(-squared / (4.0 * grain_px**2)) for grain_px in GRAIN_PX)])
@@ -53,8 +52,8 @@ PLANE, _KERNELS = _plane(), _kernels()
 
 
 def blank_patches(window: Array, free: Mask, variance_dn2: float) -> Array:
-    """(n, PATCH_PX, PATCH_PX) grey values less a plane, of patches of the window (height, width) that are wholly free
-    and vary about as much as the noise of that variance; none where there are too few."""
+    """(n, PATCH_PX, PATCH_PX) grey values minus a plane in the blank patches of a window (height, width): wholly free,
+    with a variance near the given one. Empty if there are too few."""
     patches = _squares(window)[_squares(free).all(axis=(1, 2))].reshape(-1, PATCH_PX**2)
     rest = patches - patches @ PLANE @ PLANE.T
     variances = (rest**2).sum(axis=1) / (PATCH_PX**2 - PLANE.shape[1])
@@ -63,17 +62,17 @@ def blank_patches(window: Array, free: Mask, variance_dn2: float) -> Array:
 
 
 def is_coloured(patches: Array) -> bool:
-    """Whether neighbouring pixels of the patches are alike, by more than three standard errors of chance."""
+    """Whether neighbouring pixels of the patches are correlated, at three standard errors."""
     if not len(patches):
         return False
     sums = (patches[:, :, 1:] * patches[:, :, :-1]).sum() + (patches[:, 1:] * patches[:, :-1]).sum()
-    # A plane takes three pixels' worth out of a patch, and as much out of the products.
+    # The plane absorbs three degrees of freedom of a patch, which biases the correlation.
     correlation = sums / (2 * (patches**2).sum()) + PLANE.shape[1] / PATCH_PX**2
     return bool(abs(correlation) > 3 / np.sqrt(2 * patches.size))
 
 
 def _squares(image: Array | Mask) -> Array:
-    """(n, PATCH_PX, PATCH_PX) the squares that an image divides into."""
+    """(n, PATCH_PX, PATCH_PX) squares of an image."""
     rows, cols = (size // PATCH_PX for size in image.shape)
     inner = image[: rows * PATCH_PX, : cols * PATCH_PX].reshape(rows, PATCH_PX, cols, PATCH_PX)
     return np.asarray(inner.swapaxes(1, 2).reshape(-1, PATCH_PX, PATCH_PX), float)
@@ -82,18 +81,18 @@ def _squares(image: Array | Mask) -> Array:
 def grain_model(
     residuals: Array, used: Mask, taken: Array, neighbour_correlation: float, blank: Array | None = None
 ) -> NoiseModel:
-    """The noise model, a sum of white noise and grains, whose residuals after the fit are most like the ones there are.
+    """Fit a sum of white noise and grains to the residuals, allowing for what the fit absorbs.
 
     Parameters
     ----------
     residuals, used : (height, width)
-        What the fit left, and where it counts.
+        Residuals of the fit, and the pixels used.
     taken : (1 + grains, distances)
-        What the fit takes out of the noise, as `taken_out` gives it.
+        Part of the noise that the fit absorbs, from `taken_out`.
     neighbour_correlation : float
         Of the residuals.
     blank : (n, PATCH_PX, PATCH_PX), optional
-        Patches of blank film less a plane.
+        Patches of blank film minus a plane.
     """
     rings = _rings(_FARTHEST_PX)
     pairs = _pixel_products(used[None], rings)
@@ -108,27 +107,27 @@ def grain_model(
         expected = np.concatenate([expected, len(blank) * patch_expected * weights], axis=1)
     lags = np.tensordot(nnls(expected.T, left)[0], _KERNELS, axes=1)
     variance, neighbours = lags[_REACH_PX, _REACH_PX], lags[_REACH_PX, _REACH_PX + 1]
-    # A fit makes residuals less alike than the noise is. If they still are more alike than the coarsest grain, or the
-    # model is, a landscape was taken for grain.
+    # A fit lowers the correlation of residuals. If it is still above that of the coarsest grain, in the residuals or in
+    # the model, a landscape was taken for grain.
     alike, most = max(neighbour_correlation, neighbours / max(variance, 1e-300)), np.exp(-1 / (4.0 * _COARSEST_PX**2))
     return NoiseModel(float(variance), lags, neighbour_correlation, has_blank and bool(alike < most))
 
 
 def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> Array:
-    """What a fit takes out of the sums of products of pixels so far apart, up to farthest_px.
+    """Part of the sums of products of pixels at each distance, up to farthest_px, that a fit absorbs.
 
-    The fit leaves M C M of a covariance matrix C, with M = I - Q Q'. Summed over pixels so far apart, by D, that
-    is tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q): the last two are sums of products of Q's columns, lag by lag,
-    times the autocorrelation at that lag, whatever it is.
+    The residuals have the covariance matrix M C M, with M = I - Q Q'. Summed over pixels at one distance, by D, this is
+    tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q). The last two terms are sums of products of the columns of Q, lag by
+    lag, times the autocorrelation at that lag.
 
     Parameters
     ----------
     used, design : (height, width), (unknowns, height, width)
-        The pixels used, and the model's derivatives by its unknowns.
+        Pixels used, and derivatives of the model by its unknowns.
 
     Returns
     -------
-    (1 + grains, distances) of white noise and noise of each grain at unit variance.
+    (1 + grains, distances), for white noise and each grain at unit variance.
     """
     border, used_design = int(farthest_px), design[:, used]
     within = np.pad(used, border)
@@ -148,20 +147,20 @@ def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> A
 
 
 def _pixel_products(images: Array | Mask, rings: Sequence[Lags]) -> Array:
-    """(distances,) sums over images (n, height, width) of the products of their pixels so far apart."""
+    """(distances,) sums over images (n, height, width) of products of pixels at each distance."""
     shape = padded(images.shape[1:], _REACH_PX)
     lags = fft.irfft2((np.abs(fft.rfft2(images.astype(np.float32), s=shape)) ** 2).sum(axis=0), s=shape)
     return np.array([lags[*ring.T].sum() for ring in rings])
 
 
 def _ring_kernels(rings: Sequence[Lags]) -> Array:
-    """(1 + grains, distances) autocorrelations so far apart."""
+    """(1 + grains, distances) autocorrelations at each distance."""
     return np.asarray(_KERNELS[:, *np.array([ring[0] for ring in rings]).T + _REACH_PX])
 
 
 def _ring_sums(images: Single, ring: Lags, width: int) -> Single:
-    """Of the pixels at these lags from each pixel of images (n, pixels), row after row of that width, which are 0 in a
-    border as wide as the lags."""
+    """(n, pixels) sums of the pixels at the lags of a ring from each pixel of images (n, pixels), stored row by row
+    with a border of zeros as wide as the lags."""
     total, most = np.zeros_like(images), int(np.abs(ring).max()) * (width + 1)
     for lag in (ring @ (width, 1)).tolist():
         total[:, most : total.shape[1] - most] += images[:, most + lag : total.shape[1] - most + lag]
@@ -170,7 +169,7 @@ def _ring_sums(images: Single, ring: Lags, width: int) -> Single:
 
 @cache
 def _rings(farthest_px: float) -> tuple[Lags, ...]:
-    """The lags of each length up to the farthest, the shortest first."""
+    """Lags grouped by length, up to the farthest, the shortest first."""
     lags = np.argwhere(np.ones((2 * int(farthest_px) + 1,) * 2)) - int(farthest_px)
     squares = (lags**2).sum(axis=1)
     return tuple(lags[squares == square] for square in np.unique(squares[squares <= farthest_px**2]))
@@ -178,8 +177,8 @@ def _rings(farthest_px: float) -> tuple[Lags, ...]:
 
 @cache
 def _patch() -> tuple[Array, Array]:
-    """Of a patch of blank film, how many pairs of pixels lie so far apart, and what noise leaves of their products less
-    a plane."""
+    """For a patch of blank film, by distance: number of pixel pairs, and expected sums of products after removal of a
+    plane."""
     whole, rings = np.ones((PATCH_PX, PATCH_PX), dtype=bool), _rings(_FARTHEST_BLANK_PX)
     pairs = _pixel_products(whole[None], rings)
     taken = taken_out(whole, PLANE.T.reshape(-1, PATCH_PX, PATCH_PX), _FARTHEST_BLANK_PX)

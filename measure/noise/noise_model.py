@@ -1,4 +1,4 @@
-"""The noise of film and scanner behind the residuals of a fit: variance, autocovariance, and weights that follow."""
+"""Noise model of the residuals of a fit: variance, autocovariance, and the weights that follow from them."""
 
 from dataclasses import dataclass, replace
 from math import prod
@@ -10,38 +10,38 @@ from scipy import fft
 from measure.array_types import Array, Mask, Single
 from measure.noise.robust_estimation import Real, robust_scale
 
-WHITE = 0.02  # of the variance at least is taken as white: no film's grain is known better at the finest frequencies
-REACH_PX = 5  # the coarsest grain that matters at scanning pitch: correlated over 1.5 px, gone beyond 5
+WHITE = 0.02  # least fraction of white noise: grain is not known better at the highest frequencies
+REACH_PX = 5  # reach of the coarsest grain that matters at scanning pitch, correlated over 1.5 px
 
-_ALIKE = 1e-10  # of the largest eigenvalue: what images differ by in less is no direction of its own
-_ODDS = 13.8  # chi-square of two coordinates: one in a thousand
+_ALIKE = 1e-10  # relative eigenvalue below which images are linearly dependent
+_ODDS = 13.8  # chi-square of two coordinates at p = 0.001
 _TEXTURE = 0.25  # correlation at REACH_PX that grain never has
-_POWER, _POWER_SIGMA, _MOST = 0.4, 0.25, 1 - 1 / 2.2  # of light: what is believed of any scan
-_OTHER, _SAME = 0.5, 0.15  # of light's greatest change: from where noise differs, up to where it does not
-_GREATEST = 0.98  # of the pixels change less than what is called the greatest change
-_FEWEST = 12  # pixels that tell how noisy they are
-_SCALE_VARIANCE = 1.36  # of the logarithm of a robust scale, times the number of values it is of
-_LEAST = 0.1  # of light's logarithm: noise hardly changes with less
-_DARKEST = 5e-4  # of full scale: nearer to black no scanner's noise is less
-_ROUNDS = 8  # of conjugate gradients, at most
-_CLOSE = 0.03  # of a derivative: so little left costs a thousandth of the standard deviation
-_MISFIT = 0.003  # of the contrast: what the drawing itself gets wrong from pixel to pixel
+_POWER, _POWER_SIGMA, _MOST = 0.4, 0.25, 1 - 1 / 2.2  # exponent of noise over light: prior, its sigma, upper bound
+_OTHER, _SAME = 0.5, 0.15  # fractions of the largest change of log light: above, noise differs; below, it does not
+_GREATEST = 0.98  # quantile that counts as the largest change
+_FEWEST = 12  # pixels needed to estimate their noise
+_SCALE_VARIANCE = 1.36  # variance of the logarithm of a robust scale, times the number of values
+_LEAST = 0.1  # change of log light below which noise is constant
+_DARKEST = 5e-4  # of full scale: below it noise does not decrease further
+_ROUNDS = 8  # of conjugate gradients at most
+_CLOSE = 0.03  # relative residual of a derivative that costs 0.001 of the standard deviation
+_MISFIT = 0.003  # model error from pixel to pixel, in contrasts
 
 
 def combined(factors: Array, images: Array) -> Array:
-    """Images (n, height, width) times factors (n,), summed to one image, or (m, n), to m images."""
+    """Linear combination of images (n, height, width) with factors (n,) to one image, or (m, n) to m images."""
     sums = factors @ images.reshape(len(images), prod(images.shape[1:]))
     return np.asarray(sums.reshape(*factors.shape[:-1], *images.shape[1:]))
 
 
 def products(first: Array, second: Array) -> Array:
-    """(n, m) the sums over all pixels of the products of images (n, height, width) and (m, height, width)."""
+    """(n, m) inner products of images (n, height, width) and (m, height, width)."""
     return np.asarray(first.reshape(len(first), -1) @ second.reshape(len(second), -1).T)
 
 
 def to_orthonormal(normal: Array) -> Array:
-    """(k, n) the factors by which images become an orthonormal base of the space they span, of k dimensions; normal
-    (n, n): the sums of their products."""
+    """(k, n) factors that combine images to an orthonormal basis of their k-dimensional span; normal (n, n): their
+    inner products."""
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     values, vectors = np.linalg.eigh(normal / np.outer(size, size))
     significant = values > _ALIKE * values[-1]
@@ -49,17 +49,22 @@ def to_orthonormal(normal: Array) -> Array:
 
 
 def factors(images: Array, image: Array) -> Array:
-    """(n,) the factors by which images (n, height, width), 0 where they do not count, come closest to an image in least
-    squares."""
+    """(n,) least-squares factors of images (n, height, width), 0 where not used, that approximate an image."""
     inverse = np.linalg.pinv(products(images, images), hermitian=True)
     return np.asarray(inverse @ products(images, image[None])[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """variance_dn2 of one pixel, and the (2 * reach + 1) square of autocovariances about it, a lone value for white
-    noise. neighbour_correlation: the mean correlation of pixels that touch along an edge. is_grain: whether blank film
-    shows it, and not a fit's residuals alone, which may be a landscape's."""
+    """Stationary noise.
+
+    Attributes
+    ----------
+    variance_dn2 : of one pixel.
+    autocovariance_dn2 : (2 reach + 1, 2 reach + 1) by lag; (1, 1) for white noise.
+    neighbour_correlation : mean correlation of pixels that touch along an edge.
+    is_grain : whether blank film confirms it; residuals of a fit alone may be those of a landscape.
+    """
 
     variance_dn2: float
     autocovariance_dn2: Array
@@ -71,8 +76,8 @@ class NoiseModel:
         return self.autocovariance_dn2.size == 1
 
     def floored(self, variance_dn2: float) -> "NoiseModel":
-        """The same, of a variance that is not smaller."""
-        if not self.variance_dn2:  # a picture without any noise: there is nothing to enlarge
+        """Scale the noise to at least this variance."""
+        if not self.variance_dn2:  # no noise at all: nothing to scale
             return NoiseModel(variance_dn2, np.full((1, 1), variance_dn2), 0.0, self.is_grain)
         larger = max(variance_dn2 / self.variance_dn2, 1.0)
         return replace(
@@ -81,9 +86,9 @@ class NoiseModel:
 
 
 def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
-    """The noise model of residuals (height, width), where used, after a fit of so many unknowns.
+    """Estimate the noise model from residuals (height, width), where used, of a fit with the given number of unknowns.
 
-    Noise counts as white where the correlation of neighbours is within three standard errors of nothing.
+    Noise counts as white if the correlation of neighbours is within three standard errors of zero.
     """
     noise, is_white = as_if_white(residuals, used, unknowns)
     if is_white:
@@ -93,8 +98,17 @@ def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
 
 
 def influence_covariances(influences: Array, residuals: Array, used: Mask, unknowns: int) -> tuple[Array, Array]:
-    """The covariances (n, k, k) of n estimates that depend on their pixels by influences (n, k, height, width), and the
-    variances (n,) of a pixel, as the noise models of the residuals (n, height, width), where used, have them."""
+    """Covariances of linear estimates under their own correlated noise.
+
+    Parameters
+    ----------
+    influences : (n, k, height, width) derivatives of n estimates by their pixels.
+    residuals, used : (n, height, width), from which the noise is estimated.
+
+    Returns
+    -------
+    Covariances (n, k, k), and variances (n,) of a pixel.
+    """
     kept, count = np.where(used, residuals, 0.0), np.maximum(used.sum(axis=(1, 2)), 1)
     squares = (kept**2).sum(axis=(1, 2))
     variances = squares / np.maximum(count - unknowns, 1)
@@ -107,7 +121,7 @@ def influence_covariances(influences: Array, residuals: Array, used: Mask, unkno
     shape = padded(residuals.shape[1:], REACH_PX)
     kernels = np.zeros((len(residuals), *shape), np.float32)
     kernels[:, index[:, None], index] = lags
-    weights = np.full(shape[1] // 2 + 1, 2.0)  # of a real transform's columns, which stand for their opposites, too
+    weights = np.full(shape[1] // 2 + 1, 2.0)  # columns of a real transform also stand for their conjugates
     weights[[0, *([-1] if shape[1] % 2 == 0 else [])]] = 1.0
     weights = fft.rfft2(kernels).real * (weights / np.prod(shape)).astype(np.float32)
     waves = fft.rfft2(influences.astype(np.float32), s=shape)
@@ -118,7 +132,7 @@ def influence_covariances(influences: Array, residuals: Array, used: Mask, unkno
 
 
 def _faded(lags: Array) -> Array:
-    """The far lags are noise themselves: they fade out."""
+    """Taper the far lags, which are dominated by noise."""
     index = np.arange(-REACH_PX, REACH_PX + 1)
     return np.asarray(lags * np.clip(REACH_PX + 1 - np.hypot(index[:, None], index), 0.0, 1.0))
 
@@ -126,8 +140,8 @@ def _faded(lags: Array) -> Array:
 def as_if_white(
     residuals: Array, used: Mask, unknowns: int, information: float | None = None
 ) -> tuple[NoiseModel, bool]:
-    """The same without correlations, and whether it has none. information: of how many ordinary pixels they have the
-    information, where some are clipped and residuals are their scores."""
+    """White-noise model, and whether the residuals are white. information: equivalent number of ordinary pixels, where
+    some are clipped and residuals are their scores."""
     count, kept = max(int(used.sum()), 1), np.where(used, residuals, 0.0)
     squares = float((kept**2).sum())
     variance = squares / max((count if information is None else information) - unknowns, 1)
@@ -136,8 +150,8 @@ def as_if_white(
 
 
 def is_textured(residuals: Array, used: Mask, floor_dn: float) -> bool:
-    """Whether what a fit leaves is a landscape rather than grain: still alike beyond the reach of any grain. Residuals
-    below floor_dn are the drawing's own."""
+    """Whether residuals show a landscape rather than grain: still correlated beyond the reach of grain. floor_dn: model
+    error, which does not count."""
     kept = np.where(used, residuals, 0.0)
     if not kept.any():
         return False
@@ -145,13 +159,13 @@ def is_textured(residuals: Array, used: Mask, floor_dn: float) -> bool:
 
 
 def may_be_noise(off: Array, covariance: Array) -> bool:
-    """Whether noise of that covariance (2, 2) may have moved a place by off (2,)."""
+    """Whether an offset (2,) is compatible with noise of covariance (2, 2), at p = 0.001."""
     return bool(off @ np.linalg.solve(covariance, off) < _ODDS)
 
 
 def correlated(columns: Array, noise: NoiseModel, power: float = 1.0) -> Array:
-    """The noise's covariance matrix, or a power of it as if the picture had no border, times images (n, height, width):
-    without ever forming it."""
+    """Product of the noise's covariance matrix and images (n, height, width), by FFT; powers other than 1 ignore the
+    image border."""
     spectrum, shape = _spectrum(noise, columns.shape[1:])
     if power != 1.0:
         spectrum = np.maximum(spectrum, WHITE * noise.variance_dn2) ** power
@@ -159,7 +173,7 @@ def correlated(columns: Array, noise: NoiseModel, power: float = 1.0) -> Array:
 
 
 def _spectrum(noise: NoiseModel, size: tuple[int, ...]) -> tuple[Array, list[int]]:
-    """Of the noise, in a transform of images of a size, and the transform's own size."""
+    """Power spectrum of the noise for images of a size, and the size of the transform."""
     reach = len(noise.autocovariance_dn2) // 2
     shape, index = padded(size, reach), np.arange(-reach, reach + 1)
     kernel = np.zeros(shape)
@@ -168,15 +182,15 @@ def _spectrum(noise: NoiseModel, size: tuple[int, ...]) -> tuple[Array, list[int
 
 
 def _filtered(images: NDArray[Real], spectrum: NDArray[Real], shape: list[int]) -> NDArray[Real]:
-    """Images (n, height, width) by a spectrum in a transform of a size."""
+    """Filter images (n, height, width) with a spectrum of the given transform size."""
     height, width = images.shape[1:]
     smeared = fft.irfft2(fft.rfft2(images, s=shape) * spectrum, s=shape)
     return np.asarray(smeared[:, :height, :width], images.dtype)
 
 
 def autocovariance(kept: Array, used: Mask, reach: int) -> Array:
-    """Mean products (..., lags, lags) of images (..., height, width) at all lags up to reach, averaged over opposite
-    and mirrored lags: grain has no direction."""
+    """(..., lags, lags) autocovariance of images (..., height, width) up to reach, averaged over mirrored lags, since
+    grain is isotropic."""
     shape = padded(kept.shape[-2:], reach)
     spectra = np.abs(fft.rfft2(np.stack([kept, used]), s=shape)) ** 2
     products, pairs = fft.irfft2(spectra, s=shape)
@@ -187,12 +201,12 @@ def autocovariance(kept: Array, used: Mask, reach: int) -> Array:
 
 
 def padded(shape: tuple[int, ...], reach: int) -> list[int]:
-    """The size of a transform in which lags up to the reach do not run into one another."""
+    """Transform size that avoids wrap-around up to the reach."""
     return [fft.next_fast_len(size + reach, real=True) for size in shape]
 
 
 def _covariance_along(kept: Array, used: Mask, lag: int) -> Array:
-    """(...) the mean product of images (..., height, width) at a lag along a row or a column."""
+    """(...) mean product of images (..., height, width) at a lag along rows and columns."""
     products = kept[..., lag:] * kept[..., :-lag], kept[..., lag:, :] * kept[..., :-lag, :]
     pairs = used[..., lag:] & used[..., :-lag], used[..., lag:, :] & used[..., :-lag, :]
     sums = [
@@ -202,25 +216,25 @@ def _covariance_along(kept: Array, used: Mask, lag: int) -> Array:
     return np.asarray(sum(sums) / 2)
 
 
-# Weights of pixels: by noise that grows with light, and for grain by what the inverse of the noise's covariance matrix
-# makes of a fit's derivatives.
+# Weights of pixels: noise that grows with light, and generalised least squares for grain.
 #
-# A sensor's own noise is alike in light. What is added to grey values that are a power of light, or rounded or
-# compressed away of them, is alike in these, and in light the larger the more light there is; grain lies between. So
-# the standard deviation of noise is taken to grow as a power of light, from 0, alike in light, to that of noise alike
-# in grey values of a gamma of 2.2: the same however a file codes light. What seems to grow faster is no noise: it is a
-# mark that is not as drawn, and to weigh it down would fit less and less of it.
+# Sensor noise is constant in light. Noise added to grey values that are a power of light, by rounding or compression,
+# is constant in grey values and grows with light; grain lies between. The standard deviation is therefore modelled as
+# a power of light with an exponent from 0 (constant in light) to 1 - 1 / 2.2 (constant in grey values of gamma 2.2).
+# A faster growth is not noise but a misfit of the mark, and must not be down-weighted.
 #
-# Generalised least squares solves `B r = 0`, B being the derivatives times that inverse. Conjugate gradients give B to
-# some per cent in a few rounds without forming a matrix. B need not be exact: the estimate is unbiased with any, and
-# its covariance follows from the very B that was used.
+# Generalised least squares solves `B r = 0`, with B the derivatives times the inverse of the noise's covariance
+# matrix. Conjugate gradients give B to some per cent in a few rounds without forming a matrix. B need not be exact:
+# the estimate is unbiased for any B, and its covariance is computed with the B that was used.
 
 
 def steadiness(residuals: Array, light: Array, ground: Mask, used: Mask) -> Array:
-    """(height, width): the standard deviation of the ground's noise over that of each pixel.
+    """(height, width) standard deviation of the background's noise over that of each pixel.
 
-    residuals (height, width): light that a fit left; light, alike: what it draws, of full scale; ground, used,
-    alike: the ordinary pixels, and those that count. Damage hardly does: scales are medians.
+    Parameters
+    ----------
+    residuals, light : (height, width) residuals and model of a fit, in light; the latter as a fraction of full scale.
+    ground, used : (height, width) background pixels, and pixels used. Robust scales limit the effect of damage.
     """
     at_ground = ground & used
     if not at_ground.any():
@@ -242,18 +256,18 @@ def steadiness(residuals: Array, light: Array, ground: Mask, used: Mask) -> Arra
 
 
 def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -> tuple[Array, Array]:
-    """B and C B', each (unknowns, height, width) and 0 where not used: weighted derivatives, and the covariance matrix
-    of the noise times them."""
+    """Weighted derivatives B and C B', each (unknowns, height, width) and 0 where not used; C: covariance of the
+    noise."""
     scale_dn2, (spectrum_dn2, shape) = noise.variance_dn2, _spectrum(noise, used.shape)
     least = max(WHITE * scale_dn2, (_MISFIT * contrast_dn) ** 2) / scale_dn2
     spectrum: Single = np.maximum(spectrum_dn2 / scale_dn2, least).astype(np.float32)
     counts = used.astype(np.float32)
-    inverse: Single = np.asarray(1 / spectrum, np.float32)  # as if the pixels used had no border
-    # The columns are scaled for single precision, and all are solved at once.
+    inverse: Single = np.asarray(1 / spectrum, np.float32)  # preconditioner: ignores the border
+    # Scale the columns for single precision; all are solved together.
     right = (design * used).astype(np.float32)
     size = np.sqrt(_dots(right, right))
     right /= size
-    # Columns that are close leave the rounds: those of a mark's edges are so at once, the ground's later.
+    # Converged columns leave the iteration: those of a mark's edges first, those of the background later.
     solution, left, rests = np.zeros_like(right), np.arange(len(right)), right.copy()
     direction = ahead = _filtered(right, inverse, shape) * counts
     strength = _dots(right, ahead)

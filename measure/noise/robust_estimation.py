@@ -1,4 +1,4 @@
-"""Robust estimation: weights and losses against outliers, robust scales, and Gauss-Newton steps."""
+"""Robust estimation: M-estimator weights and losses, robust scales, Gauss-Newton steps."""
 
 from dataclasses import dataclass
 from typing import TypeVar
@@ -10,24 +10,24 @@ from measure.array_types import Array, Mask
 
 Real = TypeVar("Real", np.float32, np.float64)
 
-MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
-STUDENT_FREEDOM = 4.0  # of Student's t: a fifth of false observations moves little
+MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, relative to one from the mean of squares
+STUDENT_FREEDOM = 4.0  # degrees of freedom of Student's t: robust against a fifth of outliers
 _TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
-_WORST_CONDITION = 1e10  # of normal equations that determine their unknowns
+_WORST_CONDITION = 1e10  # of regular normal equations
 
 
-SIGMA_OF_DEVIATION = 1.4826  # the standard deviation of normal values over their median absolute deviation
+SIGMA_OF_DEVIATION = 1.4826  # ratio of standard deviation and median absolute deviation of normal values
 
 
 def tukey_weights(residuals: NDArray[Real], scale: float) -> NDArray[Real]:
-    """Weights between 0 and 1, all 1 where the scale is infinite."""
+    """Tukey's biweight, between 0 and 1; 1 where the scale is infinite."""
     if not np.isfinite(scale):
         return np.ones_like(residuals)
     return np.asarray((1 - np.clip(np.abs(residuals) / (_TUKEY * scale), 0.0, 1.0) ** 2) ** 2)
 
 
 def tukey_loss(residuals: Array, scale: float) -> float:
-    """Tukey's loss, in units of squares; the sum of squares itself where the scale is infinite."""
+    """Tukey's loss, scaled like a sum of squares; the sum of squares where the scale is infinite."""
     if not np.isfinite(scale):
         return float(np.sum(residuals**2))
     limit = _TUKEY * scale
@@ -35,15 +35,14 @@ def tukey_loss(residuals: Array, scale: float) -> float:
 
 
 def student_weights(squares: Array, dimensions: float) -> Array:
-    """Of observations of so many dimensions that lie so many standard deviations off, squared, in Student's t
-    distribution (Lange, Little and Taylor 1989)."""
+    """Weights of Student's t distribution from squared Mahalanobis distances of observations with the given dimension
+    (Lange, Little and Taylor 1989)."""
     return np.asarray((STUDENT_FREEDOM + dimensions) / (STUDENT_FREEDOM + squares))
 
 
 def gauss_newton_step(design: NDArray[Real], residuals: NDArray[Real], weights: NDArray[Real], damping: float) -> Array:
-    """(..., unknowns) by which residuals (..., observations) shrink most, for derivatives (..., unknowns,
-    observations) of the model and weights (..., observations). damping: what is added to the normal equations' unit
-    diagonal, to which they are scaled (Levenberg)."""
+    """(..., unknowns) Gauss-Newton step for derivatives (..., unknowns, observations), residuals and weights (...,
+    observations). damping: added to the diagonal of the normal equations scaled to unit diagonal (Levenberg)."""
     weighted = design * weights[..., None, :]
     normal = (weighted @ design.swapaxes(-1, -2)).astype(float)
     right = (weighted @ residuals[..., None]).astype(float)
@@ -53,8 +52,7 @@ def gauss_newton_step(design: NDArray[Real], residuals: NDArray[Real], weights: 
 
 
 def solution(normal: Array, right: Array, free: Mask) -> Array | None:
-    """The solution of normal equations (unknowns, unknowns) for the free unknowns, 0 for the others; None where they
-    are singular."""
+    """Solve normal equations (unknowns, unknowns) for the free unknowns, 0 for the others; None if singular."""
     squares = np.diag(normal)[free]
     if not np.all(squares > 0) or not np.all(np.isfinite(squares)):
         return None
@@ -70,7 +68,7 @@ def solution(normal: Array, right: Array, free: Mask) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class TukeyFit:
-    """values = factors (unknowns,) @ design + residuals (observations,); weights (observations,) by the latter."""
+    """values = factors (unknowns,) @ design + residuals (observations,); weights (observations,)."""
 
     factors: Array
     residuals: Array
@@ -78,8 +76,10 @@ class TukeyFit:
 
 
 def tukey_fit(design: Array, values: Array, rounds: int, least_scale: float) -> TukeyFit:
-    """The linear fit of design (unknowns, observations) to values by Tukey's weights, whose scale is that of the
-    residuals, but no less than the least; plain in the first of the rounds."""
+    """Fit design (unknowns, observations) to values by iteratively reweighted least squares with Tukey's weights.
+
+    The first round is unweighted; the scale is that of the residuals, at least least_scale.
+    """
     weights = np.ones_like(values)
     for _ in range(rounds):
         weighted = design * weights
@@ -92,9 +92,11 @@ def tukey_fit(design: Array, values: Array, rounds: int, least_scale: float) -> 
 def least_distances(
     design: Array, places: Array, least: float, rounds: int, prior: Array | None = None, usual: Array | None = None
 ) -> Array:
-    """(..., unknowns, 2) maps from design (..., n, unknowns) to places (..., n, 2) by least distances, as some may be
-    false; distances below the least weigh alike. prior (unknowns, unknowns): the weight of what the map is usually
-    (unknowns, 2), that of a place being 1 at most."""
+    """(..., unknowns, 2) maps from design (..., n, unknowns) to places (..., n, 2) by the least sum of distances.
+
+    Robust against false places; distances below least have equal weight. prior (unknowns, unknowns): weight matrix of
+    the prior map usual (unknowns, 2), where the weight of a place is at most 1.
+    """
     weights, unknowns = np.ones(design.shape[:-1]), design.shape[-1]
     prior = np.zeros((unknowns, unknowns)) if prior is None else prior
     usual = np.zeros((unknowns, 2)) if usual is None else usual
@@ -107,20 +109,20 @@ def least_distances(
 
 
 def robust_scale(values: Array) -> float:
-    """The standard deviation of normal values, from their median absolute deviation."""
+    """Robust standard deviation from the median absolute deviation."""
     if values.size == 0:
         return 0.0
     return SIGMA_OF_DEVIATION * _median(np.abs(values - _median(values)))
 
 
 def robust_scales(values: NDArray[np.floating]) -> Array:
-    """(n,) that of each row of many values (n, many), at once."""
+    """(n,) robust standard deviation of each row of values (n, many)."""
     middle = values.shape[1] // 2
     off = np.abs(values - np.partition(values, middle, axis=1)[:, middle, None])
     return np.asarray(SIGMA_OF_DEVIATION * np.partition(off, middle, axis=1)[:, middle], float)
 
 
 def _median(values: Array) -> float:
-    middle = values.size // 2  # numpy's own takes many times as long for a small window
+    middle = values.size // 2  # np.median is many times slower for a small window
     parted = np.partition(values, middle, axis=None)
     return float(parted[middle] if values.size % 2 else (parted[:middle].max() + parted[middle]) / 2)
