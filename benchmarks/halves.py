@@ -30,7 +30,7 @@ from measure.boards.measure import measure_board
 from measure.boards.specs import ChessboardSpec
 from measure.scans.opening import open_scan
 from pipeline.calibration.intrinsics import camera_intrinsics
-from pipeline.calibration.lens_choice import LensModel, lens_of
+from pipeline.calibration.lens_choice import LensModel, free_lens
 from pipeline.calibration.pictures import CameraPictures
 from pipeline.results.comparator_file import read_comparator
 
@@ -204,7 +204,7 @@ def board_network(chosen: BoardSet, pictures: Sequence[Corners]) -> Network:
     free = Prior(chosen.size_px[0] * PIXEL_MM, np.inf)
     width_mm, height_mm = (size * PIXEL_MM for size in chosen.size_px)
     camera = Camera(
-        "camera", free, None, None, lens_of(chosen.lens, square_pixels=False),
+        "camera", free, None, None, free_lens(chosen.lens, square_pixels=False),
         center_mm=(width_mm / 2, -height_mm / 2), frame_mm=(width_mm, height_mm),
     )  # fmt: skip
     xy_mm = np.concatenate([each.places_px for each in pictures]) * [PIXEL_MM, -PIXEL_MM]

@@ -29,7 +29,7 @@ _PIECE_BYTES = 1 << 20
 
 def fingerprint(value: object) -> str:
     """SHA-256 of a value made of dataclasses, mappings, sequences, arrays, numbers and text."""
-    return of_content(canonical_json(value).encode("utf-8", "surrogateescape"))
+    return hash_content(canonical_json(value).encode("utf-8", "surrogateescape"))
 
 
 def canonical_json(value: object) -> str:
@@ -42,14 +42,14 @@ def canonical_json(value: object) -> str:
     return json.dumps(_json(value), ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
 
 
-def of_content(data: bytes) -> str:
+def hash_content(data: bytes) -> str:
     """SHA-256 of the content of a file."""
     return hashlib.sha256(data).hexdigest()
 
 
-def of_file(path: Path) -> str:
+def hash_file(path: Path) -> str:
     """The same, the file read here."""
-    return of_content(read_bytes(path))
+    return hash_content(read_bytes(path))
 
 
 def scan_fingerprint(path: Path) -> str:
@@ -63,7 +63,7 @@ def scan_fingerprint(path: Path) -> str:
                 pieces.append(file.read(_PIECE))
     except OSError:
         return ""
-    return fingerprint([size, *map(of_content, pieces)])
+    return fingerprint([size, *map(hash_content, pieces)])
 
 
 def _json(value: Any) -> Any:
@@ -77,7 +77,10 @@ def _json(value: Any) -> Any:
             return {str(key): _json(item) for key, item in value.items()}
         return {"pairs": sorted(([_json(key), _json(item)] for key, item in value.items()), key=json.dumps)}
     if isinstance(value, np.ndarray):
-        return {"array": f"{value.dtype.str}{value.shape}", "sha256": of_content(np.ascontiguousarray(value).tobytes())}
+        return {
+            "array": f"{value.dtype.str}{value.shape}",
+            "sha256": hash_content(np.ascontiguousarray(value).tobytes()),
+        }
     if isinstance(value, Set):
         return _json(sorted(value, key=str))
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
@@ -124,7 +127,7 @@ class FileStates:
         self._folder = os.path.abspath(folder)
         self._below: dict[str, str] = {}  # by folder, what stands before the names of its files
 
-    def of(self, path: str | Path) -> FileState:
+    def get(self, path: str | Path) -> FileState:
         """Of a file or an object; one that does not answer is as one that is not there."""
         try:
             if isinstance(path, Address):
@@ -155,7 +158,7 @@ class FileStates:
 
 def file_state(path: Path, folder: Path) -> FileState:
     """The state of one file or object. folder: that of the project."""
-    return FileStates(folder).of(path)
+    return FileStates(folder).get(path)
 
 
 def parts_hash(path: Path, max_pixels: int | None = None) -> str:

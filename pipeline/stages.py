@@ -22,11 +22,11 @@ from pipeline.archive.checked_statuses import (
     remember_written,
 )
 from pipeline.archive.measurement import (
-    decisions_by,
-    fingerprints_of,
+    count_decisions,
     measured_scans,
     picture_sizes_mm,
     pitches,
+    read_fingerprints,
     read_measurement,
     remember_place,
     written_scans,
@@ -39,7 +39,7 @@ from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
-from pipeline.provenance import of_file
+from pipeline.provenance import hash_file
 from pipeline.publishing.made_from import adjusted_from, differing, measured_from
 from pipeline.publishing.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
@@ -48,9 +48,9 @@ from pipeline.report.page import write_frame_page, write_report
 from pipeline.results.adjustment_file import read_adjustment, write_adjustment
 from pipeline.results.comparator_file import (
     ComparatorPoint,
-    measurement_of,
-    pitches_of,
     read_comparator,
+    read_measurement_hash,
+    read_pitches,
     write_comparator,
 )
 from pipeline.results.covariance_file import covariance_path
@@ -100,7 +100,7 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
         return _measured_shard(project, reporter, work, work.shard)
     with unpublished(project) as new:
         digest = _measure(project, new, reporter, work)
-        data = measured_data(project, new.at) if len(project.scans) <= _ONE_BY_ONE else None
+        data = measured_data(project, new.current_path) if len(project.scans) <= _ONE_BY_ONE else None
         _publish(project, new)
     if project.images_path is not None:
         _fill_images(project, measured_scans(project.measurement_path, digest))
@@ -110,7 +110,7 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
 
 def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> tuple[list[Merged], Summary]:
     """The stores of shards into that of the project; and, where they hold all its scans, the marks of all together."""
-    with Store(project.measurement_path) as store, ThumbnailStore.beside(store.path) as thumbnails:
+    with Store(project.measurement_path) as store, ThumbnailStore.open(store.path) as thumbnails:
         taken = merge(store, stores)
         thumbnails.take(stores)
     try:
@@ -127,9 +127,9 @@ def run_adjust(project: Project, reporter: Reporter) -> Summary:
             # Not kept: what is written takes as much memory, and is read again for the summary.
             _write_adjustment(project, adjust_marks(project, _given_marks(project, new)), new)
         earlier = project.adjustment_path
-        if earlier.exists() and of_file(earlier) != of_file(new.at(earlier)):
+        if earlier.exists() and hash_file(earlier) != hash_file(new.current_path(earlier)):
             new.remove(project.check_path)  # it belongs to the earlier one
-        data = adjusted_data(project, new.at)
+        data = adjusted_data(project, new.current_path)
         new.publish()
     covariance = covariance_path(project.adjustment_path)
     return summarise(data, {"adjustment": project.adjustment_path, "covariance": covariance})
@@ -144,7 +144,7 @@ def run_check(project: Project, reporter: Reporter) -> Summary:
             marks = _given_marks(project, new)
             _check_adjusted(project, marks)
             _write_check(project, adjust_marks(project, marks), new)
-        data = adjusted_data(project, new.at)
+        data = adjusted_data(project, new.current_path)
         new.publish()
     return summarise(data, {"check": project.check_path})
 
@@ -174,12 +174,12 @@ def run_frame_pages(project: Project, images: Sequence[str], reporter: Reporter)
     image that there is not."""
     with unpublished(project) as new, reporter.stage("reporting") as count:
         _comparator(project, new)
-        data = frame_data(project, new.at, frozenset(images))
+        data = frame_data(project, new.current_path, frozenset(images))
         pages = {image: project.frame_page_path(image) for image in images}
         with _thumbnails(project, data) as pictures:
             for done, (image, path) in enumerate(pages.items()):
                 count(image, done, len(pages))
-                write_frame_page(replace(data, thumbnail=pictures.of), image, new.place(path))
+                write_frame_page(replace(data, thumbnail=pictures.get), image, new.place(path))
         new.publish()
         return pages
 
@@ -234,9 +234,9 @@ def _adjusted_marks(
     if not scans:
         return adjustment
     from pipeline.adjusting.second_visit import measure_again
-    from pipeline.archive.measure_archive import executor_of
+    from pipeline.archive.measure_archive import open_executor
 
-    again = measure_again(project, scans, adjustment, reporter, lambda: executor_of(project, work or WorkOptions()))
+    again = measure_again(project, scans, adjustment, reporter, lambda: open_executor(project, work or WorkOptions()))
     if again is None:
         return adjustment
     _write_again(project, again, new)
@@ -250,7 +250,7 @@ def _given_marks(project: Project, new: Unpublished) -> tuple[ComparatorPoint, .
 
 def _comparator(project: Project, new: Unpublished) -> Path:
     """The file that these stand in."""
-    path = new.at(project.comparator)
+    path = new.current_path(project.comparator)
     if not path.exists():
         raise InputError(
             f"{project.comparator}: there is no such file. Run `reseau measure` first, or put the coordinates there."
@@ -261,7 +261,7 @@ def _comparator(project: Project, new: Unpublished) -> Path:
 def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublished) -> None:
     """What a second visit found, in the place of what was judged before it."""
     with Store(project.measurement_path) as store:
-        before = find_judging(store, measurement_of(new.at(project.comparator)))
+        before = find_judging(store, read_measurement_hash(new.current_path(project.comparator)))
         assert before is not None
         digest = rejudge(store, before, scans)
         _write_marks(project, store, digest, new)
@@ -270,7 +270,7 @@ def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublish
 def _write_marks(project: Project, store: Store, digest: str, new: Unpublished) -> None:
     judging = find_judging(store, digest)
     assert judging is not None
-    decisions = decisions_by(store, digest)
+    decisions = count_decisions(store, digest)
     for camera in project.cameras.values():
         if camera.clicks is not None and camera.clicks.who:  # one decision more: how its marks look
             who = camera.path.name, camera.clicks.who
@@ -286,7 +286,7 @@ def _publish(project: Project, new: Unpublished) -> None:
     new.publish()
     if not (project.scans and project.measurement_path.exists() and project.comparator.exists()):
         return
-    digest = measurement_of(project.comparator)
+    digest = read_measurement_hash(project.comparator)
     with Store(project.measurement_path) as store:
         if find_judging(store, digest) is not None:
             drop_all_but(store, digest)
@@ -306,10 +306,10 @@ def _write_adjustment(project: Project, adjustment: Adjustment, new: Unpublished
 
 def _frames_mm(project: Project, new: Unpublished) -> dict[str, tuple[float, float]]:
     """By camera the size of its frame: of a camera without fiducials that of its pictures where its file has none."""
-    sizes = picture_sizes_mm(project.measurement_path, measurement_of(new.at(project.comparator)))
+    sizes = picture_sizes_mm(project.measurement_path, read_measurement_hash(new.current_path(project.comparator)))
     largest: dict[str, tuple[float, float]] = {}
     for image, size in sizes.items():
-        camera = project.camera_of(image)
+        camera = project.image_camera(image)
         if not camera.fiducials:
             largest[camera.name] = max(largest.get(camera.name, size), size)
     return largest | {each.name: each.frame_mm for each in project.cameras.values() if each.frame_mm is not None}
@@ -326,7 +326,7 @@ def _check_adjusted(project: Project, marks: Sequence[ComparatorPoint]) -> None:
 def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> None:
     from pipeline.opencv_check.check import check_against_opencv
 
-    made_from = {project.adjustment_path.name: of_file(new.at(project.adjustment_path))}
+    made_from = {project.adjustment_path.name: hash_file(new.current_path(project.adjustment_path))}
     found = check_against_opencv(adjustment, _board_pictures(project, new))
     write_record(replace(found, reseau=version("reseau"), made_from=made_from), new.place(project.check_path))
 
@@ -338,7 +338,7 @@ def _board_pictures(project: Project, new: Unpublished) -> "BoardPictures | None
     board = project.targets.board if project.targets else None
     if board is None or not project.scans or not detector_name(board):
         return None
-    pitch_um = pitches_of(new.at(project.comparator))
+    pitch_um = read_pitches(new.current_path(project.comparator))
     if project.pitch_um:
         pitch_um = dict.fromkeys(project.scans, project.pitch_um) | pitch_um
     images = project.given_images.turned_deg if project.given_images else {}
@@ -347,9 +347,9 @@ def _board_pictures(project: Project, new: Unpublished) -> "BoardPictures | None
 
 
 def _reported(project: Project, new: Unpublished) -> Summary:
-    data = report_data(project, new.at)
+    data = report_data(project, new.current_path)
     with _thumbnails(project, data) as pictures:
-        write_report(replace(data, thumbnail=pictures.of), new.place(project.report_path))
+        write_report(replace(data, thumbnail=pictures.get), new.place(project.report_path))
     files = {"comparator coordinates": project.comparator, "adjustment": project.adjustment_path}
     written = {word: path for word, path in files.items() if word != "adjustment" or data.adjustment}
     return summarise(data, {**written, "report": project.report_path})
@@ -360,5 +360,5 @@ def _thumbnails(project: Project, data: ReportData) -> "Thumbnails":
     from pipeline.archive.thumbnails import Thumbnails
 
     scans, path = data.measurement or {}, project.measurement_path
-    keys = fingerprints_of(path, data.made_from.get(path.name, ""), scans)
+    keys = read_fingerprints(path, data.made_from.get(path.name, ""), scans)
     return Thumbnails(scans.values(), project.max_pixels, path, keys)

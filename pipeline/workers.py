@@ -144,7 +144,7 @@ class Submits(Protocol):
         """Have `fn` called with these, some time."""
 
 
-def results_of(
+def iterate_results(
     function: Callable[[Task], Made],
     tasks: Iterable[Task],
     executor: Submits | None = None,

@@ -66,7 +66,7 @@ def add_scanner_bends(
 def name_scanners(project: Project, network: Network) -> Network:
     """The network whose images say which scanner they come from, whether its bend is to be estimated or not."""
     images = tuple(
-        image if image.transformation == "none" else replace(image, scanner=project.scanner_of(image.name))
+        image if image.transformation == "none" else replace(image, scanner=project.image_scanner(image.name))
         for image in network.images
     )
     return replace(network, images=images)

@@ -89,7 +89,7 @@ def _calibration(path: Path, content: AdjustmentRecord, name: str, lens: Lens, l
     marks = {id: np.array(mark.xy_mm) for id, mark in content.cameras[name].fiducials.items()}
     unknowns = [Parameter.interior(name, each) for each in lens.quantities]
     unknowns += [Parameter.fiducial(name, id, axis) for id in marks for axis in "xy"]
-    covariance, redundancy = read_own_covariance(path).of(unknowns), content.variance_factor.redundancy
+    covariance, redundancy = read_own_covariance(path).select(unknowns), content.variance_factor.redundancy
     return CameraCalibration(label, lens, marks, covariance, redundancy)
 
 

@@ -15,7 +15,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.network import Board, Image, LineOfSight, Network, ObjectPoint, Transformation
 from adjust.problem.observations import Calibration, Distance, Observations
 from measure.results import ON_FILM
-from pipeline.adjusting.turned_pictures import in_sensor_frame
+from pipeline.adjusting.turned_pictures import rotate_to_sensor
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile
@@ -45,7 +45,7 @@ def check_fiducials(project: Project, marks: Sequence[ComparatorPoint]) -> None:
 
 
 def _check_fiducial_names(project: Project, image: str, marks: Sequence[ComparatorPoint]) -> None:
-    camera = project.camera_of(image)
+    camera = project.image_camera(image)
     ids = [fiducial.id for fiducial in camera.fiducials]
     for mark in marks:
         if mark.point not in ids:
@@ -57,7 +57,7 @@ def _check_fiducial_names(project: Project, image: str, marks: Sequence[Comparat
 
 def _check_fiducial_unit(project: Project, image: str, marks: Sequence[ComparatorPoint]) -> None:
     """In um, inches or pixels they stand farther apart than the camera's, or closer, than film could make them."""
-    camera = project.camera_of(image)
+    camera = project.image_camera(image)
     given = {one.id: one.xy_mm for one in camera.fiducials if max(one.sigma_mm) < math.inf}
     known = [(mark.xy_mm, given[mark.point]) for mark in marks if mark.xy_mm is not None and mark.point in given]
     measured_mm, given_mm = (_extent(np.array(places)) for places in zip(*known, strict=True)) if known else (0.0, 0.0)
@@ -79,7 +79,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
 
     Raises InputError where a mark names a point, a fiducial or an image that the project does not have.
     """
-    used = in_sensor_frame(project, [mark for mark in marks if mark.status.is_observation])
+    used = rotate_to_sensor(project, [mark for mark in marks if mark.status.is_observation])
     if not used:
         raise InputError(
             f"{project.comparator}: holds no observation: no mark has the status measured or weak. "
@@ -131,14 +131,14 @@ def check_transformation(project: Project) -> None:
 
 def _frame(project: Project, image: str) -> str:
     """The name of the frame that an image is a scan of."""
-    return project.part_of(image) or image
+    return project.scanned_frame(image) or image
 
 
 def _drop_single_joins(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
     """The marks without the joins that only one scan of their frame shows."""
     shown = Counter((_frame(project, mark.image), mark.point) for mark in marks if mark.kind == "join")
     for mark in marks:
-        if mark.kind == "join" and not project.part_of(mark.image):
+        if mark.kind == "join" and not project.scanned_frame(mark.image):
             raise InputError(
                 f"{project.comparator}, line {mark.line}: image {mark.image!r} shows the join {mark.point!r}, but is "
                 "no part of a frame. Name the frame in the column part_of of images.csv, for all of its scans."
@@ -201,7 +201,7 @@ def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[
     """
     shown_points: dict[str, dict[str, set[tuple[str, str]]]] = {}
     for mark in marks:
-        if frame := project.part_of(mark.image):
+        if frame := project.scanned_frame(mark.image):
             shown_points.setdefault(frame, {}).setdefault(mark.image, set()).add((mark.kind, mark.point))
     lost = dict[str, str]()
     for frame, parts in shown_points.items():
@@ -216,7 +216,7 @@ def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[
     )
     bare = {frame: _few_fiducials(project, frame, parts, lost) for frame, parts in shown_points.items()}
     sentences += tuple(sentence for sentence in bare.values() if sentence)
-    kept_marks = [mark for mark in marks if mark.image not in lost and not bare.get(project.part_of(mark.image))]
+    kept_marks = [mark for mark in marks if mark.image not in lost and not bare.get(project.scanned_frame(mark.image))]
     if not kept_marks:
         raise InputError(f"{project.comparator}: {' '.join(sentences)}")
     return kept_marks, sentences
@@ -227,7 +227,7 @@ def _few_fiducials(
 ) -> str:
     """Why the scans of a frame that hang together have no part either; empty where they have."""
     left = [part for part in parts if part not in lost]
-    transformation = _transformation(project, project.camera_of(left[0]))
+    transformation = _transformation(project, project.image_camera(left[0]))
     shown = {point for part in left for kind, point in parts[part] if kind == "fiducial"}
     if len(shown) >= fewest_marks(transformation):
         return ""
@@ -271,12 +271,12 @@ def _why_nothing(images: Sequence[Image], targets: Counter[str], fiducials: Coun
 
 
 def _image(project: Project, name: str) -> Image:
-    camera = project.camera_of(name)
+    camera = project.image_camera(name)
     exterior = project.given_images.exterior.get(name) if project.given_images else None
     transformation = _transformation(project, camera)
     bends = project.adjust.scanner != "none" and transformation != "none"
-    scanner = project.scanner_of(name) if bends else ""
-    return Image(name, camera.name, transformation, exterior, scanner, project.part_of(name))
+    scanner = project.image_scanner(name) if bends else ""
+    return Image(name, camera.name, transformation, exterior, scanner, project.scanned_frame(name))
 
 
 def _transformation(project: Project, camera: CameraFile) -> Transformation:

@@ -18,10 +18,10 @@ from measure.targets.identification import TargetPrediction
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.target_field import Field, checked_places, measure_single_targets, target_field
-from pipeline.measuring.target_stage import with_targets
+from pipeline.measuring.target_stage import replace_targets
 from pipeline.progress import Reporter
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.workers import results_of
+from pipeline.workers import iterate_results
 
 _SEARCH_PX = 2.0  # an adjusted orientation predicts to far less than that
 
@@ -63,7 +63,7 @@ def measure_again(
         return None
     found = dict[str, tuple[MarkMeasurement, ...] | str]()
     with executor() as workers, reporter.stage("second pass of") as count:
-        for done, (visit, result) in enumerate(results_of(looked_again, visits, workers), 1):
+        for done, (visit, result) in enumerate(iterate_results(looked_again, visits, workers), 1):
             found[visit.image] = str(result) if isinstance(result, Exception) else result
             count(visit.image, done, len(visits))
     visited = [_visited(scan, found.get(scan.frame.image, ()), field, adjustment) for scan in scans]
@@ -120,7 +120,7 @@ def _visited(
     model = adjusted_image(adjustment, scan.frame.image)
     checked = checked_places(tuple((targets | fresh).values()), field, model, scan)
     fresh = {mark.point: mark for mark in checked if mark.point in fresh and mark.status.is_observation}
-    return with_targets(scan, tuple((targets | fresh).values())) if fresh else scan
+    return replace_targets(scan, tuple((targets | fresh).values())) if fresh else scan
 
 
 def _is_missed(mark: MarkMeasurement | None, settings: TargetSettings) -> bool:

@@ -11,7 +11,7 @@ from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.types import Array
 
 
-def in_sensor_frame(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
+def rotate_to_sensor(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
     """The marks as they would be in pictures that nobody turned, by the column turned_deg of images.csv.
 
     Raises InputError where the size of the picture, which this needs, is not known.
@@ -32,7 +32,7 @@ def turned_back(xy_mm: Array, turned_deg: int, last_mm: tuple[float, float]) -> 
 
 def sensor_size_mm(project: Project, image: str) -> tuple[float, float]:
     """From the first pixel to the last one of a row and of a column of the sensor. Raises InputError."""
-    camera, pitch_um = project.camera_of(image), project.pitch_um
+    camera, pitch_um = project.image_camera(image), project.pitch_um
     if camera.frame_mm is None or pitch_um is None:
         raise InputError(
             f"{project.images_path}: image {image!r} is turned (column turned_deg), which needs the size of the "

@@ -76,14 +76,14 @@ def _files_below(folder: Path) -> Iterator[Path]:
 def _copies(files: Sequence[Path], max_pixels: int | None) -> Iterator[tuple[Path, Path]]:
     """Files with the same bytes as another one, and that one: of the shortest name, for copies are called `Copy of
     0001` or `0001 (1)`, and the first of these. What tells most files apart is read first."""
-    for of_one_size in _groups_by(lambda path: path.stat().st_size, files):
-        for alike in _groups_by(lambda path: parts_hash(path, max_pixels), of_one_size):
-            for same in _groups_by(content_hash, alike):
+    for of_one_size in _equal_groups(lambda path: path.stat().st_size, files):
+        for alike in _equal_groups(lambda path: parts_hash(path, max_pixels), of_one_size):
+            for same in _equal_groups(content_hash, alike):
                 original, *others = sorted(same, key=lambda path: len(path.name))
                 yield from ((path, original) for path in others)
 
 
-def _groups_by(value: Callable[[Path], object], paths: Sequence[Path]) -> list[list[Path]]:
+def _equal_groups(value: Callable[[Path], object], paths: Sequence[Path]) -> list[list[Path]]:
     """The files, those together that have the same value; of a single one none is made."""
     if len(paths) == 1:
         return [list(paths)]

@@ -28,7 +28,7 @@ from pipeline.archive.results_integrity import (
     seal_judging,
 )
 from pipeline.archive.verdicts import scan_verdict
-from pipeline.provenance import of_file
+from pipeline.provenance import hash_file
 from pipeline.results.comparator_file import MarkRow
 from pipeline.results.measured_record import (
     Failure,
@@ -228,12 +228,12 @@ def checked_scans(
         own = _own_marks(db, judging.row, result) if own_marks else []
         try:
             if not is_whole or (own_marks and marks_digest(own) != digest):
-                raise DamagedError.of_image(name, store.path)
+                raise DamagedError.from_image(name, store.path)
             detail = json.loads(store.detail(result)) | (json.loads(changed) if changed else {})
             rows = [row for _, *row in own] if own_marks else store.mark_rows(result)
             yield read_scan(name, detail, list(map(read_mark_row, rows)), scan_location(uri, folder))
         except (DamagedError, ValueError, TypeError, KeyError):
-            sentence = str(DamagedError.of_image(name, store.path))
+            sentence = str(DamagedError.from_image(name, store.path))
             frame = FrameMeasurement(name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
             yield MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, sentence))
 
@@ -249,7 +249,7 @@ def marks_as_written(store: Store, digest: str, comparator: Path) -> bool:
 
 
 def _written(digest: str, comparator: Path) -> dict[str, str]:
-    return {"digest": digest, "file": of_file(comparator) if comparator.exists() else ""}
+    return {"digest": digest, "file": hash_file(comparator) if comparator.exists() else ""}
 
 
 def checked_marks(store: Store, judging: Judging, images: Collection[str] | None = None) -> Iterator[MarkRow]:
@@ -269,7 +269,7 @@ def checked_marks(store: Store, judging: Judging, images: Collection[str] | None
             continue
         rows = _own_marks(db, judging.row, result) if own_marks else db.execute(as_measured, (result,)).fetchall()
         if not is_whole or marks_digest(rows) != digest:
-            raise DamagedError.of_image(name, store.path)
+            raise DamagedError.from_image(name, store.path)
         for _, point, kind, col, row, *spread, causes, status, _, reason, _ in rows:
             center = None if col is None else (col, row)
             yield MarkRow(name, point, kind, center, _covariance(spread, causes), status, reason)

@@ -16,18 +16,18 @@ from pipeline.archive.results_database import Store
 from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.camera_identification import with_plates
-from pipeline.measuring.roll import CheckedScan, checked, roll_of, with_same_frames
+from pipeline.measuring.camera_identification import add_plates
+from pipeline.measuring.roll import CheckedScan, build_roll, check_scans, note_same_frames
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.provenance import content_hash, fingerprint, shard_number
 from pipeline.results.measured_record import MeasuredScan
 
 _TOGETHER = 2000  # frames of a camera that are checked beside one another: more would only take memory
 OfCamera = tuple[CameraFile, Sequence[ScanTask]]
-Said = Mapping[str, tuple[tuple[Reason, ...], tuple[str, ...]]]  # by image problems and notes
+Remarks = Mapping[str, tuple[tuple[Reason, ...], tuple[str, ...]]]  # by image problems and notes
 
 
-def judged_lots(
+def check_lots(
     project: Project,
     tasks: Sequence[ScanTask],
     work: Work,
@@ -38,10 +38,10 @@ def judged_lots(
     """Every scan as all of them show it, in lots: those whose scans are as they were need not be judged again.
 
     project: with its learned marks. copies: by image the one whose file its own is a copy of. share: the third step of
-    measuring; input_hash: `input_of` all. A lot is held at a time.
+    measuring; input_hash: `hash_inputs` of all. A lot is held at a time.
     """
     own = [task for task in tasks if task.name not in copies]
-    keys, remarks = work.keys(), _said_by_writing(project, own, work)
+    keys, remarks = work.keys(), _writing_remarks(project, own, work)
 
     def lot(some: Sequence[ScanTask], depends_on: object, scans: Callable[[], Iterable[MeasuredScan]]) -> Lot:
         results = [
@@ -54,14 +54,14 @@ def judged_lots(
         )
 
     def checked_lot(of_cameras: Sequence[OfCamera]) -> Iterable[MeasuredScan]:
-        scans = [scan for each in of_cameras for scan in _checked_beside(project, *each, work)]
-        return share([_with_said(scan, remarks) for scan in scans])
+        scans = [scan for each in of_cameras for scan in _check_camera(project, *each, work)]
+        return share([_add_remarks(scan, remarks) for scan in scans])
 
     for of_cameras in _lots(project, own):
         some = [task for _, each in of_cameras for task in each]
         of_writing = [remarks[task.name] for task in some if task.name in remarks]
         cameras = [camera for camera, _ in of_cameras]
-        depends_on = [cameras, project.film, of_writing, _shared(project, some, input_hash)]
+        depends_on = [cameras, project.film, of_writing, _project_inputs(project, some, input_hash)]
         yield lot(some, depends_on, partial(checked_lot, of_cameras))
     if copies:
         again = sorted(copies.items())
@@ -95,7 +95,7 @@ def find_copies(store: Store, tasks: Sequence[ScanTask], work: Work) -> dict[str
     return copies
 
 
-def input_of(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str], made_from: Mapping[str, str]) -> str:
+def hash_inputs(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str], made_from: Mapping[str, str]) -> str:
     """SHA-256 of all that judging starts from: the results, and what the project has."""
     keys = work.keys()
     results = [[task.name, keys[task.name]] for task in tasks]
@@ -107,58 +107,62 @@ def input_of(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str], m
 def _lots(project: Project, tasks: Sequence[ScanTask]) -> Sequence[Sequence[OfCamera]]:
     """Which scans are looked at beside one another, by camera. Natural points may be in any of all; of a sheet of
     targets the pictures of a lot tell as much."""
-    of_cameras = _beside(project, tasks)
+    of_cameras = _camera_lots(project, tasks)
     are_few = len(tasks) <= _TOGETHER and (project.targets is not None or project.has_parts)
     return [of_cameras] if project.ties is not None or are_few else [[each] for each in of_cameras]
 
 
-def _shared(project: Project, tasks: Sequence[ScanTask], input_hash: str) -> object:
+def _project_inputs(project: Project, tasks: Sequence[ScanTask], input_hash: str) -> object:
     """What of the project the third step depends on, beside the scans themselves."""
     if project.ties is not None:
         return input_hash
     points = None if project.targets is None else project.object_points
-    return [project.targets, points, [project.part_of(task.name) for task in tasks] if project.has_parts else None]
+    return [
+        project.targets,
+        points,
+        [project.scanned_frame(task.name) for task in tasks] if project.has_parts else None,
+    ]
 
 
-def _beside(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
+def _camera_lots(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
     """The scans of each camera that are checked beside one another: all of them, or of many as good as half of
     `_TOGETHER` or more, by chance, of which one scan more changes a single lot. The parts of a frame are in one."""
     found = list[OfCamera]()
     for camera in project.cameras.values():
-        own = [task for task in tasks if project.camera_of(task.name) is camera]
+        own = [task for task in tasks if project.image_camera(task.name) is camera]
         lots = 1
         while len(own) > lots * _TOGETHER:
             lots *= 2
         some = defaultdict[int, list[ScanTask]](list)
         for task in own:
-            some[shard_number(project.part_of(task.name) or task.name, lots)].append(task)
+            some[shard_number(project.scanned_frame(task.name) or task.name, lots)].append(task)
         found += [(camera, some[lot]) for lot in sorted(some)]
     return found
 
 
-def _checked_beside(
+def _check_camera(
     project: Project, camera: CameraFile, tasks: Sequence[ScanTask], work: Work
 ) -> tuple[CheckedScan, ...]:
     """The second step. Scans whose marks change names beside the others are measured again."""
     scans = [work.read(task.name) for task in tasks]
-    roll = roll_of(tasks, scans, camera.writing)
+    roll = build_roll(tasks, scans, camera.writing)
     again = list(work.measure(roll.tasks)) if roll.tasks else []
-    return checked(camera, scans, roll, again, project.film)
+    return check_scans(camera, scans, roll, again, project.film)
 
 
-def _said_by_writing(project: Project, tasks: Sequence[ScanTask], work: Work) -> Said:
+def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:
     """What is written on the scans says of others: plates of other cameras, frames that were scanned twice. No more of
     the scans is held than that."""
     names = work.written([task.name for task in tasks])
     bare = dict[str, MeasuredScan]()
     for camera in project.cameras.values():
-        own = [work.read_writing(name) for name in names if project.camera_of(name) is camera]
-        bare |= {scan.frame.image: scan for scan in with_plates(camera, own, project.cameras)}
-    noted = with_same_frames([bare[name] for name in names], project.part_of)
+        own = [work.read_writing(name) for name in names if project.image_camera(name) is camera]
+        bare |= {scan.frame.image: scan for scan in add_plates(camera, own, project.cameras)}
+    noted = note_same_frames([bare[name] for name in names], project.scanned_frame)
     return {scan.frame.image: (scan.frame.problems, scan.notes) for scan in noted if scan.frame.problems or scan.notes}
 
 
-def _with_said(scan: MeasuredScan, remarks: Said) -> MeasuredScan:
+def _add_remarks(scan: MeasuredScan, remarks: Remarks) -> MeasuredScan:
     problems, notes = remarks.get(scan.frame.image, ((), ()))
     frame = replace(scan.frame, problems=(*scan.frame.problems, *problems))
     return replace(scan, frame=frame, notes=(*scan.notes, *notes))
@@ -166,7 +170,7 @@ def _with_said(scan: MeasuredScan, remarks: Said) -> MeasuredScan:
 
 def _checked_result(scan: MeasuredScan, work: Work) -> CheckedResult:
     name = scan.frame.image
-    return CheckedResult(work.results[name], work.decided(scan), work.decisions_hash(name))
+    return CheckedResult(work.results[name], work.apply_decisions(scan), work.decisions_hash(name))
 
 
 def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:

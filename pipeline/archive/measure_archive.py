@@ -11,7 +11,7 @@ from measure.errors import MeasurementError
 from measure.scans.remote import fetch_location, scan_path
 from pipeline.archive.checked_statuses import judge_lots, latest
 from pipeline.archive.cluster import cluster_executor
-from pipeline.archive.cross_scan_checks import find_copies, input_of, judged_lots
+from pipeline.archive.cross_scan_checks import check_lots, find_copies, hash_inputs
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import tell_inapplicable
 from pipeline.archive.thumbnails import ThumbnailStore
@@ -20,10 +20,10 @@ from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
 from pipeline.measuring.learn_stage import learn_marks
-from pipeline.measuring.roll import with_known_lines
+from pipeline.measuring.roll import add_known_lines
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
-from pipeline.measuring.tie_stage import check_tie_names, tied
-from pipeline.measuring.tone_stage import said_of_tones
+from pipeline.measuring.tie_stage import check_tie_names, tie_scans
+from pipeline.measuring.tone_stage import collect_tones
 from pipeline.progress import Reporter
 from pipeline.provenance import FileStates, Identity, content_hash, parts_hash, shard_number
 from pipeline.text.wording import counted, gathered
@@ -56,7 +56,7 @@ def _check_anything_to_measure(project: Project) -> None:
 def _check_marks(project: Project) -> None:
     """One mark by itself tells neither the turn nor the scale of a frame."""
     for camera in project.cameras.values():
-        if len(camera.drawn) + len(camera.learned) == 1:
+        if len(camera.layout_marks) + len(camera.learned) == 1:
             raise InputError(
                 f"{camera.path} has one fiducial mark, and a frame is found by two or more. Add the others, or pass it "
                 'over with mark = "none".'
@@ -71,7 +71,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
     by_size = defaultdict[int, dict[str, str]](dict)
     for uri, content in store.content_hashes().items():
         by_size[known[uri].state.bytes][content] = uri
-    states = {name: files.of(file) for name, file in as_named(project.scans).items()}
+    states = {name: files.get(file) for name, file in as_named(project.scans).items()}
     unknown = {name: state for name, state in states.items() if state != getattr(known.get(state.uri), "state", None)}
     taken = {state.uri for name, state in states.items() if name not in unknown}
     found, keys = 0, dict[str, str]()
@@ -124,7 +124,7 @@ def measure_archive(
     """
     options = options or WorkOptions()
     names = check_measurable(project)
-    with executor_of(project, options) as executor, ThumbnailStore.beside(store.path) as thumbnails:
+    with open_executor(project, options) as executor, ThumbnailStore.open(store.path) as thumbnails:
         # Once nothing stands in the way of measuring again.
         lost = store.forget_damaged() if options.retry or store.has_damaged_rows() else 0
         if lost:
@@ -135,8 +135,8 @@ def measure_archive(
             thumbnails.rekey(find_moved(store, project, reporter))
         work = Work(project, store, executor, options, thumbnails)
         learned = learn_marks(project, reporter, work.measure, executor, learned_folder, store)
-        tasks = scan_tasks(learned, names, said_of_tones(learned, reporter, work.measure, store))
-        tasks, _ = with_known_lines(tasks, work.measure, reporter)
+        tasks = scan_tasks(learned, names, collect_tones(learned, reporter, work.measure, store))
+        tasks, _ = add_known_lines(tasks, work.measure, reporter)
         store.set_project({work.state(task).uri: task.name for task in tasks})
         if options.shard is not None:
             part, parts = options.shard
@@ -148,19 +148,19 @@ def measure_archive(
         _check_any(store)
         copies = find_copies(store, tasks, work)
         made = made_from()
-        input_hash = input_of(tasks, work, copies, made)
+        input_hash = hash_inputs(tasks, work, copies, made)
         before = latest(store)
         if before is not None and before.input == input_hash:
             tell_inapplicable(learned, store, before.digest, work)
             return before.digest
-        share = partial(tied, learned, reporter=reporter, executor=executor)
-        lots = judged_lots(learned, tasks, work, copies, share, input_hash)
+        share = partial(tie_scans, learned, reporter=reporter, executor=executor)
+        lots = check_lots(learned, tasks, work, copies, share, input_hash)
         digest = judge_lots(store, made, input_hash, lots)
         tell_inapplicable(learned, store, digest, work)
         return digest
 
 
-def executor_of(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:
+def open_executor(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:
     """What works on the project's scans: processes here, or the workers of a cluster."""
     if options.cluster is not None:
         return cluster_executor(

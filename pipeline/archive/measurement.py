@@ -24,7 +24,7 @@ from pipeline.archive.results_database import Store
 from pipeline.archive.results_integrity import check_judging, damaged_frames
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
-from pipeline.results.comparator_file import ComparatorPoint, DecidedBy, comparator_points, measurement_of
+from pipeline.results.comparator_file import CameraPerson, ComparatorPoint, comparator_points, read_measurement_hash
 from pipeline.results.measured_record import MeasuredScan
 
 _PLACE = "project folder"
@@ -41,7 +41,7 @@ def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
     return tuple(measured_scans(path, digest))
 
 
-def made_from_of(path: Path, digest: str) -> Mapping[str, str] | None:
+def read_inputs(path: Path, digest: str) -> Mapping[str, str] | None:
     """What a judging was made from; None where the store has not that one."""
     with Store(path) as store:
         judging = find_judging(store, digest)
@@ -73,9 +73,9 @@ def picture_sizes_mm(path: Path, digest: str) -> dict[str, tuple[float, float]]:
     return {name: (width, height) for name, width, height in rows if width and height}
 
 
-def decisions_by(store: Store, digest: str) -> dict[DecidedBy, int]:
+def count_decisions(store: Store, digest: str) -> dict[CameraPerson, int]:
     """How many decisions of whom stand behind a judging, by camera."""
-    counts = Counter[DecidedBy]()
+    counts = Counter[CameraPerson]()
     rows = store.connection.execute(
         "select camera, judged_frame.detail ->> '$.decided_by' as told from judged_frame join scan on scan.id = scan "
         "join judging on judging.id = judging where judging.digest = ? and told is not null",
@@ -97,7 +97,7 @@ def written_scans(store: Store, digest: str) -> Iterator[MeasuredScan]:
     return measured_scans(store.path, digest, {name for name, result in rows if result in written})
 
 
-def fingerprints_of(path: Path, digest: str, images: Collection[str]) -> dict[str, str]:
+def read_fingerprints(path: Path, digest: str, images: Collection[str]) -> dict[str, str]:
     """Of some images of a judging the fingerprints of their results; of none where there is no such judging."""
     if not digest or not path.exists():
         return {}
@@ -160,9 +160,9 @@ class StoredMarks:
         self._path, self._judging = path, judging
 
     @classmethod
-    def of(cls, path: Path, comparator: Path) -> "StoredMarks | None":
+    def open(cls, path: Path, comparator: Path) -> "StoredMarks | None":
         """path: of the store. None where the file has other marks than the store, or somebody has changed either."""
-        if not path.exists() or not comparator.exists() or not (digest := measurement_of(comparator)):
+        if not path.exists() or not comparator.exists() or not (digest := read_measurement_hash(comparator)):
             return None
         with Store(path) as store:
             judging = find_judging(store, digest)

@@ -38,10 +38,10 @@ def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
         if path.resolve() == store.path.resolve():
             raise InputError(f"{path}: is the results database that the others are joined into. Name the others only.")
         Store(path).close()
-    return [_taken(store, path) for path in others]
+    return [_merge_store(store, path) for path in others]
 
 
-def _taken(store: Store, path: Path) -> Merged:
+def _merge_store(store: Store, path: Path) -> Merged:
     db = store.connection
     with Store(path) as other:
         damaged = damaged_results(other.connection)

@@ -190,7 +190,7 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
             found = catalogue(given, count, max_pixels)
         except MeasurementError as error:
             raise InputError(str(error)) from error
-    found = _with_cameras(found, reporter, max_pixels)
+    found = _identify_cameras(found, reporter, max_pixels)
     new = NewProject(folder, tuple(given), found, _left_out(found))
     if new.digital and not new.cameras:
         raise InputError(_only_digital(new))
@@ -208,7 +208,7 @@ def _given_paths(given: Path) -> list[Path]:
     return [scan_path(line) if is_address(line) else given.parent / line for line in named]
 
 
-def _with_cameras(found: Catalogue, reporter: Reporter, max_pixels: int | None) -> Catalogue:
+def _identify_cameras(found: Catalogue, reporter: Reporter, max_pixels: int | None) -> Catalogue:
     """The groups with the cameras of the library that their samples show, tried in processes side by side."""
     with worker_pool(sum(len(group.to_try) for group in found.groups)) as workers:
         grouped = GroupedScans(found.groups, found.broken)

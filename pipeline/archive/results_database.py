@@ -154,7 +154,7 @@ class Store:
             "select coalesce(name, uri) from scan where result = ?1 or id = (select scan from result where id = ?1)",
             (result,),
         ).fetchone()
-        return DamagedError.of_image(str(found[0]) if found else "(unknown)", self.path)
+        return DamagedError.from_image(str(found[0]) if found else "(unknown)", self.path)
 
     def has_damaged_rows(self) -> bool:
         """Whether a scan, a result or what scans tell others is not as it was written; marks are not looked at."""

@@ -23,7 +23,7 @@ _FRAME = ("scan", "result", "name", "verdict", "own_marks", "detail", "lot", "de
 _KEPT = ("key", "value")
 
 
-def digest_of(table: str, columns: Sequence[str]) -> str:
+def row_digest_sql(table: str, columns: Sequence[str]) -> str:
     """The digest of a row as an SQL expression. table: its name, or the alias that a query gives it."""
     return f"row_digest({', '.join(f'{table}.{column}' for column in columns)})"
 
@@ -31,12 +31,12 @@ def digest_of(table: str, columns: Sequence[str]) -> str:
 def is_sound(table: str, alias: str = "") -> str:
     """Whether a row is as it was written, as an SQL expression. alias: that a query gives the table."""
     name = alias or table
-    return f"({name}.digest is {digest_of(name, _COLUMNS[table])})"
+    return f"({name}.digest is {row_digest_sql(name, _COLUMNS[table])})"
 
 
 def seal(table: str) -> str:
     """What sets the digests of rows that were written just now, as SQL that a `where` may follow."""
-    return f"update {table} set digest = {digest_of(table, _COLUMNS[table])}"
+    return f"update {table} set digest = {row_digest_sql(table, _COLUMNS[table])}"
 
 
 _COLUMNS = {"scan": _SCAN, "result": _RESULT, "judged_frame": _FRAME, "kept": _KEPT}
@@ -46,7 +46,7 @@ class DamagedError(InputError):
     """What stands in a store is not as it was written."""
 
     @classmethod
-    def of_image(cls, image: str, path: object) -> "DamagedError":
+    def from_image(cls, image: str, path: object) -> "DamagedError":
         return cls(damaged_sentence(image, path))
 
 

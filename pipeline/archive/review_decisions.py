@@ -15,9 +15,9 @@ from pipeline.archive.checked_statuses import find_judging
 from pipeline.archive.results_database import Store
 from pipeline.archive.results_integrity import row_digest
 from pipeline.files.decision import LEARNED, About, Choice, Decision
-from pipeline.files.decisions_file import put_on, standing
+from pipeline.files.decisions_file import push_decision, standing
 from pipeline.files.project_file import Project
-from pipeline.measuring.scan_task import ScanTask, options_of
+from pipeline.measuring.scan_task import ScanTask, image_options
 from pipeline.provenance import fingerprint, options_hash
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean
@@ -34,12 +34,12 @@ _NAMED = 10
 Marks = Mapping[tuple[str, str], bool]  # by point and kind whether something was measured
 
 
-def asked_of(project: Project) -> Callable[[str], str]:
+def request_hasher(project: Project) -> Callable[[str], str]:
     """A hash of it, by the image's name. Raises InputError for marks that cannot be sought."""
-    options, hashes = options_of(project, {}), dict[int, str]()
+    options, hashes = image_options(project, {}), dict[int, str]()
     decisions_of = {
         image: [one for one in decisions if one.decision in _MEASURED]
-        for image, decisions in by_image(project.decisions).items()
+        for image, decisions in group_decisions(project.decisions).items()
     }
 
     def request_hash(image: str) -> str:
@@ -60,18 +60,18 @@ def asked_of(project: Project) -> Callable[[str], str]:
 
 
 @dataclass(frozen=True)
-class Decided:
+class ReviewedTask:
     """A scan's task as decisions leave it, and those that count, by what they are about."""
 
     task: ScanTask
     counting: Mapping[About, Decision]
 
 
-def by_image(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Decision]]:
+def group_decisions(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Decision]]:
     """The decisions about each scan, the oldest first; those about a camera's marks left out."""
     grouped = defaultdict[str, list[Decision]](list)
     for one in decisions:
-        if one.about[2] != LEARNED:
+        if one.subject[2] != LEARNED:
             grouped[one.image].append(one)
     return grouped
 
@@ -81,17 +81,17 @@ def decisions_hash(decisions: Sequence[Decision]) -> str:
     if not decisions:
         return ""
     values = [
-        (str(one.decision), *one.about, one.col_px, one.row_px, one.pose, one.note, one.who, one.fingerprint)
+        (str(one.decision), *one.subject, one.col_px, one.row_px, one.pose, one.note, one.who, one.fingerprint)
         for one in decisions
     ]
     return row_digest(*values)
 
 
-def decided(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf) -> Decided:
+def apply_decisions(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf) -> ReviewedTask:
     """decisions: about this scan, the oldest first. key_of: the fingerprint of a task's result; pose_of: the pose in
     which the result of a fingerprint names its marks, None where it is not known."""
     if not decisions:
-        return Decided(task, {})
+        return ReviewedTask(task, {})
     counted, now, key = list[Decision](), task, key_of(task)
     current_keys = {key}  # of the results that a decision may have been made about
     ever = set(current_keys)
@@ -100,11 +100,11 @@ def decided(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_o
         if one.decision is not Choice.UNDO and one.fingerprint and one.fingerprint not in known:
             continue
         before, old_key, counted = now, key, [*counted, one]
-        now = _with(task, standing(counted).values())
+        now = _apply_to_task(task, standing(counted).values())
         key = key_of(now)
         current_keys = current_keys | {key} if _names_alike(before, now, pose_of(old_key)) else {key}
         ever |= current_keys
-    return Decided(now, standing(counted))
+    return ReviewedTask(now, standing(counted))
 
 
 def _names_alike(before: ScanTask, now: ScanTask, pose: str | None) -> bool:
@@ -126,12 +126,12 @@ def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> Meas
     return replace(_changed(scan, counting), decided_by=dict(sorted(people.items())))
 
 
-def _with(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:
+def _apply_to_task(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:
     clicks, fiducials = list[Click](), task.options.fiducials
-    for one in sorted(decisions, key=lambda one: one.about):
+    for one in sorted(decisions, key=lambda one: one.subject):
         if one.decision is Choice.POSE:
             fiducials = replace(fiducials, pose=one.pose)
-        elif one.decision is Choice.PLACE and one.about[2] == "fiducial":
+        elif one.decision is Choice.PLACE and one.subject[2] == "fiducial":
             assert one.col_px is not None
             assert one.row_px is not None
             clicks.append(Click(one.point, one.col_px, one.row_px))
@@ -139,11 +139,11 @@ def _with(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:
 
 
 def _changed(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
-    marks = [_decided(mark, counting.get((scan.frame.image, mark.point, mark.kind))) for mark in scan.frame.marks]
+    marks = [_apply_to_mark(mark, counting.get((scan.frame.image, mark.point, mark.kind))) for mark in scan.frame.marks]
     return replace(scan, frame=replace(scan.frame, marks=tuple(marks)))
 
 
-def _decided(mark: MarkMeasurement, decision: Decision | None) -> MarkMeasurement:
+def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeasurement:
     if decision is None:
         return mark
     by = f"by {decision.who or 'somebody'}{f' ({decision.note})' if decision.note else ''}"
@@ -207,7 +207,7 @@ def _known_images(project: Project, store: Store, digest: str, work: "Work") -> 
     for image, *mark, is_measured in store.connection.execute(query, (judging.row, json.dumps(list(decisions)))):
         marks[image][mark[0], mark[1]] = bool(is_measured)
     for image, own in decisions.items():
-        yield from _idle_lines(own, work.counting_of(image), marks[image])
+        yield from _idle_lines(own, work.counting_decisions(image), marks[image])
 
 
 def _idle_lines(
@@ -215,9 +215,9 @@ def _idle_lines(
 ) -> Iterator[tuple[int, str]]:
     stacks = dict[About, list[Decision]]()
     for one in decisions:
-        if one.decision is Choice.UNDO and not stacks.get(one.about):
+        if one.decision is Choice.UNDO and not stacks.get(one.subject):
             yield one.line, f"there is nothing to undo about {_named(one)}."
-        put_on(stacks, one)
+        push_decision(stacks, one)
     for about, stack in stacks.items():
         if stack and (why := _why(stack[-1], counting.get(about), marks)):
             yield stack[-1].line, why
@@ -225,7 +225,7 @@ def _idle_lines(
 
 def _why(one: Decision, counted: Decision | None, marks: Marks) -> str:
     """Why a decision that stands does not apply; "" of one that does."""
-    _, point, kind = one.about
+    _, point, kind = one.subject
     if point and (point, kind) not in marks:
         hint = did_you_mean(point, [name for name, of_kind in marks if of_kind == kind])
         return f"image {one.image!r} has no {kind} {point!r}.{hint}"
@@ -237,4 +237,4 @@ def _why(one: Decision, counted: Decision | None, marks: Marks) -> str:
 
 
 def _named(one: Decision) -> str:
-    return f"{one.about[2]} {one.point!r} of image {one.image!r}" if one.point else f"image {one.image!r}"
+    return f"{one.subject[2]} {one.point!r} of image {one.image!r}" if one.point else f"image {one.image!r}"

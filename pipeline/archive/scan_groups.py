@@ -249,10 +249,10 @@ def name_cameras(grouped: GroupedScans, identified: Try, reporter: Reporter, wor
         for group in grouped.groups
     ]
     unread = {path: answer for path, answer in answers.items() if isinstance(answer, str)}
-    return GroupedScans(tuple(part for group in groups for part in _of_one_camera(group)), {**grouped.unread, **unread})
+    return GroupedScans(tuple(part for group in groups for part in _split_cameras(group)), {**grouped.unread, **unread})
 
 
-def _of_one_camera(group: ScanGroup) -> list[ScanGroup]:
+def _split_cameras(group: ScanGroup) -> list[ScanGroup]:
     """The group; where all its scans were tried and show several cameras, the scans of each."""
     if group.camera or group.digital or len(group.samples) < len(group.paths) or len(group.paths) < 2:
         return [group]

@@ -17,10 +17,10 @@ from pipeline.archive.checked_statuses import checked_scans, latest
 from pipeline.archive.results_database import Store
 from pipeline.archive.results_integrity import check_judging, is_sound
 from pipeline.archive.review_decisions import (
-    asked_of,
-    by_image,
     decisions_hash,
+    group_decisions,
     inapplicable,
+    request_hasher,
     shortened,
     unknown_images,
 )
@@ -69,7 +69,7 @@ class ArchiveStatus:
     def all_good(self) -> bool:
         return not self.idle_decisions and not any(scan.verdict.needs_look for scan in self.scans)
 
-    def of(self, verdict: Verdict | None) -> "ArchiveStatus":
+    def select(self, verdict: Verdict | None) -> "ArchiveStatus":
         """The scans of one verdict; None: all."""
         scans = self.scans if verdict is None else tuple(s for s in self.scans if s.verdict is verdict)
         return replace(self, scans=scans)
@@ -87,9 +87,9 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
             idle = inapplicable(store, judging.digest) if judging is not None else ()
     files, cameras = FileStates(project.path.resolve().parent), project.cameras.values()
     camera_names = {id(camera): camera.path.name for camera in cameras}
-    scans, request_hash, decisions = [], asked_of(project), by_image(project.decisions)
+    scans, request_hash, decisions = [], request_hasher(project), group_decisions(project.decisions)
     for name, file in as_named(project.scans).items():
-        state, camera = files.of(file), camera_names[id(project.camera_of(name))]
+        state, camera = files.get(file), camera_names[id(project.image_camera(name))]
         found = rows.get(state.uri)
         if found is None or found[5] is None:
             scans.append(ScanStatus(name, state.uri, camera, Verdict.WAITING))

@@ -45,7 +45,7 @@ class ThumbnailStore:
         self._path, self._db = path, opened(path, _SCHEMA)
 
     @classmethod
-    def beside(cls, measurement: Path) -> "ThumbnailStore":
+    def open(cls, measurement: Path) -> "ThumbnailStore":
         """Those of a store of measurements."""
         return cls(thumbnails_path(measurement))
 
@@ -71,7 +71,7 @@ class ThumbnailStore:
         self._db.execute(f"update thumbnail set digest = {_DIGEST} where fingerprint = ?", (fingerprint,))
         self._db.execute("commit")
 
-    def of(self, fingerprint: str, point: str = "", kind: str = "frame") -> StoredThumbnail | None:
+    def get(self, fingerprint: str, point: str = "", kind: str = "frame") -> StoredThumbnail | None:
         """That of a mark of a result, or of the whole scan; None where there is none that is as it was written."""
         where = f"fingerprint = ? and point = ? and kind = ? and digest is {_DIGEST}"
         try:
@@ -130,7 +130,7 @@ class Thumbnails:
         self._kept: ThumbnailStore | None = None
         if is_kept and measurement is not None:
             with suppress(InputError):  # of a damaged file, without which pictures are cut from the scans
-                self._kept = ThumbnailStore.beside(measurement)
+                self._kept = ThumbnailStore.open(measurement)
         self._open: tuple[Path, Scan] | None = None
 
     def __enter__(self) -> Self:
@@ -142,20 +142,20 @@ class Thumbnails:
         if self._kept is not None:
             self._kept.close()
 
-    def of(self, image: str, point: str, kind: str) -> Thumbnail | None:
+    def get(self, image: str, point: str, kind: str) -> Thumbnail | None:
         """The picture of a mark; None where it has no place, or its scan cannot be read any more."""
         mark = self._marks.get((image, point, kind == "fiducial"))
         if mark is None or mark.center_px is None:
             return None
-        if (kept := self._kept_of(image, mark)) is not None:
+        if (kept := self._get_stored(image, mark)) is not None:
             return kept
         try:
             return cut(self._scan(scan_path(self._scans[image].scan)), mark)
         except MeasurementError:
             return None
 
-    def _kept_of(self, image: str, mark: MarkMeasurement) -> Thumbnail | None:
-        stored = self._kept and self._kept.of(self._fingerprints.get(image, ""), mark.point, mark.kind)
+    def _get_stored(self, image: str, mark: MarkMeasurement) -> Thumbnail | None:
+        stored = self._kept and self._kept.get(self._fingerprints.get(image, ""), mark.point, mark.kind)
         if not stored or mark.center_px is None:
             return None
         thumbnail = stored.thumbnail

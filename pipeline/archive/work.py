@@ -9,7 +9,14 @@ from functools import lru_cache
 
 from measure.scans.remote import scan_path
 from pipeline.archive.results_database import Kept, Store
-from pipeline.archive.review_decisions import after_checks, asked_of, before_checks, by_image, decided, decisions_hash
+from pipeline.archive.review_decisions import (
+    after_checks,
+    apply_decisions,
+    before_checks,
+    decisions_hash,
+    group_decisions,
+    request_hasher,
+)
 from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.files.decision import About, Decision
 from pipeline.files.project_file import Project
@@ -19,7 +26,7 @@ from pipeline.progress import Reporter
 from pipeline.provenance import FileState, FileStates, Identity, options_hash, parts_hash, result_key
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import count_sentence, counted, drop_file_name, listed
-from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, results_of
+from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, iterate_results
 
 _hash_of = lru_cache(maxsize=4096)(options_hash)
 
@@ -55,9 +62,9 @@ class ExpectedTime:
         return f"{done} of {counted(len(self._left), 'group')}"
 
 
-def state_of(task: ScanTask, files: FileStates) -> FileState:
+def file_state(task: ScanTask, files: FileStates) -> FileState:
     """The state of a task's file."""
-    return files.of(scan_path(task.scan)) if task.scan else FileState(f"(none) {task.name}", -1)
+    return files.get(scan_path(task.scan)) if task.scan else FileState(f"(none) {task.name}", -1)
 
 
 class Work:
@@ -79,8 +86,8 @@ class Work:
         self._identities, self._rows = store.identities(), store.fingerprints()
         self._files = FileStates(self._folder)
         self._states: dict[str, FileState] = {}
-        self._asked = asked_of(project)
-        self._decisions = by_image(project.decisions)
+        self._asked = request_hasher(project)
+        self._decisions = group_decisions(project.decisions)
         self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, of what was asked for last
         self._now: set[int] = set()  # rows that were measured now
         self.results: dict[str, int] = {}  # by image, the row of what was asked for last
@@ -88,18 +95,18 @@ class Work:
     def measure(self, tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
         """What each task gives, measured or kept, without the marks that are none by decision: a `Measure`."""
         missing = []
-        for task in map(self._decided, tasks):
+        for task in map(self._reviewed_task, tasks):
             row = self._row(task)
             if row is None:
                 missing.append(task)
             else:
-                yield self._found(task, row)
-        for task, row, _ in self._measured(missing):
-            yield self._found(task, row)
+                yield self._read_row(task, row)
+        for task, row, _ in self._measure(missing):
+            yield self._read_row(task, row)
 
     def complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
         """Measure what is missing of the scans of the project, and say how much that is. Nothing of it is held."""
-        tasks = [self._decided(task) for task in tasks]
+        tasks = [self._reviewed_task(task) for task in tasks]
         known = {task.name: row for task in tasks if (row := self._row(task)) is not None}
         missing = [task for task in tasks if task.name not in known]
         self.results |= known
@@ -131,7 +138,7 @@ class Work:
         """All about scans, by image, the oldest first."""
         return self._decisions
 
-    def counting_of(self, name: str) -> Mapping[About, Decision]:
+    def counting_decisions(self, name: str) -> Mapping[About, Decision]:
         """The decisions that count of an image, by what they are about."""
         return self._counting.get(name, {})
 
@@ -143,7 +150,7 @@ class Work:
         """Of the decisions about an image, whether they count or not."""
         return decisions_hash(self._decisions.get(name, ()))
 
-    def decided(self, scan: MeasuredScan) -> MeasuredScan:
+    def apply_decisions(self, scan: MeasuredScan) -> MeasuredScan:
         """A scan that was checked, as decisions have it."""
         return after_checks(scan, self._counting.get(scan.frame.image, {}))
 
@@ -155,16 +162,16 @@ class Work:
     def state(self, task: ScanTask) -> FileState:
         """Of the task's file, as it was when it was first asked for."""
         if task.scan not in self._states or not task.scan:
-            self._states[task.scan] = state_of(task, self._files)
+            self._states[task.scan] = file_state(task, self._files)
         return self._states[task.scan]
 
     def _complete(self, tasks: Sequence[ScanTask], scans: int, reporter: Reporter) -> None:
         """Measure these, the last of so many scans: those that are measured already count as done."""
-        cameras = [self._project.camera_of(task.name).path.stem for task in tasks]
+        cameras = [self._project.image_camera(task.name).path.stem for task in tasks]
         expected = ExpectedTime(tasks, cameras, self._at_a_time)
         failed = defaultdict[str, list[str]](list)
         with reporter.stage("measured") as count:
-            for done, (task, row, kept) in enumerate(self._measured(tasks, as_scans=True), 1):
+            for done, (task, row, kept) in enumerate(self._measure(tasks, as_scans=True), 1):
                 measured = scans - len(tasks) + done
                 self.results[task.name] = row
                 expected.is_done(task.name, kept.scan.seconds)
@@ -180,7 +187,7 @@ class Work:
             if others:
                 reporter.say(f"failed as {first} did: {counted(len(others), 'scan')} more, {listed(others)}")
 
-    def _decided(self, task: ScanTask) -> ScanTask:
+    def _reviewed_task(self, task: ScanTask) -> ScanTask:
         """The task as decisions about its scan have it."""
         decisions = self._decisions.get(task.name)
         if decisions is None:
@@ -190,7 +197,7 @@ class Work:
         if known is None or known.state != state:
             known = Identity(state, parts_hash(scan_path(task.scan), task.max_pixels))
         identity = known
-        now = decided(
+        now = apply_decisions(
             task,
             decisions,
             lambda one: result_key(identity, _hash_of(_options_json(one))),
@@ -207,18 +214,18 @@ class Work:
             return None
         return self._rows.get(result_key(known, _hash_of(_options_json(task))))
 
-    def _found(self, task: ScanTask, row: int) -> MeasuredScan:
+    def _read_row(self, task: ScanTask, row: int) -> MeasuredScan:
         self.results[task.name] = row
         return self.read(task.name)
 
-    def _measured(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, int, Kept]]:
+    def _measure(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, int, Kept]]:
         """Each kept as soon as it is there. as_scans: of the project, and not only for what they tell the others."""
         if tasks and self._only_kept:
             raise NotMeasured
         states = {task.name: self.state(task) for task in tasks}
-        for task, result in results_of(measure_file, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
+        for task, result in iterate_results(measure_file, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
             file = result if isinstance(result, MeasuredFile) else MeasuredFile(ended_scan(task, result), "", -1)
-            kept = self._kept(task, states[task.name], file)
+            kept = self._result(task, states[task.name], file)
             if self._thumbnails is not None and file.thumbnails:
                 self._thumbnails.keep(kept.fingerprint, file.thumbnails)
             request_hash = self._asked(task.name) if as_scans else None
@@ -227,7 +234,7 @@ class Work:
             self._now.add(row)
             yield task, row, kept
 
-    def _kept(self, task: ScanTask, state: FileState, file: MeasuredFile) -> Kept:
+    def _result(self, task: ScanTask, state: FileState, file: MeasuredFile) -> Kept:
         known = self._identities.get(state.uri)
         lost = not file.parts_hash and known is not None and known.state == state
         parts = known.parts_hash if lost and known is not None else file.parts_hash
@@ -236,7 +243,7 @@ class Work:
             _options_json(task),
             file.scan,
             file.bytes_read,
-            self._project.camera_of(task.name).path.name,
+            self._project.image_camera(task.name).path.name,
         )
 
 

@@ -23,7 +23,7 @@ from pipeline.files.images_file import ELEMENTS, GivenImages
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.resampling.resample_stage import FAST, Resampled, resample, resample_tasks
-from pipeline.results.comparator_file import ComparatorPoint, pitches_of, points_text, read_comparator
+from pipeline.results.comparator_file import ComparatorPoint, points_text, read_comparator, read_pitches
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
 from pipeline.text.wording import counted
@@ -75,14 +75,14 @@ def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: 
         interior = {picture.image: given_interior(cameras[picture.camera]) for picture in pictures}
         poses = oriented_by_control(found, pictures, marks, project.object_points, interior)
         own = written_block(project, folder, (*marks, *ties), poses)
-    left_out = tuple(sorted({project.part_of(mark.image) or mark.image for mark in marks} - set(poses)))
+    left_out = tuple(sorted({project.scanned_frame(mark.image) or mark.image for mark in marks} - set(poses)))
     return OrientedBlock(own, found, pictures, clock.seconds, left_out, len(ties), len({tie.point for tie in ties}))
 
 
 def coarse_pitch_um(project: Project) -> float | None:
     """A pitch by which the frames have so many pixels that features come in minutes; None where that of the scans is
     as coarse."""
-    pitches = pitches_of(project.comparator)
+    pitches = read_pitches(project.comparator)
     sides = [max(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm is not None]
     enough = 1000.0 * max(sides, default=0.0) / MOST_PX
     finest = min((min(pitch) for pitch in pitches.values()), default=0.0)
@@ -106,8 +106,8 @@ def written_block(
     poses: dict[str, tuple[Array, Array]],
 ) -> Project:
     """comparator.csv and images.csv of the block, and the project that is made of them."""
-    pitches, given = pitches_of(project.comparator), project.given_images or GivenImages({}, {})
-    frames = {mark.image: project.part_of(mark.image) or mark.image for mark in marks}
+    pitches, given = read_pitches(project.comparator), project.given_images or GivenImages({}, {})
+    frames = {mark.image: project.scanned_frame(mark.image) or mark.image for mark in marks}
     kept = [mark for mark in marks if mark.kind != "target" or frames[mark.image] in poses]
     write_atomically(folder / "comparator.csv", points_text(kept, pitches))
     exterior: dict[str, Exterior | None] = {}

@@ -168,7 +168,7 @@ def calibrate_pictures(
                     project = write_project(out, pictures, options, lenses)
                 choices[camera.name] = choice = _chosen_lens(project, own, camera, options, left_out)
                 lenses[camera.name] = choice.model if choice else first
-                adjustments[camera.name] = _adjusted(write_project(out, pictures, options, lenses), own)
+                adjustments[camera.name] = _adjust(write_project(out, pictures, options, lenses), own)
             except (AdjustmentError, InputError) as error:
                 not_calibrated[camera.name] = str(error)
     if not adjustments:
@@ -249,7 +249,7 @@ def _alike(network: Network, unmodelled_mm: float) -> Network:
     return replace(network, observations=replace(observations, covariance_mm2=covariance))
 
 
-def _adjusted(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
+def _adjust(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
     """The adjustment of one camera. Raises InputError or AdjustmentError where there is no solution."""
     adjustment = adjust_marks(project, marks)
     if not adjustment.converged:

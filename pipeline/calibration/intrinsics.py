@@ -14,7 +14,7 @@ from adjust.solution.result import Adjustment
 from pipeline.calibration.lens_choice import LensChoice
 from pipeline.calibration.pictures import CameraPictures
 from pipeline.results.check_file import CameraCheck, PixelCalibration
-from pipeline.results.pixel_intrinsics import CENTRE, in_pixels
+from pipeline.results.pixel_intrinsics import CENTRE, pixel_intrinsics
 from pipeline.text.wording import counted, listed
 from pipeline.types import Array
 
@@ -182,7 +182,7 @@ def camera_intrinsics(
     (camera,) = adjustment.network.cameras
     names = [name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0]
     keys = [Parameter.interior(camera.name, name) for name in ("c", "x0", "y0", *names)]
-    values, by_mm = in_pixels({key.quantity: adjustment.value(key) for key in keys}, pixel_mm)
+    values, by_mm = pixel_intrinsics({key.quantity: adjustment.value(key) for key in keys}, pixel_mm)
     covariance = by_mm @ (adjustment.sigma0**2 * adjustment.cofactor_of(keys)) @ by_mm.T
     clusters = adjustment.cluster_covariance_of(keys)
     scatter = None if clusters is None else np.sqrt(np.diagonal(by_mm @ clusters @ by_mm.T))

@@ -42,7 +42,7 @@ class LensChoice:
     scores: tuple[LensScore, ...]
 
 
-def lens_of(model: LensModel, square_pixels: bool) -> Distortion:
+def free_lens(model: LensModel, square_pixels: bool) -> Distortion:
     """The distortion of a model, all parameters free; b1, by which fx and fy differ, unless pixels are square."""
     family = "opencv_fisheye" if model == "fisheye" else "opencv"
     names = PARAMETERS[model] if square_pixels else (*PARAMETERS[model], "b1")
@@ -71,7 +71,7 @@ def choose_lens(network: Network, square_pixels: bool, pixel_mm: float, adjusted
     for model in PARAMETERS:
         if model == "fisheye" and not is_wide:
             continue
-        fitted = _fitted(_with_lens(network, lens_of(model, square_pixels)), adjusted)
+        fitted = _try_adjustment(_replace_lens(network, free_lens(model, square_pixels)), adjusted)
         squares[model] = None if fitted is None else fitted.prediction_errors(FOLDS)
         if model == "opencv4":
             is_wide = fitted is None or _is_wide(fitted)
@@ -91,7 +91,7 @@ def _is_better(squares: Array | None, than: Array | None) -> bool:
     return bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
-def _fitted(network: Network, adjusted: Adjust) -> Adjustment | None:
+def _try_adjustment(network: Network, adjusted: Adjust) -> Adjustment | None:
     """The adjustment; None without a solution."""
     try:
         result = adjusted(network)
@@ -107,6 +107,6 @@ def _is_wide(fitted: Adjustment) -> bool:
     return float(np.hypot(*camera.frame_mm)) / 2.0 > WIDE * c_mm
 
 
-def _with_lens(network: Network, lens: Distortion) -> Network:
+def _replace_lens(network: Network, lens: Distortion) -> Network:
     (camera,) = network.cameras
     return replace(network, cameras=(replace(camera, distortion=lens),))

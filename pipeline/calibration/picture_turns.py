@@ -50,7 +50,7 @@ def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: Camer
     fixed = sorted(shown - set(sought))
     adjusted = partial(adjust, options=adjustment_options(project))
 
-    def network_of(images: Collection[str], turns: Mapping[str, int]) -> Network:
+    def turned_network(images: Collection[str], turns: Mapping[str, int]) -> Network:
         given = project.given_images or GivenImages({}, {})
         turned = replace(project, given_images=replace(given, turned_deg=turns))
         return build_network(turned, [mark for mark in marks if mark.image in images])[0]
@@ -58,7 +58,7 @@ def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: Camer
     groups = [[name] for name in sought]
     lens: Adjustment | None = None
     if len(fixed) >= FEWEST_PICTURES:
-        lens = adjusted(network_of(fixed, known))
+        lens = adjusted(turned_network(fixed, known))
     else:
         groups = [sought]  # all alike
     turns, unsure = dict[str, int](), list[str]()
@@ -66,7 +66,7 @@ def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: Camer
         fits = dict[int, _Fit]()
         for turn in QUARTERS_DEG:
             images = group if lens else [*fixed, *group]
-            network = network_of(images, known | dict.fromkeys(group, turn))
+            network = turned_network(images, known | dict.fromkeys(group, turn))
             if lens is not None:
                 network = replace(network, cameras=(_held_camera(network.cameras[0], lens),))
             try:

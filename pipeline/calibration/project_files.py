@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.calibration.board_options import BoardOptions
-from pipeline.calibration.lens_choice import LensModel, LensSetting, lens_of
+from pipeline.calibration.lens_choice import LensModel, LensSetting, free_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project, read_project
 from pipeline.text.atomic import write_atomically
@@ -69,7 +69,7 @@ unmodelled = "estimate"
 
 
 def _camera_text(camera: CameraPictures, options: CalibrationOptions, lens: LensModel) -> str:
-    distortion = lens_of(lens, options.square_pixels)
+    distortion = free_lens(lens, options.square_pixels)
     free = "".join(f'{name} = "free"\n' for name in distortion.parameters)
     width_mm, height_mm = (size * options.pixel_mm for size in (camera.width_px, camera.height_px))
     return f"""name = {quoted(camera.name)}

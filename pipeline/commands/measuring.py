@@ -184,7 +184,7 @@ def status(
             print_status(shown, console, every=verdict is not None)
 
     every = archive_status(read(project))
-    shown = every.of(verdict)
+    shown = every.select(verdict)
     show(as_json, partial(status_json, shown), printed)
     print_next(as_json or as_csv, *verdict_steps(project, shown.counts), command_step("run", project))
     return DONE if every.all_good else LOOK

@@ -11,7 +11,7 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.line_of_sight import LineOfSight
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
-from pipeline.adjusting.turned_pictures import in_sensor_frame
+from pipeline.adjusting.turned_pictures import rotate_to_sensor
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -20,7 +20,7 @@ from pipeline.publishing.made_from import adjusted_from, differing
 from pipeline.resampling.canvas import FrameChain, image_chain
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.adjustment_record import AdjustmentRecord
-from pipeline.results.comparator_file import ComparatorPoint, pitches_of, pixel_from_comparator, read_comparator
+from pipeline.results.comparator_file import ComparatorPoint, pixel_from_comparator, read_comparator, read_pitches
 from pipeline.results.covariance_file import Covariance, read_own_covariance
 from pipeline.types import Array
 
@@ -192,7 +192,7 @@ class Block:
         """The frames that scans show: those of one frame (column part_of) together."""
         parts: dict[str, list[OutFrame]] = {}
         for scan in scans:
-            parts.setdefault(self.project.part_of(scan.image) or scan.image, []).append(scan)
+            parts.setdefault(self.project.scanned_frame(scan.image) or scan.image, []).append(scan)
         return [WholeFrame(name, tuple(own)) for name, own in parts.items()]
 
     def unoriented_note(self) -> tuple[str, ...]:
@@ -219,9 +219,9 @@ def read_block(project: Project) -> Block:
         raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first.")
     marks = read_comparator(project.comparator, project.list_pitch_um)
     adjustment = current_adjustment(project, marks)
-    pitches = pitches_of(project.comparator)
+    pitches = read_pitches(project.comparator)
     by_image: dict[str, list[ComparatorPoint]] = {mark.image: [] for mark in marks}
-    for mark in in_sensor_frame(project, marks):
+    for mark in rotate_to_sensor(project, marks):
         if mark.status.is_observation:
             by_image[mark.image].append(mark)
     frames = [
@@ -256,10 +256,10 @@ def _frame(
     pitch_um: tuple[float, float] | None,
 ) -> OutFrame:
     known = adjustment.images.get(image) if adjustment else None
-    camera, scan = project.camera_of(image).name, project.scans.get(image)
+    camera, scan = project.image_camera(image).name, project.scans.get(image)
     if adjustment is None or known is None:
         return OutFrame(image, camera, scan, pitch_um, marks, None, None, False)
-    lens = adjustment.cameras[adjustment.camera_of(image)].lens()
+    lens = adjustment.cameras[adjustment.image_camera(image)].lens()
     places = _places_mm(marks)
     middle_mm = (places.min(axis=0) + places.max(axis=0)) / 2.0 if len(places) else np.zeros(2)
     chain = image_chain(image, adjustment, NO_PITCH, middle_mm, False)

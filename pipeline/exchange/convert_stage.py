@@ -18,7 +18,7 @@ from pipeline.exchange.export_stage import check_folder, publish, readme
 from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.mark_table import Picture, picture_file
-from pipeline.provenance import of_content
+from pipeline.provenance import hash_content
 from pipeline.results.adjustment_file import observed_mm, read_adjustment
 from pipeline.results.adjustment_record import (
     CameraRecord,
@@ -68,7 +68,7 @@ class Conversion:
     def as_json(self) -> dict[str, object]:
         """As `--json` prints it."""
         return {
-            **plain_json(DistortionRecord.of(self.lens.lens.distortion, {})),
+            **plain_json(DistortionRecord.from_distortion(self.lens.lens.distortion, {})),
             "same": self.lens.is_same,
             "largest_um": self.misfit_um,
             "rms_um": 1e3 * self.lens.rms_mm,
@@ -137,12 +137,12 @@ def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> 
     """The whole adjustment.json and adjustment.npz, with one camera's lens converted."""
     content, covariance = read_adjustment(path), read_own_covariance(path)
     name, given = calibrated_lens(path, content, options.camera)
-    known = np.sqrt(np.diag(covariance.of(_parameters(name, given)[3:])))
+    known = np.sqrt(np.diag(covariance.select(_parameters(name, given)[3:])))
     places = observed_mm(path, content, name)
     corners_mm = np.array([places.min(axis=0), places.max(axis=0)])
     lens, sentences = _convert(given, known, corners_mm, options)
     moved = _moved_covariance(covariance, name, given, lens)
-    sigmas = np.sqrt(np.diag(moved.of(_parameters(name, lens.lens))))
+    sigmas = np.sqrt(np.diag(moved.select(_parameters(name, lens.lens))))
     entry = _camera_entry(content.cameras[name], given.distortion, lens, sigmas)
     gone = {Parameter.interior(name, each).text for each in given.quantities[3:]}
     correlations = tuple(row for row in content.correlations if not gone & set(row.parameters))
@@ -156,7 +156,7 @@ def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> 
         "values": moved.values,
         "matrix": moved.matrix,
     }
-    kept["fingerprint"] = np.array(of_content(text.encode("utf-8")))
+    kept["fingerprint"] = np.array(hash_content(text.encode("utf-8")))
     np.savez_compressed(arrays, allow_pickle=False, **kept)
     return lens, sigmas, sentences, {"adjustment.json": text, "adjustment.npz": arrays.getvalue()}
 
@@ -172,7 +172,7 @@ def _moved_covariance(covariance: Covariance, camera: str, source: Lens, lens: C
     by_old = np.zeros((len(new) + len(others), len(old) + len(others)))
     by_old[: len(new), : len(old)] = lens.by_source
     by_old[len(new) :, len(old) :] = np.eye(len(others))
-    matrix = by_old @ covariance.of((*old, *others)) @ by_old.T
+    matrix = by_old @ covariance.select((*old, *others)) @ by_old.T
     value = dict(zip(covariance.parameters, covariance.values, strict=True))
     values = np.concatenate([lens.lens.values, [value[each] for each in others]])
     return Covariance((*new, *others), values, (matrix + matrix.T) / 2.0)
@@ -187,10 +187,10 @@ def _camera_entry(camera: CameraRecord, source: Distortion, lens: ConvertedLens,
         camera,
         principal_distance_mm=c,
         principal_point_mm=PrincipalPointRecord(x0, y0),
-        distortion=DistortionRecord.of(lens.lens.distortion, named),
+        distortion=DistortionRecord.from_distortion(lens.lens.distortion, named),
         significance=(),
         converted=ConvertedFrom(
-            DistortionRecord.of(source, {}), lens.is_same, 1e3 * lens.largest_mm, 1e3 * lens.rms_mm
+            DistortionRecord.from_distortion(source, {}), lens.is_same, 1e3 * lens.largest_mm, 1e3 * lens.rms_mm
         ),
     )
 

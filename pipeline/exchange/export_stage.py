@@ -12,7 +12,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.block import Block, read_block
 from pipeline.exchange.formats import Convention, ExportOptions, Written, format_writer
 from pipeline.files.project_file import Project
-from pipeline.results.comparator_file import decisions_of, decisions_told
+from pipeline.results.comparator_file import describe_decisions, read_decision_counts
 from pipeline.text.atomic import write_atomically, writing
 from pipeline.text.names import path_below
 
@@ -40,7 +40,7 @@ def run_export(project: Project, format: str, folder: Path, options: ExportOptio
     block = read_block(project)
     _check_names(block)
     written = write(block, options)
-    decisions = decisions_told(decisions_of(project.comparator))
+    decisions = describe_decisions(read_decision_counts(project.comparator))
     written = replace(written, notes=tuple(filter(None, [*written.notes, *block.lens_reach.values(), decisions])))
     parts = {"Lost": written.lost, "Notes": written.notes, "Left out": written.left_out}
     readme_text = readme(format, _convention_lines(convention), parts)

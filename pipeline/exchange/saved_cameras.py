@@ -21,9 +21,9 @@ from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.camera_tables import Source
 from pipeline.files.camera_text import camera_text
 from pipeline.files.earlier_calibration import EarlierCalibration
-from pipeline.files.mark_table import saved_in
+from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project
-from pipeline.provenance import of_file
+from pipeline.provenance import hash_file
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.covariance_file import covariance_path, read_own_covariance
@@ -99,20 +99,20 @@ def _calibrations(project: Project) -> list[_Calibration]:
         if camera.name not in record.cameras or not record.cameras[camera.name].is_calibrated:
             continue
         own = tuple(one for one in values if one.kind in _ONE_CAMERA and one.owner == camera.name)
-        images = record.images_of(camera.name)
+        images = record.camera_images(camera.name)
         frames = {record.images[image].part_of or image for image in images}
-        scanners = {project.scanner_of(image) for image in images}
+        scanners = {project.image_scanner(image) for image in images}
         numbers = np.array([values[one] for one in own])
         found.append(
-            _Calibration(project, camera, record, own, numbers, covariance.of(own), len(frames), len(scanners))
+            _Calibration(project, camera, record, own, numbers, covariance.select(own), len(frames), len(scanners))
         )
     return found
 
 
 def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     first = calibrations[0]
-    values, covariance, spread = _joined(calibrations)
-    record = _with_quantities(first, dict(zip(first.parameters, values.tolist(), strict=True)), covariance)
+    values, covariance, spread = _combine(calibrations)
+    record = _replace_quantities(first, dict(zip(first.parameters, values.tolist(), strict=True)), covariance)
     frames, scanners = sum(one.frames for one in calibrations), sum(one.scanners for one in calibrations)
     archives = listed([one.project.title for one in calibrations])
     text = f"adjusted from {counted(frames, 'frame')} of {counted(scanners, 'scanner')} in {archives}"
@@ -121,13 +121,13 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     earlier = path.with_name(f"{path.stem}-calibration.json")
     _write_calibration(first, record, values, covariance, earlier)
     camera = _adjusted_camera(first, record.cameras[first.camera.name], earlier, path, source)
-    body = camera_text(camera, saved_in(path.parent, f"{path.stem}-"))
+    body = camera_text(camera, picture_writer(path.parent, f"{path.stem}-"))
     write_atomically(path, f"{_HEAD}: values, and in {earlier.name} their covariance.\n{body}")
     read_camera(path)  # raises for what later projects could not read
     return SavedCamera(first.camera.name, path, source)
 
 
-def _joined(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mapping[Parameter, float]]:
+def _combine(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mapping[Parameter, float]]:
     """Values and covariance of the first one's quantities by all calibrations, and the standard deviation between
     archives of each that is estimated."""
     first = calibrations[0]
@@ -142,7 +142,7 @@ def _joined(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mapping
     normals = [np.linalg.inv(matrix / np.outer(scale, scale)) for matrix in cofactors]
     joint = np.linalg.inv(np.sum(normals, axis=0))
     means = scale * (joint @ np.sum([n @ (x / scale) for n, x in zip(normals, own, strict=True)], axis=0))
-    variances = _variances_between(np.array(own), np.array([np.diag(matrix) for matrix in cofactors]))
+    variances = _archive_variances(np.array(own), np.array([np.diag(matrix) for matrix in cofactors]))
     values, covariance = first.values.copy(), first.covariance.copy()
     values[is_free] = means
     covariance[np.ix_(is_free, is_free)] = joint * np.outer(scale, scale) + np.diag(variances / len(own))
@@ -150,7 +150,7 @@ def _joined(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mapping
     return values, covariance, dict(zip(free, np.sqrt(variances).tolist(), strict=True))
 
 
-def _variances_between(values: Array, variances: Array) -> Array:
+def _archive_variances(values: Array, variances: Array) -> Array:
     """(n,) variance between archives of quantities (archives, n) with their own variances, by the method of moments; 0
     where their differences are no larger than these explain."""
     weights = 1.0 / variances
@@ -181,7 +181,7 @@ def _order(first: _Calibration, other: _Calibration) -> Array:
     return order
 
 
-def _with_quantities(one: _Calibration, values: Mapping[Parameter, float], covariance: Array) -> AdjustmentRecord:
+def _replace_quantities(one: _Calibration, values: Mapping[Parameter, float], covariance: Array) -> AdjustmentRecord:
     """The adjustment with these quantities of the one camera, and without images, points and residuals."""
     name, record = one.camera.name, one.record
     sigmas = dict(zip(one.parameters, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
@@ -224,7 +224,12 @@ def _write_calibration(
             file.writelines(json_text(record))
         names = np.array([each.text for each in one.parameters], dtype=np.str_)
         with arrays.open("wb") as data:
-            content = {"fingerprint": np.array(of_file(result)), "names": names, "values": values, "matrix": covariance}
+            content = {
+                "fingerprint": np.array(hash_file(result)),
+                "names": names,
+                "values": values,
+                "matrix": covariance,
+            }
             np.savez_compressed(data, allow_pickle=False, **content)
 
 

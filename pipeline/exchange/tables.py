@@ -95,7 +95,7 @@ def _covariances(block: Block) -> Iterable[Row]:
             of_image.setdefault(each.owner, []).append(each)
     for frame in block.frames:
         own = of_image.get(frame.image, [])
-        matrix = block.covariance.of(own)
+        matrix = block.covariance.select(own)
         for i, first in enumerate(own):
             for j, second in enumerate(own[: i + 1]):
                 covariance = float(matrix[i, j])

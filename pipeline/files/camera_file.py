@@ -128,12 +128,12 @@ class CameraFile:
         return tuple(one for one in self.fiducials if isinstance(one.mark, shapes.LearnedMark))
 
     @property
-    def is_asked(self) -> bool:
+    def needs_clicks(self) -> bool:
         """Whether a person may be asked where its marks are: they are to be learned, and its own file shows none."""
         return bool(self.learned) and (self.clicks is None or bool(self.clicks.who))
 
     @property
-    def drawn(self) -> tuple[shapes.LayoutMark, ...]:
+    def layout_marks(self) -> tuple[shapes.LayoutMark, ...]:
         """The fiducials that can be found in a scan."""
         return tuple(
             shapes.LayoutMark(one.id, one.seen_mm or one.xy_mm, one.sigma_mm, one.mark)
@@ -153,7 +153,7 @@ class CameraFile:
                     'Add mark = "NAME" to it and a table [mark.NAME] that draws it, or mark = "none" to pass it over; '
                     "a camera of the library is copied with `reseau cameras NAME` for that."
                 )
-        return shapes.FiducialLayout(self.drawn, self.frame_mm, self.writing)
+        return shapes.FiducialLayout(self.layout_marks, self.frame_mm, self.writing)
 
     def camera(self, center_mm: tuple[float, float] = (0.0, 0.0)) -> Camera:
         """The camera for the adjustment. center_mm: where the principal point is sought when the file has none."""

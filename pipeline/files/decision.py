@@ -15,7 +15,7 @@ from typing import Any
 from measure.geometry import POSES
 from pipeline.errors import InputError
 from pipeline.provenance import NO_FINGERPRINT
-from pipeline.text.text_file import shown
+from pipeline.text.text_file import quote_value
 from pipeline.text.wording import did_you_mean
 
 KINDS = ("fiducial", "target", "tie")
@@ -70,7 +70,7 @@ class Decision:
     line: int = field(default=0, compare=False, metadata=NO_FINGERPRINT)
 
     @property
-    def about(self) -> About:
+    def subject(self) -> About:
         """What of which scan it is about. A line that names no kind is about the fiducial."""
         return self.image, self.point, self.kind or (KINDS[0] if self.point else "")
 
@@ -145,7 +145,7 @@ def _decisions(objects: Sequence[Any], numbers: Sequence[int]) -> list[Decision]
     groups = defaultdict[tuple[str, ...], list[tuple[int, dict[str, Any]]]](list)
     for number, told in zip(numbers, objects, strict=True):
         if not isinstance(told, dict):
-            raise LineError(f"must be a JSON object, not {shown(told)}.")
+            raise LineError(f"must be a JSON object, not {quote_value(told)}.")
         groups[str(told.get("decision")), *told].append((number, told))
     decisions = [
         one for (_, *keys), group in groups.items() for one in _decisions_alike(keys, *zip(*group, strict=True))
@@ -159,7 +159,7 @@ def _decisions_alike(keys: Sequence[str], numbers: Sequence[int], objects: Seque
         if key not in _CHECKS:
             raise LineError(f"there is no such key.{did_you_mean(key, _CHECKS)} Known: {', '.join(_CHECKS)}.", key)
     columns = zip(*map(dict.values, objects), strict=True)
-    values = {key: _checked(key, column) for key, column in zip(keys, columns, strict=True)}
+    values = {key: _check_values(key, column) for key, column in zip(keys, columns, strict=True)}
     if "decision" not in values:
         raise LineError("is missing.", "decision")
     choice, needed = _RULES[values["decision"][0]]
@@ -178,7 +178,7 @@ def _decisions_alike(keys: Sequence[str], numbers: Sequence[int], objects: Seque
     return decisions
 
 
-def _checked(key: str, values: Sequence[Any]) -> Sequence[Any]:
+def _check_values(key: str, values: Sequence[Any]) -> Sequence[Any]:
     """The values of a key in many lines. Each text is checked once, and held once."""
     check = _CHECKS[key]
     if set(map(type, values)) != {str}:
@@ -192,26 +192,28 @@ def _checked(key: str, values: Sequence[Any]) -> Sequence[Any]:
 
 def _check_text(key: str, value: Any) -> str:
     if not isinstance(value, str):
-        raise LineError(f"must be text, not {shown(value)}.", key)
+        raise LineError(f"must be text, not {quote_value(value)}.", key)
     return value
 
 
 def _check_choice(key: str, value: Any) -> str:
-    return value if value.__class__ is str and value in _RULES else _one_of(key, value, _RULES)
+    return value if value.__class__ is str and value in _RULES else _check_word(key, value, _RULES)
 
 
 def _check_kind(key: str, value: Any) -> str:
-    return value if value.__class__ is str and value in _KINDS_OR_NONE else _one_of(key, value, _KINDS_OR_NONE[1:])
+    return value if value.__class__ is str and value in _KINDS_OR_NONE else _check_word(key, value, _KINDS_OR_NONE[1:])
 
 
 def _check_pose(key: str, value: Any) -> str:
-    return _one_of(key, value, POSES) if value != "" else value
+    return _check_word(key, value, POSES) if value != "" else value
 
 
-def _one_of(key: str, value: Any, choices: Collection[str]) -> str:
+def _check_word(key: str, value: Any, choices: Collection[str]) -> str:
     text = _check_text(key, value)
     if text not in choices:
-        raise LineError(f"must be one of {', '.join(choices)}, not {shown(value)}.{did_you_mean(text, choices)}", key)
+        raise LineError(
+            f"must be one of {', '.join(choices)}, not {quote_value(value)}.{did_you_mean(text, choices)}", key
+        )
     return text
 
 
@@ -223,13 +225,13 @@ def _check_pixels(key: str, value: Any) -> float | None:
     if value is None:
         return None
     if not _is_pixel(value):
-        raise LineError(f"must be {_MUST_BE[key]}, not {shown(value)}.", key)
+        raise LineError(f"must be {_MUST_BE[key]}, not {quote_value(value)}.", key)
     return float(value)
 
 
 def _check_places(key: str, value: Any) -> dict[str, tuple[float, float]]:
     if not isinstance(value, dict) or not all(map(_is_place, value.values())):
-        raise LineError(f"must be {_MUST_BE[key]}, not {shown(value)}.", key)
+        raise LineError(f"must be {_MUST_BE[key]}, not {quote_value(value)}.", key)
     return {point: (float(col), float(row)) for point, (col, row) in value.items()}
 
 
@@ -240,7 +242,7 @@ def _is_place(value: Any) -> bool:
 def _check_time(key: str, value: Any) -> str:
     text = _check_text(key, value)
     if not _is_time(text):
-        raise LineError(f"must be a time as 2026-01-31T12:00:00+00:00, not {shown(text)}.", key)
+        raise LineError(f"must be a time as 2026-01-31T12:00:00+00:00, not {quote_value(text)}.", key)
     return text
 
 

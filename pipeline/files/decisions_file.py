@@ -60,7 +60,7 @@ def decisions_bytes(path: Path, start: int = 0) -> bytes:
 def parse_decisions(path: Path, data: bytes, first_line: int = 1) -> tuple[Decision, ...]:
     """The same of lines of the file, from one on. path: for messages."""
     decisions, start, number = list[Decision](), 0, first_line
-    with _without_search_for_cycles():
+    with _pause_garbage_collection():
         while start < len(data):
             end = data.find(b"\n", start + _BYTES_AT_A_TIME) + 1 or len(data)
             lines = data[start:end].split(b"\n")
@@ -109,13 +109,13 @@ def standing(decisions: Sequence[Decision]) -> Mapping[About, Decision]:
     """The one that counts, by what it is about, the others and what was taken back left out."""
     stacks = dict[About, list[Decision]]()
     for decision in decisions:
-        put_on(stacks, decision)
+        push_decision(stacks, decision)
     return {about: stack[-1] for about, stack in stacks.items() if stack}
 
 
-def put_on(stacks: dict[About, list[Decision]], decision: Decision) -> None:
+def push_decision(stacks: dict[About, list[Decision]], decision: Decision) -> None:
     """Add one to those about the same, by what they are about, or take the last of these back."""
-    stack = stacks.setdefault(decision.about, [])
+    stack = stacks.setdefault(decision.subject, [])
     if decision.decision is not Choice.UNDO:
         stack.append(decision)
     elif stack:
@@ -124,7 +124,7 @@ def put_on(stacks: dict[About, list[Decision]], decision: Decision) -> None:
 
 def learned_from(decisions: Sequence[Decision], images: Collection[str]) -> Decision | None:
     """By which the marks of a camera that has these images are learned: the last one that was made, and stands."""
-    own = [one for one in decisions if one.about[2] == LEARNED and one.image in images]
+    own = [one for one in decisions if one.subject[2] == LEARNED and one.image in images]
     left = standing(own).values()
     return max(left, key=own.index, default=None)
 
@@ -178,7 +178,7 @@ def _end_last_line(file: BinaryIO, path: Path) -> None:
 
 
 @contextmanager
-def _without_search_for_cycles() -> Iterator[None]:
+def _pause_garbage_collection() -> Iterator[None]:
     """A million objects without any cycle are made in half the time."""
     was_enabled = gc.isenabled()
     gc.disable()

@@ -91,10 +91,10 @@ def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
     content, covariance = read_adjustment(path), read_covariance(path)
     if not content.converged:
         raise sigma.error("calibration", f"{path} holds no calibration: its adjustment did not converge.")
-    name = _camera_in(sigma, path, content, camera.name)
+    name = _find_camera(sigma, path, content, camera.name)
     distortion = content.cameras[name].distortion
     _check_family(sigma, path, distortion, camera.distortion)
-    earlier = _taken(path, distortion, covariance, name, camera, fiducials)
+    earlier = _calibration(path, distortion, covariance, name, camera, fiducials)
     if not np.isfinite(earlier.values).all():
         raise sigma.error("calibration", f"{path} holds no interior orientation: it was made without object points.")
     _check_agreement(sigma, path, name, content.cameras[name], covariance)
@@ -111,7 +111,7 @@ def _check_agreement(sigma: Table, path: Path, name: str, camera: CameraRecord, 
         raise sigma.error("calibration", f"{has} holds {each.label}, and {lacks.name} does not. {_TOGETHER}")
     parameters = tuple(stored)
     values = dict(zip(covariance.parameters, covariance.values.tolist(), strict=True))
-    matrix = covariance.of(parameters)
+    matrix = covariance.select(parameters)
     for each, variance in zip(parameters, np.diag(matrix).tolist(), strict=True):
         here = stored[each]
         for what, in_json, in_npz in (
@@ -159,7 +159,7 @@ def _no_covariance(parameters: Sequence[Parameter], matrix: Array) -> str:
     return ""
 
 
-def _camera_in(sigma: Table, path: Path, content: AdjustmentRecord, name: str) -> str:
+def _find_camera(sigma: Table, path: Path, content: AdjustmentRecord, name: str) -> str:
     """The camera of that name; where the file has just one, that one."""
     names = list(content.cameras)
     if name not in names and len(names) != 1:
@@ -186,7 +186,7 @@ def _check_family(sigma: Table, path: Path, earlier: DistortionRecord, distortio
             )
 
 
-def _taken(
+def _calibration(
     path: Path, distortion: DistortionRecord, covariance: Covariance, there: str, camera: Camera, fiducials: bool
 ) -> EarlierCalibration:
     parameters = [Parameter.interior(there, name) for name in (*INTERIOR, *parameter_names(camera.distortion.family))]
@@ -194,7 +194,7 @@ def _taken(
         parameters += [Parameter.fiducial(there, id, axis) for id in camera.fiducials for axis in "xy"]
     value = dict(zip(covariance.parameters, covariance.values.tolist(), strict=True))
     parameters = [each for each in parameters if each in value]
-    matrix = covariance.of(parameters)
+    matrix = covariance.select(parameters)
     values = np.array([value[each] for each in parameters])
     free = np.diag(matrix) > 0.0
     return EarlierCalibration(

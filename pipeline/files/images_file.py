@@ -40,7 +40,7 @@ class GivenImages:
     part_of: Mapping[str, str] = field(default_factory=dict)
     cuts: Mapping[str, tuple[int | None, Window | None]] = field(default_factory=dict)
 
-    def parts_of(self, frame: str) -> tuple[str, ...]:
+    def frame_parts(self, frame: str) -> tuple[str, ...]:
         """The scans of a frame that was scanned in parts, in the order of their names."""
         return tuple(sorted(image for image, whole in self.part_of.items() if whole and whole == frame))
 

@@ -101,7 +101,7 @@ def _entry(name: str, camera: CameraFile) -> Json:
             "sigma": camera.principal_distance_sigma_mm,
         },
         "fiducials": len(camera.fiducials),
-        "drawn": [mark.id for mark in camera.drawn],
+        "drawn": [mark.id for mark in camera.layout_marks],
         "learned": [one.id for one in camera.learned],
         "reports": camera.source.reports if camera.source else 0,
         "source": camera.source.text if camera.source else "",

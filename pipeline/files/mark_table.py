@@ -112,7 +112,7 @@ def read_clicks(table: Table, learned: Sequence[str]) -> Clicks:
 # What was learned from scans stands in `[mark.NAME.learned]`: a chip that somebody cut out has none of it.
 
 
-def saved_in(folder: Path, prefix: str = "") -> SavePicture:
+def picture_writer(folder: Path, prefix: str = "") -> SavePicture:
     """What stores pictures in a folder, their names beginning with the prefix."""
 
     def save(name: str, picture: Picture) -> str:
@@ -124,7 +124,7 @@ def saved_in(folder: Path, prefix: str = "") -> SavePicture:
 
 
 def picture_file(picture: Picture) -> bytes:
-    """A picture as the TIFF file that `saved_in` stores."""
+    """A picture as the TIFF file that `picture_writer` stores."""
     import tifffile
 
     file = io.BytesIO()

@@ -23,9 +23,9 @@ from pipeline.files.library import PREFIX, camera_path
 from pipeline.files.mark_table import Clicks
 from pipeline.files.points_file import GivenDistance, GivenPoints, read_distances, read_points
 from pipeline.files.project_tables import UNITS_MM, ProjectTable
-from pipeline.files.scan_files import FoundScans, as_named, find_scans, with_cuts
+from pipeline.files.scan_files import FoundScans, add_cuts, as_named, find_scans
 from pipeline.files.target_table import TargetSettings, TieSettings
-from pipeline.provenance import of_content
+from pipeline.provenance import hash_content
 from pipeline.results.covariance_file import covariance_path
 from pipeline.text.names import path_below
 from pipeline.text.table_models import read_model
@@ -197,11 +197,11 @@ class Project:
     def default_camera(self) -> CameraFile:
         return next(iter(self.cameras.values()))
 
-    def camera_of(self, image: str) -> CameraFile:
+    def image_camera(self, image: str) -> CameraFile:
         name = self.given_images.camera.get(image, "") if self.given_images else ""
         return self.cameras[name] if name else self.default_camera
 
-    def part_of(self, image: str) -> str:
+    def scanned_frame(self, image: str) -> str:
         """The frame of which an image is one of several scans, "" where it is the only one."""
         return self.given_images.part_of.get(image, "") if self.given_images else ""
 
@@ -214,7 +214,7 @@ class Project:
         """Whether a frame was scanned in several parts."""
         return self.given_images is not None and any(self.given_images.part_of.values())
 
-    def scanner_of(self, image: str) -> str:
+    def image_scanner(self, image: str) -> str:
         """The name of the scanner of an image; all images that name none are of one."""
         return (self.given_images.scanner.get(image, "") if self.given_images else "") or DEFAULT_SCANNER
 
@@ -257,7 +257,7 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
         path=path,
         cameras={} if lacks_camera else _cameras(table, given.camera, images),
         missing_camera=given.camera if lacks_camera else "",
-        scans=with_cuts(found.files, images, named.get("images")),
+        scans=add_cuts(found.files, images, named.get("images")),
         left_out=found.left_out,
         comparator=folder / given.comparator,
         pitch_um=given.pitch_um,
@@ -277,7 +277,7 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
         board_bend_sigma=given.object.board_bend,
         transparent=given.object.transparent,
     )
-    project = with_decisions(project)
+    project = reload_decisions(project)
     if not project.scans and not project.comparator.exists():
         raise InputError(
             f"{path}: there are no scans and no comparator coordinates. Give scans = [...] to measure, or comparator = "
@@ -287,26 +287,26 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
     return project
 
 
-def with_decisions(project: Project) -> Project:
+def reload_decisions(project: Project) -> Project:
     """The project with what is decided now. Marks that are to be learned, and that the camera's own file does not show,
     are shown where a person decided. Raises InputError naming the line, or the marks that are missing."""
     data = decisions_bytes(project.decisions_path)
     decisions, cut_short = parse_decisions(project.decisions_path, data), cut_short_line(data)
     cameras = dict(project.cameras)
     for name, camera in project.cameras.items():
-        if camera.is_asked:
-            images = {image for image in project.scans if project.camera_of(image) is camera}
-            cameras[name] = replace(camera, clicks=_shown(project, camera, learned_from(decisions, images)))
+        if camera.needs_clicks:
+            images = {image for image in project.scans if project.image_camera(image) is camera}
+            cameras[name] = replace(camera, clicks=_clicks(project, camera, learned_from(decisions, images)))
     return replace(
         project,
         cameras=cameras,
         decisions=decisions,
-        decisions_hash=of_content(data) if decisions else "",
+        decisions_hash=hash_content(data) if decisions else "",
         decisions_cut_short=cut_short,
     )
 
 
-def _shown(project: Project, camera: CameraFile, shown: Decision | None) -> Clicks | None:
+def _clicks(project: Project, camera: CameraFile, shown: Decision | None) -> Clicks | None:
     if shown is None:
         return None
     missing = [one.id for one in camera.learned if one.id not in shown.px]

@@ -49,7 +49,7 @@ def folders_below(root: Path) -> Iterator[str]:
             continue
         entered.add(real)
         yield place
-        for name, is_link in _folders_in(real):
+        for name, is_link in _list_folders(real):
             below, target = os.path.join(place, name), os.path.join(real, name)
             if not is_link:
                 waiting.append((below, target))
@@ -77,7 +77,7 @@ def each_once(files: Mapping[str, bool], without: Iterable[str]) -> set[str]:
     return set(kept.values())
 
 
-def _folders_in(folder: str) -> list[tuple[str, bool]]:
+def _list_folders(folder: str) -> list[tuple[str, bool]]:
     """The names of its folders, and whether each is a link; none of a folder that may not be listed."""
     with suppress(OSError), os.scandir(folder) as entries:
         return sorted((one.name, one.is_symlink()) for one in entries if one.is_dir() and not one.name.startswith("."))
@@ -122,7 +122,7 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
     found, is_named = dict[str, Named](), dict[str, bool]()  # paths are slow keys
     for pattern in patterns:
         try:
-            own = _found(pattern, folder)
+            own = _find_files(pattern, folder)
         except MeasurementError as error:
             raise table.error("scans", str(error)) from error
         if not own and is_address(pattern):
@@ -134,7 +134,7 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
         found |= {str(file): file for file in own}
         if not is_address(pattern):
             is_named |= {str(file): own == [str(folder / pattern)] for file in own}
-    left_out = {str(file): file for pattern in exclude for file in _found(pattern, folder)}
+    left_out = {str(file): file for pattern in exclude for file in _find_files(pattern, folder)}
     repeated = is_named.keys() - each_once(is_named, [text for text in left_out if not is_address(text)])
     files = [file for text, file in found.items() if text not in left_out and text not in repeated]
     if not files:
@@ -154,7 +154,7 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
     return FoundScans(ScanFiles(scans), frozenset(names_below(files, left_out.values())))
 
 
-def with_cuts(scans: Mapping[str, Path], images: GivenImages | None, path: Path | None) -> Mapping[str, Path]:
+def add_cuts(scans: Mapping[str, Path], images: GivenImages | None, path: Path | None) -> Mapping[str, Path]:
     """The scans, those of which images.csv names pages or windows replaced by these. Such an image is called as its
     scan, or so with something behind it. Raises InputError where it is called as no scan."""
     if images is None or not images.cuts:
@@ -182,14 +182,14 @@ def as_named(scans: Mapping[str, Path]) -> Mapping[str, Named]:
     return scans.named if isinstance(scans, ScanFiles) else scans
 
 
-def _found(pattern: str, folder: Path) -> Sequence[Named]:
+def _find_files(pattern: str, folder: Path) -> Sequence[Named]:
     """The file of that very name, brackets and all, or those that the pattern finds in the folder, also links
     that lead nowhere: a scan that is named is opened or refused. `**` is any number of folders."""
     if is_address(pattern):
         return find_addresses(pattern)
     if (folder / pattern).is_file():
         return [str(folder / pattern)]
-    return _without_folders(_below(folder, sorted(found_names(pattern, folder))))
+    return _drop_folders(_below(folder, sorted(found_names(pattern, folder))))
 
 
 def _below(folder: Path, names: Sequence[str]) -> list[str]:
@@ -199,7 +199,7 @@ def _below(folder: Path, names: Sequence[str]) -> list[str]:
     return [begins[place] + name for place, name in places if name]
 
 
-def _without_folders(files: Sequence[str]) -> list[str]:
+def _drop_folders(files: Sequence[str]) -> list[str]:
     """What is a folder is asked once for all that stands in one."""
     folders = set[str]()
     for parent in {text[: text.rfind(os.sep) + 1] for text in files}:

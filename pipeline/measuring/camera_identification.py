@@ -32,7 +32,7 @@ CLOSE = 0.85  # of the best score: a camera that comes so near is not told from 
 _SHRUNK = 0.03  # of its size: more than film and cameras of a model differ by
 
 
-def plate_of(lines: Sequence[Line]) -> dict[str, str]:
+def parse_plate(lines: Sequence[Line]) -> dict[str, str]:
     """Maker, number and principal distance in mm, as far as one plate says them."""
     found = {name: {field.value for field in find_fields(lines) if field.name == name} - {""} for name in CAMERA}
     return {name: next(iter(values)) for name, values in found.items() if len(values) == 1}
@@ -40,7 +40,7 @@ def plate_of(lines: Sequence[Line]) -> dict[str, str]:
 
 def is_whole_plate(lines: Sequence[Line]) -> bool:
     """Whether they say all that a plate says."""
-    return len(plate_of(lines)) == len(CAMERA)
+    return len(parse_plate(lines)) == len(CAMERA)
 
 
 def contradictions(camera: CameraFile, plate: dict[str, str]) -> list[str]:
@@ -59,18 +59,18 @@ def contradictions(camera: CameraFile, plate: dict[str, str]) -> list[str]:
     return clauses
 
 
-def with_plates(
+def add_plates(
     camera: CameraFile, scans: Sequence[MeasuredScan], cameras: Mapping[str, CameraFile]
 ) -> list[MeasuredScan]:
     """The scans of one camera with what their plates say. A principal distance that was read changes nothing. cameras:
     all of the project, by the names that images.csv has for them."""
-    plates = {scan.frame.image: plate_of(scan.frame.writing or ()) for scan in scans}
+    plates = {scan.frame.image: parse_plate(scan.frame.writing or ()) for scan in scans}
     numbers = sorted({plate["camera_number"] for plate in plates.values() if "camera_number" in plate})
     known = {other.number: name for name, other in cameras.items() if other.number}
-    return [_told(camera, scan, plates[scan.frame.image], numbers, known) for scan in scans]
+    return [_add_plate(camera, scan, plates[scan.frame.image], numbers, known) for scan in scans]
 
 
-def _told(
+def _add_plate(
     camera: CameraFile, scan: MeasuredScan, plate: dict[str, str], numbers: Sequence[str], known: Mapping[str, str]
 ) -> MeasuredScan:
     problems, notes = [], []
@@ -217,7 +217,7 @@ class Identification:
         named = [name for trial in self.best for name in trial.cameras if name in self.unreported]
         text += "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
         against = self.against_pitch()
-        return text + self._of_forms() + self._of_plate() + (f" {against}" if against else "")
+        return text + self._form_remark() + self._plate_remark() + (f" {against}" if against else "")
 
     def much_alike(self) -> tuple[str, ...]:
         """Other cameras whose marks are drawn much like those that stand out: wings, notches or arrows."""
@@ -225,7 +225,7 @@ class Identification:
         others = (other for name in best for other in self.alike.get(name, ()) if other not in best)
         return tuple(dict.fromkeys(others))
 
-    def _of_forms(self) -> str:
+    def _form_remark(self) -> str:
         """That a name rests on the form of marks alone, of which others have much the same."""
         others = " or ".join(self.much_alike())
         if not others:
@@ -234,7 +234,7 @@ class Identification:
             f" That rests on the form of its marks alone, and {others} has marks much like them: compare the drawings."
         )
 
-    def _of_plate(self) -> str:
+    def _plate_remark(self) -> str:
         """What the plate says of the cameras that stand out."""
         if not self.plate:
             return ""

@@ -31,7 +31,7 @@ from pipeline.measuring.camera_identification import (
     drawn_alike,
     is_solid,
     is_whole_plate,
-    plate_of,
+    parse_plate,
 )
 from pipeline.progress import Count, Reporter
 
@@ -80,7 +80,7 @@ class LayoutSearch:
         )
         self._known: list[Tried] = []
 
-    def at_pitch(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
+    def try_pitch(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
         """At the scan's pitch."""
         return self._as_given(layout, pitch_um, lambda given: [given], 0)
 
@@ -103,7 +103,7 @@ class LayoutSearch:
         ((given,), *_) = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
         return self._tried(_some(layout), bold, picture, hypotheses(given), before)
 
-    def at_any_pitch(self, layout: FiducialLayout) -> Tried:
+    def try_any_pitch(self, layout: FiducialLayout) -> Tried:
         """Where the frame may fill the scan, its pixels being square."""
         bold = _boldest(layout)
         picture = self._coarse_solid if all(is_solid(mark) for mark in bold.marks) else self._coarse
@@ -124,7 +124,7 @@ class LayoutSearch:
         layout, bold = _stretched(tried.layout), _stretched(tried.bold)
         return self._tried(layout, bold, tried.picture, tried.hypotheses, tried.before)
 
-    def seen(self, tried: Tried) -> Frame | None:
+    def recognise(self, tried: Tried) -> Frame | None:
         """The frame as its marks look."""
         return recognise_frame(self._scan, tried.layout, tried.answer, self._scan.width_px / tried.picture.width_px)
 
@@ -180,7 +180,7 @@ def identify(
     """
     picture, times, its_pitch_um = _picture(path, max_pixels)
     given, search = its_pitch_um if pitch_um is None else (pitch_um, pitch_um), LayoutSearch(picture)
-    layouts = {names: _as_seen(cameras[names[0]].layout()) for names in _alike(cameras)}
+    layouts = {names: _limit_drawings(cameras[names[0]].layout()) for names in _alike(cameras)}
     pitch = None if given is None else (times * given[0], times * given[1])
     with reporter.stage("trying") as count:
         trials, tries = _first_that_stand_out(search, layouts, pitch, count)
@@ -205,7 +205,7 @@ def _picture(path: Path, max_pixels: int | None) -> tuple[Scan, float, tuple[flo
         return picture, whole.width_px / picture.width_px, whole.pitch_um
 
 
-def _as_seen(layout: FiducialLayout) -> FiducialLayout:
+def _limit_drawings(layout: FiducialLayout) -> FiducialLayout:
     """With the drawings of wings known within the frame alone. What is left of a mark beyond the frame's edge is hardly
     more than a corner, and answers to many a thing: it is taken as drawn."""
     half_mm = np.array(layout.frame_mm) / 2
@@ -217,7 +217,7 @@ def _as_seen(layout: FiducialLayout) -> FiducialLayout:
 def _plate(picture: Scan) -> dict[str, str]:
     """What the camera's own plate says in the scan, as far as anything is there that reads."""
     reader = networks()
-    return {} if reader is None else plate_of(read_writing(picture, reader, enough=is_whole_plate))
+    return {} if reader is None else parse_plate(read_writing(picture, reader, enough=is_whole_plate))
 
 
 def _alike_in_scan(
@@ -230,7 +230,8 @@ def _alike_in_scan(
     found = dict[str, Names]()
     for trial in trials:
         others = dict.fromkeys(own[name] for name in drawn.get(trial.cameras[0], ())) if trial.stands_out else {}
-        frames = {names: search.seen(replace(tries[trial.cameras], layout=tries[names].layout)) for names in others}
+        best = tries[trial.cameras]
+        frames = {names: search.recognise(replace(best, layout=tries[names].layout)) for names in others}
         near = [names for names, frame in frames.items() if frame and likeness(frame) >= CLOSE * trial.score]
         found |= dict.fromkeys(trial.cameras, tuple(names[0] for names in near)) if near else {}
     return found
@@ -243,7 +244,7 @@ def _first_that_stand_out(
     put so; where none of them stands out, with pixels that may be longer one way; where still none does, at any pitch.
     """
     if pitch_um is not None:
-        given = _each(layouts, partial(search.at_pitch, pitch_um=pitch_um), count)
+        given = _each(layouts, partial(search.try_pitch, pitch_um=pitch_um), count)
         if any(each.answer.expected <= CAMERA_BY_CHANCE for each in given.values()):
             trials = _trials(search, given, count)
             if any(trial.stands_out for trial in trials):
@@ -253,7 +254,7 @@ def _first_that_stand_out(
         trials = _trials(search, likelier, count)
         if any(trial.stands_out for trial in trials):
             return trials, likelier
-    return _at_any_pitch(search, layouts, count)
+    return _try_any_pitch(search, layouts, count)
 
 
 def _expected(each: Tried) -> float:
@@ -270,12 +271,12 @@ def _each(
     return tries
 
 
-def _at_any_pitch(
+def _try_any_pitch(
     search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count
 ) -> tuple[list[Trial], Mapping[Names, Tried]]:
     """The trials of a scan that the frame may fill: what its pixels then measure each layout says for itself, and those
     that answer best are tried at that pitch."""
-    tries = _each(layouts, search.at_any_pitch, count)
+    tries = _each(layouts, search.try_any_pitch, count)
     least = sorted({each.answer.expected for each in tries.values()})[:_FEW]
     best = {names: search.refined(each) for names, each in tries.items() if each.answer.expected in least}
     return _trials(search, tries | best, count), tries | best
@@ -291,7 +292,7 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
         each, standing = tries[names], [trial for trial in trials if trial.stands_out]
         limits = [_expected_at_most(trial, len(each.layout.marks)) for trial in standing]
         if each.answer.expected > min([*limits, _HOPELESS]):
-            trials.append(_not_looked_at(names, each))
+            trials.append(_skipped_trial(names, each))
         else:
             count(", ".join(names), done, 2 * len(ranked))
             trials.append(_trial(search, names, each, CLOSE * max((trial.score for trial in standing), default=0.0)))
@@ -311,7 +312,7 @@ def _expected_at_most(seen: Trial, marks: int) -> float:
     return min(most, _ODDS * seen.expected) if seen.found > marks else most
 
 
-def _not_looked_at(names: Names, each: Tried) -> Trial:
+def _skipped_trial(names: Names, each: Tried) -> Trial:
     expected = each.answer.expected
     if np.isfinite(expected):
         reason = f"not measured: {expected:.1g} false alarms expected in such a scan"
@@ -324,10 +325,10 @@ def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
     """The names of cameras with drawn marks, those together whose marks a scan cannot tell apart."""
     groups: list[list[str]] = []
     for name, camera in cameras.items():
-        own = next((group for group in groups if same_marks(cameras[group[0]].drawn, camera.drawn)), None)
+        own = next((group for group in groups if same_marks(cameras[group[0]].layout_marks, camera.layout_marks)), None)
         if own is not None:
             own.append(name)
-        elif camera.drawn:
+        elif camera.layout_marks:
             groups.append([name])
     return [tuple(group) for group in groups]
 
@@ -335,7 +336,7 @@ def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
 def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Trial:
     """close: the score from which on it is named beside another: with less it need not be held against chance."""
     start, expected = time.perf_counter(), each.answer.expected
-    frame = search.seen(each)
+    frame = search.recognise(each)
     fits = [fit for fit in frame.fits if fit] if frame else []
     residual = _residual(frame, each.layout) if frame else None
     score = likeness(frame) if frame else 0.0
@@ -361,7 +362,7 @@ def _score_by_chance(search: LayoutSearch, each: Tried) -> float:
     wrong = search.stretched(each)
     if wrong.answer.expected > _ODDS * each.answer.expected:
         return 0.0
-    frame = search.seen(wrong)
+    frame = search.recognise(wrong)
     return likeness(frame) if frame else 0.0
 
 

@@ -44,7 +44,7 @@ class CodedPoints:
     settings: TargetSettings
 
     @classmethod
-    def of(cls, project: Project, settings: TargetSettings) -> "CodedPoints":
+    def from_project(cls, project: Project, settings: TargetSettings) -> "CodedPoints":
         """The points of points.csv. Raises InputError where it holds too few, or lacks a coded one."""
         if project.given_points is None:
             raise InputError(
@@ -191,7 +191,7 @@ def measure_coded_field(
     if misread:
         others = listed(sorted({id for id, _ in misread}))
         notes = (*notes, f"Rings that read as {others} lie where the field has another point, or none.")
-    predictions = named.predictions(_of_size(field, named, measured), measured)
+    predictions = named.predictions(_set_dot_size(field, named, measured), measured)
     contradicted = {
         one.point: MarkMeasurement(one.point, "target", one.center_px, None, Status.REJECTED, reason)
         for one in predictions
@@ -220,7 +220,7 @@ def _is_mirrored(measured: MeasuredScan) -> bool:
     return place is not None and bool(np.linalg.det(place[:, :2]) > 0.0)
 
 
-def _of_size(field: Field, named: NamedField, measured: MeasuredScan) -> Field:
+def _set_dot_size(field: Field, named: NamedField, measured: MeasuredScan) -> Field:
     """The field with the size that its dots have in the picture, where the project does not say it."""
     if field.radius > 0.0:
         return field

@@ -44,7 +44,7 @@ def first_pictures(camera: CameraFile, tasks: Sequence[ScanTask], workers: Execu
     """The camera with one scan's pictures in the place of marks that are to be learned, and from which scan they are.
     tasks: to measure the drawn marks of this camera's scans. Raises InputError or MeasurementError where nothing shows
     the marks."""
-    return _clicked(camera, camera.clicks, tasks) if camera.clicks else _in_common(camera, tasks, workers)
+    return _clicked(camera, camera.clicks, tasks) if camera.clicks else _learn_recurring_marks(camera, tasks, workers)
 
 
 def _clicked(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> CameraFile:
@@ -100,7 +100,7 @@ def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Place
     )
 
 
-def _in_common(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor | None) -> CameraFile:
+def _learn_recurring_marks(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor | None) -> CameraFile:
     """The marks that recur in all scans near their coordinates."""
     if len(tasks) < 2:
         raise InputError(
@@ -154,10 +154,10 @@ def _view(task: ScanTask) -> _View | None:
     try:
         with task.opened() as scan:
             placement = _drawn_placement(task.options, scan)
-            if placement is None and len(camera.drawn) >= 2:
+            if placement is None and len(camera.layout_marks) >= 2:
                 return None
             if placement is None:
-                placement = _in_the_middle(task.options, scan)
+                placement = _central_frame(task.options, scan)
             windows = {
                 one.id: about(scan, placement, np.array(one.xy_mm), one.learned_mm, _REACH * one.learned_mm)
                 for one in camera.learned
@@ -169,13 +169,13 @@ def _view(task: ScanTask) -> _View | None:
 
 def _drawn_placement(options: ScanOptions, scan: Scan) -> Array | None:
     """The frame as the drawn marks give it."""
-    if len(options.camera.drawn) < 2:
+    if len(options.camera.layout_marks) < 2:
         return None
     pitch = options.pitch_um or scan.pitch_um
     return measure_fiducials(scan, options.camera.layout(), pitch, options.fiducials).pixel_from_camera
 
 
-def _in_the_middle(options: ScanOptions, scan: Scan) -> Array:
+def _central_frame(options: ScanOptions, scan: Scan) -> Array:
     """The frame in the middle of its scan, in the pose that the project gives."""
     pose = "0" if options.fiducials.pose == "auto" else options.fiducials.pose
     pitch = np.array(_pitch_mm(options, scan))
@@ -196,7 +196,7 @@ def _through_clicks(options: ScanOptions, scan: Scan, px: Places) -> Array:
     """The frame as the clicks give it: mirrored where that fits better."""
     camera = options.camera
     if len(px) == 1:
-        matrix = _in_the_middle(options, scan)
+        matrix = _central_frame(options, scan)
         xy = next(np.array(one.xy_mm) for one in camera.learned)
         matrix[:, 2] = next(iter(px.values())) - matrix[:, :2] @ xy
         return matrix

@@ -19,12 +19,12 @@ from measure.results import MEASURE_REVISION, FrameMeasurement
 from measure.scans.parallel import map_items
 from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
 from pipeline.files.camera_text import camera_text
-from pipeline.files.mark_table import saved_in
+from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project
 from pipeline.measuring.first_pictures import digest, first_pictures
 from pipeline.measuring.scan_task import Measure, Memory, ScanTask, scan_tasks
 from pipeline.progress import Reporter
-from pipeline.provenance import fingerprint, of_file
+from pipeline.provenance import fingerprint, hash_file
 from pipeline.text.atomic import write_atomically
 
 _BY = f"# Marks learned by reseau {version('reseau')}"
@@ -38,23 +38,23 @@ def learn_marks(
     they cannot be learned. A scan that cannot be measured adds nothing to them. What was learned once
     stays, whatever scans come or go, as long as its files stand in out/learned."""
     files = _file_names([camera.path for camera in project.cameras.values()], _learned_folder(project))
-    known = with_learned(project, memory)
+    known = add_learned_marks(project, memory)
     cameras = dict(known.cameras)
     for name, camera in known.cameras.items():
         if camera.learned:
             place = folder / f"{files[camera.path]}.toml"
             cameras[name] = _learned(project, camera, place, reporter, measure, workers)
             if place.exists():
-                memory.remember(_key(project, camera), {"file": place.name, "sha256": of_file(place)})
+                memory.remember(_key(project, camera), {"file": place.name, "sha256": hash_file(place)})
     return replace(project, cameras=cameras)
 
 
-def with_learned(project: Project, memory: Memory) -> Project:
+def add_learned_marks(project: Project, memory: Memory) -> Project:
     """The project with what was learned of its marks before; of other cameras they are yet to be learned."""
     cameras = {
         name: (_stored_earlier(project, camera, memory.recall(_key(project, camera))) or camera)
         if camera.learned
-        else _known(project, camera)
+        else _check_learned_scan(project, camera)
         for name, camera in project.cameras.items()
     }
     return replace(project, cameras=cameras)
@@ -69,10 +69,10 @@ def _key(project: Project, camera: CameraFile) -> str:
 def _stored_earlier(project: Project, camera: CameraFile, kept: Mapping[str, str] | None) -> CameraFile | None:
     """The camera with the marks that were learned before, where their files still stand as they were written."""
     path = _learned_folder(project) / (kept or {}).get("file", "")
-    if kept is None or not path.is_file() or of_file(path) != kept["sha256"]:
+    if kept is None or not path.is_file() or hash_file(path) != kept["sha256"]:
         return None
     learned = read_camera(path)
-    return _known(project, replace(camera, fiducials=learned.fiducials, learned_from=learned.learned_from))
+    return _check_learned_scan(project, replace(camera, fiducials=learned.fiducials, learned_from=learned.learned_from))
 
 
 def _learned_folder(project: Project) -> Path:
@@ -92,17 +92,17 @@ def _file_names(cameras: Sequence[Path], learned: Path) -> Mapping[Path, str]:
     return names
 
 
-def _known(project: Project, camera: CameraFile) -> CameraFile:
+def _check_learned_scan(project: Project, camera: CameraFile) -> CameraFile:
     """A camera whose marks were learned before, or drawn. Another scan may have the name of the one they were learned
     from: then that tells nothing of how this project's scans lie, and none of these has a share in the marks."""
     learned = camera.learned_from
     if learned is None or (learned.scan in project.scans and digest(project.scans[learned.scan]) == learned.sha256):
         return camera
-    fiducials = tuple(replace(one, mark=_of_other_scans(one.mark)) for one in camera.fiducials)
+    fiducials = tuple(replace(one, mark=_drop_shares(one.mark)) for one in camera.fiducials)
     return replace(camera, fiducials=fiducials, learned_from=None)
 
 
-def _of_other_scans(mark: Mark | LearnedMark | None) -> Mark | LearnedMark | None:
+def _drop_shares(mark: Mark | LearnedMark | None) -> Mark | LearnedMark | None:
     """A learned mark whose shares are those of no image: a name never holds a line's end."""
     if not isinstance(mark, MarkTemplate):
         return mark
@@ -112,7 +112,7 @@ def _of_other_scans(mark: Mark | LearnedMark | None) -> Mark | LearnedMark | Non
 def _learned(
     project: Project, camera: CameraFile, place: Path, reporter: Reporter, measure: Measure, workers: Executor | None
 ) -> CameraFile:
-    names = [name for name in project.scans if project.camera_of(name).path == camera.path]
+    names = [name for name in project.scans if project.image_camera(name).path == camera.path]
     if not names:
         return camera
     with reporter.stage("learning marks of") as tell:
@@ -121,7 +121,7 @@ def _learned(
         tell(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
         chips, rivals = _chips(camera.learned, start, _tasks(project, start, names), measure, workers)
         if rivals:
-            start = _with_common_origins(start, rivals)
+            start = _average_origins(start, rivals)
             chips, _ = _chips(camera.learned, start, _tasks(project, start, names), measure, workers)
         tell(f"{camera.name}: averaged", 2, 3)
         mean = _averaged(start, camera.learned, chips, workers)
@@ -146,13 +146,13 @@ def _chips(
     frames = {scan.frame.image: scan.frame for scan in measure(tasks)}
     named = [(task, frames[task.name]) for task in tasks if _is_named(frames[task.name], start)]
     chips = dict[str, list[Chip]]()
-    for scan_fingerprint in map_items(workers, partial(_chips_of, learned), named):
+    for scan_fingerprint in map_items(workers, partial(_learned_chips, learned), named):
         for id, chip in scan_fingerprint.items():
             chips.setdefault(id, []).append(chip)
     return chips, {rival for frame in frames.values() if frame.pose for rival in frame.pose.rivals}
 
 
-def _chips_of(learned: Sequence[GivenFiducial], named: tuple[ScanTask, FrameMeasurement]) -> Mapping[str, Chip]:
+def _learned_chips(learned: Sequence[GivenFiducial], named: tuple[ScanTask, FrameMeasurement]) -> Mapping[str, Chip]:
     """The pictures of learned marks in one scan, as far as they were found."""
     task, frame = named
     matrix = frame.pixel_from_camera
@@ -184,14 +184,14 @@ def _averaged(
     mean = {one.id: template for one, template in zip(found, templates, strict=True)}
     camera = replace(start, fiducials=tuple(replace(one, mark=mean.get(one.id, one.mark)) for one in start.fiducials))
     alike = {pose for one in start.fiducials if isinstance(one.mark, MarkTemplate) for pose in one.mark.alike}
-    return _with_common_origins(camera, alike)
+    return _average_origins(camera, alike)
 
 
 def _template(job: tuple[list[Chip], float]) -> MarkTemplate:
     return learn_template(*job)
 
 
-def _with_common_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
+def _average_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
     """The camera with the origins of its learned marks where those poses, which frames do not tell apart, take them to
     one another, as far as the marks look alike in them."""
     learned = [one for one in camera.fiducials if isinstance(one.mark, MarkTemplate) and one.mark.learned_mm]
@@ -210,7 +210,7 @@ def _with_common_origins(camera: CameraFile, poses: Collection[str]) -> CameraFi
 def _stored(camera: CameraFile, place: Path, folder: Path) -> CameraFile:
     """The camera with its templates written as a file that can be used instead, and as that file has them: so what is
     measured with it is what is measured now. place: of the file for now; folder: where it is to stand."""
-    save = saved_in(place.parent, f"{place.stem}-")
+    save = picture_writer(place.parent, f"{place.stem}-")
     write_atomically(place, camera_text(replace(camera, path=place), save))
     stored = replace(camera, fiducials=read_camera(place).fiducials)
     write_atomically(place, f"{_BY}\n{camera_text(replace(camera, path=folder / place.name), save)}")

@@ -19,9 +19,9 @@ from measure.geometry import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import WrittenPlace
 from measure.results import FrameMeasurement, Pose
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, few_of
+from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, sample_names
 from pipeline.progress import Reporter
-from pipeline.results.frames_file import said
+from pipeline.results.frames_file import unique_fields
 from pipeline.results.measured_record import MeasuredScan
 
 _ONE_QUESTION = (
@@ -56,7 +56,7 @@ class Roll:
         return replace(new, frame=replace(new.frame, pose=pose, writing=frame.writing))
 
 
-def roll_of(tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Roll:
+def build_roll(tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Roll:
     """The roll of one camera's scans, which were measured by these tasks. places: where the camera writes."""
     both = list(zip(tasks, scans, strict=True))
     free = [scan for task, scan in both if task.options.fiducials.pose == "auto" and not scan.failure]
@@ -66,7 +66,7 @@ def roll_of(tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places: Se
     return Roll(poses, tuple(task for task in again if task.options.fiducials.pose != names.get(task.name)))
 
 
-def with_known_lines(
+def add_known_lines(
     tasks: Sequence[ScanTask], measure: Measure, reporter: Reporter
 ) -> tuple[tuple[ScanTask, ...], Mapping[str, MeasuredScan]]:
     """The tasks, in their order, with the lines by which to know that a frame lies as others of its camera; and, by
@@ -96,14 +96,14 @@ def with_known_lines(
 
 def _first(tasks: Sequence[ScanTask]) -> list[ScanTask]:
     """Those of a camera on which all writing is read."""
-    few = few_of([task.name for task in tasks], _READ_FIRST)
+    few = sample_names([task.name for task in tasks], _READ_FIRST)
     return [task for task in tasks if task.name in few]
 
 
 def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:
     """The lines by which to know, on frames that are not read yet, that they lie as some of these do: of each way in
     which two or more lie in their scans the one that tells itself best."""
-    lines = [(known, line) for frame in frames for line in frame.writing or () if (known := _known(frame, line))]
+    lines = [(known, line) for frame in frames for line in frame.writing or () if (known := _known_line(frame, line))]
     recurring = [
         (known, line)
         for known, line in lines
@@ -115,7 +115,7 @@ def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:
     return tuple(known for known, _ in list(best.values())[:_WAYS])
 
 
-def _known(frame: FrameMeasurement, line: Line) -> KnownLine | None:
+def _known_line(frame: FrameMeasurement, line: Line) -> KnownLine | None:
     """The line as others of its roll may have it; None where too little is written in it."""
     letters = masked_text(line.text)
     if frame.pixel_from_camera is None or frame.pose is None or len(letters) < _LEAST or not letters.strip("0"):
@@ -150,7 +150,7 @@ def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[Wr
         for line in frame.writing or ():
             texts.setdefault(re.sub(r"[\W\d]", "", line.text) or re.sub(r"\d", "0", line.text), (frame.pose, line))
     decided_turns = {_turn(frame.pose) for frame in frames if frame.pose and frame.pose.decided}
-    scores = [sum(line_score(line, places, _in_scan(pose, turn)) for pose, line in texts.values()) for turn in _TURNS]
+    scores = [sum(line_score(line, places, _scan_pose(pose, turn)) for pose, line in texts.values()) for turn in _TURNS]
     likelihoods = bounded(np.array(scores)) - [DECIDED if decided_turns - {turn} else 0.0 for turn in _TURNS]
     return dict(zip(_TURNS, (likelihoods - likelihoods.max()).tolist(), strict=True))
 
@@ -159,8 +159,8 @@ def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Po
     """The pose of a frame whose writing lies in the camera's frame as in that of so many frames together. told: whether
     these say so, or only agree."""
     assert frame.pose is not None
-    pose = replace(frame.pose, name=_in_scan(frame.pose, turn))
-    if not _face_is_told(pose) or _is_doubted(frame):
+    pose = replace(frame.pose, name=_scan_pose(frame.pose, turn))
+    if not _face_is_known(pose) or _is_doubted(frame):
         like = f"named {pose.name} as the other frames of the camera, so that its writing lies as theirs."
         return replace(pose, evidence=(*pose.evidence, like)) if pose.name != frame.pose.name else pose
     if not told:
@@ -169,7 +169,7 @@ def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Po
     return replace(pose, decided=True, evidence=(together, *pose.evidence[1:]))
 
 
-def _face_is_told(pose: Pose) -> bool:
+def _face_is_known(pose: Pose) -> bool:
     """Whether the frame by itself says if its scan is mirrored."""
     faces = [
         max((value for name, value in pose.written.items() if name.endswith("m") == mirrored), default=0.0)
@@ -189,7 +189,7 @@ def _turn(pose: Pose) -> str:
     return pose_in_camera(pose.writing, pose.name)
 
 
-def _in_scan(pose: Pose, turn: str) -> str:
+def _scan_pose(pose: Pose, turn: str) -> str:
     """The pose of a frame whose writing lies so in the camera's frame."""
     return next(name for name in POSES if pose_in_camera(pose.writing, name) == turn)
 
@@ -198,7 +198,7 @@ def _in_scan(pose: Pose, turn: str) -> str:
 # checked is made anew whenever a scan comes to them.
 
 
-def checked(
+def check_scans(
     camera: CameraFile,
     measured: Sequence[MeasuredScan],
     roll: Roll,
@@ -215,21 +215,21 @@ def checked(
     frames = [replace(scan.frame, marks=own) for scan, own in zip(scans, marks, strict=True)]
     by_image = {
         scan.frame.image: replace(scan, frame=frame)
-        for scan, frame in zip(scans, _judged(camera, frames, scans, film), strict=True)
+        for scan, frame in zip(scans, _check_fiducials(camera, frames, scans, film), strict=True)
     }
     return tuple(CheckedScan(by_image.get(scan.frame.image, scan)) for scan in measured)
 
 
-def _judged(
+def _check_fiducials(
     camera: CameraFile, frames: Sequence[FrameMeasurement], scans: Sequence[MeasuredScan], film: BelievedFilm
 ) -> Sequence[FrameMeasurement]:
     """The fiducials judged together, if the camera has any."""
-    if not camera.drawn:
+    if not camera.layout_marks:
         return frames
     return check_frames(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames
 
 
-def with_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:
+def note_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:
     """The scans, with a problem where another one says that it is the same frame. part_of: the frame of which an image
     is one of several scans, which are meant to be of one frame."""
     named: dict[tuple[tuple[str, str], ...], list[str]] = {}
@@ -237,16 +237,16 @@ def with_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str
     for image, name in names.items():
         if name:
             named.setdefault(name, []).append(image)
-    return [_with_problem(scan, names[scan.frame.image], named, part_of) for scan in scans]
+    return [_note_same_frame(scan, names[scan.frame.image], named, part_of) for scan in scans]
 
 
 def _name(frame: FrameMeasurement) -> tuple[tuple[str, str], ...]:
     """What names the frame: its number, and the run, its frames or the date, as far as they are known."""
-    values = said(frame.writing or (), ("frame", *_SAME))
+    values = unique_fields(frame.writing or (), ("frame", *_SAME))
     return tuple(values.items()) if "frame" in values and len(values) > 1 else ()
 
 
-def _with_problem(
+def _note_same_frame(
     scan: MeasuredScan,
     name: tuple[tuple[str, str], ...],
     named: Mapping[tuple[tuple[str, str], ...], list[str]],

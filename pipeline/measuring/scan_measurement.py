@@ -29,9 +29,9 @@ from pipeline.measuring.tone_stage import tone_before
 from pipeline.provenance import parts_hash
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails
-from pipeline.workers import Submits, results_of
+from pipeline.workers import Submits, iterate_results
 
-Look = Callable[[Scan, MeasuredScan], None]
+SecondPass = Callable[[Scan, MeasuredScan], None]
 
 
 _COUNTED = Path("/proc/self/io")
@@ -44,7 +44,7 @@ def measure_scans(
 
     executor: None: here, one after the other. in_flight: how many tasks are handed out at a time.
     """
-    for task, result in results_of(measured_scan, tasks, executor, in_flight):
+    for task, result in iterate_results(measured_scan, tasks, executor, in_flight):
         yield ended_scan(task, result) if isinstance(result, Exception) else result
 
 
@@ -59,7 +59,7 @@ def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
     )
 
 
-def measured_scan(task: ScanTask, look: Look | None = None) -> MeasuredScan:
+def measured_scan(task: ScanTask, look: SecondPass | None = None) -> MeasuredScan:
     """Measure one scan: its fiducials, then its targets. A scan that cannot be measured is a result that says why: this
     raises nothing but interrupts. look: gets the scan while it is open, and what was measured in it."""
     start = time.monotonic()
@@ -74,7 +74,7 @@ def failed_scan(task: ScanTask, code: FailureCode, sentence: str) -> MeasuredSca
     """Of a scan that could not be measured: a row for each mark that would have been sought, all of them absent."""
     sentence = public_text(sentence)
     reason = Reason(f"the scan could not be measured: {sentence}", Code.FAILED_SCAN)
-    fiducials, targets = [mark.id for mark in task.options.camera.drawn], task.options.targets
+    fiducials, targets = [mark.id for mark in task.options.camera.layout_marks], task.options.targets
     marks = (
         *(MarkMeasurement(id, "fiducial", None, None, Status.ABSENT, reason) for id in fiducials),
         *(MarkMeasurement(id, "target", None, None, Status.ABSENT, reason) for id in (targets.ids if targets else ())),
@@ -111,16 +111,16 @@ def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
     )
 
 
-def _opened_and_measured(task: ScanTask, look: Look | None) -> MeasuredScan:
+def _opened_and_measured(task: ScanTask, look: SecondPass | None) -> MeasuredScan:
     with task.opened() as scan:
         window = scan.path.window if isinstance(scan.path, ScanPart) else None
-        measured = _in_window(task, scan, window) if window else _measured(task, scan, task.options)
+        measured = _measure_window(task, scan, window) if window else _measure(task, scan, task.options)
         if look is not None:
             look(scan, measured)
         return measured
 
 
-def _in_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
+def _measure_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
     """The scan with what a window of it shows, all places in pixels of the whole scan."""
     try:
         cropped = crop_scan(scan, window)
@@ -130,12 +130,12 @@ def _in_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
     fiducials = task.options.fiducials
     clicks = (replace(one, col_px=one.col_px - first[0], row_px=one.row_px - first[1]) for one in fiducials.clicks)
     options = replace(task.options, fiducials=replace(fiducials, clicks=tuple(clicks)))
-    measured = _measured(task, cropped, options)
+    measured = _measure(task, cropped, options)
     frame = moved_frame(measured.frame, first)
     return replace(measured, width_px=scan.width_px, height_px=scan.height_px, frame=frame)
 
 
-def _measured(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
+def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     """What a scan shows, whole or in a window."""
     # Fiducials are seen through the curve; targets have edges all round, and are measured as they are.
     tone = tone_before(options.tone, options.said, scan.path)
@@ -173,7 +173,7 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
         measured = replace(measured, problems=(*measured.problems, wrong) if wrong else measured.problems)
     if options.known_pose is not None and measured.pose is not None:
         measured = replace(measured, pose=options.known_pose)
-    return replace(measured, marks=_with_sizes(measured, layout, scan, pitch))
+    return replace(measured, marks=_add_sizes(measured, layout, scan, pitch))
 
 
 def reads_writing(options: ScanOptions) -> bool:
@@ -190,7 +190,7 @@ def _missed_reading(options: ScanOptions, frame: FrameMeasurement) -> tuple[str,
     return (f"{MISSING[0].upper()}{MISSING[1:]}.",) if is_requested and networks() is None else ()
 
 
-def _with_sizes(
+def _add_sizes(
     measured: FrameMeasurement, layout: FiducialLayout, scan: Scan, pitch_um: tuple[float, float] | None
 ) -> tuple[MarkMeasurement, ...]:
     """The marks with how large each is drawn in the scan, px, for whoever shows a picture of it."""

@@ -117,7 +117,7 @@ def scan_tasks(
 ) -> tuple[ScanTask, ...]:
     """Tasks of these images, in their order; scans that have all in common share their options. said: by image what
     other scans say of its scanner's curve. Raises InputError for marks that cannot be sought."""
-    options = options_of(project, said or {})
+    options = image_options(project, said or {})
     scans = {name: project.scans.get(name) for name in names}
     return tuple(
         ScanTask(name, "" if scan is None else fetch_location(scan), options(name), project.max_pixels)
@@ -125,7 +125,7 @@ def scan_tasks(
     )
 
 
-def options_of(project: Project, said: Mapping[str, tuple[ToneInformation, ...]]) -> Callable[[str], ScanOptions]:
+def image_options(project: Project, said: Mapping[str, tuple[ToneInformation, ...]]) -> Callable[[str], ScanOptions]:
     """How each image is to be measured, by its name; as `scan_tasks` has it."""
     cameras = {name: _sought(project, camera) for name, camera in project.cameras.items()}
     key_of = {id(camera): name for name, camera in project.cameras.items()}
@@ -133,11 +133,11 @@ def options_of(project: Project, said: Mapping[str, tuple[ToneInformation, ...]]
     shared: dict[tuple[object, ...], ScanOptions] = {}
 
     def options_for(name: str) -> ScanOptions:
-        given = project.camera_of(name)
+        given = project.image_camera(name)
         pose, known = _pose(project, given, name)
         by_others = said.get(name, ())
         exterior = project.given_images.exterior.get(name) if project.given_images and targets else None
-        part = bool(project.part_of(name))
+        part = bool(project.scanned_frame(name))
         key = (key_of[id(given)], pose, known is None, part, *map(id, by_others), id(exterior))
         if key not in shared:
             film = project.film
@@ -158,10 +158,10 @@ def _targets(project: Project) -> "SoughtTargets | None":
         return None
     from pipeline.measuring.target_stage import SoughtTargets  # and all that looks for them
 
-    return SoughtTargets.of(project)
+    return SoughtTargets.from_project(project)
 
 
-def few_of(names: Sequence[str], count: int) -> list[str]:
+def sample_names(names: Sequence[str], count: int) -> list[str]:
     """So many of them, in their order: the same ones where another name comes to them, but rarely."""
     chosen = set(sorted(names, key=lambda name: sha256(name.encode("utf-8", "surrogateescape")).digest())[:count])
     return [name for name in names if name in chosen]

@@ -46,7 +46,7 @@ class _Verdict:
     is_beyond: bool
 
 
-def with_checked_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
+def check_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
     """The scans, those points of a sheet or board doubted or refused that lie where neither the other points of their
     picture nor the other pictures of the sheet put them."""
     sheet = _sheet(project)
@@ -54,7 +54,7 @@ def with_checked_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple
         return tuple(scans)
     images = _images(project, scans, sheet)
     verdicts = dict(zip(images, _verdicts(list(images.values()), sheet), strict=True))
-    return tuple(_judged(scan, verdicts.get(scan.frame.image, {})) for scan in scans)
+    return tuple(_apply_verdicts(scan, verdicts.get(scan.frame.image, {})) for scan in scans)
 
 
 def _sheet(project: Project) -> _Sheet | None:
@@ -65,7 +65,7 @@ def _sheet(project: Project) -> _Sheet | None:
         return _Sheet(tuple(points), plane_coordinates(np.array(list(points.values()))))
     if settings is None or settings.code is None:
         return None
-    coded = CodedPoints.of(project, settings)
+    coded = CodedPoints.from_project(project, settings)
     return _Sheet(coded.ids, plane_coordinates(coded.xyz)) if coded.is_flat else None
 
 
@@ -74,13 +74,13 @@ def _images(project: Project, scans: Sequence[MeasuredScan], sheet: _Sheet) -> d
     row = {id: i for i, id in enumerate(sheet.ids)}
     images: dict[str, ImagePoints] = {}
     for camera in project.cameras.values():
-        own = [scan for scan in scans if project.camera_of(scan.frame.image) is camera]
-        points = predict_sheet_points([_seen(scan, row) for scan in own], sheet.places)
+        own = [scan for scan in scans if project.image_camera(scan.frame.image) is camera]
+        points = predict_sheet_points([_sheet_image(scan, row) for scan in own], sheet.places)
         images |= {scan.frame.image: one for scan, one in zip(own, points, strict=True) if one is not None}
     return images
 
 
-def _seen(scan: MeasuredScan, row: Mapping[str, int]) -> SheetImage:
+def _sheet_image(scan: MeasuredScan, row: Mapping[str, int]) -> SheetImage:
     targets = [mark for mark in scan.frame.marks if mark.kind == "target" and mark.point in row]
     marks = [mark for mark in targets if mark.status.is_observation]
     return SheetImage(
@@ -111,15 +111,15 @@ def _verdicts(images: Sequence[ImagePoints], sheet: _Sheet) -> list[dict[str, _V
     return verdicts
 
 
-def _judged(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> MeasuredScan:
+def _apply_verdicts(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> MeasuredScan:
     marks = tuple(
-        _judged_mark(mark, verdicts[mark.point]) if mark.kind == "target" and mark.point in verdicts else mark
+        _apply_verdict(mark, verdicts[mark.point]) if mark.kind == "target" and mark.point in verdicts else mark
         for mark in scan.frame.marks
     )
     return replace(scan, frame=replace(scan.frame, marks=marks))
 
 
-def _judged_mark(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
+def _apply_verdict(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
     """Without another picture nobody knows whether the mark is off its place, or the point on the sheet; of a few which
     one is off."""
     if verdict.chance > SHEET_POINT_OFF_PLACE:

@@ -141,7 +141,7 @@ class Field:
     normals: Mapping[str, Array]
     radius: float
 
-    def of(self, rows: Sequence[int]) -> "Field":
+    def select(self, rows: Sequence[int]) -> "Field":
         """Some of them."""
         return replace(self, ids=tuple(self.ids[row] for row in rows), xyz=self.xyz[rows], sigmas=self.sigmas[rows])
 
@@ -201,14 +201,14 @@ def checked_places(
     if len(observed) < 2:
         return tuple(marks)
     row = {id: i for i, id in enumerate(field.ids)}
-    targets = target_places(field.of([row[id] for id in observed]), model, scan)
+    targets = target_places(field.select([row[id] for id in observed]), model, scan)
     comparison = compare_targets(targets, places_px, covariances, (scan.width_px, scan.height_px))
     far = np.linalg.norm(comparison.off_px, axis=1)
     verdicts = dict(zip(observed, zip(far.tolist(), comparison.chance.tolist(), strict=True), strict=True))
-    return tuple(_judged(mark, verdicts) for mark in marks)
+    return tuple(_apply_verdict(mark, verdicts) for mark in marks)
 
 
-def _judged(mark: MarkMeasurement, verdicts: Mapping[str, tuple[float, float]]) -> MarkMeasurement:
+def _apply_verdict(mark: MarkMeasurement, verdicts: Mapping[str, tuple[float, float]]) -> MarkMeasurement:
     off_px, chance = verdicts.get(mark.point, (0.0, 1.0))
     if chance > TARGET_OFF_PLACE:
         return mark

@@ -71,11 +71,11 @@ class SoughtTargets:
     unit_mm: float
 
     @classmethod
-    def of(cls, project: Project) -> "SoughtTargets":
+    def from_project(cls, project: Project) -> "SoughtTargets":
         """Raises InputError for single targets and rings that nothing in the project could name."""
         settings = project.targets
         assert settings is not None
-        coded = CodedPoints.of(project, settings) if settings.code is not None else None
+        coded = CodedPoints.from_project(project, settings) if settings.code is not None else None
         field = target_field(project)
         if settings.board is None and coded is None:
             _check(project, settings, field)
@@ -122,8 +122,8 @@ def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) ->
     settings, field = sought.settings, sought.field
     if sought.coded is not None:
         if sought.coded.is_flat:
-            return with_targets(measured, *measure_sheet(scan, sought.coded))
-        return with_targets(measured, *measure_coded_field(scan, sought.coded, field, options.camera, measured))
+            return replace_targets(measured, *measure_sheet(scan, sought.coded))
+        return replace_targets(measured, *measure_coded_field(scan, sought.coded, field, options.camera, measured))
     if settings.board is not None:
         board = measure_board(scan, settings.board)
         refused = (
@@ -135,18 +135,18 @@ def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) ->
         # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
         notes = tuple(f"{note}." for note in board.notes) if sought.surveyed else ()
         mirrored = (_MIRRORED,) if board.is_mirrored and not settings.transparent else ()
-        return with_targets(measured, board.marks, (*problems, *mirrored, *notes), Code.NO_BOARD)
+        return replace_targets(measured, board.marks, (*problems, *mirrored, *notes), Code.NO_BOARD)
     found, notes = _oriented_by_targets(options, sought, scan, measured)
     if isinstance(found, str):
         unnamed = Reason(found, Code.UNNAMED)
         marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in field.ids)
-        return with_targets(measured, marks, (*notes, f"No target has a name: {found}."))
+        return replace_targets(measured, marks, (*notes, f"No target has a name: {found}."))
     model, predictions = found
     fitted = measure_single_targets(scan, predictions, settings)
-    return with_targets(measured, checked_places(fitted, field, model, measured), notes)
+    return replace_targets(measured, checked_places(fitted, field, model, measured), notes)
 
 
-def with_targets(
+def replace_targets(
     measured: MeasuredScan,
     targets: Sequence[MarkMeasurement],
     problems: Sequence[str] = (),

@@ -18,7 +18,7 @@ from measure.tie_points.joins import measure_joins
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TieSettings
-from pipeline.measuring.sheet_check import with_checked_sheet
+from pipeline.measuring.sheet_check import check_sheet
 from pipeline.progress import Count, Reporter
 from pipeline.results.measured_record import MeasuredScan
 
@@ -36,34 +36,36 @@ _NO_FRAME = Reason(
 TiedScan = NewType("TiedScan", MeasuredScan)  # beside all others of its project
 
 
-def with_joins(
+def add_joins(
     project: Project, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
 ) -> tuple[MeasuredScan, ...]:
     """The scans, those of one frame with the joins that they share; where their fiducials contradict these, with a
     problem, and then those of the scan that shows fewer are rejected."""
     by_frame: dict[str, list[MeasuredScan]] = {}
     for scan in scans:
-        if frame := project.part_of(scan.frame.image):
+        if frame := project.scanned_frame(scan.frame.image):
             by_frame.setdefault(frame, []).append(scan)
     joined: dict[str, MeasuredScan] = {}
     for done, (frame, parts) in enumerate(sorted(by_frame.items()), 1):
-        joined |= {scan.frame.image: scan for scan in _joined(project, frame, parts, workers)}
+        joined |= {scan.frame.image: scan for scan in _join_parts(project, frame, parts, workers)}
         count(frame, done, len(by_frame))
     return tuple(joined.get(scan.frame.image, scan) for scan in scans)
 
 
-def _joined(
+def _join_parts(
     project: Project, frame: str, parts: Sequence[MeasuredScan], workers: Executor | None
 ) -> list[MeasuredScan]:
     if len(parts) < 2:
         lacking = Reason(
             f"It is a part of frame {frame}, of which no other scan could be measured: nothing joins it.", Code.FEW_TIES
         )
-        return [_with(scan, (), (lacking,)) for scan in parts]
+        return [_add_marks(scan, (), (lacking,)) for scan in parts]
     parts = sorted(parts, key=lambda scan: scan.frame.image)
     joins = measure_joins([_part_frame(project, scan) for scan in parts], workers=workers)
     problems = {image: (problem,) for image, problem in joins.problems.items()}
-    return _agreed([_with(scan, joins.marks[scan.frame.image], problems.get(scan.frame.image, ())) for scan in parts])
+    return _agreed(
+        [_add_marks(scan, joins.marks[scan.frame.image], problems.get(scan.frame.image, ())) for scan in parts]
+    )
 
 
 def _part_frame(project: Project, scan: MeasuredScan) -> TieFrame:
@@ -76,7 +78,7 @@ def _part_frame(project: Project, scan: MeasuredScan) -> TieFrame:
     return TieFrame(scan.frame.image, scan_path(scan.scan), np.eye(2, 3), None, marks, project.max_pixels)
 
 
-def _with(scan: MeasuredScan, marks: Sequence[MarkMeasurement], problems: Sequence[Reason]) -> MeasuredScan:
+def _add_marks(scan: MeasuredScan, marks: Sequence[MarkMeasurement], problems: Sequence[Reason]) -> MeasuredScan:
     frame = scan.frame
     return replace(scan, frame=replace(frame, marks=(*frame.marks, *marks), problems=(*frame.problems, *problems)))
 
@@ -98,10 +100,10 @@ def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
             for scan, other in ((first, second), (second, first)):
                 result[scan.frame.image] = _contradicted(result[scan.frame.image], other, off_mm)
     checked_parts = [_unchecked(result[scan.frame.image], scan.frame.image in checked) for scan in scans]
-    return [_with_others(scan, checked_parts) for scan in checked_parts]
+    return [_excuse_outside(scan, checked_parts) for scan in checked_parts]
 
 
-def _with_others(scan: MeasuredScan, parts: Sequence[MeasuredScan]) -> MeasuredScan:
+def _excuse_outside(scan: MeasuredScan, parts: Sequence[MeasuredScan]) -> MeasuredScan:
     """Fiducials outside of a scan that another part shows are not missed."""
     shown = {point: part.frame.image for part in reversed(parts) for point in _fiducials(part)}
     marks = [
@@ -201,7 +203,7 @@ def check_tie_names(project: Project) -> None:
         )
 
 
-def with_ties(
+def add_ties(
     project: Project, settings: TieSettings, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
 ) -> tuple[MeasuredScan, ...]:
     """The scans with the natural points that they share."""
@@ -224,7 +226,7 @@ def with_ties(
 
 def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
     """None where the camera has fiducials and too few of them were measured."""
-    camera = project.camera_of(scan.frame.image)
+    camera = project.image_camera(scan.frame.image)
     taken = [
         (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
         for mark in scan.frame.marks
@@ -238,21 +240,21 @@ def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
         pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
         frame_mm = None
     path, marks = scan_path(scan.scan), np.array(taken).reshape(-1, 3)
-    frame = project.part_of(scan.frame.image)
+    frame = project.scanned_frame(scan.frame.image)
     return TieFrame(scan.frame.image, path, pixel_from_camera, frame_mm, marks, project.max_pixels, frame)
 
 
-def tied(
+def tie_scans(
     project: Project, scans: Sequence[MeasuredScan], reporter: Reporter, executor: Executor | None = None
 ) -> tuple[TiedScan, ...]:
     """Checked scans as all of the project together show them, in their order: points of a sheet or board that
     contradict its other pictures, what joins the parts of frames, and natural points."""
-    together = with_checked_sheet(project, [scan for scan in scans if not scan.failure])
+    together = check_sheet(project, [scan for scan in scans if not scan.failure])
     if project.has_parts:
         with reporter.stage("parts joined of") as count:
-            together = with_joins(project, together, count, executor)
+            together = add_joins(project, together, count, executor)
     if project.ties is not None:
         with reporter.stage("natural points sought in") as count:
-            together = with_ties(project, project.ties, together, count, executor)
+            together = add_ties(project, project.ties, together, count, executor)
     by_image = {scan.frame.image: scan for scan in together}
     return tuple(TiedScan(by_image.get(scan.frame.image, scan)) for scan in scans)

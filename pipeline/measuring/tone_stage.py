@@ -14,7 +14,7 @@ from measure.scans.opening import declared_tone
 from measure.tone.curve import Tone, ToneInformation, power, srgb
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.scan_task import Measure, Memory, few_of, scan_tasks
+from pipeline.measuring.scan_task import Measure, Memory, sample_names, scan_tasks
 from pipeline.progress import Reporter
 from pipeline.provenance import fingerprint
 from pipeline.results.measured_record import read_tone_information, tone_information_record
@@ -29,12 +29,12 @@ def tone_before(setting: float | str, said: Sequence[ToneInformation], scan: Pat
     return _prior(setting, scan).include_information(said)
 
 
-def said_of_tones(
+def collect_tones(
     project: Project, reporter: Reporter, measure: Measure, memory: Memory
 ) -> Mapping[str, tuple[ToneInformation, ...]]:
     """By image what others of its scanner say of the curve: some scans of each, where marks of the camera lean on it. A
     scan that cannot be measured says nothing. What was said once stays, whatever scans come or go."""
-    names = [name for name in project.scans if _leans_on_tone(project.camera_of(name))]
+    names = [name for name in project.scans if _leans_on_tone(project.image_camera(name))]
     if project.tone != "auto" or len(names) < 2:
         return {}
     kinds: dict[str, list[str]] = {}
@@ -42,7 +42,7 @@ def said_of_tones(
         kinds.setdefault(_kind(project, name), []).append(name)
     keys = {kind: _key(project, kind, of_kind) for kind, of_kind in kinds.items() if len(of_kind) > 1}
     before = {kind: memory.recall(key) for kind, key in keys.items()}
-    samples = {kind: few_of(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
+    samples = {kind: sample_names(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
     said = {name: read_tone_information(one) for kept in before.values() for name, one in (kept or {}).items()}
     with reporter.stage("tone curve estimated from") as tell:
@@ -63,7 +63,7 @@ def said_of_tones(
 
 def _key(project: Project, kind: str, names: Sequence[str]) -> str:
     """Of what the scans of a scanner say: by which marks and settings they are asked."""
-    firsts = {project.camera_of(name).path: name for name in reversed(names)}
+    firsts = {project.image_camera(name).path: name for name in reversed(names)}
     tasks = scan_tasks(project, sorted(firsts.values()))
     options = sorted(task.fiducials_alone(project.tone).options_json() for task in tasks)
     return f"tone {fingerprint([kind, options, MEASURE_REVISION])}"
@@ -81,12 +81,12 @@ def _kind(project: Project, image: str) -> str:
     """One scanner codes light in one way, but for files of another kind or that say another curve."""
     scan = project.scans[image]
     curve_hash = sha256(np.ascontiguousarray(_prior(project.tone, scan).base).tobytes()).hexdigest()[:8]
-    return f"{project.scanner_of(image)} {scan.suffix.lower()} {curve_hash}"
+    return f"{project.image_scanner(image)} {scan.suffix.lower()} {curve_hash}"
 
 
 def _leans_on_tone(camera: CameraFile) -> bool:
     """Whether it has marks that another curve moves: those with edges on one side only."""
-    return any(_has_tip(one.mark) for one in camera.drawn)
+    return any(_has_tip(one.mark) for one in camera.layout_marks)
 
 
 def _has_tip(mark: Mark | object) -> bool:

@@ -58,7 +58,7 @@ def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None 
     says which.
     """
     names = [camera.name for camera in adjustment.network.cameras]
-    return Check.of({name: _check_camera(adjustment, name, pictures) for name in names})
+    return Check.from_cameras({name: _check_camera(adjustment, name, pictures) for name in names})
 
 
 class _NotPossible(Exception):
@@ -195,7 +195,7 @@ def _rows(
     names: Sequence[str], freedom: Freedom, conversion: Converted, sigma0: float, opencv: OpenCvCalibration
 ) -> tuple[Row, ...]:
     return tuple(
-        Row.of(
+        Row.from_numbers(
             name,
             "mm" if name in INTERIOR else "rad" if name in ("tau_x", "tau_y") else "1",
             Estimate(float(conversion.parameters[k]), float(sigma0 * conversion.sigmas[k])),

@@ -8,7 +8,7 @@ from typing import Any
 from pipeline.archive.results_database import known_identities
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.provenance import FileStates, Identity, fingerprint, of_content, parts_hash
+from pipeline.provenance import FileStates, Identity, fingerprint, hash_content, parts_hash
 from pipeline.results.comparator_file import ComparatorPoint
 
 MadeFrom = dict[str, str]
@@ -57,8 +57,8 @@ def measured_from(project: Project) -> MadeFrom:
     ]
 
     def scan_hash(image: str, path: Path) -> str:
-        text = f"{_parts(path, project, known, files)} {project.camera_of(image).name}"
-        return of_content(text.encode("utf-8", "surrogateescape"))
+        text = f"{_parts(path, project, known, files)} {project.image_camera(image).name}"
+        return hash_content(text.encode("utf-8", "surrogateescape"))
 
     return {
         SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
@@ -88,7 +88,7 @@ def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFro
 def _parts(path: Path, project: Project, known: Mapping[str, Identity], files: FileStates) -> tuple[int, str]:
     """Of a scan's file its size and what its telling parts hold: read only where it is not as the store knows it. A
     file that was touched, or stands elsewhere, is the same."""
-    state = files.of(path)
+    state = files.get(path)
     found = known.get(state.uri)
     is_known = found is not None and found.state == state
     return state.bytes, found.parts_hash if found is not None and is_known else parts_hash(path, project.max_pixels)

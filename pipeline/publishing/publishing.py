@@ -43,7 +43,7 @@ class Unpublished:
             return path.with_name(f".{path.stem}{self.folder.name}{path.suffix}")
         return self.folder / path.relative_to(self._project.output)
 
-    def at(self, path: Path) -> Path:
+    def current_path(self, path: Path) -> Path:
         """Where the result of `path` stands now, if there is one: not yet published, or an earlier one."""
         place = self.place(path)
         return place if place.exists() or path in self._removed else path

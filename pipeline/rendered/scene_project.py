@@ -13,7 +13,7 @@ from adjust.functional_model.lens import Prior
 from measure.marks import shapes
 from pipeline.files.camera_file import CameraFile, GivenFiducial
 from pipeline.files.camera_text import camera_text
-from pipeline.files.mark_table import saved_in
+from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_tables import UNITS_MM
 from pipeline.rendered.design_table import DesignSettings
 from pipeline.text.atomic import write_atomically
@@ -64,7 +64,7 @@ def write_project(scene_file: SceneFile, out_dir: Path) -> None:
     """Write camera.toml, points.csv, images.csv and project.toml. Raises InputError where that cannot be done."""
     generator = np.random.default_rng([scene_file.scene.seed, 20])
     camera = replace(_given_camera(scene_file, generator), path=out_dir / "camera.toml")
-    write_atomically(camera.path, camera_text(camera, saved_in(out_dir)))
+    write_atomically(camera.path, camera_text(camera, picture_writer(out_dir)))
     targets = field_targets(scene_file.scene.field)
     if targets:
         write_atomically(out_dir / "points.csv", _points_csv(scene_file, targets, generator))

@@ -11,7 +11,7 @@ from pipeline.report.data import ReportData
 from pipeline.results.adjustment_record import CameraRecord, Quantity
 from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import ImageUnit
-from pipeline.results.pixel_intrinsics import in_pixels
+from pipeline.results.pixel_intrinsics import pixel_intrinsics
 from pipeline.types import Array
 
 INTERIOR_MEANING = {
@@ -61,11 +61,11 @@ def camera_values(data: ReportData, name: str) -> list[CameraValue]:
     known = {key: camera.interior[key] for key in ("c", "x0", "y0")} | known
     keys = [Parameter.interior(name, key) for key in known]
     sigmas = np.array([each.sigma for each in known.values()])
-    model = np.diag(sigmas**2) if data.covariance is None else data.covariance.of(keys)
+    model = np.diag(sigmas**2) if data.covariance is None else data.covariance.select(keys)
     values, by_mm = _stated(camera, known, unit)
     sigma = _sigmas(by_mm, model) if np.isfinite(sigmas).all() else np.abs(by_mm) @ sigmas
     if data.covariance is not None and data.covariance.clusters is not None:
-        sigma = np.maximum(sigma, _sigmas(by_mm, data.covariance.clusters.of(keys)))
+        sigma = np.maximum(sigma, _sigmas(by_mm, data.covariance.clusters.select(keys)))
     return list(map(CameraValue, values, values.values(), sigma.tolist(), _units(camera, values, unit)))
 
 
@@ -73,7 +73,7 @@ def _stated(camera: CameraRecord, known: Mapping[str, Quantity], unit: ImageUnit
     """The values by their names in this unit, and their derivatives by those in mm."""
     mm = {key: each.value for key, each in known.items()}
     if unit.is_pixel and family_of(camera.distortion.family).y_down:
-        return in_pixels(mm, 1.0 / unit.per_mm)
+        return pixel_intrinsics(mm, 1.0 / unit.per_mm)
     scale = np.array([unit.per_mm if key in ("c", "x0", "y0") else 1.0 for key in mm])
     return dict(zip(mm, (scale * list(mm.values())).tolist(), strict=True)), np.diag(scale)
 
@@ -93,5 +93,5 @@ def cluster_ratio(name: str, camera: CameraRecord, covariance: Covariance | None
     keys = [key for key, each in camera.interior.items() if each.sigma > 0.0]
     if covariance is None or covariance.clusters is None or not keys:
         return 0.0
-    scatter = np.diagonal(covariance.clusters.of(Parameter.interior(name, key) for key in keys))
+    scatter = np.diagonal(covariance.clusters.select(Parameter.interior(name, key) for key in keys))
     return float((np.sqrt(scatter) / [camera.interior[key].sigma for key in keys]).max())

@@ -75,7 +75,7 @@ def camera_views(data: ReportData) -> list[CameraView]:
 
 
 def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraRecord) -> CameraView:
-    images, by_image = stored.images_of(name), residuals_by_image(data)
+    images, by_image = stored.camera_images(name), residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
     known, unit = data.covariance if stored.converged else None, data.unit_of_camera(name)
     # Where there is no solution, none of what is missing was left out.

@@ -97,7 +97,7 @@ class ReportData:
         sizes: dict[str, set[float]] = {name: set() for name in stored.cameras}
         for name, image in stored.images.items():
             is_film = image.transformation.kind != "none"
-            sizes[stored.camera_of(name)] |= {math.nan} if is_film else {*self.pitch_um.get(name, (math.nan,))}
+            sizes[stored.image_camera(name)] |= {math.nan} if is_film else {*self.pitch_um.get(name, (math.nan,))}
         if any(len(each) != 1 or math.isnan(min(each)) for each in sizes.values()):
             return {}
         return {name: ImageUnit(min(each)) for name, each in sizes.items()}
@@ -107,4 +107,4 @@ class ReportData:
 
     def unit_of_image(self, image: str) -> ImageUnit:
         stored = self.adjustment
-        return self.unit_of_camera(stored.camera_of(image)) if stored and image in stored.images else FILM_UNIT
+        return self.unit_of_camera(stored.image_camera(image)) if stored and image in stored.images else FILM_UNIT

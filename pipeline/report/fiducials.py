@@ -95,7 +95,7 @@ def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figur
     camera = stored.cameras[name]
     if _is_measured(name, stored):
         return figure_of_films(name, camera.fiducials, covariance, {}, _MEASURED)
-    films = {} if camera.is_calibrated else stored.films(stored.images_of(name))
+    films = {} if camera.is_calibrated else stored.films(stored.camera_images(name))
     return figure_of_films(name, camera.fiducials, covariance, films)
 
 
@@ -133,7 +133,7 @@ def figure_of_films(
         image, first = next(iter(films.items()))
         unknowns += [Parameter.film(image, each) for each in film_parameter_names(first.transformation)]
     by_unknowns = left.by_unknowns[:, : len(unknowns)]
-    whole = covariance.of(unknowns[: by_unknowns.shape[1]])
+    whole = covariance.select(unknowns[: by_unknowns.shape[1]])
     keeps = not films or left.transformation in KEEPS_DISTANCES
     distances = _distances(tuple(known), estimated, given, whole[:count, :count]) if keeps else ()
     changes = 1e3 * left.corrections_mm, 1e6 * by_unknowns @ whole @ by_unknowns.T

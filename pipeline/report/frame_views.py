@@ -172,7 +172,7 @@ def _plots(
 
     def plot(image: str) -> Markup:
         places, unit = vectors.VectorField.from_residuals(by_image[image]).places_mm, data.unit_of_image(image)
-        on = vectors.plane(places, data.frame_mm.get(stored.camera_of(image)), PLOT_PX, unit)
+        on = vectors.plane(places, data.frame_mm.get(stored.image_camera(image)), PLOT_PX, unit)
         return vectors.image_plot(image, by_image[image], on, scale, suspects)
 
     return {image: plot(image) for image in images}

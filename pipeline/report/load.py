@@ -5,12 +5,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pipeline.archive.measurement import StoredMarks, made_from_of, measured_scans
+from pipeline.archive.measurement import StoredMarks, measured_scans, read_inputs
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import inapplicable
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
-from pipeline.provenance import of_file
+from pipeline.provenance import hash_file
 from pipeline.publishing.made_from import (
     CAMERA,
     DECISIONS,
@@ -28,12 +28,12 @@ from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.check_file import read_check
 from pipeline.results.comparator_file import (
     ComparatorPoint,
-    decisions_of,
-    decisions_told,
+    describe_decisions,
     has_pixels_alone,
-    measurement_of,
-    pitches_of,
     read_comparator,
+    read_decision_counts,
+    read_measurement_hash,
+    read_pitches,
 )
 from pipeline.results.covariance_file import read_covariance
 from pipeline.results.measured_record import FailureCode, MeasuredScan
@@ -52,7 +52,7 @@ def measured_data(
     """
     comparator = at(project.comparator)
     marks = read_comparator(comparator, project.list_pitch_um) if rows is None else rows
-    pitch_um = pitches_of(comparator)
+    pitch_um = read_pitches(comparator)
     if project.list_pitch_um is not None and has_pixels_alone(comparator):
         pitch_um = dict.fromkeys((mark.image for mark in marks), project.list_pitch_um)
     data = ReportData(
@@ -61,13 +61,13 @@ def measured_data(
         pitch_um=pitch_um,
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
-        notes=tuple(filter(None, [outside_note(project), decisions_told(decisions_of(comparator))])),
-        made_from={project.comparator.name: of_file(comparator)},
+        notes=tuple(filter(None, [outside_note(project), describe_decisions(read_decision_counts(comparator))])),
+        made_from={project.comparator.name: hash_file(comparator)},
     )
-    digest, path = measurement_of(comparator), project.measurement_path
+    digest, path = read_measurement_hash(comparator), project.measurement_path
     if not path.exists():
         return data
-    made = made_from_of(path, digest)
+    made = read_inputs(path, digest)
     if made is None and not digest:
         return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
     if made is None:
@@ -135,11 +135,11 @@ def _stored(project: Project, at: At) -> StoredMarks | None:
     """The marks where they need not be read all: comparator.csv is as it was written, and nothing is adjusted."""
     if not project.scans or at(project.adjustment_path).exists():
         return None
-    return StoredMarks.of(project.measurement_path, at(project.comparator))
+    return StoredMarks.open(project.measurement_path, at(project.comparator))
 
 
 def _camera_name(project: Project, image: str) -> str:
-    return project.camera_of(image).name
+    return project.image_camera(image).name
 
 
 def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> ReportData:
@@ -147,7 +147,7 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
     data, path = measured_data(project, at, most_frames), at(project.adjustment_path)
     if not path.exists():
         return data
-    adjustment, covariance, fingerprint = read_adjustment(path), read_covariance(path), of_file(path)
+    adjustment, covariance, fingerprint = read_adjustment(path), read_covariance(path), hash_file(path)
     made, not_shown = adjustment.made_from, ""
     if others := differing(made, adjusted_from(project, data.comparator)):
         what = f"of other {' and '.join(others)} than there are now" if made else "of what it does not say"
@@ -166,7 +166,7 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
     if check.made_from != {path.name: fingerprint}:
         what = f"{check_path.name} is of another adjustment: it is not shown."
         return _add_problems(data, Problem(what, "Run `reseau check`."))
-    return replace(data, check=check, made_from={**data.made_from, check_path.name: of_file(check_path)})
+    return replace(data, check=check, made_from={**data.made_from, check_path.name: hash_file(check_path)})
 
 
 def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem]:

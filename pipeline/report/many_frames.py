@@ -210,7 +210,7 @@ def _verdicts(data: ReportData, shots: Sequence[Frame]) -> Mapping[tuple[str, st
         return data.totals.verdicts
     stored, counts = data.adjustment, defaultdict[tuple[str, str], Counter[str]](Counter)
     for frame in shots:
-        camera = stored.camera_of(frame.image) if stored and frame.image in stored.images else "none"
+        camera = stored.image_camera(frame.image) if stored and frame.image in stored.images else "none"
         kind = camera, _ending(frame.scan.scan) if frame.scan else "given"
         counts[kind][_verdict(frame)] += 1
     return counts

@@ -70,7 +70,7 @@ def _scaled(known: Quantity, factor: float) -> Quantity:
 def high_correlations(name: str, camera: CameraRecord, covariance: Covariance) -> list[tuple[str, str, float]]:
     """Pairs of parameters that the observations hardly tell apart, the highest correlation first."""
     parameters = ["c", "x0", "y0", *parameter_names(camera.distortion.family)]
-    block = covariance.of(Parameter.interior(name, parameter) for parameter in parameters)
+    block = covariance.select(Parameter.interior(name, parameter) for parameter in parameters)
     sigma = np.sqrt(np.maximum(np.diag(block), 0.0))
     free = np.flatnonzero(sigma > 0.0)
     correlation = block[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])

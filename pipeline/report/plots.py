@@ -41,7 +41,7 @@ def write_plots(data: ReportData, folder: Path) -> list[Path]:
     files = []
     for camera, record in calibrated_cameras(data):
         figure = Figure(figsize=SIZE_IN, layout="constrained")
-        for name in _drawn(camera, record, figure):
+        for name in _draw(camera, record, figure):
             for ending in ("png", "pdf"):
                 path = folder / f"{file_word(camera.name)}-{name}.{ending}"
                 with atomic_path(path) as new:
@@ -53,7 +53,7 @@ def write_plots(data: ReportData, folder: Path) -> list[Path]:
     return files
 
 
-def _drawn(plots: CameraPlots, record: CameraRecord, figure: "Figure") -> Iterator[str]:
+def _draw(plots: CameraPlots, record: CameraRecord, figure: "Figure") -> Iterator[str]:
     """Draw one plot after the other; its name in the files."""
     plots.plot_residuals(figure.subplots())
     yield "residuals"
@@ -75,7 +75,7 @@ def calibrated_cameras(data: ReportData) -> Iterator[tuple[CameraPlots, CameraRe
         return
     by_image = residuals_by_image(data)
     for name, record in stored.cameras.items():
-        images = stored.images_of(name)
+        images = stored.camera_images(name)
         rows = [row for image in images for row in by_image.get(image, []) if row.kind != "join"]
         is_fiducial = np.array([row.kind == "fiducial" for row in rows], dtype=bool)
         if not record.is_calibrated or is_fiducial.all():

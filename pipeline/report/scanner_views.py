@@ -66,6 +66,6 @@ def bend_field(name: str, scanner: ScannerRecord, covariance: Covariance, xy_mm:
     """How far the scanner puts points (n, 2) in mm off their places, (n, 2) in um, with the covariances (n, 2, 2)."""
     bend, values = scanner.bend()
     at = bend.displacement(values, xy_mm)
-    of_terms = covariance.of(Parameter.scanner(name, term) for term in scanner.terms)
+    of_terms = covariance.select(Parameter.scanner(name, term) for term in scanner.terms)
     by_terms = UM_PER_MM * at.parameter_jacobian
     return UM_PER_MM * at.value, np.einsum("nik,kl,njl->nij", by_terms, of_terms, by_terms)

@@ -66,7 +66,7 @@ def image_chain(
     image = adjustment.images[name]
     scanner = adjustment.scanners.get(image.scanner)
     bend = (NO_BEND, np.empty(0)) if scanner is None else scanner.bend()
-    lens = adjustment.cameras[adjustment.camera_of(name)].lens() if with_lens else None
+    lens = adjustment.cameras[adjustment.image_camera(name)].lens() if with_lens else None
     return FrameChain(pitch_um, image.transformation.film(middle_mm), *bend, lens)
 
 

@@ -123,7 +123,7 @@ def resample_tasks(
     failed = []
     for measured in read_measurement(project.measurement_path):
         image = measured.frame.image
-        frame = project.part_of(image) or image
+        frame = project.scanned_frame(image) or image
         chain = _chain(measured, adjustment, with_lens, is_part=frame != image)
         if isinstance(chain, str):
             failed.append(Resampled(image, None, problem=chain))
@@ -135,7 +135,7 @@ def resample_tasks(
         pitch_mm = (pitch_um or float(np.sqrt(np.prod(measured.pitch_um)))) / 1000.0
         tasks[frame] = ResampleTask(
             image=frame,
-            camera=project.camera_of(image).name,
+            camera=project.image_camera(image).name,
             scan=scan_path(measured.scan),
             chain=chain,
             pose=measured.frame.pose.name if measured.frame.pose else "0",

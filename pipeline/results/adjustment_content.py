@@ -160,7 +160,7 @@ def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float
     return CameraRecord(
         principal_distance_mm=quantity("c", camera.principal_distance_mm),
         principal_point_mm=PrincipalPointRecord(quantity("x0", camera.x0_mm), quantity("y0", camera.y0_mm)),
-        distortion=DistortionRecord.of(camera.distortion, parameters),
+        distortion=DistortionRecord.from_distortion(camera.distortion, parameters),
         significance=together,
         fiducials={
             id: FiducialRecord(

@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
-from pipeline.provenance import of_file
+from pipeline.provenance import hash_file
 from pipeline.results.adjustment_content import adjustment_record
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.covariance_file import AGAIN, covariance_arrays, covariance_path
@@ -46,7 +46,7 @@ def write_adjustment(
         with result.open("w", encoding="utf-8", newline="\n") as file:
             file.writelines(json_text(record))
         del record
-        fingerprint, arrays = np.array(of_file(result)), covariance_arrays(adjustment)
+        fingerprint, arrays = np.array(hash_file(result)), covariance_arrays(adjustment)
         with covariance.open("wb") as data:
             np.savez_compressed(data, allow_pickle=False, fingerprint=fingerprint, **arrays)
 

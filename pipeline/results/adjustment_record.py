@@ -93,7 +93,7 @@ class DistortionRecord:
         )
 
     @classmethod
-    def of(cls, distortion: Distortion, parameters: Mapping[str, Quantity]) -> "DistortionRecord":
+    def from_distortion(cls, distortion: Distortion, parameters: Mapping[str, Quantity]) -> "DistortionRecord":
         """Of a distortion with the estimates of its parameters."""
         model = family(distortion.family)
         return cls(
@@ -432,12 +432,12 @@ class AdjustmentRecord:
         """Whether sigma0 was estimated, and standard deviations are not a priori ones."""
         return not self.variance_factor.a_priori
 
-    def camera_of(self, image: str) -> str:
+    def image_camera(self, image: str) -> str:
         """The name of an image's camera; the only one where the file does not say."""
         return self.images[image].camera or next(iter(self.cameras))
 
-    def images_of(self, camera: str) -> list[str]:
-        return [image for image in self.images if self.camera_of(image) == camera]
+    def camera_images(self, camera: str) -> list[str]:
+        return [image for image in self.images if self.image_camera(image) == camera]
 
     def films(self, images: Iterable[str]) -> dict[str, Film]:
         """The film transformations of some images, in their order."""
@@ -457,6 +457,6 @@ class AdjustmentRecord:
 
     def observed_mm(self, camera: str) -> Array:
         """(n, 2) where a camera has observations, in its frame."""
-        rows = (row for row in self.residuals if self.camera_of(row.image) == camera)
+        rows = (row for row in self.residuals if self.image_camera(row.image) == camera)
         places = np.array([(row.camera_x_mm, row.camera_y_mm) for row in rows], dtype=float).reshape(-1, 2)
         return np.asarray(places[np.isfinite(places).all(axis=1)])

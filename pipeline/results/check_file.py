@@ -29,7 +29,7 @@ class Row:
     difference_sigmas: float
 
     @classmethod
-    def of(cls, name: str, unit: str, reseau: Estimate, opencv: Estimate) -> "Row":
+    def from_numbers(cls, name: str, unit: str, reseau: Estimate, opencv: Estimate) -> "Row":
         apart = abs(reseau.value - opencv.value)
         return cls(name, unit, reseau, opencv, apart / reseau.sigma if reseau.sigma > 0 else 0.0)
 
@@ -85,7 +85,7 @@ class Check:
     cameras: Mapping[str, CameraCheck]
 
     @classmethod
-    def of(cls, cameras: Mapping[str, CameraCheck]) -> "Check":
+    def from_cameras(cls, cameras: Mapping[str, CameraCheck]) -> "Check":
         verdicts = {check.verdict for check in cameras.values()}
         verdict: Verdict = "agrees" if verdicts == {"agrees"} else "not possible"
         verdict = "differs" if "differs" in verdicts else verdict

@@ -22,7 +22,7 @@ class ModelRecord:
     bends: Mapping[str, tuple[str, ...]]
 
     @classmethod
-    def of(cls, model: Model) -> "ModelRecord":
+    def from_model(cls, model: Model) -> "ModelRecord":
         return cls(model.transformation, model.family, model.parameters, dict(model.bends))
 
 
@@ -56,7 +56,7 @@ class CandidateRecord:
     warnings: tuple[str, ...] | None = None
 
     @classmethod
-    def of(cls, candidate: Candidate) -> "CandidateRecord":
+    def from_candidate(cls, candidate: Candidate) -> "CandidateRecord":
         model = candidate.model
         known = cls(
             name=model.name,
@@ -113,11 +113,11 @@ def choice_record(choice: Choice, made_from: Mapping[str, str]) -> ChoiceRecord:
     return ChoiceRecord(
         reseau=version("reseau"),
         made_from=made_from,
-        chosen=ModelRecord.of(choice.chosen.model) if choice.chosen else None,
-        given=ModelRecord.of(choice.given),
+        chosen=ModelRecord.from_model(choice.chosen.model) if choice.chosen else None,
+        given=ModelRecord.from_model(choice.given),
         verdict=choice.verdict,
         reasons=choice.reasons,
-        candidates=tuple(map(CandidateRecord.of, choice.candidates)),
+        candidates=tuple(map(CandidateRecord.from_candidate, choice.candidates)),
         tests=tuple(ModelTest(t.simpler.name, t.richer.name, t.f, t.degrees, t.p) for t in choice.tests),
     )
 

@@ -31,8 +31,8 @@ COLUMNS = (
 PIXEL_SIGMAS = ("scol_px", "srow_px")  # of lists of pixels; rho then is that of column and row
 _KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 
-DecidedBy = tuple[str, str]  # camera, and who
-_NOBODY: Mapping[DecidedBy, int] = MappingProxyType({})
+CameraPerson = tuple[str, str]  # camera, and who
+_NOBODY: Mapping[CameraPerson, int] = MappingProxyType({})
 _DECISIONS = re.compile(r'^"?# (\d+) decisions of (.+), camera (.+?)"?$', re.MULTILINE)
 _HEAD = 4096
 _PITCH = re.compile(r'^"?# pitch of (.+): ([0-9.e+-]+) um across, ([0-9.e+-]+) um down"?$', re.MULTILINE)
@@ -81,7 +81,7 @@ def write_comparator(
     marks: Iterable[MarkRow],
     pitch_um: Mapping[str, tuple[float, float]],
     measurement: str = "",
-    decided: Mapping[DecidedBy, int] | None = None,
+    decided: Mapping[CameraPerson, int] | None = None,
 ) -> None:
     """Write every mark, in their order. Raises InputError where the file cannot be written.
 
@@ -113,7 +113,7 @@ def _point_line(point: ComparatorPoint, pitch_um: tuple[float, float] | None) ->
 
 
 def _head(
-    pitch_um: Mapping[str, tuple[float, float]], measurement: str = "", decided: Mapping[DecidedBy, int] = _NOBODY
+    pitch_um: Mapping[str, tuple[float, float]], measurement: str = "", decided: Mapping[CameraPerson, int] = _NOBODY
 ) -> list[str]:
     known_pitches = [(image, pitch) for image, pitch in sorted(pitch_um.items()) if math.isfinite(pitch[0])]
     return [
@@ -184,7 +184,7 @@ def comparator_points(
         yield ComparatorPoint(mark.image, mark.point, kind, xy, sigma, rho, status, mark.reason)
 
 
-def measurement_of(path: Path) -> str:
+def read_measurement_hash(path: Path) -> str:
     """The fingerprint of the measurement that a comparator file was written from; "" of one that does not say so, as
     one that a user made."""
     with path.open("rb") as file:
@@ -192,7 +192,7 @@ def measurement_of(path: Path) -> str:
     return found[1].decode() if found else ""
 
 
-def decisions_of(path: Path) -> dict[DecidedBy, int]:
+def read_decision_counts(path: Path) -> dict[CameraPerson, int]:
     """How many decisions of whom stand behind the marks of each camera, as the lines above the table tell it."""
     with path.open("rb") as file:
         head = takewhile(lambda line: line.lstrip(b'"\xef\xbb\xbf').startswith(b"#"), file)
@@ -200,7 +200,7 @@ def decisions_of(path: Path) -> dict[DecidedBy, int]:
     return {(camera, who): int(count) for count, who, camera in _DECISIONS.findall(text)}
 
 
-def decisions_told(decided: Mapping[DecidedBy, int]) -> str:
+def describe_decisions(decided: Mapping[CameraPerson, int]) -> str:
     """That in a sentence; "" where there are none."""
     cameras = sorted({camera for camera, _ in decided})
     parts = [
@@ -211,7 +211,7 @@ def decisions_told(decided: Mapping[DecidedBy, int]) -> str:
     return f"Decisions stand behind these marks: {'; '.join(named)}." if named else ""
 
 
-def pitches_of(path: Path) -> dict[str, tuple[float, float]]:
+def read_pitches(path: Path) -> dict[str, tuple[float, float]]:
     """The pitch of every scan in um, across and down, as the lines above the table tell it; of those that they tell."""
     text = read_bytes(path).decode("utf-8", "replace")
     return {image: (float(x), float(y)) for image, x, y in _PITCH.findall(text)}

@@ -24,7 +24,7 @@ class ChiSquareTest:
     probability: float
 
     @classmethod
-    def of(cls, test: Test) -> "ChiSquareTest":
+    def from_test(cls, test: Test) -> "ChiSquareTest":
         return cls(test.chi_square, test.freedom, test.probability)
 
 
@@ -96,8 +96,8 @@ def comparison_record(comparison: Comparison, remarks: Sequence[str], level: flo
         probability=comparison.probability,
         level=level,
         use=comparison.use,
-        same=ChiSquareTest.of(comparison.same),
-        trend=ChiSquareTest.of(trend) if trend else None,
+        same=ChiSquareTest.from_test(comparison.same),
+        trend=ChiSquareTest.from_test(trend) if trend else None,
         calibrations=tuple(
             ComparedCalibration(each.name, time, each.lens.distortion.family)
             for each, time in zip(comparison.calibrations, comparison.times.tolist(), strict=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from adjust.problem.parameter import Parameter, as_parameter, parameters_from_texts
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
-from pipeline.provenance import of_file
+from pipeline.provenance import hash_file
 from pipeline.text.text_file import MOST_MB, read_bytes
 from pipeline.types import Array, Indices
 
@@ -38,7 +38,7 @@ class Covariance:
     adjustment: str = ""
     clusters: "Covariance | None" = None
 
-    def of(self, parameters: Iterable[Parameter | str]) -> Array:
+    def select(self, parameters: Iterable[Parameter | str]) -> Array:
         """The covariance (k, k) of some unknowns, by keys or by their texts in the file; one that is not listed was
         fixed, its row is zero."""
         at = np.array([self._positions.get(as_parameter(each), -1) for each in parameters], dtype=int)
@@ -173,7 +173,7 @@ def _named_matrix(data: bytes, prefix: str, file: Path) -> tuple[tuple[Parameter
 def read_own_covariance(path: Path) -> Covariance:
     """The same, refused where it says that it is of another adjustment than that at `path`."""
     covariance = read_covariance(path)
-    if covariance.adjustment not in ("", of_file(path)):
+    if covariance.adjustment not in ("", hash_file(path)):
         raise InputError(
             f"{covariance_path(path)}: is of another adjustment than {path}. Bring both files of one adjustment "
             "together, or run `reseau adjust` again."

@@ -27,7 +27,7 @@ def write_frames(path: Path, scans: Iterable[MeasuredScan]) -> bool:
 
 def for_images(scans: Iterable[MeasuredScan], names: Sequence[str]) -> Mapping[str, Mapping[str, str]]:
     """By image the fields of these names."""
-    return {scan.frame.image: said(scan.frame.writing or (), names) for scan in scans}
+    return {scan.frame.image: unique_fields(scan.frame.writing or (), names) for scan in scans}
 
 
 def _rows(frame: FrameMeasurement) -> list[tuple[str, ...]]:
@@ -42,7 +42,7 @@ def _rows(frame: FrameMeasurement) -> list[tuple[str, ...]]:
     return rows
 
 
-def said(lines: Sequence[Line], names: Sequence[str]) -> dict[str, str]:
+def unique_fields(lines: Sequence[Line], names: Sequence[str]) -> dict[str, str]:
     """The fields of these names that lines of writing say, as far as one line says them, or several alike."""
     fields = find_fields(lines)
     values = {name: {field.value for field in fields if field.name == name} for name in names}

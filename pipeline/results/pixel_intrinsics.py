@@ -9,7 +9,7 @@ from pipeline.types import Array
 CENTRE = ("fx", "fy", "cx", "cy")
 
 
-def in_pixels(mm: Mapping[str, float], pixel_mm: float) -> tuple[dict[str, float], Array]:
+def pixel_intrinsics(mm: Mapping[str, float], pixel_mm: float) -> tuple[dict[str, float], Array]:
     """fx, fy, cx, cy and the distortion from c, x0', y0' and its parameters, and their derivatives (m, n).
 
     The unit of x is c (1 + b1), that of y is c; y0' counts upward (`adjust.functional_model.opencv_family`).

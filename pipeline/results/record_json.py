@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pipeline.errors import InputError
 from pipeline.text.atomic import write_atomically
-from pipeline.text.text_file import read_json, shown
+from pipeline.text.text_file import quote_value, read_json
 
 Record = TypeVar("Record")
 Read = Callable[[Any], Any]
@@ -38,7 +38,7 @@ class WrongForm(Exception):
         super().__init__(problem)
         self.problem, self.place = problem, place
 
-    def within(self, place: str) -> "WrongForm":
+    def nested_in_list(self, place: str) -> "WrongForm":
         return WrongForm(self.problem, place + self.place)
 
 
@@ -187,13 +187,13 @@ def _annotated(kind: Any, note: Any) -> Read:
 
 
 def _optional(read: Read) -> Read:
-    def of(value: Any) -> Any:
+    def read_value(value: Any) -> Any:
         try:
             return None if value is None else read(value)
         except WrongForm as wrong:
             raise wrong if wrong.place else WrongForm(f"{wrong.problem} or null") from None
 
-    return of
+    return read_value
 
 
 def _word(words: tuple[str, ...]) -> Read:
@@ -206,7 +206,7 @@ def _word(words: tuple[str, ...]) -> Read:
 
 
 def _list(read: Read, length: int | None) -> Read:
-    def of(value: Any) -> tuple[Any, ...]:
+    def read_value(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, list) or (length is not None and len(value) != length):
             raise _wrong(value, "a list" if length is None else f"a list of {length}")
         made: list[Any] = []
@@ -214,14 +214,14 @@ def _list(read: Read, length: int | None) -> Read:
             for item in value:
                 made.append(read(item))  # noqa: PERF401  # as many are made as were right
         except WrongForm as wrong:
-            raise wrong.within(f"[{len(made)}]") from None
+            raise wrong.nested_in_list(f"[{len(made)}]") from None
         return tuple(made)
 
-    return of
+    return read_value
 
 
 def _mapping(read: Read) -> Read:
-    def of(value: Any) -> dict[str, Any]:
+    def read_value(value: Any) -> dict[str, Any]:
         if not isinstance(value, dict):
             raise _wrong(value, "a table")
         made, key = {}, ""
@@ -229,10 +229,10 @@ def _mapping(read: Read) -> Read:
             for key, item in value.items():
                 made[key] = read(item)
         except WrongForm as wrong:
-            raise wrong.within(f"[{key!r}]") from None
+            raise wrong.nested_in_list(f"[{key!r}]") from None
         return made
 
-    return of
+    return read_value
 
 
 def _record_reader(kind: type) -> Read:
@@ -254,7 +254,7 @@ def _record_reader(kind: type) -> Read:
                 elif key == REST:
                     made[name] = of({each: item for each, item in value.items() if each not in keys})
         except WrongForm as wrong:
-            raise wrong.within("" if key == REST else f".{key}") from None
+            raise wrong.nested_in_list("" if key == REST else f".{key}") from None
         try:
             return kind(**made)
         except ValueError as error:  # what does not go together
@@ -264,4 +264,4 @@ def _record_reader(kind: type) -> Read:
 
 
 def _wrong(value: Any, expected: str) -> WrongForm:
-    return WrongForm(f"is {shown(value)}; it should be {expected}")
+    return WrongForm(f"is {quote_value(value)}; it should be {expected}")

@@ -58,7 +58,7 @@ class StoredThumbnail:
     jpeg: bytes
 
     @classmethod
-    def of(cls, thumbnail: Thumbnail, point: str, kind: str) -> "StoredThumbnail":
+    def from_thumbnail(cls, thumbnail: Thumbnail, point: str, kind: str) -> "StoredThumbnail":
         return cls(point, kind, thumbnail.origin_px, thumbnail.step_px, thumbnail.jpeg)
 
     @property
@@ -74,8 +74,11 @@ class StoredThumbnail:
 def stored_thumbnails(scan: Scan, measured: MeasuredScan) -> tuple[StoredThumbnail, ...]:
     """All of a scan that was just measured: of its marks, and of the whole where measuring looked at it."""
     marks = [(mark, cut(scan, mark)) for mark in measured.frame.marks]
-    whole = [StoredThumbnail.of(picture, *_WHOLE) for picture in _whole(scan)]
-    return (*whole, *(StoredThumbnail.of(picture, m.point, m.kind) for m, picture in marks if picture is not None))
+    whole = [StoredThumbnail.from_thumbnail(picture, *_WHOLE) for picture in _whole(scan)]
+    return (
+        *whole,
+        *(StoredThumbnail.from_thumbnail(picture, m.point, m.kind) for m, picture in marks if picture is not None),
+    )
 
 
 class TakenThumbnails(list[StoredThumbnail]):

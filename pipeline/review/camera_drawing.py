@@ -23,7 +23,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.files.camera_text import camera_text
-from pipeline.files.mark_table import SavePicture, saved_in, template_lines
+from pipeline.files.mark_table import SavePicture, picture_writer, template_lines
 from pipeline.text.atomic import write_atomically
 from pipeline.text.tables import Table
 from pipeline.text.wording import listed, table_lines
@@ -250,7 +250,7 @@ def save_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, 
         raise InputError("the frame's size is not known. Give it in mm, or click two of its opposite corners.")
     drawn_camera(drawing, placement, path).layout()
     if drawing.is_picture:
-        mark = _chip_lines(drawing, placement, scan, saved_in(path.parent, f"{path.stem}-"))
+        mark = _chip_lines(drawing, placement, scan, picture_writer(path.parent, f"{path.stem}-"))
     else:
         mark = table_lines(drawing.mark, f"mark.{MARK}")
     body = [*table_lines(camera_content(drawing, placement)), "", f"[mark.{MARK}]", *mark]
@@ -260,14 +260,14 @@ def save_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, 
 
 def save_learned(camera: CameraFile, remarks: Sequence[str], path: Path) -> CameraFile:
     """Write a camera whose marks one scan's pictures show, and read it again."""
-    text = camera_text(replace(camera, path=path, clicks=None), saved_in(path.parent, f"{path.stem}-"))
+    text = camera_text(replace(camera, path=path, clicks=None), picture_writer(path.parent, f"{path.stem}-"))
     write_atomically(path, "\n".join([*remarks, "", text]))
     return read_camera(path)
 
 
 def learned_remarks(image: str) -> list[str]:
     """What a camera file says of marks that were learned from one scan."""
-    return [f"{_DRAWN_BY}: its marks were learned from their places in {_on_one_line(image)}."]
+    return [f"{_DRAWN_BY}: its marks were learned from their places in {_join_lines(image)}."]
 
 
 def _chip_lines(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, save: SavePicture) -> list[str]:
@@ -293,8 +293,8 @@ def _remarks(drawing: CameraDrawing, placement: FramePlacement) -> list[str]:
         lines.append("frame_mm: between two corners clicked in the scan.")
     if drawing.principal_distance_mm is None:
         lines.append("principal_distance_mm is not known: the adjustment finds it from the points.")
-    return [_on_one_line(f"# {line.removeprefix('# ')}") for line in lines]
+    return [_join_lines(f"# {line.removeprefix('# ')}") for line in lines]
 
 
-def _on_one_line(text: str) -> str:
+def _join_lines(text: str) -> str:
     return "".join(one if one.isprintable() else "?" for one in text)

@@ -38,7 +38,7 @@ class DrawingAnswers:
         """The drawing after a step, and all that is shown of it."""
         drawing, placement = self._placed(_part(body, "drawing"))
         if step := body.get("step"):
-            scan = self._session.scan_of(drawing.image)
+            scan = self._session.scan_location(drawing.image)
             drawing = self._pictures.compute(scan, lambda file: take_step(drawing, placement, step, file))
             placement = self._placement(drawing)
         return drawing_json(drawing, placement)
@@ -52,7 +52,7 @@ class DrawingAnswers:
         matrix, blur_px = shown.pixel_from_mark, shown.clicked.blur_px
         if query.text("of") == "drawing":
             return self._pictures.drawing(shown.mark, matrix, blur_px, half)
-        return self._pictures.residual(self._session.scan_of(drawing.image), shown.mark, matrix, blur_px, half)
+        return self._pictures.residual(self._session.scan_location(drawing.image), shown.mark, matrix, blur_px, half)
 
     def save(self, query: Query, body: Any) -> Any:
         """The camera file written, and what to do next."""
@@ -65,16 +65,16 @@ class DrawingAnswers:
             clicks = Clicks(drawing.image, {one.id: one.px for one in drawing.marks}, who=self._session.who)
             learned = camera_as_shown(known, camera, clicks)
             return self._saved(save_learned(learned, learned_remarks(drawing.image), path))
-        scan = self._session.scan_of(drawing.image)
+        scan = self._session.scan_location(drawing.image)
         return self._saved(self._pictures.compute(scan, lambda file: save_drawing(drawing, placement, file, path)))
 
     def save_learned(self, query: Query, body: Any) -> Any:
         """A camera of the project written with its marks as one scan shows them at clicked places."""
         image, path = str(_part(body, "image")), camera_path(self._session.folder, str(body.get("file", "")))
-        self._session.scan_of(image)  # raises for one that is none
+        self._session.scan_location(image)  # raises for one that is none
         px = {str(point): (float(col), float(row)) for point, (col, row) in _part(body, "px").items()}
         project = self._session.project
-        camera = project.camera_of(image)
+        camera = project.image_camera(image)
         if missing := [one.id for one in camera.learned if one.id not in px]:
             raise InputError(f"{image}: click {', '.join(missing)}, too.")
         learned = camera_as_shown(project, camera, Clicks(image, px, who=self._session.who))
@@ -92,7 +92,7 @@ class DrawingAnswers:
 
     def _placement(self, drawing: CameraDrawing) -> FramePlacement:
         project = self._session.project
-        size_px, file_um = self._pictures.size(self._session.scan_of(drawing.image))
+        size_px, file_um = self._pictures.size(self._session.scan_location(drawing.image))
         known_um: Point | None = project.pitch_um or file_um
         return place_frame(
             drawing, size_px, known_um, "as the project says" if project.pitch_um else "as the file says"

@@ -24,12 +24,12 @@ from pipeline.review.frame_view import outlines_px
 from pipeline.review.mark_handles import (
     Handle,
     MarkJson,
+    add_vertex,
     first_drawing,
     first_part,
     handles,
+    remove_part,
     scaled_mark,
-    with_vertex,
-    without,
 )
 from pipeline.review.pictures import window_start
 from pipeline.text.table_models import key_rows
@@ -176,11 +176,11 @@ def take_step(drawing: CameraDrawing, placement: FramePlacement, step: Mapping[s
     match step:
         case {"click": [float() | int() as col, float() | int() as row]}:
             if mark["kind"] != "polygon":
-                return _moved(drawing, (float(col), float(row)))
+                return _move_drawing(drawing, (float(col), float(row)))
             place = _handle_affine(drawing, shown).inverse.apply(np.array([col, row], float))
-            return replace(drawing, mark=dict(with_vertex(mark, place)))
+            return replace(drawing, mark=dict(add_vertex(mark, place)))
         case {"drag": "place", "px": [float() | int() as col, float() | int() as row]}:
-            return _moved(drawing, (float(col), float(row)))
+            return _move_drawing(drawing, (float(col), float(row)))
         case {"drag": str(key), "px": [float() | int() as col, float() | int() as row]}:
             handle = next((one for one in handles(mark, shown.toward) if one.key == key), None)
             if handle is None:
@@ -188,11 +188,11 @@ def take_step(drawing: CameraDrawing, placement: FramePlacement, step: Mapping[s
             place = _handle_affine(drawing, shown).inverse.apply(np.array([col, row], float))
             return replace(drawing, mark=dict(handle.dragged(place)))
         case {"remove": str(key)}:
-            return replace(drawing, mark=dict(without(mark, key)))
+            return replace(drawing, mark=dict(remove_part(mark, key)))
     raise InputError("that is no step of a drawing.")
 
 
-def _moved(drawing: CameraDrawing, px: Point) -> CameraDrawing:
+def _move_drawing(drawing: CameraDrawing, px: Point) -> CameraDrawing:
     marks = tuple(replace(one, px=px) if one.id == drawing.point else one for one in drawing.marks)
     return replace(drawing, marks=marks)
 

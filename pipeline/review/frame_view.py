@@ -75,9 +75,9 @@ class LookedAt:
     camera: CameraFile
 
     @cached_property
-    def drawn(self) -> Mapping[str, LayoutMark]:
+    def layout_marks(self) -> Mapping[str, LayoutMark]:
         """The marks of the camera that have a drawing or a picture, by name."""
-        return {mark.id: mark for mark in self.camera.layout().marks} if self.camera.drawn else {}
+        return {mark.id: mark for mark in self.camera.layout().marks} if self.camera.layout_marks else {}
 
     def mark(self, point: str, kind: str) -> MarkMeasurement:
         """Raises KeyError where the frame has no such mark."""
@@ -88,7 +88,7 @@ class LookedAt:
 
     def predicted_px(self, point: str, kind: str) -> Array | None:
         """Where the frame puts a fiducial."""
-        matrix, drawn = self.scan.frame.pixel_from_camera, self.drawn.get(point)
+        matrix, drawn = self.scan.frame.pixel_from_camera, self.layout_marks.get(point)
         if matrix is None or drawn is None or kind != "fiducial":
             return None
         return np.asarray(matrix @ (*drawn.xy_mm, 1.0))
@@ -102,7 +102,7 @@ class LookedAt:
 
     def pixel_from_mark(self, point: str, kind: str) -> Array | None:
         """(2, 3), as the frame turns and scales a fiducial, at its place."""
-        matrix, drawn = self.scan.frame.pixel_from_camera, self.drawn.get(point)
+        matrix, drawn = self.scan.frame.pixel_from_camera, self.layout_marks.get(point)
         if matrix is None or drawn is None or kind != "fiducial" or isinstance(drawn.mark, FrameCorner):
             return None
         return np.column_stack([matrix[:, :2], self.place_px(point, kind)])
@@ -115,7 +115,7 @@ class LookedAt:
     def detail_json(self, point: str, kind: str) -> Json:
         """All that the page shows of a mark."""
         mark = self.mark(point, kind)
-        drawn, linear = self.drawn.get(point), self.pixel_from_mark(point, kind)
+        drawn, linear = self.layout_marks.get(point), self.pixel_from_mark(point, kind)
         return {
             **mark_json(mark),
             "image": self.scan.frame.image,
@@ -154,7 +154,7 @@ class LookedAt:
             if pose is None
             else {"name": pose.name, "decided": pose.decided, "evidence": list(pose.evidence), "roll": pose.roll},
             "marks": marks,
-            "fiducials": {id: mark.xy_mm for id, mark in self.drawn.items()},
+            "fiducials": {id: mark.xy_mm for id, mark in self.layout_marks.items()},
             "writing": [{"text": line.text, "outline": line.outline_px} for line in frame.writing or ()],
         }
 
@@ -175,7 +175,7 @@ class Looking:
         with Store(self._store) as store:
             return latest(store)
 
-    def at(self, image: str) -> LookedAt:
+    def view(self, image: str) -> LookedAt:
         """Raises KeyError where no such image is judged."""
         with Store(self._store) as store:
             judging = latest(store)
@@ -247,7 +247,7 @@ def _causes(mark: MarkMeasurement) -> list[Json]:
 def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) -> MeasuredScan:
     """The scan's fiducials, as `reseau measure` would find them with these decisions. project: with what was learned of
     its marks. Raises InputError for a mark that the camera does not have."""
-    known = {mark.id for mark in project.camera_of(image).drawn}
+    known = {mark.id for mark in project.image_camera(image).layout_marks}
     unknown = [click.point for click in clicks if click.point not in known]
     if unknown:
         raise InputError(f"{image}: its camera has no mark {', '.join(unknown)}.")
@@ -259,7 +259,7 @@ def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) 
 def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float, float]], image: str) -> MeasuredScan:
     """A scan's fiducials, found by the pictures of marks that are to be learned at places of one scan, which may be
     itself. shown: that scan; px: column and row of its camera's marks. Raises InputError for a mark that is missing."""
-    camera = project.camera_of(shown)
+    camera = project.image_camera(shown)
     missing = [one.id for one in camera.learned if one.id not in px]
     if missing:
         raise InputError(f"{shown}: click {', '.join(missing)}, too.")

@@ -87,7 +87,7 @@ def scaled_mark(mark: MarkJson, factor: float) -> MarkJson:
     return _rounded({key: scaled(key, value) for key, value in mark.items()})
 
 
-def with_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
+def add_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
     """A polygon with one more corner: in the nearest side of its outline, or at the end of one that is not closed."""
     vertices = [*mark["vertices_mm"]]
     at = len(vertices)
@@ -100,7 +100,7 @@ def with_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
     return _rounded({**mark, "vertices_mm": [*vertices[:at], place_mm.tolist(), *vertices[at:]]})
 
 
-def without(mark: MarkJson, key: str) -> MarkJson:
+def remove_part(mark: MarkJson, key: str) -> MarkJson:
     """The mark without the corner, or without the part, that a handle's key names."""
     name, *rest = key.split(".")
     if name not in ("vertices_mm", "part"):
@@ -108,12 +108,12 @@ def without(mark: MarkJson, key: str) -> MarkJson:
     at = int(rest[0])
     part = mark[name][at]
     if rest[1:2] == ["vertices_mm"] and len(part["vertices_mm"]) > 3:
-        part = {**part, "vertices_mm": _list_without(part["vertices_mm"], int(rest[2]))}
+        part = {**part, "vertices_mm": _remove_item(part["vertices_mm"], int(rest[2]))}
         return {**mark, name: [*mark[name][:at], part, *mark[name][at + 1 :]]}
-    return {**mark, name: _list_without(mark[name], at)}
+    return {**mark, name: _remove_item(mark[name], at)}
 
 
-def _list_without(values: list[Any], at: int) -> list[Any]:
+def _remove_item(values: list[Any], at: int) -> list[Any]:
     return [*values[:at], *values[at + 1 :]]
 
 

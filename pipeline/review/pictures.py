@@ -137,14 +137,17 @@ def _reduced_window(scan: Scan, col0: int, row0: int, side: int, step: int) -> N
     """side x side pixels, each the mean of step x step of the scan. Only what the scan has is read, and only one row of
     these pixels is held at a time."""
     shown = np.full((side, side), _NOTHING, np.uint8)
-    cols, rows = _pixels_on(col0, scan.width_px, side, step), _pixels_on(row0, scan.height_px, side, step)
+    cols, rows = (
+        _overlapping_pixels(col0, scan.width_px, side, step),
+        _overlapping_pixels(row0, scan.height_px, side, step),
+    )
     if cols and rows:
         means = [_means(scan, col0 + step * cols.start, row0 + step * row, len(cols), step) for row in rows]
         shown[rows.start : rows.stop, cols.start : cols.stop] = stretched(np.stack(means))
     return shown
 
 
-def _pixels_on(start_px: int, extent_px: int, side: int, step: int) -> range:
+def _overlapping_pixels(start_px: int, extent_px: int, side: int, step: int) -> range:
     """Which of a row or column of reduced pixels show something of a scan."""
     return range(max(0, -start_px // step), min(side, -((start_px - extent_px) // step)))
 

@@ -70,7 +70,7 @@ class Entry:
         return self.images[0].rpartition("/")[0]
 
 
-def queue_of(project: Project, db: sqlite3.Connection | None, judging: int) -> tuple[Entry, ...]:
+def build_queue(project: Project, db: sqlite3.Connection | None, judging: int) -> tuple[Entry, ...]:
     """Every question of a judging, the worst first. db: None where nothing is judged yet."""
     if db:
         check_judging(db, judging, project.measurement_path)
@@ -147,7 +147,9 @@ def _cameras(project: Project, with_marks: Collection[str]) -> Iterator[Entry]:
     """One for each camera whose marks are learned from its scans. with_marks: images in which some were found."""
     for camera in project.cameras.values():
         images = (
-            tuple(image for image in project.scans if project.camera_of(image) is camera) if camera.is_asked else ()
+            tuple(image for image in project.scans if project.image_camera(image) is camera)
+            if camera.needs_clicks
+            else ()
         )
         if images:
             found = sum(image in with_marks for image in images)

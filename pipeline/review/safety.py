@@ -40,7 +40,7 @@ class Guard:
             await self._app(scope, receive, send)
             return
         answer = self._refusal(Request(scope))
-        await (answer or self._app)(scope, receive, _with_headers(send))
+        await (answer or self._app)(scope, receive, _add_headers(send))
 
     def _refusal(self, request: Request) -> Response | None:
         """What is said to a request that is not let through; None to one that is."""
@@ -70,7 +70,7 @@ def _refused(text: str) -> Response:
     return PlainTextResponse(text, status_code=403)
 
 
-def _with_headers(send: Send) -> Send:
+def _add_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
             own: Mapping[str, str] = HEADERS

@@ -24,7 +24,7 @@ from pipeline.errors import InputError
 from pipeline.files.decision import KINDS, LEARNED, MEANING, OF_SCANS, Choice, Decision
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
-from pipeline.measuring.scan_task import few_of
+from pipeline.measuring.scan_task import sample_names
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.review.drawing_answers import DrawingAnswers
 from pipeline.review.frame_view import mark_json, measured_as_shown, measured_from_clicks
@@ -71,7 +71,7 @@ class Server:
 
 def serve(project: Project, port: int, who: str | None, opens_browser: bool, say: Callable[[str], None]) -> None:
     """Print the address on a line of its own, and answer until Ctrl-C. who: decides; None: who is logged in."""
-    server = Server(project, port, who or _logged_in())
+    server = Server(project, port, who or _login_name())
     say(server.address)
     sys.stdout.flush()
     if opens_browser:
@@ -79,7 +79,7 @@ def serve(project: Project, port: int, who: str | None, opens_browser: bool, say
     server.run()
 
 
-def _logged_in() -> str:
+def _login_name() -> str:
     try:
         return getpass.getuser()
     except (OSError, KeyError):  # of a container whose user has no name
@@ -137,7 +137,7 @@ class _Answers:
             "project": session.project.title,
             "who": session.who,
             "poses": list(POSES),
-            "scans": few_of(list(session.project.scans), _OFFERED),
+            "scans": sample_names(list(session.project.scans), _OFFERED),
             "kinds": list(MARK_TABLES),
             "pose": session.project.pose,
             "file": session.camera_name,
@@ -152,11 +152,11 @@ class _Answers:
 
     def mark(self, query: Query, body: Any) -> Any:
         image, point, kind = query.text("image"), query.text("point"), query.text("kind")
-        view, session = self._session.looking.at(image), self._session
-        others = [session.looking.at(name) for name in session.looking.others(image, point, kind)]
+        view, session = self._session.looking.view(image), self._session
+        others = [session.looking.view(name) for name in session.looking.others(image, point, kind)]
         return {
             **view.detail_json(point, kind),
-            "decided": session.decided_in(image),
+            "decided": session.image_decisions(image),
             "others": [
                 {
                     "image": other.scan.frame.image,
@@ -169,24 +169,24 @@ class _Answers:
 
     def frame(self, query: Query, body: Any) -> Any:
         image = query.text("image")
-        return {**self._session.looking.at(image).frame_json(), "decided": self._session.decided_in(image)}
+        return {**self._session.looking.view(image).frame_json(), "decided": self._session.image_decisions(image)}
 
     def camera(self, query: Query, body: Any) -> Any:
         """Whose marks are to be learned: which they are, and scans to click them in."""
         entry = self._session.entry(query.text("key"))
-        camera = self._session.project.camera_of(entry.images[0])
+        camera = self._session.project.image_camera(entry.images[0])
         return {
             "camera": camera.name,
             "fiducials": {one.id: one.xy_mm for one in camera.learned},
-            "images": few_of(entry.images, _OFFERED),
-            "tried": few_of(entry.images, _TRIED),
+            "images": sample_names(entry.images, _OFFERED),
+            "tried": sample_names(entry.images, _TRIED),
         }
 
     def scan(self, query: Query, body: Any) -> Any:
         """A scan that need not be measured yet."""
         image = query.text("image")
-        learned = self._session.project.camera_of(image).learned if self._session.project.cameras else ()
-        size_px, pitch_um = self._pictures.size(self._session.scan_of(image))
+        learned = self._session.project.image_camera(image).learned if self._session.project.cameras else ()
+        size_px, pitch_um = self._pictures.size(self._session.scan_location(image))
         pitch_um = self._session.project.pitch_um or pitch_um
         most_mm = max((one.learned_mm for one in learned), default=0.0)
         half_px = 500.0 * most_mm / min(pitch_um) if pitch_um else _HALF_PX
@@ -197,12 +197,12 @@ class _Answers:
         return self._pictures.window(self._scan(query), *place, query.whole("size", 8, _WIDEST_PX))
 
     def residual(self, query: Query) -> bytes:
-        view = self._session.looking.at(query.text("image"))
+        view = self._session.looking.view(query.text("image"))
         point, kind = query.text("point"), query.text("kind")
         matrix, blur_px = view.pixel_from_mark(point, kind), view.mark(point, kind).quality.get("blur_px", 0.0)
         if matrix is None or blur_px <= 0:
             raise MeasurementError("nothing was fitted there")
-        drawn = view.drawn[point].mark
+        drawn = view.layout_marks[point].mark
         return self._pictures.residual(view.scan.scan, drawn, matrix, blur_px, view.window_px(point, kind))
 
     def whole(self, query: Query) -> bytes:
@@ -225,7 +225,7 @@ class _Answers:
         if not isinstance(body, dict):
             raise InputError("clicks are missing.")
         image, clicks = str(body.get("image", "")), body.get("clicks")
-        self._session.looking.at(image)  # raises for one that is none
+        self._session.looking.view(image)  # raises for one that is none
         if not isinstance(clicks, list) or len(clicks) < 3:
             raise InputError("three clicks on named marks or more are needed.")
         given = [Click(str(one["point"]), float(one["col_px"]), float(one["row_px"])) for one in clicks]
@@ -237,11 +237,11 @@ class _Answers:
             raise InputError("clicks are missing.")
         shown, image = str(body.get("image", "")), str(body.get("of", ""))
         for name in (shown, image):
-            self._session.scan_of(name)  # raises for one that is none
+            self._session.scan_location(name)  # raises for one that is none
         return _trial_json(measured_as_shown(self._session.project, shown, _places(body["px"]), image))
 
     def _scan(self, query: Query) -> str:
-        return self._session.scan_of(query.text("image"))
+        return self._session.scan_location(query.text("image"))
 
 
 def _decision(given: Any) -> Decision:

@@ -14,12 +14,18 @@ from measure.scans.remote import fetch_location
 from pipeline.archive.results_database import Store
 from pipeline.errors import InputError
 from pipeline.files.decision import LEARNED, About, Choice, Decision
-from pipeline.files.decisions_file import append_decisions, decisions_bytes, learned_from, parse_decisions, put_on
-from pipeline.files.project_file import Project, with_decisions
+from pipeline.files.decisions_file import (
+    append_decisions,
+    decisions_bytes,
+    learned_from,
+    parse_decisions,
+    push_decision,
+)
+from pipeline.files.project_file import Project, reload_decisions
 from pipeline.measuring.first_pictures import digest
-from pipeline.measuring.learn_stage import with_learned
+from pipeline.measuring.learn_stage import add_learned_marks
 from pipeline.review.frame_view import Looking
-from pipeline.review.queue import Entry, Question, queue_of
+from pipeline.review.queue import Entry, Question, build_queue
 
 _COMPARED = 4096  # bytes before what is new, by which a file that goes on is told from another one
 Json = dict[str, Any]
@@ -36,7 +42,7 @@ class Ledger:
         self._seen: tuple[int, int, int] | None = None  # which file, its size, and when it was written
         self._forget()
 
-    def read_on(self) -> frozenset[str] | None:
+    def update(self) -> frozenset[str] | None:
         """The images about which there is something new; None where the whole file is another one."""
         before, self._seen = self._seen, _state(self._path)
         if self._seen == before:
@@ -52,7 +58,7 @@ class Ledger:
         stack = self._stacks.get(about)
         return stack[-1] if stack else None
 
-    def of_image(self, image: str) -> Iterable[Decision]:
+    def image_decisions(self, image: str) -> Iterable[Decision]:
         """Of its marks and its pose, in the order in which somebody first decided about each."""
         return (one for about in self._abouts.get(image, ()) if (one := self.get(about)) and about[2] != LEARNED)
 
@@ -76,9 +82,9 @@ class Ledger:
     def _take(self, data: bytes) -> frozenset[str]:
         new = parse_decisions(self._path, data, self._lines + 1)
         for one in new:
-            put_on(self._stacks, one)
-            self._abouts[one.image][one.about] = None
-        self._learned += [one for one in new if one.about[2] == LEARNED]
+            push_decision(self._stacks, one)
+            self._abouts[one.image][one.subject] = None
+        self._learned += [one for one in new if one.subject[2] == LEARNED]
         self._end, self._lines = self._end + len(data), self._lines + data.count(b"\n")
         self._tail = (self._tail + data)[-_COMPARED:]
         return frozenset(one.image for one in new)
@@ -123,10 +129,10 @@ class _Shown:
     filters: Filters
     entries: tuple[Entry, ...]
     keys: tuple[str, ...]
-    asked: frozenset[str]
+    open_keys: frozenset[str]
 
     @classmethod
-    def of(cls, filters: Filters, queue: Sequence[Entry]) -> "_Shown":
+    def from_queue(cls, filters: Filters, queue: Sequence[Entry]) -> "_Shown":
         entries = tuple(filter(filters.lets_through, queue))
         keys = tuple(entry.key for entry in entries)
         asked = (key for key, entry in zip(keys, entries, strict=True) if entry.is_left)
@@ -140,7 +146,7 @@ class Session:
         """Raises InputError where there is nothing to ask yet."""
         self.project, self.who = project, who
         self.folder = project.path.resolve().parent
-        self.looking = Looking(project.measurement_path, self.folder, lambda image: self.learned.camera_of(image))
+        self.looking = Looking(project.measurement_path, self.folder, lambda image: self.learned.image_camera(image))
         self._lock = threading.RLock()
         self._judging: int | None = None
         self._ledger = Ledger(project.decisions_path)
@@ -157,15 +163,15 @@ class Session:
         with self._lock:
             judging = self.looking.judging()
             row = _NONE if judging is None else judging.row
-            changed = self._ledger.read_on()
+            changed = self._ledger.update()
             if row != self._judging:
                 self._take_queue(row)
                 changed = None
             if changed is None:
                 self._answers, self._left = {}, Counter(entry.question for entry in self._queue if entry.is_left)
                 self._total = self._left.total()
-            for entry in self._queue if changed is None else self._entries_of(changed):
-                before, now = self._answers.pop(entry.key, None), self._answer_of(entry)
+            for entry in self._queue if changed is None else self._image_entries(changed):
+                before, now = self._answers.pop(entry.key, None), self._find_answer(entry)
                 if now is not None:
                     self._answers[entry.key] = now
                 if entry.is_left:
@@ -182,7 +188,7 @@ class Session:
                 entry = self._by_key[key]
                 frames = tuple(zip(entry.images, entry.fingerprints, strict=True))
                 decisions = [replace(one, image=image, fingerprint=seen) for one in decisions for image, seen in frames]
-            complete = [replace(self._of_file(one), who=self.who, when=when) for one in decisions]
+            complete = [replace(self._add_fingerprint(one), who=self.who, when=when) for one in decisions]
             append_decisions(self.project.decisions_path, complete)
             self.refresh()
 
@@ -191,7 +197,7 @@ class Session:
         self.refresh()
         with self._lock:
             if self._shown is None or self._shown.filters != filters:
-                self._shown = _Shown.of(filters, self._queue)
+                self._shown = _Shown.from_queue(filters, self._queue)
             shown = self._shown
             order = chain(range(start, len(shown.keys)), range(min(start, len(shown.keys))))
             return {
@@ -199,7 +205,7 @@ class Session:
                 "total": self._total,
                 "left": {"all": self._left.total(), **{str(question): self._left[question] for question in Question}},
                 "shown": len(shown.entries),
-                "shown_left": len(shown.asked - self._answers.keys()),
+                "shown_left": len(shown.open_keys - self._answers.keys()),
                 "next_left": next((at for at in order if self._asks(shown, at)), -1),
                 "start": start,
                 "entries": [self.entry_json(entry) for entry in shown.entries[start : start + PAGE]],
@@ -207,7 +213,7 @@ class Session:
 
     def _asks(self, shown: _Shown, at: int) -> bool:
         key = shown.keys[at]
-        return key in shown.asked and key not in self._answers
+        return key in shown.open_keys and key not in self._answers
 
     def choices(self) -> Json:
         """What filters can be set to."""
@@ -250,24 +256,24 @@ class Session:
             "old": self._old_json(entry),
         }
 
-    def scan_of(self, image: str) -> str:
+    def scan_location(self, image: str) -> str:
         """The path or the address of its file. Raises KeyError where no such image is known."""
         given = self.project.scans.get(image)
-        return self.looking.at(image).scan.scan if given is None else fetch_location(given)
+        return self.looking.view(image).scan.scan if given is None else fetch_location(given)
 
-    def decided_in(self, image: str) -> list[Json]:
+    def image_decisions(self, image: str) -> list[Json]:
         """All that stands decided in a frame."""
         with self._lock:
-            return [_answer_json(one) for one in self._ledger.of_image(image)]
+            return [_answer_json(one) for one in self._ledger.image_decisions(image)]
 
     def _take_queue(self, judging: int) -> None:
-        self.project = self.learned = with_decisions(self.project)
+        self.project = self.learned = reload_decisions(self.project)
         if judging == _NONE:
-            self._queue = queue_of(self.project, None, judging)
+            self._queue = build_queue(self.project, None, judging)
         else:
             with Store(self.project.measurement_path) as store:
-                self.learned = with_learned(self.project, store)
-                self._queue = queue_of(self.project, store.connection, judging)
+                self.learned = add_learned_marks(self.project, store)
+                self._queue = build_queue(self.project, store.connection, judging)
         self._by_key = {entry.key: entry for entry in self._queue}
         of_image = defaultdict[str, list[Entry]](list)
         for entry in self._queue:
@@ -275,26 +281,30 @@ class Session:
                 of_image[image].append(entry)
         self._of_image, self._judging, self._shown = of_image, judging, None
 
-    def _entries_of(self, images: Collection[str]) -> Collection[Entry]:
+    def _image_entries(self, images: Collection[str]) -> Collection[Entry]:
         return {entry.key: entry for image in images for entry in self._of_image.get(image, ())}.values()
 
-    def _answer_of(self, entry: Entry) -> Decision | None:
+    def _find_answer(self, entry: Entry) -> Decision | None:
         """What answers a question: about all of its frames; of one without marks, about any of its marks; of a mark in
         a frame that lies otherwise, that it does."""
         match entry.question:
             case Question.CAMERA:
                 return self._ledger.learned(frozenset(entry.images))
             case Question.FRAME:
-                made = [one for one in self._ledger.of_image(entry.images[0]) if _is_about(one, entry.fingerprints[0])]
+                made = [
+                    one
+                    for one in self._ledger.image_decisions(entry.images[0])
+                    if _names_result(one, entry.fingerprints[0])
+                ]
                 return made[-1] if made else None
         if entry.question is Question.MARK:
             pose = self._ledger.get((entry.images[0], "", ""))
-            if pose is not None and _is_about(pose, entry.fingerprints[0]) and pose.pose != entry.pose:
+            if pose is not None and _names_result(pose, entry.fingerprints[0]) and pose.pose != entry.pose:
                 return pose  # the mark will have another name
         first = None
         for image, fingerprint in zip(entry.images, entry.fingerprints, strict=True):
             one = self._ledger.get((image, entry.point, entry.kind))
-            if one is None or not _is_about(one, fingerprint):
+            if one is None or not _names_result(one, fingerprint):
                 return None
             first = first or one
         return first
@@ -304,21 +314,21 @@ class Session:
         if entry.question in (Question.CAMERA, Question.FRAME):
             return None
         one = self._ledger.get((entry.images[0], entry.point, entry.kind))
-        return None if one is None or _is_about(one, entry.fingerprints[0]) else _answer_json(one)
+        return None if one is None or _names_result(one, entry.fingerprints[0]) else _answer_json(one)
 
-    def _of_file(self, one: Decision) -> Decision:
+    def _add_fingerprint(self, one: Decision) -> Decision:
         """Pictures are learned from the file as it is now, and from no other one of its name."""
         is_learned = one.decision is Choice.LEARN
         return replace(one, fingerprint=digest(self.project.scans[one.image])) if is_learned else one
 
     def _check(self, one: Decision) -> None:
         """Images and points are those of the project and its store, and never paths."""
-        if one.about[2] == LEARNED:
+        if one.subject[2] == LEARNED:
             self._check_learned(one)
             return
         try:
-            view = self.looking.at(one.image)
-            mark = view.mark(one.point, one.about[2]) if one.point else None
+            view = self.looking.view(one.image)
+            mark = view.mark(one.point, one.subject[2]) if one.point else None
         except KeyError as error:
             raise InputError(f"there is no image or mark {error.args[0]!r}.") from None
         if one.decision in (Choice.ACCEPT, Choice.REJECT) and (mark is None or mark.covariance is None):
@@ -331,17 +341,17 @@ class Session:
     def _check_learned(self, one: Decision) -> None:
         if one.image not in self.project.scans:
             raise InputError(f"there is no image or mark {one.image!r}.")
-        wanted = {mark.id for mark in self.project.camera_of(one.image).learned}
+        wanted = {mark.id for mark in self.project.image_camera(one.image).learned}
         if one.decision is Choice.LEARN and set(one.px) != wanted:
             raise InputError(f"{one.image}: click {', '.join(sorted(wanted))}: all marks of its camera, and no others.")
 
 
-def _is_about(one: Decision, fingerprint: str) -> bool:
+def _names_result(one: Decision, fingerprint: str) -> bool:
     """Whether a decision is about the result that is there now."""
     return one.fingerprint in ("", fingerprint)
 
 
 def _answer_json(one: Decision) -> Json:
-    head = {"decision": str(one.decision), "point": one.point, "kind": one.about[2], "who": one.who, "when": one.when}
+    head = {"decision": str(one.decision), "point": one.point, "kind": one.subject[2], "who": one.who, "when": one.when}
     place = {"pose": one.pose, "note": one.note, "col_px": one.col_px, "row_px": one.row_px}
     return {**head, **place, "image": one.image, "px": one.px}

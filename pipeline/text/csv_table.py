@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.text.text_file import LARGEST, SMALLEST_SIGMA, read_bytes, shown
+from pipeline.text.text_file import LARGEST, SMALLEST_SIGMA, quote_value, read_bytes
 from pipeline.text.wording import did_you_mean
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
@@ -44,7 +44,7 @@ class Row:
         if not value:
             raise self.error(column, "is empty; every line needs it.")
         if len(value) > _LONGEST_NAME or any(unicodedata.category(letter) in ("Cc", "Cs") for letter in value):
-            raise self.error(column, f"{shown(value)} can be no name: too long, or not all of it can be read.")
+            raise self.error(column, f"{quote_value(value)} can be no name: too long, or not all of it can be read.")
         return value
 
     def number(self, column: str) -> float | None:
@@ -55,11 +55,13 @@ class Row:
         try:
             number = float(value)
         except ValueError:
-            raise self.error(column, f"must be a number with a decimal point or blank, not {shown(value)}.") from None
+            raise self.error(
+                column, f"must be a number with a decimal point or blank, not {quote_value(value)}."
+            ) from None
         if not math.isfinite(number):
-            raise self.error(column, f"must be a finite number or blank, not {shown(value)}.")
+            raise self.error(column, f"must be a finite number or blank, not {quote_value(value)}.")
         if abs(number) > LARGEST:
-            raise self.error(column, f"{shown(value)} is larger than anything that is measured. Correct it.")
+            raise self.error(column, f"{quote_value(value)} is larger than anything that is measured. Correct it.")
         return number
 
     def sigma(self, column: str) -> float | None:
@@ -172,8 +174,8 @@ def _check_header(
         if column and column not in known:
             hint = did_you_mean(column, known)
             raise InputError(
-                f"{path}, line {line}: {shown(column)} is no column of this file.{hint} Known: {','.join(known)}."
+                f"{path}, line {line}: {quote_value(column)} is no column of this file.{hint} Known: {','.join(known)}."
             )
     twice = [column for column in header if header.count(column) > 1]
     if twice:
-        raise InputError(f"{path}, line {line}: the column {shown(twice[0])} is named twice.")
+        raise InputError(f"{path}, line {line}: the column {quote_value(twice[0])} is named twice.")

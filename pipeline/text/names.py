@@ -5,7 +5,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.text.text_file import shown
+from pipeline.text.text_file import quote_value
 
 SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".j2k", ".png")
 
@@ -38,8 +38,9 @@ def path_below(folder: Path, name: str, suffix: str = "") -> Path:
     parts = name.split("/")
     if not name.isprintable() or any(map(_leads_elsewhere, parts)):
         raise InputError(
-            f"the name {shown(name)} cannot be that of a file below {folder}: nothing was written. A name is a file's, "
-            "with folders before it and `/` between, without .. and backslash. Rename the image, frame or camera."
+            f"the name {quote_value(name)} cannot be that of a file below {folder}: nothing was written. A name is a "
+            "file's, with folders before it and `/` between, without .. and backslash. Rename the image, frame or "
+            "camera."
         )
     return folder.joinpath(*parts[:-1], f"{parts[-1]}{suffix}")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.text.text_file import LARGEST, read_bytes, shown
+from pipeline.text.text_file import LARGEST, quote_value, read_bytes
 from pipeline.text.wording import LISTED, did_you_mean, nearest
 
 FREE = "free"
@@ -92,10 +92,10 @@ class Table:
     def text(self, key: str, default: str | None = None, choices: Sequence[str] = ()) -> str:
         value = self._get(key, default)
         if not isinstance(value, str):
-            raise self.error(key, f'must be text in quotes, not {shown(value)}. Write {key} = "...".')
+            raise self.error(key, f'must be text in quotes, not {quote_value(value)}. Write {key} = "...".')
         if choices and value not in choices:
             raise self.error(
-                key, f"is {shown(value)}; possible are {list_words(choices)}.{did_you_mean(value, choices)}"
+                key, f"is {quote_value(value)}; possible are {list_words(choices)}.{did_you_mean(value, choices)}"
             )
         return value
 
@@ -121,7 +121,7 @@ class Table:
     def flag(self, key: str, default: bool) -> bool:
         value = self._get(key, default)
         if not isinstance(value, bool):
-            raise self.error(key, f"must be true or false, not {shown(value)}.")
+            raise self.error(key, f"must be true or false, not {quote_value(value)}.")
         return value
 
     def number(
@@ -139,7 +139,7 @@ class Table:
         value = self._get(key, default)
         if isinstance(value, str) and value not in choices:
             also = f"{did_you_mean(value, choices)} A number above {above:g}, without quotes, is possible, too."
-            raise self.error(key, f"is {shown(value)}; possible are {list_words(choices)}.{also}")
+            raise self.error(key, f"is {quote_value(value)}; possible are {list_words(choices)}.{also}")
         if isinstance(value, str):
             return value
         return self.number(key, default if isinstance(default, float) else None, above=above)
@@ -148,7 +148,7 @@ class Table:
         value = self._get(key, default)
         if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
             limits = f"at least {least}" if isinstance(value, int) and value < least else f"{least} to {most}"
-            raise self.error(key, f"must be a whole number of {limits}, not {shown(value)}.")
+            raise self.error(key, f"must be a whole number of {limits}, not {quote_value(value)}.")
         return value
 
     def pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
@@ -169,13 +169,13 @@ class Table:
 
     def _several(self, key: str, value: Any, count: int, form: str) -> list[float]:
         if not isinstance(value, list | tuple) or len(value) != count:
-            raise self.error(key, f"must be {form}, not {shown(value)}.")
+            raise self.error(key, f"must be {form}, not {quote_value(value)}.")
         return [self._number(key, item) for item in value]
 
     def pairs(self, key: str) -> tuple[tuple[float, float], ...]:
         value = self._get(key, None)
         if not isinstance(value, list) or not all(isinstance(item, list) and len(item) == 2 for item in value):
-            raise self.error(key, f"must be a list of points, [[x, y], [x, y], ...], not {shown(value)}.")
+            raise self.error(key, f"must be a list of points, [[x, y], [x, y], ...], not {quote_value(value)}.")
         return tuple((self._number(key, x), self._number(key, y)) for x, y in value)
 
     def sigma(self, key: str, default: float | None = None) -> float:
@@ -187,7 +187,7 @@ class Table:
         value = self._get(key, default)
         if isinstance(value, Sequence) and not isinstance(value, str):
             if len(value) != 2:
-                raise self.error(key, f"must be one standard deviation or two, [sx, sy], not {shown(value)}.")
+                raise self.error(key, f"must be one standard deviation or two, [sx, sy], not {quote_value(value)}.")
             return (self._sigma(key, value[0]), self._sigma(key, value[1]))
         sigma = self._sigma(key, value)
         return (sigma, sigma)
@@ -195,14 +195,14 @@ class Table:
     def texts(self, key: str) -> tuple[str, ...]:
         value = self._get(key, None)
         if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise self.error(key, f'must be a list of texts, ["...", "..."], not {shown(value)}.')
+            raise self.error(key, f'must be a list of texts, ["...", "..."], not {quote_value(value)}.')
         return tuple(value)
 
     def numbers(self, key: str) -> tuple[float, ...]:
         """A list of numbers, whole ones as they are."""
         value = self._get(key, None)
         if not isinstance(value, list) or not value:
-            raise self.error(key, f"must be a list of numbers, [1.0, 2.0, ...], not {shown(value)}.")
+            raise self.error(key, f"must be a list of numbers, [1.0, 2.0, ...], not {quote_value(value)}.")
         numbers = [self._number(key, item) for item in value]
         return tuple(item if type(item) is int else number for item, number in zip(value, numbers, strict=True))
 
@@ -210,7 +210,7 @@ class Table:
         """A table inside of this one; an empty one where it is absent."""
         value = self._get(key, {})
         if not isinstance(value, dict):
-            raise self.error(key, f"must be a table, [{self._inside(key)}], not {shown(value)}.")
+            raise self.error(key, f"must be a table, [{self._inside(key)}], not {quote_value(value)}.")
         return Table(value, self.file, self._inside(key))
 
     def tables(self, key: str) -> tuple["Table", ...]:
@@ -254,7 +254,7 @@ class Table:
     def _path(self, key: str, text: str) -> str:
         longest = max((len(os.fsencode(name)) for name in Path(text).parts), default=0)
         if not text.isprintable() or len(os.fsencode(text)) > _LONGEST_PATH or longest > _LONGEST_NAME:
-            raise self.error(key, f"{shown(text)} can be no file's name: too long, or not all of it can be read.")
+            raise self.error(key, f"{quote_value(text)} can be no file's name: too long, or not all of it can be read.")
         return text
 
     def _number(self, key: str, value: Any) -> float:
@@ -263,16 +263,16 @@ class Table:
         except OverflowError:
             number = math.inf
         if not math.isfinite(number):
-            raise self.error(key, f"must be a number, not {shown(value)}.")
+            raise self.error(key, f"must be a number, not {quote_value(value)}.")
         if abs(number) > LARGEST:
-            raise self.error(key, f"{shown(value)} is larger than anything that is measured. Correct it.")
+            raise self.error(key, f"{quote_value(value)} is larger than anything that is measured. Correct it.")
         return number
 
     def _sigma(self, key: str, value: Any) -> float:
         if value == FREE or value == math.inf:
             return math.inf
         if isinstance(value, str):
-            raise self.error(key, f'must be a standard deviation, 0 (fixed) or "{FREE}", not {shown(value)}.')
+            raise self.error(key, f'must be a standard deviation, 0 (fixed) or "{FREE}", not {quote_value(value)}.')
         sigma = self._number(key, value)
         if sigma < 0.0:
             raise self.error(

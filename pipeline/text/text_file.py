@@ -69,7 +69,7 @@ def _no_number(text: str) -> float:
     raise ValueError(f"{text} is no number of JSON")
 
 
-def shown(value: object) -> str:
+def quote_value(value: object) -> str:
     """A wrong value as a message quotes it: of one line, and not longer than makes sense."""
     try:
         text = repr(value)

@@ -7,7 +7,7 @@ from pipeline.archive.checked_statuses import CheckedResult, checked_scans, find
 from pipeline.archive.measurement import remember_place
 from pipeline.archive.results_database import Kept, Store
 from pipeline.provenance import Identity, file_state, parts_hash
-from pipeline.results.comparator_file import measurement_of
+from pipeline.results.comparator_file import read_measurement_hash
 from pipeline.results.measured_record import MeasuredScan, mark_row, scan_detail
 
 
@@ -33,7 +33,7 @@ def content(file: Path) -> bytes:
         return file.read_bytes()
     comparator = file.parents[1] / "comparator.csv"
     with Store(file) as store:
-        judging = find_judging(store, measurement_of(comparator)) if comparator.exists() else None
+        judging = find_judging(store, read_measurement_hash(comparator)) if comparator.exists() else None
         scans = () if judging is None else checked_scans(store, judging, file.parent)
         kept = [[scan_detail(scan, ""), *map(mark_row, scan.frame.marks)] for scan in scans]
         return b"" if judging is None else repr([judging.digest, *kept]).encode()

@@ -268,11 +268,11 @@ def _with(result: Adjustment) -> ReportData:
         write_adjustment(result, path)
         stored, covariance = read_adjustment(path), read_covariance(path)
     rows = tuple(
-        Row.of(name, unit, Estimate(value, sigma), Estimate(value + 0.1 * sigma, sigma))
+        Row.from_numbers(name, unit, Estimate(value, sigma), Estimate(value + 0.1 * sigma, sigma))
         for name, unit, value, sigma in CHECKED
     )
     camera = CameraCheck("agrees", "All parameters agree within 0.1 sigma.", 5, 120, 4.61, 4.60, 0.012, rows)
-    return replace(measured(), adjustment=stored, covariance=covariance, check=Check.of({CAMERA: camera}))
+    return replace(measured(), adjustment=stored, covariance=covariance, check=Check.from_cameras({CAMERA: camera}))
 
 
 @cache

@@ -63,7 +63,7 @@ def test_angles_are_in_degrees_in_the_json_and_in_rad_in_the_covariance(adjustme
     omega = file_content(path)["images"]["f3"]["exterior"]["omega_deg"]
     assert omega["value"] == pytest.approx(np.rad2deg(adjustment.value("EO.f3.omega")), rel=1e-14)
     assert omega["sigma"] == pytest.approx(np.rad2deg(3e-5) * adjustment.sigma0, rel=1e-12)
-    variance = read_covariance(path).of(["EO.f3.omega"])
+    variance = read_covariance(path).select(["EO.f3.omega"])
     assert variance[0, 0] == pytest.approx((3e-5 * adjustment.sigma0) ** 2, rel=1e-12)
 
 
@@ -75,7 +75,7 @@ def test_an_observed_attitude_is_given_in_degrees_and_a_mere_approximation_witho
 
 
 def test_the_covariance_is_a_posteriori_and_holds_correlations(adjustment: Adjustment, path: Path) -> None:
-    block = read_covariance(path).of(["IO.RC 20.c", "IO.RC 20.k3", "IO.RC 20.nothing"])
+    block = read_covariance(path).select(["IO.RC 20.c", "IO.RC 20.k3", "IO.RC 20.nothing"])
     assert block[0, 1] == pytest.approx(-0.95 * 0.0041 * 3.1e-9 * 262.1 / 257)
     assert np.all(block[2] == 0.0)
     assert np.all(block[:, 2] == 0.0)
@@ -238,13 +238,13 @@ def test_of_a_large_network_points_and_images_stand_by_themselves(
         write_adjustment(adjustment, path)
         covariance = read_covariance(path)
         assert sorted(each.text for each in covariance.parameters) == sorted(together)
-        np.testing.assert_array_equal(covariance.of(cameras), whole.of(cameras))
+        np.testing.assert_array_equal(covariance.select(cameras), whole.select(cameras))
         assert f"every {' and every '.join(kinds)} by itself" in file_content(path)["covariance"]
         with np.load(covariance_path(path)) as arrays:
             for kind in kinds:
                 for names, matrix in zip(arrays[f"{kind}_names"], arrays[f"{kind}_matrices"], strict=True):
                     listed = [str(name) for name in names if name]
-                    np.testing.assert_array_equal(matrix[: len(listed), : len(listed)], whole.of(listed))
+                    np.testing.assert_array_equal(matrix[: len(listed), : len(listed)], whole.select(listed))
                     assert not matrix[len(listed) :].any()
             assert arrays["point_names"].shape == (24, 3)
 
@@ -264,7 +264,7 @@ def test_names_that_would_run_together_have_results_of_their_own(tmp_path: Path)
             stored = cameras[name]["fiducials"][mark(id)][f"{axis}_mm"]
             assert stored["value"] == plain.value(own)
             assert stored["sigma"] == plain.sigma(own) > 0.0
-            assert covariance.of([alike])[0, 0] == pytest.approx(plain.sigma(own) ** 2, rel=1e-12)
+            assert covariance.select([alike])[0, 0] == pytest.approx(plain.sigma(own) ** 2, rel=1e-12)
 
 
 def test_a_covariance_whose_names_say_nothing_is_refused(path: Path) -> None:
@@ -296,10 +296,10 @@ def test_a_check_with_a_value_of_a_wrong_type_is_refused_with_its_place(tmp_path
         1.0,
         1.1,
         0.1,
-        (Row.of("k1", "", Estimate(1.0, 0.1), Estimate(1.0, 0.1)),),
+        (Row.from_numbers("k1", "", Estimate(1.0, 0.1), Estimate(1.0, 0.1)),),
         corners,
     )
-    content = plain_json(Check.of({"K": camera}))
+    content = plain_json(Check.from_cameras({"K": camera}))
     path = tmp_path / "check.json"
     path.write_text(json.dumps(content), encoding="utf-8")
     assert plain_json(read_check(path)) == content

@@ -30,10 +30,10 @@ from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.cli import run
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import read_project
-from pipeline.measuring.roll import CheckedScan, checked
+from pipeline.measuring.roll import CheckedScan, check_scans
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
-from pipeline.results.comparator_file import measurement_of
+from pipeline.results.comparator_file import read_measurement_hash
 from pipeline.results.measured_record import MeasuredScan, pose_record
 
 SAID = pytest.CaptureFixture[str]
@@ -80,7 +80,7 @@ def measure(folder: Path, *options: str) -> int:
 
 @pytest.mark.study
 def test_the_size_of_a_picture_is_that_of_its_scan(done: Path) -> None:
-    digest = measurement_of(done / "comparator.csv")
+    digest = read_measurement_hash(done / "comparator.csv")
     height, width = tifffile.imread(done / "a.tif").shape[:2]
     size = pytest.approx((width * PITCH_UM / 1000.0, height * PITCH_UM / 1000.0))
     assert picture_sizes_mm(done / "out" / "measurement.db", digest) == {"a": size, "b": size, "c": size}
@@ -181,7 +181,7 @@ def test_moved_and_touched_files_are_known_by_their_content_where_that_is_asked(
         """A step that has scans measured before all others, as that which reads a roll's first frames."""
         return tasks, {scan.frame.image: scan for scan in measure(tasks)}
 
-    monkeypatch.setattr("pipeline.archive.measure_archive.with_known_lines", asks_first)
+    monkeypatch.setattr("pipeline.archive.measure_archive.add_known_lines", asks_first)
     measure(folder, "--moved")  # hashes whole files
     assert not measured
     os.utime(folder / "a.tif", ns=(1, 1))
@@ -393,9 +393,9 @@ def test_of_many_scans_only_the_lot_of_a_new_one_is_judged_again(
 
     def counted(camera: CameraFile, scans: Sequence[MeasuredScan], *more: Any) -> tuple[CheckedScan, ...]:
         beside.append([scan.frame.image for scan in scans])
-        return checked(camera, scans, *more)
+        return check_scans(camera, scans, *more)
 
-    monkeypatch.setattr("pipeline.archive.cross_scan_checks.checked", counted)
+    monkeypatch.setattr("pipeline.archive.cross_scan_checks.check_scans", counted)
     shutil.copy(three / "a.tif", folder / "other.tif")  # a copy is no frame of its own, and needs no checks
     pixels = tifffile.imread(three / "a.tif")
     for number, (name, lots) in enumerate({"d": [["d"]], "h": [["h"]], "e": [["a", "b", "c", "e"]]}.items()):

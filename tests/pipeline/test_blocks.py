@@ -203,7 +203,7 @@ def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> N
     own = written_block(read_project(tmp_path / "project.toml"), tmp_path / "block", cut, {"f1": placed["f1"]})
     again = read_images(tmp_path / "block" / "images.csv")
     assert again.part_of == {f"f{i}{half}": f"f{i}" for i in IMAGES for half in "lr"}
-    assert own.part_of("f2l") == "f2"
+    assert own.scanned_frame("f2l") == "f2"
     for half in "lr":
         exterior = again.exterior[f"f1{half}"]
         assert exterior is not None

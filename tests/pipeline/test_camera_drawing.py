@@ -32,7 +32,7 @@ from pipeline.review.camera_drawing import (
     save_drawing,
 )
 from pipeline.review.drawing_view import drawing_json, take_step
-from pipeline.review.mark_handles import first_drawing, handles, with_vertex, without
+from pipeline.review.mark_handles import add_vertex, first_drawing, handles, remove_part
 from pipeline.review.session import Session
 
 pytestmark = pytest.mark.xdist_group("review")
@@ -92,11 +92,11 @@ def test_a_dragged_size_is_what_the_camera_file_means_by_it() -> None:
 
 def test_corners_of_a_polygon_come_where_they_are_clicked_and_go() -> None:
     mark = {"kind": "polygon", "vertices_mm": [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0]]}
-    more = with_vertex(mark, np.array([1.0, -0.2]))
+    more = add_vertex(mark, np.array([1.0, -0.2]))
     assert more["vertices_mm"] == [[0.0, 0.0], [1.0, -0.2], [2.0, 0.0], [2.0, 2.0]]
-    assert without(more, "vertices_mm.1") == mark
+    assert remove_part(more, "vertices_mm.1") == mark
     parts = {"kind": "parts", "part": [{"shape": "disk", "center_mm": [0, 0], "radius_mm": 1.0}] * 2}
-    assert len(without(parts, "part.0.radius_mm")["part"]) == 1
+    assert len(remove_part(parts, "part.0.radius_mm")["part"]) == 1
 
 
 # --- where the frame lies

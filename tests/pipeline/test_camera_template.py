@@ -94,7 +94,7 @@ def test_eight_marks_of_an_aerial_camera_have_the_places_and_names_of_calibratio
 def test_marks_to_be_learned_ask_for_clicks(tmp_path: Path) -> None:
     camera = camera_of(tmp_path, sizes("learned", "square"))
     assert len(camera.learned) == 4
-    assert camera.is_asked
+    assert camera.needs_clicks
 
 
 @pytest.mark.parametrize(

@@ -383,11 +383,11 @@ def test_what_opencv_has_no_model_for() -> None:
 def test_verdict_on_the_whole() -> None:
     good, bad = CameraCheck("agrees", "a."), CameraCheck("differs", "d.")
     impossible = CameraCheck("not possible", "n.")
-    assert Check.of({"1": good, "2": good}).verdict == "agrees"
-    assert Check.of({"1": good, "2": impossible}).verdict == "not possible"
-    assert Check.of({"1": bad, "2": impossible}).verdict == "differs"
-    assert Check.of({"1": bad, "2": impossible}).reason == "Camera 1: d."
-    assert Check.of({"1": good}).reason == "a."
+    assert Check.from_cameras({"1": good, "2": good}).verdict == "agrees"
+    assert Check.from_cameras({"1": good, "2": impossible}).verdict == "not possible"
+    assert Check.from_cameras({"1": bad, "2": impossible}).verdict == "differs"
+    assert Check.from_cameras({"1": bad, "2": impossible}).reason == "Camera 1: d."
+    assert Check.from_cameras({"1": good}).reason == "a."
 
 
 def test_json_has_the_documented_keys_and_no_nan() -> None:

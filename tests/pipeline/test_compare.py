@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.adjusting.compare_stage import _labels
 from pipeline.cli import run
-from pipeline.provenance import of_file
+from pipeline.provenance import hash_file
 from pipeline.results.comparison_file import read_comparison
 from pipeline.results.record_json import plain_json
 
@@ -27,7 +27,7 @@ def moved(project: Path, name: str, change_mm: float) -> Path:
     copy.write_text(json.dumps(content), encoding="utf-8")
     with np.load(project / "out" / "adjustment.npz") as arrays:
         whole = dict(arrays)
-    whole["fingerprint"] = np.array(of_file(copy))
+    whole["fingerprint"] = np.array(hash_file(copy))
     whole["values"] = whole["values"] + change_mm * np.char.endswith(whole["names"], ".c")
     np.savez(copy.with_suffix(".npz"), **whole)
     return copy

@@ -59,7 +59,7 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
             found, given = (getattr(each.distortion.parameters[name], key) for each in (after, before))
             assert found == pytest.approx(given, rel=1e-6)
     names = ["IO.L.c", "IO.L.k1", "EO.i0.omega", "EO.i3.X0"]
-    one, other = (read_covariance(path).of(names) for path in (first, back / "adjustment.json"))
+    one, other = (read_covariance(path).select(names) for path in (first, back / "adjustment.json"))
     np.testing.assert_allclose(other, one, rtol=1e-5)
     converted = read_adjustment(there / "adjustment.json").cameras["L"]
     assert converted.converted is not None

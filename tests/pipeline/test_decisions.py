@@ -15,7 +15,7 @@ from drawn_project import write_project
 from measure.fiducials.options import Click, FiducialOptions
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
-from pipeline.archive.review_decisions import after_checks, before_checks, decided
+from pipeline.archive.review_decisions import after_checks, apply_decisions, before_checks
 from pipeline.cli import run
 from pipeline.errors import InputError, WriteError
 from pipeline.files import decisions_file
@@ -23,7 +23,13 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.decision import Choice, Decision
 from pipeline.files.decisions_file import append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
-from pipeline.results.comparator_file import decisions_of, decisions_told, mark_rows, read_comparator, write_comparator
+from pipeline.results.comparator_file import (
+    describe_decisions,
+    mark_rows,
+    read_comparator,
+    read_decision_counts,
+    write_comparator,
+)
 from pipeline.results.measured_record import MeasuredScan
 
 TASK = ScanTask("a", "a.tif", ScanOptions(cast(CameraFile, SimpleNamespace()), None, FiducialOptions()))
@@ -255,7 +261,7 @@ def test_a_wrong_line_is_named(line: str, words: str, tmp_path: Path) -> None:
 
 def test_the_last_line_counts_and_undo_takes_back_the_one_before() -> None:
     accept, reject, undo = (mark_decision(choice) for choice in (Choice.ACCEPT, Choice.REJECT, Choice.UNDO))
-    about = accept.about
+    about = accept.subject
     assert standing([accept, reject])[about] is reject
     assert standing([accept, reject, undo])[about] is accept
     assert standing([accept, undo, undo, reject])[about] is reject
@@ -265,30 +271,34 @@ def test_the_last_line_counts_and_undo_takes_back_the_one_before() -> None:
 def test_decisions_of_another_result_do_not_count() -> None:
     old = mark_decision(Choice.ACCEPT, fingerprint="another file")
     own = mark_decision(Choice.REJECT, "2", fingerprint=key_of(TASK))
-    assert list(decided(TASK, [old, own], key_of, pose_of).counting.values()) == [own]
+    assert list(apply_decisions(TASK, [old, own], key_of, pose_of).counting.values()) == [own]
 
 
 def test_decisions_count_for_what_follows_from_those_before_them() -> None:
     """Accepted, then another mark placed, then, on what was measured from that, one more rejected."""
     accept = mark_decision(Choice.ACCEPT, "1", fingerprint=key_of(TASK))
     placed = place("2", 7.0, fingerprint=key_of(TASK))
-    now = decided(TASK, [accept, placed], key_of, pose_of)
+    now = apply_decisions(TASK, [accept, placed], key_of, pose_of)
     assert now.task.options.fiducials.clicks == (Click("2", 7.0, 2.0),)
     reject = mark_decision(Choice.REJECT, "3", fingerprint=key_of(now.task))
-    assert set(decided(TASK, [accept, placed, reject], key_of, pose_of).counting.values()) == {accept, placed, reject}
+    assert set(apply_decisions(TASK, [accept, placed, reject], key_of, pose_of).counting.values()) == {
+        accept,
+        placed,
+        reject,
+    }
 
 
 def test_what_was_decided_about_marks_does_not_count_in_another_pose() -> None:
     placed = place("2", 7.0, fingerprint=key_of(TASK))
     pose = Decision("a", Choice.POSE, pose="90", fingerprint=key_of(TASK))
     late = mark_decision(Choice.ACCEPT, "3", fingerprint=key_of(TASK))  # on a page that was not measured anew yet
-    now = decided(TASK, [pose, late], key_of, pose_of)
+    now = apply_decisions(TASK, [pose, late], key_of, pose_of)
     assert now.task.options.fiducials.pose == "90"
     assert list(now.counting.values()) == [pose]
     other = replace(pose, pose="180")  # somebody thinks again, on that page
-    assert decided(TASK, [pose, other], key_of, pose_of).task.options.fiducials.pose == "180"
+    assert apply_decisions(TASK, [pose, other], key_of, pose_of).task.options.fiducials.pose == "180"
     undone = Decision("a", Choice.UNDO, fingerprint="whatever is shown")
-    assert decided(TASK, [placed, pose, undone], key_of, pose_of).task.options.fiducials.pose == "auto"
+    assert apply_decisions(TASK, [placed, pose, undone], key_of, pose_of).task.options.fiducials.pose == "auto"
 
 
 def test_what_was_decided_about_marks_counts_on_in_the_pose_in_which_they_were_found() -> None:
@@ -296,11 +306,11 @@ def test_what_was_decided_about_marks_counts_on_in_the_pose_in_which_they_were_f
     early, late = (mark_decision(Choice.ACCEPT, point, fingerprint=key_of(TASK)) for point in "13")
     pose = Decision("a", Choice.POSE, pose="90", fingerprint=key_of(TASK))
     found = {key_of(TASK): "90"}
-    now = decided(TASK, [early, pose, late], key_of, found.get)
+    now = apply_decisions(TASK, [early, pose, late], key_of, found.get)
     assert now.task.options.fiducials.pose == "90"
     assert set(now.counting.values()) == {early, pose, late}
     found = {key_of(TASK): "180"}
-    assert set(decided(TASK, [pose, late], key_of, found.get).counting.values()) == {pose}
+    assert set(apply_decisions(TASK, [pose, late], key_of, found.get).counting.values()) == {pose}
 
 
 def scan_of(*marks: MarkMeasurement) -> MeasuredScan:
@@ -316,7 +326,9 @@ def weak(point: str, kind: Any = "fiducial") -> MarkMeasurement:
 
 def test_a_mark_becomes_what_was_decided_and_says_by_whom() -> None:
     choices = {"1": Choice.ACCEPT, "2": Choice.REJECT, "3": Choice.ABSENT}
-    counting = {one.about: one for point, choice in choices.items() if (one := mark_decision(choice, point, who="ann"))}
+    counting = {
+        one.subject: one for point, choice in choices.items() if (one := mark_decision(choice, point, who="ann"))
+    }
     scan = scan_of(*(weak(point) for point in "1234"))
     before, after = before_checks(scan, counting), after_checks(scan, counting)
     statuses = [Status.WEAK, Status.REJECTED, Status.ABSENT, Status.WEAK]
@@ -334,12 +346,12 @@ def test_a_mark_that_was_not_measured_cannot_be_accepted() -> None:
         "1", "fiducial", np.array([5.0, 6.0]), None, Status.PREDICTED, Reason("not seen", Code.NOT_FOUND)
     )
     one = mark_decision(Choice.ACCEPT)
-    assert after_checks(scan_of(bare), {one.about: one}).frame.marks[0].status is Status.PREDICTED
+    assert after_checks(scan_of(bare), {one.subject: one}).frame.marks[0].status is Status.PREDICTED
 
 
 def test_a_target_that_is_placed_counts_as_well_as_one_points() -> None:
     one = Decision("a", Choice.PLACE, "1", "target", col_px=50.0, row_px=60.0)
-    (mark,) = after_checks(scan_of(weak("1", "target")), {one.about: one}).frame.marks
+    (mark,) = after_checks(scan_of(weak("1", "target")), {one.subject: one}).frame.marks
     assert mark.status is Status.WEAK
     assert mark.center_px is not None
     np.testing.assert_array_equal(mark.center_px, (50.0, 60.0))
@@ -392,12 +404,14 @@ def test_what_is_decided_is_not_open_and_every_command_says_who_decided(
 
 
 def test_whose_decisions_stand_behind_a_file_is_read_from_its_head(tmp_path: Path) -> None:
-    decided = {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line\nend"): 3}
+    apply_decisions = {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line\nend"): 3}
     path = tmp_path / "comparator.csv"
-    write_comparator(path, mark_rows([FrameMeasurement("f", (weak("1"),))]), {"f": (20.0, 20.0)}, decided=decided)
-    read = decisions_of(path)
+    write_comparator(
+        path, mark_rows([FrameMeasurement("f", (weak("1"),))]), {"f": (20.0, 20.0)}, decided=apply_decisions
+    )
+    read = read_decision_counts(path)
     assert read == {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line end"): 3}
     said = "a.toml: 2 of ann, the second; b.toml: 1 of bob, 3 of line end"
-    assert decisions_told(read) == f"Decisions stand behind these marks: {said}."
-    assert decisions_told({}) == ""
+    assert describe_decisions(read) == f"Decisions stand behind these marks: {said}."
+    assert describe_decisions({}) == ""
     assert len(read_comparator(path)) == 1

@@ -35,7 +35,7 @@ class Known:
     def __init__(self, adjustment: Adjustment) -> None:
         self.adjustment = adjustment
 
-    def of(self, names: Iterable[str]) -> Array:
+    def select(self, names: Iterable[str]) -> Array:
         return self.adjustment.sigma0**2 * self.adjustment.cofactor_of(list(names))
 
 

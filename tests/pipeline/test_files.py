@@ -21,7 +21,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import read_images
-from pipeline.files.mark_table import saved_in
+from pipeline.files.mark_table import picture_writer
 from pipeline.files.points_file import read_points
 from pipeline.files.project_file import Project, read_project
 from pipeline.results.comparator_file import (
@@ -103,7 +103,7 @@ def test_self_calibration_sets_count_in_halves_of_the_frame(tmp_path: Path) -> N
     own = text.replace("family =", "half_mm = [100.0, 90.0]\nfamily =")
     camera = read_camera(written(tmp_path, "camera.toml", own))
     assert camera.distortion.half_mm == (100.0, 90.0)
-    again = camera_text(camera, saved_in(tmp_path))
+    again = camera_text(camera, picture_writer(tmp_path))
     assert read_camera(written(tmp_path, "again.toml", again)).distortion == camera.distortion
 
 
@@ -112,7 +112,7 @@ def test_a_template_that_is_turned_stays_so_in_a_written_camera(tmp_path: Path) 
     grey = np.arange(80, dtype=np.uint16).reshape(10, 8)
     tifffile.imwrite(tmp_path / "chip.tif", grey)
     camera = read_camera(written(tmp_path, "camera.toml", CAMERA.replace(DRAWN, chip)))
-    again = read_camera(written(tmp_path, "again.toml", camera_text(camera, saved_in(tmp_path))))
+    again = read_camera(written(tmp_path, "again.toml", camera_text(camera, picture_writer(tmp_path))))
     for each in (camera, again):
         mark = each.fiducials[0].mark
         assert isinstance(mark, MarkTemplate)
@@ -123,7 +123,7 @@ def test_a_template_that_is_turned_stays_so_in_a_written_camera(tmp_path: Path) 
 def test_where_a_drawing_is_true_is_turned_with_it_and_written_with_it(tmp_path: Path) -> None:
     about = DRAWN + "\ntrue_mm = [[-0.5, -1.0], [2.0, 1.0]]"
     camera = read_camera(written(tmp_path, "camera.toml", CAMERA.replace(DRAWN, about)))
-    again = read_camera(written(tmp_path, "again.toml", camera_text(camera, saved_in(tmp_path))))
+    again = read_camera(written(tmp_path, "again.toml", camera_text(camera, picture_writer(tmp_path))))
     for each in (camera, again):
         mark = each.fiducials[0].mark
         assert isinstance(mark, MarkShape)

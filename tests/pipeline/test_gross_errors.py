@@ -138,7 +138,7 @@ def test_a_lens_known_in_the_middle_alone_needs_a_look(frame_mm: float, level: i
     assert known["corner_sigma_um"] > known["sigma_um"] > 0.0
     # By dr = k3 r³ + k5 r⁵ and the covariance that stands in adjustment.npz.
     covariance = read_own_covariance(tmp_path / "out" / "adjustment.json")
-    of_terms = covariance.of([Parameter.interior("K", each) for each in ("k3", "k5")])
+    of_terms = covariance.select([Parameter.interior("K", each) for each in ("k3", "k5")])
     for radius, sigma in (("radius_mm", "sigma_um"), ("corner_mm", "corner_sigma_um")):
         by_terms = 1e3 * known[radius] ** np.array([3.0, 5.0])
         assert known[sigma] == pytest.approx(float(np.sqrt(by_terms @ of_terms @ by_terms)), rel=1e-6)

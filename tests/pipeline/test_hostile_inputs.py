@@ -35,7 +35,7 @@ from pipeline.files.decision import Choice, Decision
 from pipeline.files.decisions_file import append_decisions, read_decisions
 from pipeline.files.project_file import read_project
 from pipeline.results.measured_record import FailureCode, mark_row, scan_detail
-from pipeline.review.queue import queue_of
+from pipeline.review.queue import build_queue
 from pipeline.text.names import names_below
 
 REFUSED = (InputError, MeasurementError, AdjustmentError)
@@ -92,7 +92,7 @@ def readings(folder: Path) -> dict[str, Any]:
     def questions() -> Any:
         with Store(path) as store:
             judging = latest(store)
-            queue = queue_of(project, store.connection, judging.row) if judging is not None else ()
+            queue = build_queue(project, store.connection, judging.row) if judging is not None else ()
         return [entry for entry in queue if entry.fingerprints != ("",)]
 
     def statuses() -> Any:

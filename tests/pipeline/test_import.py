@@ -23,7 +23,7 @@ from pipeline.exchange.certificate import balanced_mm, fit, read_certificate
 from pipeline.exchange.xml_tree import read_xml
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.images_file import read_images
-from pipeline.results.comparator_file import pitches_of, read_comparator
+from pipeline.results.comparator_file import read_comparator, read_pitches
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def test_marks_come_back_as_they_went(format: str, project: Path, tmp_path: Path
     for key, mark in there.items():
         np.testing.assert_allclose(mark.xy_mm, here[key].xy_mm, atol=1e-9)  # type: ignore[arg-type]
         np.testing.assert_allclose(mark.sigma_mm, here[key].sigma_mm, rtol=1e-9)  # type: ignore[arg-type]
-    assert pitches_of(folder / "comparator.csv")["f3"] == (100.0, 100.0)
+    assert read_pitches(folder / "comparator.csv")["f3"] == (100.0, 100.0)
     if format == "micmac":
         given = {one.id: one.xy_mm for one in read_camera(folder / "camera.toml").fiducials}
         for id, xy in FIDUCIALS.items():

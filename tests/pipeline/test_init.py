@@ -147,7 +147,7 @@ def test_the_project_that_is_written_is_read_and_has_each_scans_camera(box: Path
     told = json.loads(capsys.readouterr().out)
     project = read_project(out / "project.toml")
     assert sorted(project.scans) == ["0001", "0002", "0003", "0004"]
-    assert all(project.camera_of(name).name == "Wild RC10, 153 mm" for name in project.scans)
+    assert all(project.image_camera(name).name == "Wild RC10, 153 mm" for name in project.scans)
     lines = (out / "images.csv").read_text(encoding="utf-8").splitlines()
     assert lines[:2] == ["image,camera", "0001,library:wild-rc10-153"]
     assert told["scans"] == len(lines) - 1 == 4
@@ -220,7 +220,7 @@ def test_what_a_server_lists_is_looked_at_as_a_folder_is(box: Path, tmp_path: Pa
     assert {name: str(path) for name, path in project.scans.items()} == {
         name: f"{server.url}/1952/{name}.tif" for name in ("0001", "0002", "0003", "0004")
     }
-    assert project.camera_of("0001").name == read_library()["wild-rc10-153"].name
+    assert project.image_camera("0001").name == read_library()["wild-rc10-153"].name
 
 
 @pytest.mark.usefixtures("told")

@@ -221,7 +221,7 @@ def test_cameras_whose_files_are_named_alike_are_stored_apart(
     )
     known = learned(read_project(tmp_path / "project.toml"))
     for image, file in {"f0": "camera.toml", "f1": "camera-3.toml", "f2": "camera-2.toml"}.items():
-        for camera in (known.camera_of(image), read_camera(tmp_path / "out" / "learned" / file)):
+        for camera in (known.image_camera(image), read_camera(tmp_path / "out" / "learned" / file)):
             assert camera.learned_from is not None
             assert camera.learned_from.scan == image
 

@@ -48,6 +48,6 @@ def test_a_fisheye_is_tried_where_the_field_is_wide(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("model", ["opencv4", "opencv5", "opencv8", "fisheye"])
 def test_focal_lengths_are_apart_unless_pixels_are_square(model: LensModel) -> None:
-    assert lens_choice.lens_of(model, square_pixels=False).parameters.keys() - lens_choice.lens_of(
+    assert lens_choice.free_lens(model, square_pixels=False).parameters.keys() - lens_choice.free_lens(
         model, square_pixels=True
     ).parameters.keys() == {"b1"}

@@ -142,7 +142,7 @@ def test_images_may_name_a_camera_of_the_library(tmp_path: Path) -> None:
     text = 'camera = "library:wild-rc8-153"\n[object]\nimages = "images.csv"\n'
     (tmp_path / "project.toml").write_text(text, encoding="utf-8")
     project = read_project(tmp_path / "project.toml")
-    assert [project.camera_of(name).name for name in "ab"] == ["Wild RC9, 88 mm", "Wild RC8, 153 mm"]
+    assert [project.image_camera(name).name for name in "ab"] == ["Wild RC9, 88 mm", "Wild RC8, 153 mm"]
 
 
 @one_frame
@@ -177,7 +177,7 @@ def test_the_frame_is_told_from_another_camera(frame: Path, monkeypatch: pytest.
     """A ring with a cross holds the plain cross of older cameras too: the ring then counts as damage. No other pitch
     than the file's is tried."""
     monkeypatch.setattr(LayoutSearch, "longer_one_way", None)
-    monkeypatch.setattr(LayoutSearch, "at_any_pitch", None)
+    monkeypatch.setattr(LayoutSearch, "try_any_pitch", None)
     (scan,) = (frame.parent / "scans").glob("*.tif")
     few = {name: LIBRARY[name] for name in ("jena-lmk-153", "wild-rc5-153", "wild-rc8-153", RENDERED)}
     found = identify(scan, few, None, Reporter())
@@ -204,8 +204,8 @@ def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras
     """Four scans of one size and one of another, in a folder and below it: three and one are tried. A scan that cannot
     be read costs no other, and the project's camera, which the library has not, is named beside its twins. No other
     pitch than the files' is tried."""
-    monkeypatch.setattr(LayoutSearch, "longer_one_way", LayoutSearch.at_pitch)
-    monkeypatch.setattr(camera_trials, "_at_any_pitch", lambda *_: ([], {}))
+    monkeypatch.setattr(LayoutSearch, "longer_one_way", LayoutSearch.try_pitch)
+    monkeypatch.setattr(camera_trials, "_try_any_pitch", lambda *_: ([], {}))
     (scan,) = (frame.parent / "scans").glob("*.tif")
     folder = tmp_path / "scans"
     (folder / "b").mkdir(parents=True)
@@ -256,7 +256,7 @@ def test_marks_are_looked_at_once_a_search_answers_that_chance_does_not_make(
         seen.append(each.before)
         return replace(trial(names, 0.5, None), expected=each.answer.expected)
 
-    monkeypatch.setattr(LayoutSearch, "at_pitch", answers(0, *at_pitch))
+    monkeypatch.setattr(LayoutSearch, "try_pitch", answers(0, *at_pitch))
     monkeypatch.setattr(LayoutSearch, "longer_one_way", answers(1, 0.02 if at_pitch[0] > 1 else 1e-3, 7.0))
     monkeypatch.setattr(camera_trials, "_trial", looked)
     identify(scan, two, 100.0, Reporter())
@@ -345,7 +345,7 @@ def test_a_form_that_fits_the_scan_clearly_worse_is_not_told_beside_a_name(
     """a was found with 0.85. b, drawn much like it, is looked at where a lies; c, as much alike, has no mark there."""
 
     class Search:
-        def seen(self, tried: Tried) -> str | None:
+        def recognise(self, tried: Tried) -> str | None:
             assert (tried.answer, tried.bold) == (of_a.answer, of_a.bold)
             return "frame" if tried.layout.marks[0].id == "b" else None
 

@@ -22,7 +22,7 @@ from pipeline.report.frame_views import MOST_CARDS
 from pipeline.report.load import report_data
 from pipeline.report.many_frames import MOST_FRAMES, reduced
 from pipeline.report.page import render_frame_page
-from pipeline.results.comparator_file import ComparatorPoint, mark_rows, measurement_of, write_comparator
+from pipeline.results.comparator_file import ComparatorPoint, mark_rows, read_measurement_hash, write_comparator
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 
 pytestmark = pytest.mark.xdist_group("many frames")  # made up once for all
@@ -203,7 +203,7 @@ def stored(folder: Path) -> tuple[Path, list[MeasuredScan]]:
 def as_written(folder: Path) -> None:
     """As `reseau measure` says it at its end."""
     with Store(folder / "out" / "measurement.db") as store:
-        remember_written(store, measurement_of(folder / "comparator.csv"), folder / "comparator.csv")
+        remember_written(store, read_measurement_hash(folder / "comparator.csv"), folder / "comparator.csv")
 
 
 @pytest.mark.study

@@ -22,7 +22,7 @@ from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.images_file import read_images
 from pipeline.files.project_file import Project, read_project
-from pipeline.measuring.tie_stage import with_joins
+from pipeline.measuring.tie_stage import add_joins
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_record import MeasuredScan
 
@@ -289,7 +289,7 @@ def test_fiducials_that_contradict_the_joins_are_rejected(halves: Path) -> None:
     assert shifted is not None
     shifted = shifted + np.array([[0.0, 0.0, 50.0], [0.0, 0.0, 0.0]])
     wrong = _with_frame(scans[1], shifted)
-    told = with_joins(project, [scans[0], wrong], lambda *_: None, None)
+    told = add_joins(project, [scans[0], wrong], lambda *_: None, None)
     assert all("contradict those of" in " ".join(scan.frame.problems) for scan in told)
     assert not any(mark.kind == "fiducial" and mark.status.is_observation for mark in told[1].frame.marks)
 
@@ -347,5 +347,5 @@ def test_one_part_tells_the_orientation_of_all(tmp_path: Path) -> None:
         "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,part_of\na,,,,,,,f\nb,1,0,9,0,0,0,f\n", encoding="utf-8"
     )
     given = read_images(path)
-    assert given.parts_of("f") == ("a", "b")
+    assert given.frame_parts("f") == ("a", "b")
     assert given.exterior["a"] is given.exterior["b"] is not None

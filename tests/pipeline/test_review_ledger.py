@@ -20,20 +20,22 @@ def check(ledger: Ledger, path: Path) -> None:
     stands = standing(read_decisions(path))
     assert {about: ledger.get(about) for about in stands} == dict(stands)
     for image in "abc":
-        assert {one.about: one for one in ledger.of_image(image)} == {a: o for a, o in stands.items() if a[0] == image}
+        assert {one.subject: one for one in ledger.image_decisions(image)} == {
+            a: o for a, o in stands.items() if a[0] == image
+        }
 
 
 def test_only_what_is_new_is_told(tmp_path: Path) -> None:
     path, rng = tmp_path / "decisions.jsonl", random.Random(3)
     ledger = Ledger(path)
-    assert ledger.read_on() == frozenset()  # there is no file yet
+    assert ledger.update() == frozenset()  # there is no file yet
     append_decisions(path, some(rng, 5))
-    assert ledger.read_on() is None
+    assert ledger.update() is None
     for count in (1, 40, 3):
         new = some(rng, count)
         append_decisions(path, new)
-        assert ledger.read_on() == frozenset(one.image for one in new)
-        assert ledger.read_on() == frozenset()
+        assert ledger.update() == frozenset(one.image for one in new)
+        assert ledger.update() == frozenset()
         check(ledger, path)
 
 
@@ -42,22 +44,22 @@ def test_a_file_that_is_another_one_is_read_anew(tmp_path: Path) -> None:
     path, rng = tmp_path / "decisions.jsonl", random.Random(4)
     ledger = Ledger(path)
     append_decisions(path, some(rng, 30))
-    ledger.read_on()
+    ledger.update()
     other = tmp_path / "other"
     append_decisions(other, some(rng, 60))
     other.replace(path)
-    assert ledger.read_on() is None
+    assert ledger.update() is None
     check(ledger, path)
     text = path.read_text().replace('"reject"', '"accept"') + path.read_text()
     path.write_text(text)
-    assert ledger.read_on() is None
+    assert ledger.update() is None
     check(ledger, path)
     with path.open("a") as file:
         file.write('{"image": "a", "deci')
-    ledger.read_on()
+    ledger.update()
     append_decisions(path, some(rng, 3))
-    assert ledger.read_on() is None
+    assert ledger.update() is None
     check(ledger, path)
     path.unlink()
-    assert ledger.read_on() is None
+    assert ledger.update() is None
     check(ledger, path)

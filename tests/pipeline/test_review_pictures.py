@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import tifffile
 
-from pipeline.review.pictures import Pictures, _pixels_on
+from pipeline.review.pictures import Pictures, _overlapping_pixels
 
 
 def test_a_wide_window_takes_little_memory_and_shows_the_scan_in_its_place(tmp_path: Path) -> None:
@@ -34,4 +34,4 @@ def test_reduced_pixels_on_a_scan_are_those_that_touch_it() -> None:
     rng = np.random.default_rng(4)
     for start, extent, side, step in zip(*rng.integers((-100, 1, 1, 2), (120, 80, 30, 9), (500, 4)).T, strict=True):
         touching = [k for k in range(side) if start + k * step < extent and start + (k + 1) * step > 0]
-        assert list(_pixels_on(int(start), int(extent), int(side), int(step))) == touching
+        assert list(_overlapping_pixels(int(start), int(extent), int(side), int(step))) == touching

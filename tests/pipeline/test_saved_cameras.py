@@ -10,7 +10,7 @@ from test_earlier_calibrations import two_networks
 
 from pipeline.cli import run
 from pipeline.errors import InputError
-from pipeline.exchange.saved_cameras import _variances_between, save_cameras
+from pipeline.exchange.saved_cameras import _archive_variances, save_cameras
 from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import read_project
 from pipeline.results.adjustment_file import read_adjustment
@@ -79,7 +79,7 @@ def test_the_spread_between_archives_is_what_their_own_sigmas_do_not_explain() -
     rng = np.random.default_rng(5)
     for true in (2.0, 0.0):
         values = true * rng.normal(size=(5, 4000)) + rng.normal(size=(5, 4000))
-        between = _variances_between(values, np.ones((5, 4000)))
+        between = _archive_variances(values, np.ones((5, 4000)))
         assert float(between.mean()) == pytest.approx(true**2, rel=0.06, abs=0.3)
 
 

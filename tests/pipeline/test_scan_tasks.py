@@ -22,7 +22,7 @@ from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.measuring import scan_measurement
 from pipeline.measuring.scan_measurement import measure_scans, measured_scan
-from pipeline.measuring.scan_task import ScanTask, few_of, scan_tasks
+from pipeline.measuring.scan_task import ScanTask, sample_names, scan_tasks
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_record import FailureCode, MeasuredScan
 
@@ -125,11 +125,11 @@ def test_the_marks_of_another_camera_do_not_count(tmp_path: Path) -> None:
 
 def test_few_of_many_scans_are_the_same_when_another_one_comes() -> None:
     names = [f"roll/{number}" for number in range(60)]
-    few = [few_of(names[:count], 4) for count in range(10, 60)]
+    few = [sample_names(names[:count], 4) for count in range(10, 60)]
     assert all(len(each) == 4 and each == sorted(each, key=names.index) for each in few)
     assert sum(before != after for before, after in pairwise(few)) < 15  # 4 in so many, of each: 7 are to be expected
-    assert few_of(names[::-1], 4) == few_of(names, 4)[::-1]
-    assert few_of(names[:3], 4) == names[:3]
+    assert sample_names(names[::-1], 4) == sample_names(names, 4)[::-1]
+    assert sample_names(names[:3], 4) == names[:3]
 
 
 class Watched:

@@ -77,7 +77,7 @@ def test_the_field_of_the_report_has_the_band_of_its_terms(tmp_path: Path) -> No
     value_um, covariance_um2 = bend_field("1", scanner, covariance, corner)
     terms = scanner.terms
     assert value_um[0, 0] == pytest.approx(1e3 * (terms["a20"].value + terms["a02"].value))
-    matrix = covariance.of(["SC.1.a20", "SC.1.a02"])
+    matrix = covariance.select(["SC.1.a20", "SC.1.a02"])
     assert covariance_um2[0, 0, 0] == pytest.approx(1e6 * matrix.sum())
     assert covariance_um2[0, 1, 1] == pytest.approx(0.0)
 

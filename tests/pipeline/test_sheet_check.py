@@ -12,7 +12,7 @@ from single_scans import measure_scan
 from measure.flags import Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.files.project_file import Project, read_project
-from pipeline.measuring.sheet_check import with_checked_sheet
+from pipeline.measuring.sheet_check import check_sheet
 from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]
@@ -73,12 +73,12 @@ def test_what_one_picture_alone_shows_off_its_place_is_refused(tmp_path: Path) -
     project = board(tmp_path)
     wrong = {"p0": {"r0c0": 1.5, "r3c4": 0.8}, "p2": {"r7c8": 2.0, BUCKLED: 1.0}, "p4": {"r4c4": 40.0, "r6c1": 0.6}}
     names = [f"p{number}" for number in range(5)]
-    checked = with_checked_sheet(project, [measured(rng, project, name, wrong.get(name, {})) for name in names])
+    checked = check_sheet(project, [measured(rng, project, name, wrong.get(name, {})) for name in names])
     assert all(scan.frame.marks[0].status is Status.MEASURED for scan in checked)  # a fiducial of a point's name
     assert status(checked, Status.REJECTED) == {(name, id) for name, ids in wrong.items() for id in ids}
     assert not status(checked, Status.WEAK)
-    assert with_checked_sheet(project, []) == ()
-    alone = with_checked_sheet(project, [measured(rng, project, "p0", {"r3c4": 3.0, "r1c1": 400.0})])
+    assert check_sheet(project, []) == ()
+    alone = check_sheet(project, [measured(rng, project, "p0", {"r3c4": 3.0, "r1c1": 400.0})])
     doubted = status(alone, Status.WEAK)
     assert status(alone, Status.REJECTED) == {("p0", "r1c1")}
     assert ("p0", "r3c4") in doubted

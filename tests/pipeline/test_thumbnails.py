@@ -10,11 +10,11 @@ import tifffile
 from drawn_project import write_project
 
 from measure.scans.opening import open_scan
-from pipeline.archive.measurement import fingerprints_of, read_measurement
+from pipeline.archive.measurement import read_fingerprints, read_measurement
 from pipeline.archive.results_database import Store
 from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore, thumbnails_path
 from pipeline.cli import run
-from pipeline.results.comparator_file import measurement_of
+from pipeline.results.comparator_file import read_measurement_hash
 from pipeline.results.thumbnail import cut
 
 pytestmark = pytest.mark.xdist_group("thumbnails")  # measured once for all
@@ -34,8 +34,8 @@ def folder(measured: Path, tmp_path: Path) -> Path:
 
 
 def keys(folder: Path) -> dict[str, str]:
-    digest = measurement_of(folder / "comparator.csv")
-    return fingerprints_of(folder / "out" / "measurement.db", digest, ("a", "b", "c", "none"))
+    digest = read_measurement_hash(folder / "comparator.csv")
+    return read_fingerprints(folder / "out" / "measurement.db", digest, ("a", "b", "c", "none"))
 
 
 def grey(pixels: np.ndarray) -> np.ndarray:
@@ -47,11 +47,11 @@ def grey(pixels: np.ndarray) -> np.ndarray:
 def test_every_mark_has_the_picture_that_its_scan_shows(folder: Path) -> None:
     found = keys(folder)
     assert set(found) == {"a", "b", "c"}
-    with ThumbnailStore.beside(folder / "out" / "measurement.db") as store:
+    with ThumbnailStore.open(folder / "out" / "measurement.db") as store:
         for scan in read_measurement(folder / "out" / "measurement.db"):
             with open_scan(scan.scan) as opened:
                 for mark in scan.frame.marks:
-                    stored, own = store.of(found[scan.frame.image], mark.point, mark.kind), cut(opened, mark)
+                    stored, own = store.get(found[scan.frame.image], mark.point, mark.kind), cut(opened, mark)
                     assert stored is not None
                     assert own is not None
                     kept = stored.thumbnail
@@ -64,8 +64,8 @@ def test_every_mark_has_the_picture_that_its_scan_shows(folder: Path) -> None:
 
 
 def test_the_whole_scan_is_kept_where_measuring_saw_it(folder: Path) -> None:
-    with ThumbnailStore.beside(folder / "out" / "measurement.db") as store:
-        stored = store.of(keys(folder)["a"])
+    with ThumbnailStore.open(folder / "out" / "measurement.db") as store:
+        stored = store.get(keys(folder)["a"])
     assert stored is not None
     assert stored.is_whole
     pixels = tifffile.imread(folder / "a.tif").astype(float)
@@ -99,12 +99,12 @@ def test_without_the_file_pictures_come_from_the_scans_again(folder: Path) -> No
 def test_a_mark_that_was_measured_elsewhere_since_is_cut_anew(folder: Path) -> None:
     scans, path = read_measurement(folder / "out" / "measurement.db"), folder / "out" / "measurement.db"
     with Thumbnails(scans, None, path, keys(folder)) as kept:
-        assert kept.of("a", "1", "fiducial").pixels.dtype == np.uint8  # type: ignore[union-attr]
+        assert kept.get("a", "1", "fiducial").pixels.dtype == np.uint8  # type: ignore[union-attr]
     for mark in scans[0].frame.marks:
         assert mark.center_px is not None
         np.add(mark.center_px, 60.0, out=mark.center_px)
     with Thumbnails(scans, None, path, keys(folder)) as kept:
-        assert kept.of("a", "1", "fiducial").pixels.dtype == np.float32  # type: ignore[union-attr]
+        assert kept.get("a", "1", "fiducial").pixels.dtype == np.float32  # type: ignore[union-attr]
 
 
 def test_pictures_follow_results_that_are_moved_or_merged(folder: Path) -> None:
@@ -116,9 +116,9 @@ def test_pictures_follow_results_that_are_moved_or_merged(folder: Path) -> None:
     with Store(folder / "out" / "measurement.db") as store:
         now = set(store.fingerprints()) - set(before.values())
     assert len(now) == 1
-    with ThumbnailStore.beside(folder / "out" / "measurement.db") as thumbnails:
-        assert thumbnails.of(now.pop(), "1", "fiducial") is not None
-        assert thumbnails.of(before["a"], "1", "fiducial") is None
+    with ThumbnailStore.open(folder / "out" / "measurement.db") as thumbnails:
+        assert thumbnails.get(now.pop(), "1", "fiducial") is not None
+        assert thumbnails.get(before["a"], "1", "fiducial") is None
 
 
 @pytest.mark.study
@@ -130,8 +130,8 @@ def test_stores_of_shards_bring_their_pictures(measured: Path, tmp_path: Path) -
         run(["measure", project, "--shard", f"{k}/5", "--workers", "1"])
     run(["merge", project, *(str(parts / "out" / f"measurement.{k}-of-5.db") for k in (1, 2))])
     assert thumbnails_path(parts / "out" / "measurement.1-of-5.db").exists()
-    with ThumbnailStore.beside(parts / "out" / "measurement.db") as thumbnails:
-        assert all(thumbnails.of(key, "1", "fiducial") for key in keys(parts).values())
+    with ThumbnailStore.open(parts / "out" / "measurement.db") as thumbnails:
+        assert all(thumbnails.get(key, "1", "fiducial") for key in keys(parts).values())
     assert len(keys(parts)) == 3
 
 

@@ -23,8 +23,8 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import parse_camera, read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import WRITTEN, fill_images, read_images
-from pipeline.measuring.camera_identification import Identification, Trial, contradictions, plate_of, with_plates
-from pipeline.measuring.roll import known_lines, poses_of_roll, with_known_lines, with_same_frames
+from pipeline.measuring.camera_identification import Identification, Trial, add_plates, contradictions, parse_plate
+from pipeline.measuring.roll import add_known_lines, known_lines, note_same_frames, poses_of_roll
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
@@ -76,7 +76,7 @@ def test_empty_columns_of_images_csv_are_filled_and_nothing_else_is_touched(tmp_
 
 def test_two_scans_that_say_the_same_frame_are_told() -> None:
     lines = [line(text) for text in TITLES]
-    first, second, other = with_same_frames(
+    first, second, other = note_same_frames(
         [scan("a", lines), scan("b", lines), scan("c", lines[:-2])], lambda image: ""
     )
     assert "frame 8617, run 7, frames 8601-8639, date 1968-05-16" in first.frame.problems[0]
@@ -87,7 +87,7 @@ def test_two_scans_that_say_the_same_frame_are_told() -> None:
 
 def test_scans_of_parts_of_one_frame_are_meant_to_say_the_same() -> None:
     lines = [line(text) for text in TITLES]
-    halves = with_same_frames([scan("a", lines), scan("b", lines)], lambda image: "8617")
+    halves = note_same_frames([scan("a", lines), scan("b", lines)], lambda image: "8617")
     assert all(half.frame.problems == () for half in halves)
 
 
@@ -220,7 +220,7 @@ def test_a_few_frames_of_a_roll_are_read_and_the_others_know_by_what() -> None:
             yield replace(scan(task.name, None), frame=frame_of_roll(task.name, "0", f"DEVELOPMENT {task.name}"))
 
     tasks = roll_tasks([f"{number:04d}" for number in range(200)])
-    knowing, read = with_known_lines(tasks, measure, Reporter(Console(quiet=True)))
+    knowing, read = add_known_lines(tasks, measure, Reporter(Console(quiet=True)))
     assert [task.name for task in knowing] == [task.name for task in tasks]
     assert sorted(asked) == sorted(read)
     assert len(read) == 4
@@ -230,14 +230,14 @@ def test_a_few_frames_of_a_roll_are_read_and_the_others_know_by_what() -> None:
     assert len({id(task.options) for task in knowing}) == 2
     assert knowing[0].posed("90").options.fiducials.known_lines == ()
     for none in (roll_tasks(["a", "b", "c", "d"]), roll_tasks([f"{n}" for n in range(9)], "all")):
-        assert with_known_lines(none, measure, Reporter(Console(quiet=True))) == (tuple(none), {})
+        assert add_known_lines(none, measure, Reporter(Console(quiet=True))) == (tuple(none), {})
 
 
 def test_the_frames_that_are_read_hardly_change_with_one_scan_more() -> None:
     def first(*more: str) -> set[str]:
         silent = Reporter(Console(quiet=True))
         tasks = roll_tasks([*(f"{number:04d}" for number in range(200)), *more])
-        return set(with_known_lines(tasks, lambda own: (scan(task.name, ()) for task in own), silent)[1])
+        return set(add_known_lines(tasks, lambda own: (scan(task.name, ()) for task in own), silent)[1])
 
     assert max(len(first() - first(f"more{number}")) for number in range(20)) <= 1
 
@@ -248,21 +248,21 @@ RC10 = parse_camera(
 
 
 def test_a_plate_is_held_against_the_cameras_file() -> None:
-    own = with_plates(RC10, [scan("a", [line("WILD 15/4 UAG"), line("Nr 13043 152.75")]), scan("b", None)], {})
+    own = add_plates(RC10, [scan("a", [line("WILD 15/4 UAG"), line("Nr 13043 152.75")]), scan("b", None)], {})
     assert own[0].frame.problems == ()
     assert "(Nr 13043) says a principal distance of 152.75 mm, its file 153 mm" in own[0].notes[0]
     assert own[1].notes == ()
-    assert contradictions(RC10, plate_of([line("RMK A 30/23"), line("Nr 1234 305.12")])) == [
+    assert contradictions(RC10, parse_plate([line("RMK A 30/23"), line("Nr 1234 305.12")])) == [
         "it is of a camera by Zeiss",
         "it gives a principal distance of 305.12 mm",
     ]
-    other = with_plates(RC10, [scan("a", [line("Nr 1234 305.12")])], {})[0]
+    other = add_plates(RC10, [scan("a", [line("Nr 1234 305.12")])], {})[0]
     assert "not of Wild RC10, 153 mm: it gives a principal distance of 305.12 mm" in other.frame.problems[0]
     assert other.notes == ()
 
 
 def test_plates_of_two_cameras_under_one_file_are_told() -> None:
-    first, second, mute = with_plates(
+    first, second, mute = add_plates(
         RC10, [scan("a", [line("Nr 13043")]), scan("b", [line("Nr 13022")]), scan("c", [])], {}
     )
     assert "Nr 13022, 13043" in first.frame.problems[0]
@@ -275,7 +275,7 @@ def test_a_number_tells_two_cameras_of_a_type_apart() -> None:
     cameras = {"first.toml": first, "second.toml": second}
     plates = {"a": "Nr 13043", "b": "Nr 13022", "c": "Nr 999", "d": "RUN 7"}
     scans = [scan(image, [line(plate)]) for image, plate in plates.items()]
-    own, other, unknown, mute = with_plates(first, scans, cameras)
+    own, other, unknown, mute = add_plates(first, scans, cameras)
     assert own.frame.problems == mute.frame.problems == ()
     assert "it gives the number 13022, the file 13043. Give this scan the camera second.toml" in other.frame.problems[0]
     assert "it gives the number 999, the file 13043. Give this scan its own camera" in unknown.frame.problems[0]
