@@ -12,6 +12,14 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(cpu_limit)  # beside conftest.py: fixtures of a session are not of this folder
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What the tests of a file share is made once: all tests of a file stay with one worker."""
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.path.name))
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     skipped = [str(each.longrepr) for each in terminalreporter.stats.get("skipped", [])]
     for reason, need in (

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.xdist_group("packages")  # their files are read once for all
 ROOT = Path(__file__).parent.parent
 PACKAGES = {"measure", "adjust", "compiled", "pipeline", "synthetic_images", "reseau"}
 ALLOWED = {

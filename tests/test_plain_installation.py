@@ -12,10 +12,7 @@ import pytest
 
 from pipeline.cli import DONE, GROUPS, LOOK, WRONG_INPUT
 
-pytestmark = [
-    pytest.mark.xdist_group("plain installation"),  # the commands are run once for all
-    pytest.mark.skipif(not plain_environment.PYTHON.exists(), reason=plain_environment.REASON),
-]
+pytestmark = pytest.mark.skipif(not plain_environment.PYTHON.exists(), reason=plain_environment.REASON)
 MODULES_OF_EXTRAS = {"pipeline.review.server": "anyio", "pipeline.review.safety": "starlette"}
 READS_WRITING = "rapidocr-onnxruntime"  # installed for the files that it carries, without what it asks for
 

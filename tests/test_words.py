@@ -14,7 +14,6 @@ import pytest
 
 from pipeline.cli import GROUPS
 
-pytestmark = pytest.mark.xdist_group("words")  # the texts are read once for all
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("measure", "adjust", "pipeline", "synthetic_images")
 FOLDERS = [

@@ -22,7 +22,6 @@ MARKS = {
     "dot": MarkShape(dot(0.5)),
 }
 PHASES = 6
-same_worker = pytest.mark.xdist_group("ring-crosses")  # which matches them once
 
 
 @cache
@@ -66,7 +65,7 @@ def errors_and_sigmas(name: str, blur_px: float, snr: float, count: int) -> tupl
     ("name", "blur_px", "count"),
     [
         ("cross", 0.7, 54),
-        pytest.param("ring-cross", 1.0, 60, marks=same_worker),
+        ("ring-cross", 1.0, 60),
         ("ring-dot", 1.0, 54),
         ("dot", 0.8, 54),
     ],
@@ -79,7 +78,6 @@ def test_sigmas_are_those_of_the_errors(name: str, blur_px: float, count: int) -
     assert np.abs(errors.mean(axis=0)).max() < 4 * sigmas.mean() / np.sqrt(len(errors))
 
 
-@same_worker
 def test_errors_are_at_the_cramer_rao_bound() -> None:
     name, blur_px, snr = "ring-cross", 1.0, 25.0
     errors, sigmas = errors_and_sigmas(name, blur_px, snr, 60)

@@ -35,8 +35,6 @@ from pipeline.review.drawing_view import drawing_json, take_step
 from pipeline.review.mark_handles import add_vertex, first_drawing, handles, remove_part
 from pipeline.review.session import Session
 
-pytestmark = pytest.mark.xdist_group("review")
-
 SIZES = {"ring_mm": 0.5, "ring_line_mm": 0.1, "arm_mm": 0.8, "line_mm": 0.1}  # of the marks in the scan
 TURN_RAD = 0.004
 PROJECT = f'camera = "camera.toml"\nscans = ["*.tif"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n'

@@ -81,9 +81,6 @@ def juhl_with(quantity: str, values: tuple[float, ...], layouts: int) -> Swept:
     return sweep(scene, 1, Sweep(quantity, values))
 
 
-once = pytest.mark.xdist_group("over points")  # one sweep serves both
-
-
 @pytest.fixture(scope="module")
 def over_points() -> Swept:
     """Juhl's figure 1."""
@@ -91,7 +88,6 @@ def over_points() -> Swept:
 
 
 @pytest.mark.study
-@once
 def test_juhls_table(over_points: Swept) -> None:
     step = next(step for step in over_points.steps if step.value == 150)
     for name, printed in PAPER_UM.items():
@@ -101,7 +97,6 @@ def test_juhls_table(over_points: Swept) -> None:
 
 
 @pytest.mark.study
-@once
 def test_juhls_first_figure_falls_with_the_number_of_points(over_points: Swept) -> None:
     for name in PAPER_UM:
         assert -0.62 < over_points.slope(name) < -0.5

@@ -30,7 +30,6 @@ from synthetic_images.render import render_scene
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.xdist_group("learned")  # the frames are rendered, and their marks learned, once for all
 CORNERS = {"1": (6.0, -6.0), "2": (-6.0, -6.0), "3": (-6.0, 6.0), "4": (6.0, 6.0)}
 ARROW = areas.polygon(((0.0, 0.0), (1.1, 0.2), (0.5, 0.5), (0.3, 0.7)))  # lopsided: a mirror shows
 SHOWN = {2: "0m", 3: "180", 4: "180m", 5: "90m", 6: "270", 7: "270m", 8: "90"}  # how a viewer shows a frame of pose 0

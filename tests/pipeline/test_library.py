@@ -37,9 +37,6 @@ SPREADS = {"fairchild": 0.3, "park": 0.35}  # mm, of models whose cameras differ
 ENDS = {"left to right": ("5", "6"), "top to bottom": ("7", "8"), "1 to 2": ("1", "2"), "3 to 4": ("3", "4")}
 
 
-one_frame = pytest.mark.xdist_group("library frame")  # rendered once for all
-
-
 @pytest.fixture(scope="module")
 def frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project of one rendered frame of a library camera, which it names."""
@@ -145,7 +142,6 @@ def test_images_may_name_a_camera_of_the_library(tmp_path: Path) -> None:
     assert [project.image_camera(name).name for name in "ab"] == ["Wild RC9, 88 mm", "Wild RC8, 153 mm"]
 
 
-@one_frame
 def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
     """All drawn marks within a tenth of a pixel of the truth; those that are not drawn are passed over."""
     assert run(["measure", str(frame)]) == 0
@@ -157,7 +153,6 @@ def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
     assert (frame.parent / "comparator.csv").read_text(encoding="utf-8").count(",fiducial,") == 4
 
 
-@one_frame
 def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(
     frame: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,7 +167,6 @@ def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(
 
 
 @pytest.mark.study
-@one_frame
 def test_the_frame_is_told_from_another_camera(frame: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A ring with a cross holds the plain cross of older cameras too: the ring then counts as damage. No other pitch
     than the file's is tried."""
@@ -197,7 +191,6 @@ def trial(cameras: tuple[str, ...], score: float, chance: float | None = 0.0) ->
 
 
 @pytest.mark.study
-@one_frame
 def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras(
     frame: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -234,7 +227,6 @@ def test_a_folder_without_scans_is_told_so(tmp_path: Path, capsys: pytest.Captur
 
 
 @pytest.mark.study
-@one_frame
 @pytest.mark.parametrize(
     ("at_pitch", "looked_at"), [((1e-3, 5.0), [0]), ((0.5, 5.0), [1]), ((5.0, 0.5), [1, 0])], ids=str
 )
@@ -264,7 +256,6 @@ def test_marks_are_looked_at_once_a_search_answers_that_chance_does_not_make(
 
 
 @pytest.mark.study
-@one_frame
 @pytest.mark.parametrize(("found", "measured"), [(25, 1), (9, 2)])
 def test_a_part_of_a_lattice_is_no_other_camera(
     frame: Path, monkeypatch: pytest.MonkeyPatch, found: int, measured: int
@@ -282,7 +273,6 @@ def test_a_part_of_a_lattice_is_no_other_camera(
 
 
 @pytest.mark.study
-@one_frame
 def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     frame: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

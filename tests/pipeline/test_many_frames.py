@@ -25,7 +25,6 @@ from pipeline.report.page import render_frame_page
 from pipeline.results.comparator_file import ComparatorPoint, mark_rows, read_measurement_hash, write_comparator
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 
-pytestmark = pytest.mark.xdist_group("many frames")  # made up once for all
 FRAMES, MARKS = 2100, 8  # more of them are bad than a report shows
 BAD, FAILED = range(0, FRAMES, 10), range(5, FRAMES, 100)
 KNOWN = Covariance({Cause.NOISE: np.eye(2) * 4e-4})

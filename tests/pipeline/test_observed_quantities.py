@@ -130,9 +130,6 @@ def test_refraction_and_curvature_through_files(tmp_path: Path) -> None:
     assert check_against_opencv(first).cameras["C"].verdict == "not possible"
 
 
-one_case = pytest.mark.xdist_group("earlier calibration")  # adjusted once for all
-
-
 @pytest.fixture(scope="module")
 def earlier(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Adjustment]:
     """The folder of a reference case, and its adjustment."""
@@ -163,7 +160,6 @@ def with_antennas(earlier: tuple[Path, Adjustment], folder: Path, sigma: str) ->
     return adjusted(folder)
 
 
-@one_case
 def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
     """They are where the adjustment puts them, so that nothing moves but every station becomes more certain."""
     _, first = earlier
@@ -179,7 +175,6 @@ def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], tmp_p
     assert sum(group.redundancy for group in written.groups.values()) == pytest.approx(written.redundancy)
 
 
-@one_case
 def test_an_antenna_cannot_be_fixed(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="column sX0: is 0, but an antenna can be observed only"):
         with_antennas(earlier, tmp_path, "0")
@@ -195,7 +190,6 @@ def once_more(earlier: Path, folder: Path, change: Callable[[str], str] = str) -
     return adjusted(folder)
 
 
-@one_case
 def test_an_earlier_calibration_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
     """The same observations twice: the same values, and smaller sigmas."""
     folder, first = earlier
@@ -215,7 +209,6 @@ def test_an_earlier_calibration_through_files(earlier: tuple[Path, Adjustment], 
     assert sum(group.redundancy for group in written.groups.values()) == pytest.approx(written.redundancy)
 
 
-@one_case
 def test_the_fiducials_of_an_earlier_calibration_can_be_left_out(
     earlier: tuple[Path, Adjustment], tmp_path: Path
 ) -> None:
@@ -224,7 +217,6 @@ def test_the_fiducials_of_an_earlier_calibration_can_be_left_out(
     assert {row.name.split(".")[0] for row in second.further} == {"IO"}
 
 
-@one_case
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -26,8 +26,6 @@ from pipeline.measuring.tie_stage import add_joins
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_record import MeasuredScan
 
-pytestmark = pytest.mark.xdist_group("parts")  # measured once for all
-
 MARKS = """
 [camera]
 name = "K"

@@ -20,8 +20,6 @@ from pipeline.files.decision import Choice, Decision
 from pipeline.files.project_file import read_project
 from pipeline.review.session import Filters, Session
 
-pytestmark = pytest.mark.xdist_group("review")
-
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:

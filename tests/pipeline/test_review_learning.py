@@ -25,8 +25,6 @@ from pipeline.review.pictures import Pictures
 from pipeline.review.query import Query
 from pipeline.review.session import Session
 
-pytestmark = pytest.mark.xdist_group("review")
-
 NAMES = ("a", "b", "c")
 OFF_MM = 5.0  # of the given coordinates: nothing recurs about them
 LEARNED = (

@@ -109,9 +109,6 @@ def test_juhls_photographs_overlap_by_sixty_and_ninety_per_cent() -> None:
     assert 1 - (x[2] - x[0]) / covered == pytest.approx(0.9, abs=0.01)
 
 
-once = pytest.mark.xdist_group("template")  # rendered once for both
-
-
 @pytest.fixture(scope="module")
 def rendered_template(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str, int, int]]]:
     """The template's project, rendered once, and what it told of its progress."""
@@ -121,7 +118,6 @@ def rendered_template(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, l
     return folder / "out", calls
 
 
-@once
 def test_the_template_becomes_a_project_that_can_be_read(
     rendered_template: tuple[Path, list[tuple[str, int, int]]],
 ) -> None:
@@ -141,7 +137,6 @@ def test_the_template_becomes_a_project_that_can_be_read(
     assert [done for _, done, _ in calls] == list(range(1, 13))
 
 
-@once
 def test_truth_has_the_names_of_the_adjustment(
     rendered_template: tuple[Path, list[tuple[str, int, int]]],
 ) -> None:

@@ -17,8 +17,6 @@ from pipeline.cli import run
 from pipeline.results.comparator_file import read_measurement_hash
 from pipeline.results.thumbnail import cut
 
-pytestmark = pytest.mark.xdist_group("thumbnails")  # measured once for all
-
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:

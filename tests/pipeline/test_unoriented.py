@@ -21,7 +21,6 @@ from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.tables import read_toml
 
 Array = NDArray[np.float64]
-pytestmark = pytest.mark.xdist_group("unoriented")  # the fields are rendered once for all
 
 SCENE = """seed = 3
 [camera]

@@ -27,7 +27,6 @@ def stored_plainly(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Grey]
     return {colour: tifffile.imread(folder / str(colour) / "scans" / "f.tif") for colour in (False, True)}
 
 
-@pytest.mark.xdist_group("stored plainly")  # rendered once for all
 @pytest.mark.parametrize("compression", ["none", "lzw", "deflate", "zstd"])
 @pytest.mark.parametrize("tile_px", [0, 64, 384])
 @pytest.mark.parametrize("colour", [False, True])
