@@ -34,7 +34,7 @@ from measure.matching.tone_information import (
     tone_without_information,
 )
 from measure.matching.window import ScanWindow
-from measure.noise.grain import blank_patches, grain_model, is_coloured, taken_out
+from measure.noise.grain import blank_patches, grain_model, is_coloured
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, products
 from measure.results import Covariance, MarkFit
 from measure.tone.estimate import MarkTone
@@ -158,8 +158,7 @@ def _mark_fit(fit: PictureFit, window: ScanWindow, grey: Array) -> MarkFit:
         free, frame = _surroundings(fit, window)
         patches = blank_patches(grey, free, noise.variance_dn2)
         if not is_white or is_coloured(patches):
-            taken = taken_out(used, model.design)
-            noise = grain_model(model.residuals, used, taken, noise.neighbour_correlation, patches)
+            noise = grain_model(model.residuals, used, model.design, noise.neighbour_correlation, patches)
         result = _add_precision(result, fit, noise, (grey, frame))
     # The weights of grain may have moved the mark since.
     place = fit.state.shifted(np.asarray(fit.window.origin_px)).pixel_from_mark

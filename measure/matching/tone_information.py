@@ -12,7 +12,7 @@ from measure.noise.noise_model import combined, products
 from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import MarkTone
 from measure.tone.score import ToneScore, tone_score
-from measure.tone.sharpening import RADII_PX, Sharpening, SharpeningScore
+from measure.tone.sharpening import SharpeningScore
 
 _PIECE_PX = 8  # of a mark's edges that tell the curve by themselves, and of what JPEG rounds by itself
 _LEAST_CONTRAST = 1e-6  # of the light that is drawn: rounding is about that large
@@ -65,7 +65,7 @@ def mark_tone_information(
         covariance = fit.covariance(left) + landscape.covariance(left) + fit.noise.variance_dn2 * by_prior.T @ by_prior
         # Of departures that the picture's own unknowns take up whole, only rounding is left: it must not tell of the
         # curve.
-        whole = float(np.trace(fit.covariance(changes)))
+        whole = fit.noise.variance_dn2 * float(np.sum(changes**2))
         covariance += _LEAST_VARIANCE * max(whole, 1e-30) * np.eye(len(covariance))
         covariance *= _disagreement(score, left, residuals, covariance, on_place)
         information = score.information(covariance, tone)
@@ -101,10 +101,7 @@ def sharpening_score(
         return None
     tone, full_scale_dn, used = coding.tone, coding.full_scale_dn, fit.used
     codes, slope = tone.code(drawn, full_scale_dn), tone.slope(drawn, full_scale_dn)
-    if tone.sharpening:
-        halos = tone.sharpening.changes(codes)
-    else:
-        halos = np.stack([Sharpening(0.0, radius_px).changes(codes)[0] for radius_px in RADII_PX])
+    halos = tone.sharpening.changes(codes)
     # The light through a wrong curve lacks what the right one would add; of halos it has too much.
     changes = np.concatenate([tone.derivatives(drawn, full_scale_dn), -slope * halos]) * (used * fit.steadiness)
     flat = fit.design.reshape(len(fit.design), -1) * used.ravel()
@@ -112,7 +109,8 @@ def sharpening_score(
     score = tone_score(flat, changes.reshape(len(changes), -1), residuals, priors_dn2, departures)
     left, by_prior = score.left.reshape(changes.shape), score.by_unknown * np.sqrt(priors_dn2)[:, None]
     covariance = fit.covariance(left) + fit.noise.variance_dn2 * by_prior.T @ by_prior
-    covariance += np.diag(_LEAST_VARIANCE * np.maximum(np.diag(fit.covariance(changes)), 1e-30))
+    whole = fit.noise.variance_dn2 * np.sum(changes**2, axis=(1, 2))
+    covariance += np.diag(_LEAST_VARIANCE * np.maximum(whole, 1e-30))
     on_place = products(fit.by_grey[:2], changes[-len(halos) :])
     return SharpeningScore(score.value, score.normal, covariance, on_place)
 

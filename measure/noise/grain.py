@@ -79,7 +79,7 @@ def _squares(image: Array | Mask) -> Array:
 
 
 def grain_model(
-    residuals: Array, used: Mask, taken: Array, neighbour_correlation: float, blank: Array | None = None
+    residuals: Array, used: Mask, design: Array, neighbour_correlation: float, blank: Array | None = None
 ) -> NoiseModel:
     """Fit a sum of white noise and grains to the residuals, allowing for what the fit absorbs.
 
@@ -87,25 +87,26 @@ def grain_model(
     ----------
     residuals, used : (height, width)
         Residuals of the fit, and the pixels used.
-    taken : (1 + grains, distances)
-        Part of the noise that the fit absorbs, from `taken_out`.
+    design : (unknowns, height, width)
+        Derivatives of the fitted model with respect to its unknowns.
     neighbour_correlation : float
         Of the residuals.
     blank : (n, PATCH_PX, PATCH_PX), optional
-        Patches of blank film minus a plane.
+        Patches of blank film minus a plane. Where they hold more pixels than the window, they alone are used.
     """
-    rings = _rings(_FARTHEST_PX)
-    pairs = _pixel_products(used[None], rings)
-    weights = 1.0 / np.sqrt(np.maximum(pairs, 1.0))
-    left = _pixel_products(np.where(used, residuals, 0.0)[None], rings) * weights
-    expected = (pairs * _ring_kernels(rings) + taken) * weights
     has_blank = blank is not None and len(blank) > 0
+    parts = []
     if blank is not None and has_blank:
-        patch_pairs, patch_expected = _patch()
-        weights = 1.0 / np.sqrt(len(blank) * patch_pairs)
-        left = np.concatenate([left, _pixel_products(blank, _rings(_FARTHEST_BLANK_PX)) * weights])
-        expected = np.concatenate([expected, len(blank) * patch_expected * weights], axis=1)
-    lags = np.tensordot(nnls(expected.T, left)[0], _KERNELS, axes=1)
+        pairs, expected = _patch()
+        left = _pixel_products(blank, _rings(_FARTHEST_BLANK_PX))
+        parts.append((len(blank) * pairs, left, len(blank) * expected))
+    if blank is None or blank.size < used.sum():
+        rings = _rings(_FARTHEST_PX)
+        pairs, left = (_pixel_products(image[None], rings) for image in (used, np.where(used, residuals, 0.0)))
+        parts.append((pairs, left, pairs * _ring_kernels(rings) + taken_out(used, design)))
+    pairs, left, expected = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
+    weights = 1.0 / np.sqrt(np.maximum(pairs, 1.0))
+    lags = np.tensordot(nnls((expected * weights).T, left * weights)[0], _KERNELS, axes=1)
     variance, neighbours = lags[_REACH_PX, _REACH_PX], lags[_REACH_PX, _REACH_PX + 1]
     # A fit lowers the correlation of residuals. If it is still above that of the coarsest grain, in the residuals or in
     # the model, a landscape was taken for grain.

@@ -13,6 +13,8 @@ import numpy as np
 from measure.array_types import Array
 from measure.tone.curve import Tone, ToneInformation
 
+_SINGULAR = 1e-12  # of the normal matrix of unknowns of one size: less is rounding of its sums
+
 
 @dataclass(frozen=True, eq=False)
 class ToneScore:
@@ -59,7 +61,10 @@ def tone_score(
         wanted = np.concatenate([wanted, np.zeros((len(priors), wanted.shape[-1]))])
     # All unknowns are brought to one size: beside a strong prior the others would pass for nothing.
     size = np.maximum(np.linalg.norm(columns, axis=-2, keepdims=True), 1e-300)
-    by_unknown = np.linalg.pinv(columns / size) @ wanted / size.swapaxes(-1, -2)
+    columns = columns / size
+    across = columns.swapaxes(-1, -2)
+    inverse = np.linalg.pinv(across @ columns, rcond=_SINGULAR, hermitian=True)
+    by_unknown = inverse @ (across @ wanted) / size.swapaxes(-1, -2)
     left = changes - by_unknown.swapaxes(-1, -2) @ design
     value = -(left @ residuals[..., None])[..., 0]
     if priors is not None and departures is not None:

@@ -71,31 +71,18 @@ class Sharpening:
 
     def undone(self, codes: NDArray[np.floating]) -> Array:
         """(..., height, width) codes before they were sharpened; they are wrong within the reach of a border."""
-        return self._filtered(codes, 1 / self._gain(codes.shape))
+        smooth = _gaussian_spectrum(self.radius_px, codes.shape)
+        return _filtered(codes, 1 / (1 + self.amount * (1 - smooth)))
 
     def changes(self, codes: NDArray[np.floating]) -> Array:
-        """(2, height, width) by how much what `undone` gives grows where the true amount, and the logarithm of the
-        true radius, are larger by 1; codes (height, width): not sharpened."""
-        smooth = self._smooth(codes.shape)
-        by_amount = (1 - smooth) / self._gain(codes.shape)
-        by_radius = -2 * self.amount * smooth * np.log(np.maximum(smooth, 1e-30)) / self._gain(codes.shape)
-        return np.stack([self._filtered(codes, each) for each in (by_amount, by_radius)])
-
-    def _gain(self, shape: tuple[int, ...]) -> Array:
-        return 1 + self.amount * (1 - self._smooth(shape))
-
-    def _smooth(self, shape: tuple[int, ...]) -> Array:
-        """The spectrum of the Gaussian."""
-        rows, cols = (2 * np.pi * freq for freq in (fft.fftfreq(2 * shape[-2]), fft.rfftfreq(2 * shape[-1])))
-        return np.asarray(np.exp(-0.5 * self.radius_px**2 * (rows[:, None] ** 2 + cols**2)))
-
-    @staticmethod
-    def _filtered(codes: NDArray[np.floating], spectrum: Array) -> Array:
-        """By an even filter, as if the picture were mirrored at its borders."""
-        height, width = codes.shape[-2:]
-        mirrored = np.concatenate([codes, codes[..., ::-1]], axis=-1)
-        mirrored = np.concatenate([mirrored, mirrored[..., ::-1, :]], axis=-2)
-        return np.asarray(fft.irfft2(fft.rfft2(mirrored) * spectrum, s=mirrored.shape[-2:])[..., :height, :width])
+        """(m, height, width) by how much what `undone` gives grows with m figures of the sharpening; codes
+        (height, width): not sharpened. The figures are the amount and the logarithm of the radius or, as long as
+        nothing is sharpened, the amounts with each of `RADII_PX`."""
+        if not self:
+            return _filtered(codes, np.stack([1 - _gaussian_spectrum(radius, codes.shape) for radius in RADII_PX]))
+        smooth = _gaussian_spectrum(self.radius_px, codes.shape)
+        by_radius = -2 * self.amount * smooth * np.log(np.maximum(smooth, 1e-30))
+        return _filtered(codes, np.stack([1 - smooth, by_radius]) / (1 + self.amount * (1 - smooth)))
 
     def moved(self, step: Array, covariance: Array) -> "Sharpening":
         """After a step (2,) of amount and logarithm of radius, shortened where it is long."""
@@ -119,6 +106,17 @@ class Sharpening:
             f"The scan is sharpened, by an amount of {self.amount:.2f} (σ {sigmas[0]:.2f}) within "
             f"{self.radius_px:.2f} px (σ {sigmas[1]:.2f}); marks were measured in what it was before."
         )
+
+
+def _gaussian_spectrum(radius_px: float, shape: tuple[int, ...]) -> Array:
+    """(height, width) of a Gaussian, in the cosine transform of pictures of a shape."""
+    rows, cols = (np.exp(-0.5 * (radius_px * np.pi * np.arange(size) / size) ** 2) for size in shape[-2:])
+    return np.outer(rows, cols)
+
+
+def _filtered(codes: NDArray[np.floating], spectrum: Array) -> Array:
+    """By even filters (..., height, width), as if the picture were mirrored at its borders: a cosine transform."""
+    return np.asarray(fft.idctn(fft.dctn(codes, axes=(-2, -1)) * spectrum, axes=(-2, -1)))
 
 
 @dataclass(frozen=True, eq=False)

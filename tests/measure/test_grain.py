@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model, taken_out
+from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model
 from measure.noise.noise_model import noise_model
 
 
@@ -27,7 +27,7 @@ def test_variance_and_power_of_grain_are_found_behind_a_fit_that_took_most_of_it
         noise = grain * 2.0 * grain_px * np.sqrt(np.pi) + white * rng.standard_normal((size, size))
         residuals = np.zeros((size, size))
         residuals[used] = noise[used] - directions @ (directions.T @ noise[used])
-        models.append(grain_model(residuals, used, taken_out(used, design), 0.5))
+        models.append(grain_model(residuals, used, design, 0.5))
         naive.append(noise_model(residuals, used, len(design)))
     variance = np.median([model.variance_dn2 for model in models])
     power = np.median([model.autocovariance_dn2.sum() for model in models])
@@ -62,5 +62,5 @@ def test_coarse_grain_is_told_from_a_landscape(grain_px: float, is_grain: bool) 
     patches = (flat - flat @ PLANE @ PLANE.T).reshape(-1, PATCH_PX, PATCH_PX)
     window = grain[:19, :19] - grain[:19, :19].mean()
     used, design = np.ones((19, 19), dtype=bool), np.ones((1, 19, 19))
-    model = grain_model(window, used, taken_out(used, design), neighbours, patches)
+    model = grain_model(window, used, design, neighbours, patches)
     assert model.is_grain is is_grain
