@@ -1,8 +1,7 @@
-"""Writing by networks, those of PP-OCRv4 in ONNX run by OpenCV's DNN module: where in a picture there is some, and the
-characters of a line in the ways in which it may lie.
+"""Text detection and recognition by the networks of PP-OCRv4 (ONNX), run by OpenCV's DNN module.
 
-The networks come in the package rapidocr-onnxruntime (Apache-2.0), of which nothing but these files is used. Where it
-is not installed nothing is read.
+The networks come with the package rapidocr-onnxruntime (Apache-2.0), of which only these files are used. Without it no
+text is read.
 """
 
 import importlib.util
@@ -27,26 +26,28 @@ MISSING = (
     "rapidocr-onnxruntime` does that (without --no-deps it would replace OpenCV)"
 )
 _DETECTION, _RECOGNITION = "ch_PP-OCRv4_det_infer.onnx", "ch_PP-OCRv4_rec_infer.onnx"
-_METADATA, _KEY, _VALUE = 14, 1, 2  # fields of an ONNX ModelProto, and of an entry of its metadata
-_BYTES = 2  # the wire type of a field that is a string or a message; the others at the top are whole numbers
-_MULTIPLE_PX = 32  # that the network asks of a picture's sides
-_WRITTEN = 0.3  # probability of a pixel to be writing
-_SURE = 0.5  # the least mean probability of a place
-_LEAST_PX = 4.0  # of what the network draws of a line's height, which is less than half of it
-_UNSHRUNK = 1.6  # times area over circumference: by so much the network draws less than the line
-_TILT_DEG = 30.0  # what runs more steeply belongs to another side of the frame
-_LONG = 1.2  # times its height: what is shorter is no word
-WAYS = ("0", "180", "0m", "180m")  # in which a line may lie that runs from left to right
-HEIGHT_PX = 48  # of a line, as the network reads it
-_CERTAIN = 0.5  # a character of this confidence counts nothing, one of 1 as a whole
-_BLANK, _BLANK_COLUMNS = 1.5, 1.5  # times the usual step from letter to letter, and columns more than it
-_PLAIN = str.maketrans("′’‘´`″“”：，。．（）－—–／", "'''''\"\"\":,..()---/")  # signs for which the network knows many
+_METADATA, _KEY, _VALUE = 14, 1, 2  # field numbers of an ONNX ModelProto, and of an entry of its metadata
+_BYTES = 2  # protocol-buffer wire type of strings and messages; other top-level fields are integers
+_MULTIPLE_PX = 32  # the network needs sides that are multiples of this
+_WRITTEN = 0.3  # threshold of the probability of a text pixel
+_SURE = 0.5  # least mean probability of a line
+_LEAST_PX = 4.0  # least height of a detected region, which is less than half of the line's height
+_UNSHRUNK = 1.6  # the network shrinks lines by this times area over circumference
+_TILT_DEG = 30.0  # steeper lines belong to another side of the frame
+_LONG = 1.2  # least ratio of length and height of a word
+WAYS = ("0", "180", "0m", "180m")  # possible orientations of a line that runs from left to right
+HEIGHT_PX = 48  # height of a line for the recognition network
+_CERTAIN = 0.5  # a character of this confidence counts 0, one of confidence 1 counts 1
+_BLANK, _BLANK_COLUMNS = 1.5, 1.5  # a blank: step between letters in median steps, and columns above the median
+_PLAIN = str.maketrans(
+    "′’‘´`″“”：，。．（）－—–／", "'''''\"\"\":,..()---/"
+)  # variants of signs that the network knows
 
 
 @dataclass(frozen=True, eq=False)
 class Networks:
-    """detection: where there is writing, a probability a pixel; recognition: the characters of one line, column by
-    column. characters: by the numbers that the recognition gives them, the first being none."""
+    """detection: probability of text for each pixel; recognition: characters of one line, column by column; characters:
+    by class number, the first one blank."""
 
     detection: cv2.dnn.Net
     recognition: cv2.dnn.Net
@@ -55,7 +56,7 @@ class Networks:
 
 @cache
 def networks() -> Networks | None:
-    """The networks, loaded when they are first asked for and kept in this process; None where they are missing."""
+    """Load the networks once per process; None where they are missing."""
     files = _files()
     if not files:
         return None
@@ -65,8 +66,7 @@ def networks() -> Networks | None:
 
 
 def _files() -> tuple[Traversable, ...]:
-    """The files of both networks, none where one is missing. The package is not imported: it would ask for a runtime
-    of its own."""
+    """Files of both networks, none if one is missing. The package is not imported, since it needs another runtime."""
     spec = importlib.util.find_spec(PACKAGE)
     if spec is None:
         return ()
@@ -80,13 +80,13 @@ def _net(model: bytes) -> cv2.dnn.Net:
 
 
 def _metadata(model: bytes) -> dict[str, str]:
-    """The metadata of an ONNX file: OpenCV does not hand them out."""
+    """Metadata of an ONNX file, which OpenCV does not give access to."""
     entries = [dict(_fields(value)) for field, value in _fields(model) if field == _METADATA]
     return {entry[_KEY].decode(): entry[_VALUE].decode() for entry in entries}
 
 
 def _fields(message: bytes) -> Iterator[tuple[int, bytes]]:
-    """Numbers and contents of the fields of a protocol-buffer message that are strings or messages."""
+    """Yield number and content of the string and message fields of a protocol-buffer message."""
     place = 0
     while place < len(message):
         tag, place = _number(message, place)
@@ -97,7 +97,7 @@ def _fields(message: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _number(message: bytes, place: int) -> tuple[int, int]:
-    """A whole number of variable length, and the place behind it."""
+    """Decode a variable-length integer; returns it and the next position."""
     value = shift = 0
     while True:
         byte = message[place]
@@ -109,7 +109,7 @@ def _number(message: bytes, place: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Place:
-    """A rectangle about a line: centre (column, row), length and height in px; tilt_deg: from the rows, clockwise."""
+    """Rectangle around a line: centre (column, row), length and height, px; tilt_deg: from the rows, clockwise."""
 
     center_px: tuple[float, float]
     length_px: float
@@ -117,7 +117,7 @@ class Place:
     tilt_deg: float
 
     def outline_px(self) -> Array:
-        """(4, 2) corners, clockwise from where it begins."""
+        """(4, 2) corners, clockwise from the start of the line."""
         angle = np.deg2rad(self.tilt_deg)
         along, down = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
         half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2.0
@@ -125,18 +125,18 @@ class Place:
         return np.asarray(corners + self.center_px)
 
     def scaled(self, factor: float) -> "Place":
-        """In a picture that is so many times as large."""
+        """The place in an image that is enlarged by a factor."""
         col, row = ((place + 0.5) * factor - 0.5 for place in self.center_px)
         return Place((col, row), factor * self.length_px, factor * self.height_px, self.tilt_deg)
 
     def covers(self, other: "Place") -> bool:
-        """Whether the middle of the other lies in it."""
+        """Whether the centre of the other place lies in it."""
         outline = self.outline_px().astype(np.float32)
         return cv2.pointPolygonTest(outline, other.center_px, False) >= 0
 
 
 def find_writing(picture: Picture, networks: Networks) -> list[Place]:
-    """The lines in a picture (rows, columns), in no order that means anything."""
+    """Detect the lines of text in an image (rows, columns), in arbitrary order."""
     probability = _probability(picture, networks)
     written = (probability > _WRITTEN).astype(np.uint8)
     contours, _ = cv2.findContours(written, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
@@ -154,7 +154,8 @@ def _probability(picture: Picture, networks: Networks) -> NDArray[np.float32]:
 
 
 def _place(contour: NDArray[np.int32], probability: NDArray[np.float32]) -> Place | None:
-    """The network draws a line narrower than it is, so that neighbours stay apart."""
+    """Rectangle of a detected region, enlarged, since the network shrinks lines to keep them apart; None if it is not a
+    line."""
     center, (length, height), angle = cv2.minAreaRect(contour)
     if length < height:
         length, height, angle = height, length, angle + 90.0
@@ -174,7 +175,7 @@ def _mean_probability(contour: NDArray[np.int32], probability: NDArray[np.float3
 
 
 def read_ways(line: Picture, networks: Networks) -> Mapping[str, Reading]:
-    """A line's picture (HEIGHT_PX, width) as it reads upright, turned by half, mirrored, and both, by pose."""
+    """Read the image of a line (HEIGHT_PX, width) in all four orientations: upright, upside down, mirrored, both."""
     ways = (line, line[::-1, ::-1], line[:, ::-1], line[::-1])
     return dict(zip(WAYS, _read(ways, networks), strict=True))
 
@@ -186,8 +187,8 @@ def _read(pictures: Sequence[Picture], networks: Networks) -> list[Reading]:
 
 
 def _decoded(probabilities: NDArray[np.float32], characters: Sequence[str]) -> Reading:
-    """The likeliest character of each column (columns, characters): one that repeats at once is one, the first of all
-    is none (connectionist temporal classification). What no Latin keyboard writes is not taken for writing."""
+    """Decode the class probabilities of the columns (columns, characters) by connectionist temporal classification:
+    repeated characters are merged, blanks dropped. Characters outside ASCII are ignored."""
     best = probabilities.argmax(axis=1)
     starts = np.flatnonzero((best > 0) & np.concatenate([[True], best[1:] != best[:-1]]))
     read = [characters[best[column]].translate(_PLAIN) for column in starts]
@@ -200,7 +201,7 @@ def _decoded(probabilities: NDArray[np.float32], characters: Sequence[str]) -> R
 
 
 def _spaced(text: str, columns: NDArray[np.int_]) -> str:
-    """The text with blanks where letters stand plainly farther apart: the network sees few blanks itself."""
+    """Insert blanks where letters are clearly farther apart, since the network reports few blanks."""
     steps = np.diff(columns, prepend=columns[:1])
     usual = float(np.median(steps[1:])) if len(steps) > 1 else 0.0
     wide = steps >= max(_BLANK * usual, usual + _BLANK_COLUMNS)

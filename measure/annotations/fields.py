@@ -1,7 +1,7 @@
-"""Lines of writing in a scan, and what they say: camera, run, frame, date, height, scale, where their form is known.
+"""Lines of text on a scan and their fields of known form: camera, run, frame, date, height, scale.
 
-One table of patterns. What is ambiguous has a text and no value: a date whose day may be its month, a number that is
-perhaps another one's."""
+Fields are found by one table of patterns. An ambiguous field has a text and no value, such as a date whose day may be
+the month."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -10,14 +10,14 @@ from difflib import SequenceMatcher
 
 from measure.marks.shapes import Side
 
-_ALIKE = 0.75  # of the characters of a line that is read twice
-_PLAINLY = 5.0  # characters by which one way reads better than any other: a thousand to one
-CAMERA = ("camera_type", "camera_number", "principal_distance_mm")  # what a camera's own plate says
-STRIP = ("run", "frames", "date", "time", "height", "scale")  # what a title says that was made for the flight
+_ALIKE = 0.75  # least ratio of equal characters of one line in two readings
+_PLAINLY = 5.0  # lead in legible characters that decides an orientation: odds of a thousand to one
+CAMERA = ("camera_type", "camera_number", "principal_distance_mm")  # fields of a camera's plate
+STRIP = ("run", "frames", "date", "time", "height", "scale")  # fields of a flight's title
 _MONTHS = ("JAN", "FEB", "MAR", "APR", "MAY", "JUN", "JUL", "AUG", "SEP", "OCT", "NOV", "DEC")
-_FIRST_YEAR = 20  # of two digits: film from 1920 on; below it may be either century
-_DISTANCE = r"((?:8[5-9]|1[45]\d|20\d|21\d|30\d)[.,]\d{1,3})"  # of the cameras that there are, mm
-_BEFORE_NUMBER = r"(?:N[RO]\.? ?|AG ?)"  # also of a number that stands right behind a type: UAg 1003
+_FIRST_YEAR = 20  # of two digits: 1920 and later; below, the century is ambiguous
+_DISTANCE = r"((?:8[5-9]|1[45]\d|20\d|21\d|30\d)[.,]\d{1,3})"  # principal distances of existing cameras, mm
+_BEFORE_NUMBER = r"(?:N[RO]\.? ?|AG ?)"  # also for a number right after a type: UAg 1003
 _TYPES = (
     r"[WM]ILD[\w /.-]*",
     r"(?:\d\d ?/ ?\d ?)?S?UA[GS][A-Z-]*",
@@ -32,8 +32,8 @@ _FILM = re.compile(r"KODAK|SAFETY|\bFILM\b|ESTAR|AGFA|GEVAERT|AVIPHOT|ILFORD|FER
 
 @dataclass(frozen=True)
 class Reading:
-    """What a line says if it lies in one way. confidence: the mean of its characters', 0 to 1; legible: how many of
-    them can be read."""
+    """Text of a line in one orientation. confidence: mean over its characters, 0 to 1; legible: effective number of
+    legible characters."""
 
     text: str
     confidence: float
@@ -42,12 +42,10 @@ class Reading:
 
 @dataclass(frozen=True)
 class Line:
-    """One line of writing.
+    """One line of text.
 
-    ways: what is read of it by the pose in which it may lie (that of a writing which lies upright in its own frame);
-    only the four along its own direction: a quarter turn is no question. pose: the way that is taken for the right one.
-    outline_px: the corners (column, row) of the rectangle about it, clockwise in the scan. side: of the scan, at which
-    it stands.
+    ways: readings by the four possible orientations along its direction. pose: the orientation taken as right.
+    outline_px: corners (column, row) of the rectangle around it, clockwise in the scan. side: of the scan.
     """
 
     ways: Mapping[str, Reading]
@@ -65,12 +63,12 @@ class Line:
 
     @property
     def legible(self) -> float:
-        """How many of its characters can be read."""
+        """Effective number of legible characters."""
         return self.ways[self.pose].legible
 
     @property
     def lead(self) -> float:
-        """By how many characters its way reads better than any other."""
+        """Lead of its orientation over any other, in legible characters."""
         return self.legible - max((way.legible for pose, way in self.ways.items() if pose != self.pose), default=0.0)
 
     @property
@@ -81,10 +79,10 @@ class Line:
 
 @dataclass(frozen=True)
 class KnownLine:
-    """A line that stands at one place on frames that lie alike in their scans.
+    """A line at the same place on all frames with one scan orientation.
 
-    pose: the way in which it lies in the scan. outline_mm: its corners from the middle of the exposed frame, as the
-    scan shows them, to the right and up.
+    pose: orientation of the line in the scan. outline_mm: corners relative to the centre of the exposed frame, right
+    and up in the scan.
     """
 
     text: str
@@ -93,19 +91,19 @@ class KnownLine:
     outline_mm: tuple[tuple[float, float], ...]
 
     def matches(self, line: Line) -> bool:
-        """Whether it is plainly that line, which may say another number."""
+        """Whether a line is clearly this one; its digits may differ."""
         own, other = masked_text(self.text), masked_text(line.text)
         same = SequenceMatcher(None, own, other).ratio() >= _ALIKE
         return same and line.pose == self.pose and line.lead >= _PLAINLY
 
 
 def masked_text(text: str) -> str:
-    """A text of which frames of a roll have the same: every digit is a 0, and only letters count beside them."""
+    """Text that is equal on all frames of a roll: digits become 0, other signs than letters are dropped."""
     return re.sub(r"\d", "0", re.sub(r"[\W_]", "", text.upper()))
 
 
 def read_from_one_face(lines: Sequence[Line]) -> tuple[Line, ...]:
-    """The lines as they read from the side of the film from which most can be read, those first that say most."""
+    """Readings of all lines from the side of the film with more legible text, the longest first."""
     faces = [[_best(line, mirrored) for line in lines] for mirrored in (False, True)]
     face = max(faces, key=lambda face: sum(line.legible for line in face))
     return tuple(sorted(face, key=lambda line: (-line.legible, line.center_px)))
@@ -116,15 +114,12 @@ def _best(line: Line, mirrored: bool) -> Line:
     return replace(line, pose=max(poses, key=lambda pose: line.ways[pose].legible))
 
 
-# What single lines of writing say: camera, run, frame, date, height, scale, where their form is known.
-#
-# One table of patterns. What is ambiguous has a text and no value: a date whose day may be its month, a number that is
-# perhaps another one's.
+# Fields of single lines.
 
 
 @dataclass(frozen=True)
 class Field:
-    """One field that a line says. value: "" where the text is ambiguous."""
+    """One field of a line. value: "" where the text is ambiguous."""
 
     name: str
     text: str
@@ -137,7 +132,7 @@ def _number(match: re.Match[str]) -> str:
 
 
 def _height(match: re.Match[str]) -> str:
-    """With its unit. A height of a flight has three to five digits."""
+    """Flying height with its unit; it has three to five digits."""
     digits = _number(match)
     return f"{int(digits)} {'m' if match[2].lower() == 'm' else 'ft'}" if 3 <= len(digits) <= 5 else ""
 
@@ -152,7 +147,7 @@ def _frames(match: re.Match[str]) -> str:
 
 
 def _date(match: re.Match[str]) -> str:
-    """ISO; day first, as most of the world writes, where only that is possible or both are the same."""
+    """ISO date; "" where day and month cannot be distinguished."""
     first, second, year = int(match[1]), int(match[2]), _year(match[3])
     readings = {(day, month) for day, month in ((first, second), (second, first)) if day <= 31 and 1 <= month <= 12}
     if not year or len(readings) != 1:
@@ -177,7 +172,7 @@ def _as_it_stands(match: re.Match[str]) -> str:
 
 
 def _type(match: re.Match[str]) -> str:
-    """The maker, where the plate names one; what else it says stays text."""
+    """The camera's maker, if the plate names one."""
     return next((maker for letters, maker in _MAKERS.items() if letters in match[1]), "")
 
 
@@ -198,24 +193,23 @@ _PATTERNS: tuple[tuple[str, str, Reader], ...] = (
 
 
 def find_fields(lines: Sequence[Line]) -> tuple[Field, ...]:
-    """All fields of the lines, in their order; then the frame's own number, where one of the numbers lies among those
-    of the run's frames."""
+    """Find all fields of the lines, in their order, and the frame number if one number lies in the run's range."""
     found = [field for line in lines for field in _fields_of_line(line)]
     return (*found, *_frame_number(lines, found))
 
 
 def is_plate(line: Line) -> bool:
-    """Whether it is of the camera's own plate."""
+    """Whether the line is part of the camera's plate."""
     return any(field.name in CAMERA for field in _fields_of_line(line))
 
 
 def signs(line: Line) -> int:
-    """How many fields of a plate or a title it says."""
+    """Number of plate and title fields in a line."""
     return sum(field.name in (*CAMERA, *STRIP) for field in _fields_of_line(line))
 
 
 def is_of_film(line: Line) -> bool:
-    """Whether its maker wrote it on the film's edge, which any side of a frame may be."""
+    """Whether the line is the film maker's edge print, which may lie at any side of a frame."""
     return _FILM.search(line.text.upper()) is not None
 
 
@@ -230,7 +224,7 @@ def _fields_of_line(line: Line) -> list[Field]:
 
 
 def _frame_number(lines: Sequence[Line], found: Sequence[Field]) -> list[Field]:
-    """The only number with as many digits as the run's frames have that lies among them."""
+    """The frame number: the only number within the range of the run's frames, with as many digits."""
     ranges: Mapping[str, tuple[str, str]] = {
         field.value: (field.value.split("-")[0], field.value.split("-")[1])
         for field in found

@@ -1,8 +1,8 @@
-"""Reading what is written on a scan: beside its exposed frame, and along the inside of the frame's edges.
+"""Reading of the text on a scan: beside its exposed frame, and along the inside of the frame's edges.
 
-The four sides are looked at one by one, each as a strip that runs from left to right. Lines of writing are found in it
-at two scales and cut out of a finer picture; each is read in the four ways in which it may lie along the strip, so that
-it tells itself which way is right. Light letters on dark film are read as well as dark ones on light.
+Each of the four sides is taken as a strip from left to right. Lines are detected in it at two scales, cut out of a
+finer image, and read in their four possible orientations, which decides the orientation. Light text on dark film and
+dark text on light film are read alike.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,17 +20,17 @@ from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
 
-# Shares of the frame's longer side, 2.3 mm being 1 % of an aerial camera's:
-_BEYOND = 0.13  # how far outside of the frame writing is looked for: its data strip and its own half of a gap
-_WITHIN = 0.045  # and how far inside: plates and counters reach into it
-_FINE_PX = 2400  # the least length of the frame's longer side in the picture that lines are cut out of
-_FOUND_PX = (1800, 900)  # the same where they are found: plates of 1.5 mm, then handwriting
-_ABOUT = 0.02  # how far about the place of a line it is looked for: titles are set by hand
-_LEAST_PX = 12  # of a strip's sides
-_LONGEST_PX = 1600  # of a line as it is read: what is longer is no line
-_BLACK, _WHITE = 0.5, 99.5  # per cents of the pixels of a strip that are made black and white
-_LEAST_LEGIBLE = 1.5  # characters: less is a speck that looks like a letter
-_READ_WELL = 0.6  # the mean confidence of what need not be looked at again at a coarser scale
+# In longer sides of the frame; 1 % is 2.3 mm for an aerial camera.
+_BEYOND = 0.13  # searched outside of the frame: its data strip and half of the gap
+_WITHIN = 0.045  # searched inside of the frame, where plates and counters reach into it
+_ABOUT = 0.02  # search distance around the known place of a line: titles are set by hand
+_FINE_PX = 2400  # least longer side of the frame in the image that lines are cut out of
+_FOUND_PX = (1800, 900)  # the same for detection: plates of 1.5 mm, then handwriting
+_LEAST_PX = 12  # least side of a strip
+_LONGEST_PX = 1600  # largest length of a line at reading height
+_BLACK, _WHITE = 0.5, 99.5  # percentiles of a strip's grey values mapped to black and white
+_LEAST_LEGIBLE = 1.5  # characters; less is a speck that resembles a letter
+_READ_WELL = 0.6  # mean confidence above which a line is not read again at a coarser scale
 
 
 def read_writing(
@@ -40,12 +40,14 @@ def read_writing(
     about: tuple[Side, Array] | None = None,
     enough: Callable[[Sequence[Line]], bool] = lambda _: False,
 ) -> tuple[Line, ...]:
-    """The lines written on a scan, as they read from the face of the film from which most can be read, those first
-    that say most.
+    """Read the lines of text on a scan, from the side of the film with more legible text, the longest first.
 
-    frame_px: (n, 2) column and row of the corners of the exposed frame; None where it is not known: then what stands
-    along the edges of the scan is read. about: the side and the outline (n, 2) of a line, in px, where only what stands
-    about it is to be read. enough: whether the lines of some sides say all that is asked: then no other is read."""
+    Parameters
+    ----------
+    frame_px : (n, 2) column and row of the corners of the exposed frame. None: the edges of the scan are read instead.
+    about : side and outline (n, 2), px, of a known line; only its surroundings are read.
+    enough : returns whether the lines read so far suffice; the remaining sides are then skipped.
+    """
     places = [(side, None) for side in get_args(Side)] if about is None else [about]
     lines = list[Line]()
     for side, outline_px in places:
@@ -58,8 +60,8 @@ def read_writing(
 
 @dataclass(frozen=True, eq=False)
 class _Strip:
-    """A side of the scan as a picture that runs from left to right. scan_from_strip (2, 3): pixels; poses: in the scan,
-    of what lies so in the strip. found: how much smaller the pictures are that lines are found in."""
+    """A side of the scan as an image from left to right. scan_from_strip (2, 3): pixels; poses: orientation in the scan
+    by orientation in the strip; found: reduction factors of the images for detection."""
 
     picture: Picture
     side: Side
@@ -92,7 +94,7 @@ class _Strip:
         )
 
     def _cut(self, place: Place) -> Picture:
-        """The line (HEIGHT_PX, width), level."""
+        """Rectified image of a line (HEIGHT_PX, width)."""
         scale = place.height_px / HEIGHT_PX
         width = int(np.clip(round(place.length_px / scale), HEIGHT_PX // 2, _LONGEST_PX))
         angle = np.deg2rad(place.tilt_deg)
@@ -106,7 +108,7 @@ class _Strip:
 
 
 def _strip(scan: Scan, side: Side, frame_px: Array | None, outline_px: Array | None) -> _Strip | None:
-    """What the scan shows at a side of the frame, or about a line there; None where that is nothing."""
+    """Strip at a side of the frame, or around a known line; None if it is empty."""
     low, high, longer_px = _side_range(scan, side, frame_px)
     if outline_px is not None:
         low = np.maximum(low, outline_px.min(axis=0) - _ABOUT * longer_px)
@@ -118,7 +120,7 @@ def _strip(scan: Scan, side: Side, frame_px: Array | None, outline_px: Array | N
     if min(width, height) < _LEAST_PX:
         return None
     grey = _to_8_bits(scan.reduced_window(factor, int(first[0]), int(first[1]), width, height))
-    turn = side in ("left", "right")  # a quarter clockwise, so that its columns run up in the scan
+    turn = side in ("left", "right")  # rotated clockwise by a quarter turn: its columns run upward in the scan
     linear = factor * (np.array([[0.0, 1.0], [-1.0, 0.0]]) if turn else np.eye(2))
     start = factor * (first + ((0, height - 1) if turn else (0, 0))) + (factor - 1) / 2
     return _Strip(
@@ -131,7 +133,7 @@ def _strip(scan: Scan, side: Side, frame_px: Array | None, outline_px: Array | N
 
 
 def _side_range(scan: Scan, side: Side, frame_px: Array | None) -> tuple[Array, Array, float]:
-    """The first place and the end of what is read at a side, in px (column, row), and the frame's longer side."""
+    """Start and end (column, row), px, of the area read at a side, and the frame's longer side."""
     low, high = np.zeros(2), np.array([scan.width_px, scan.height_px], dtype=float)
     longer_px = float(high.max())
     inner_low, inner_high = low + _BEYOND * longer_px, high - _BEYOND * longer_px

@@ -1,4 +1,4 @@
-"""The grid of segments (tiles, strips) of a picture, and a cache of those decoded last."""
+"""Grid of segments (tiles or strips) of an image, and a cache of decoded segments."""
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
@@ -18,7 +18,7 @@ CACHE_BYTES = 40 << 20  # seven rows of tiles of 256 px, 16 bit, 11,500 px acros
 
 @dataclass(frozen=True)
 class LostPart:
-    """A part of a picture that its file is too damaged to give: its first column and row, its size, and why."""
+    """Undecodable part of an image: first column and row, size, and reason."""
 
     col0: int
     row0: int
@@ -28,13 +28,18 @@ class LostPart:
 
 
 class Segments(ABC):
-    """A picture as its file stores it: a grid of tiles or strips, each decoded on its own.
+    """An image as stored in a file: a grid of tiles or strips that are decoded separately.
 
-    height_px, width_px: of the picture; segment_height_px, segment_width_px: of a segment, those at the right and lower
-    border being smaller; channels: 1 (grey) or 3 (red, green, blue); full_scale_dn: the largest value;
-    sample_bytes: 1 or 2; rounding_step_dn: to which a compression with loss, as JPEG, rounds coarse detail, 0 where
-    there is none; lost: what of the segments read so far is damaged. Its samples are in the middle of the range, so
-    that nothing there looks like a mark.
+    Attributes
+    ----------
+    height_px, width_px : of the image.
+    segment_height_px, segment_width_px : of a segment; those at the right and lower border are smaller.
+    channels : 1 (grey) or 3 (red, green, blue).
+    full_scale_dn : largest value.
+    sample_bytes : 1 or 2.
+    rounding_step_dn : quantisation step of coarse detail by lossy compression; 0 without any.
+    lost : undecodable parts of the segments read so far. Their samples are set to half of the full scale, so that
+        nothing there resembles a mark.
     """
 
     height_px: int
@@ -51,26 +56,25 @@ class Segments(ABC):
         return ()
 
     def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
-        """What the file has stored of segments (row, column), where asking for all together is quicker than for one
-        after the other; else nothing."""
+        """Stored bytes of several segments (row, column), where one request for all is faster; otherwise empty."""
         return {}
 
     @abstractmethod
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
-        """Segment (row, column) of the grid: (height, width, channels), values that grow with light. stored: as
-        `fetch` gives it."""
+        """Decode segment (row, column): (height, width, channels), values that increase with light. stored: from
+        `fetch`."""
 
     @abstractmethod
     def close(self) -> None:
-        """Close the file, where one is open."""
+        """Close the file, if one is open."""
 
 
 @dataclass(frozen=True, eq=False)
 class OpenedPicture:
-    """A scan's picture as its file gives it.
+    """The image of a scan file.
 
-    notes: what is unusual about the file, a sentence each; problems: what needs a look; overviews: the same picture
-    made small; orientation: the tag by which viewers turn the picture, 1 where they do not (TIFF 6.0).
+    notes, problems: one sentence each; overviews: reduced copies of the image; orientation: the orientation tag, 1 if
+    viewers do not rotate the image (TIFF 6.0).
     """
 
     segments: Segments
@@ -83,16 +87,18 @@ class OpenedPicture:
 
 @dataclass(eq=False)
 class _Segment:
-    """samples: None until the thread that decodes them, which holds the lock, is done."""
+    """samples: None until the thread that holds the lock has decoded them."""
 
     samples: Samples | None = None
     lock: Lock = field(default_factory=Lock)
 
 
 class SegmentCache:
-    """As many segments as a memory limit allows, and at least two rows of the grid: reading a scan
-    from top to bottom decodes each once, wherever its bands begin. A thread that wants what another is decoding waits
-    for it."""
+    """Cache of decoded segments within a memory limit, at least two rows of the grid.
+
+    Reading a scan from top to bottom then decodes each segment once, wherever its bands begin. A thread that needs a
+    segment which another is decoding waits for it.
+    """
 
     def __init__(self, segments: Segments) -> None:
         self._segments = segments
@@ -105,12 +111,12 @@ class SegmentCache:
 
     @property
     def rows_kept(self) -> int:
-        """How many rows of the picture have room."""
+        """Number of rows of the image that fit into the cache."""
         return self._limit // self._row_bytes
 
     def fill(self, samples: Samples, row0: int, col0: int) -> None:
-        """Samples (height, width, channels) of the picture from a row and column on. Segments that other threads are
-        decoding come last: there may be more to decode meanwhile."""
+        """Fill samples (height, width, channels) from a row and column on. Segments under decoding by other threads are
+        taken last."""
         tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
         height, width, _ = samples.shape
         rows = range(row0 // tall, (row0 + height - 1) // tall + 1)
@@ -130,14 +136,14 @@ class SegmentCache:
             take(*key, self._decode(key, wanted[key], stored.get(key, ())))
 
     def _segment(self, key: Place) -> _Segment:
-        """Of the grid, by row and column."""
+        """Segment by row and column of the grid."""
         with self._lock:
             segment = self._kept.setdefault(key, _Segment())
             self._kept.move_to_end(key)
         return segment
 
     def _decode(self, key: Place, segment: _Segment, stored: Sequence[bytes] = ()) -> Samples:
-        """Decoded here unless another thread has begun to."""
+        """Decode a segment unless another thread has begun to."""
         with segment.lock:
             samples = segment.samples
             if samples is None:
@@ -146,7 +152,7 @@ class SegmentCache:
         return samples
 
     def _make_room(self, added: int) -> None:
-        """For so many bytes, from the segments that were wanted longest ago."""
+        """Drop the least recently used segments to make room for added bytes."""
         with self._lock:
             self._held += added
             while self._held > self._limit:
@@ -156,8 +162,8 @@ class SegmentCache:
 
 
 class WholePicture(Segments):
-    """A picture in memory: (height, width, channels) of 8 or 16 bits, one segment. damage: why it cannot be trusted, a
-    part of a sentence, empty where it can."""
+    """An image in memory, (height, width, channels) of 8 or 16 bits, as one segment. damage: why it cannot be trusted,
+    a part of a sentence; empty if it can."""
 
     def __init__(
         self,
@@ -166,7 +172,7 @@ class WholePicture(Segments):
         damage: str = "",
         full_scale_dn: float | None = None,
     ) -> None:
-        """full_scale_dn: None: all bits of a sample are used."""
+        """full_scale_dn: None if all bits of a sample are used."""
         self._samples, self._damage, self.rounding_step_dn = samples, damage, rounding_step_dn
         self.height_px, self.width_px, self.channels = samples.shape
         self.segment_height_px, self.segment_width_px = self.height_px, self.width_px
@@ -183,5 +189,5 @@ class WholePicture(Segments):
         """Nothing is open."""
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
-        """All of it."""
+        """Return the whole image."""
         return self._samples

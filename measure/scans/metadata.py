@@ -1,4 +1,4 @@
-"""What a scan file says of itself: pitch, orientation, how stored numbers become grey values; and checks of it."""
+"""Metadata of a scan file: pitch, orientation, conversion of stored numbers to grey values; and their checks."""
 
 import math
 import re
@@ -14,7 +14,7 @@ from tifffile import TiffFileError, TiffPage
 
 from measure.errors import MeasurementError, MissingError, TooLargeError
 
-# What libraries raise of a file that is not as it should be.
+# Errors that decoders raise for invalid files.
 DECODING_ERRORS = (
     RuntimeError,
     ValueError,
@@ -28,25 +28,25 @@ DECODING_ERRORS = (
     TiffFileError,
 )
 MOST_PIXELS = 4_000_000_000  # 63,000 px a side: film of 23 cm at 4 um
-MOST_PER_BYTE = 1000  # bytes of a picture for each of its file: deflate cannot do more, and film's grain allows ten
-ALWAYS_BYTES = 128 << 20  # of a picture: a drawn one without any grain may be stored in next to nothing
+MOST_PER_BYTE = 1000  # decoded bytes per stored byte: the limit of deflate; film grain allows ten
+ALWAYS_BYTES = 128 << 20  # decoded size that is always allowed: a synthetic image compresses to almost nothing
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)  # of TIFF
 WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _SEPARATED, _YCBCR = 0, 1, 2, 3, 5, 6  # PhotometricInterpretation
 _CIELAB, _ICCLAB = 8, 9
 _ICCLAB_FULL_DN = 65280.0  # L* of 100 in 16 bits (TIFF Technical Note 4); CIELab's is all ones (TIFF 6.0, section 23)
-_INK_WEIGHTS = (0.299, 0.587, 0.114)  # of red, green and blue, which cyan, magenta and yellow take away
+_INK_WEIGHTS = (0.299, 0.587, 0.114)  # of red, green and blue, the complements of cyan, magenta and yellow
 _UNSIGNED, _SIGNED, _FLOATING = 1, 2, 3  # SampleFormat
 _WORD_DN = 65535.0
 _INK_SET = 332  # 1: cyan, magenta, yellow and black
 _EXIF = 34665  # the tag of an Exif block (Exif 2.3)
-_EXPOSURE = ("FocalLength", "FNumber", "ExposureTime", "ISOSpeedRatings")  # in it, of a camera's picture
+_EXPOSURE = ("FocalLength", "FNumber", "ExposureTime", "ISOSpeedRatings")  # Exif tags of a digital camera
 _LONGEST_NAME = 60
-MOST_CHANNELS = 4  # of a pixel: colours and transparency
-_COARSEST_UM = 250.0  # about 100 dpi; 72 and 96 dpi are what programs write that know nothing
-_FINEST_UM = 1.0  # a pixel: no film scanner is as fine
+MOST_CHANNELS = 4  # colours and transparency
+_COARSEST_UM = 250.0  # about 100 dpi; 72 and 96 dpi are defaults of programs
+_FINEST_UM = 1.0  # finer than any film scanner
 
 _METRE_UM = {"inch": 25400.0, "centimetre": 10000.0, "millimetre": 1000.0, "micrometre": 1.0, "metre": 1e6}
-TIFF_UNIT = {2: "inch", 3: "centimetre", 4: "millimetre", 5: "micrometre"}  # 4 and 5 are no standard, but are written
+TIFF_UNIT = {2: "inch", 3: "centimetre", 4: "millimetre", 5: "micrometre"}  # 4 and 5 are not standard, but occur
 JFIF_UNIT = {1: "inch", 2: "centimetre"}
 PNG_UNIT = {1: "metre"}
 Samples = NDArray[np.uint8 | np.uint16]
@@ -69,10 +69,10 @@ def unsupported_error(path: Path, what: str) -> MeasurementError:
 def check_size(
     path: Path, what: str, size_px: tuple[int, int], decoded_bytes: int, stored_bytes: int, max_pixels: int | None
 ) -> None:
-    """Raises TooLargeError for a picture, or a part of one, that claims more than the stated bounds.
+    """Raise TooLargeError for an image, or a part of one, that exceeds the limits.
 
-    what: the word for it; size_px: (width, height); decoded_bytes, stored_bytes: what it takes in memory and in the
-    file; max_pixels: the bound that a user sets, in place of both: pixels in all, and pixels for what is stored.
+    what: word for it; size_px: (width, height); decoded_bytes, stored_bytes: size in memory and in the file;
+    max_pixels: limit set by the user, which replaces the limits on pixels and on bytes per stored byte.
     """
     width, height = size_px
     pixels = width * height
@@ -94,7 +94,7 @@ def check_size(
 
 
 def no_picture_error(path: Path, start: bytes) -> MeasurementError:
-    """Of a file that begins so."""
+    """Error for a file that is not an image; start: its first bytes."""
     return MeasurementError(
         f"{path} is no TIFF, JPEG, JPEG 2000 or PNG picture (it begins with {start[:8]!r}): give the scan itself, or "
         "convert it"
@@ -102,7 +102,7 @@ def no_picture_error(path: Path, start: bytes) -> MeasurementError:
 
 
 def first_bytes(path: Path) -> bytes:
-    """The file's first 16 bytes, or why there are none. A pipe or a device is not opened: either may never end."""
+    """Read the first 16 bytes of a file. A pipe or device is not opened, since reading might never end."""
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise MeasurementError(f"{path} is no regular file, but a pipe or a device: give the file of a scan")
@@ -123,7 +123,7 @@ def first_bytes(path: Path) -> bytes:
 
 @dataclass(frozen=True)
 class Pitch:
-    """um: (x, y) in µm, None where the file gives none that can be believed; note: why none, empty otherwise."""
+    """Pixel pitch. um: (x, y) in µm, None where the file has no credible one; note: the reason, else empty."""
 
     um: tuple[float, float] | None
     note: str = ""
@@ -133,7 +133,7 @@ NO_TAGS = Pitch(None, "the file has no resolution tags")
 
 
 def pitch_from_density(x: float, y: float, unit: str | None) -> Pitch:
-    """The pitch of a file with x, y pixels per unit (`inch`, ..., None: the file names no unit)."""
+    """Pitch from x, y pixels per unit (`inch`, ...; None: the file names no unit)."""
     if unit is None:
         return Pitch(None, "the file's resolution tags have no unit")
     if not (x > 0.0 and y > 0.0):
@@ -151,11 +151,19 @@ def pitch_from_density(x: float, y: float, unit: str | None) -> Pitch:
 
 @dataclass(frozen=True, eq=False)
 class Radiometry:
-    """channels: 1 (grey) or 3 (red, green, blue), from the first samples of a pixel; what follows them (transparency)
-    is left out; full_scale_dn: the largest value; inverted: 0 is white; palette: (entries, 3) colours; inks_full: the
-    value of a full ink, where the samples are cyan, magenta, yellow and black; span: the stored numbers that become 0
-    and full scale, of floating-point samples; bands: samples of a pixel that make one grey value, where there are
-    several; note: what of this is unusual.
+    """Conversion of stored samples to grey or colour values.
+
+    Attributes
+    ----------
+    channels : 1 (grey) or 3 (red, green, blue), from the first samples of a pixel; further ones (transparency) are
+        ignored.
+    full_scale_dn : largest value.
+    inverted : whether 0 is white.
+    palette : (entries, 3) colours.
+    inks_full : value of full ink, if the samples are cyan, magenta, yellow and black.
+    span : stored floating-point numbers that map to 0 and full scale.
+    bands : samples that make one grey value, if there are several.
+    note : remark for the user.
     """
 
     channels: int
@@ -169,12 +177,13 @@ class Radiometry:
 
     @property
     def used_samples(self) -> int:
-        """How many samples of a pixel, the first ones, its values are made of."""
+        """Number of samples of a pixel that are used, from the first one."""
         return self.bands if self.inks_full else self.channels
 
     @classmethod
     def from_palette(cls, colormap: NDArray[np.generic]) -> "Radiometry":
-        """colormap (3, entries) as TIFF stores it: 16 bits, in some old files 8. All grey: one channel."""
+        """Radiometry of a palette image. colormap (3, entries): 16 bits, in some old files 8; grey ones give one
+        channel."""
         palette = np.asarray(colormap, np.uint16).T
         if palette.max() < 256:
             palette = palette * np.uint16(257)
@@ -187,7 +196,7 @@ class Radiometry:
         return 1 if self.full_scale_dn < 256 else 2
 
     def apply(self, stored: NDArray[np.generic]) -> Samples:
-        """(height, width, channels) values of (height, width, samples) stored numbers."""
+        """Convert (height, width, samples) stored numbers to (height, width, channels) values."""
         if self.palette is not None:
             indices = np.minimum(stored[..., 0].astype(np.intp), len(self.palette) - 1)
             return self.palette[indices]
@@ -210,19 +219,19 @@ class Radiometry:
 
 
 def orientation_tag(page: TiffPage) -> int:
-    """The tag by which a viewer turns the picture; 1 where it does not."""
+    """Orientation tag of a page; 1 if it has none."""
     return int(page.tags.valueof(274, default=1))
 
 
 def orientation_notes(orientation: int) -> tuple[str, ...]:
-    """A viewer may show the picture turned: whoever reads places off one must know."""
+    """Note on an orientation tag, for users who read positions in a viewer that obeys it."""
     if orientation == 1:
         return ()
     return (f"the file's orientation tag ({orientation}) is not applied: columns and rows are as stored",)
 
 
 def tag_pitch(page: TiffPage) -> Pitch:
-    """From XResolution, YResolution and ResolutionUnit (inch where it is absent, as TIFF 6.0 says)."""
+    """Pitch from XResolution, YResolution and ResolutionUnit (inch by default, TIFF 6.0)."""
     stored = [page.tags.valueof(name) for name in ("XResolution", "YResolution")]
     if None in stored:
         return NO_TAGS
@@ -235,7 +244,7 @@ def tag_pitch(page: TiffPage) -> Pitch:
 
 
 def grey_or_colour(picture: NDArray[Any]) -> Samples:
-    """One or three channels of a decoded picture; transparency is left out. Raises one of DECODING_ERRORS."""
+    """One or three channels of a decoded image, without transparency. Raises one of DECODING_ERRORS."""
     if picture.size == 0:
         raise ValueError("it holds no picture")
     stored = picture[..., None] if picture.ndim == 2 else picture
@@ -244,7 +253,7 @@ def grey_or_colour(picture: NDArray[Any]) -> Samples:
 
 
 def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
-    """How the page's samples become grey or colour values."""
+    """Radiometry of a TIFF page."""
     bits, kind, samples = page.bitspersample, int(page.photometric), page.samplesperpixel
     if not isinstance(bits, int):
         raise unsupported_error(path, f"samples are of {' and '.join(map(str, bits))} bits")
@@ -278,8 +287,8 @@ def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
 
 
 def float_span(least: float, greatest: float) -> tuple[float, float]:
-    """Which floating-point numbers become 0 and full scale: those of the usual scale that holds all there are; where
-    none does, the extremes themselves."""
+    """Floating-point numbers that map to 0 and full scale: the smallest usual scale that holds all values, else the
+    extremes."""
     low = min(least, 0.0)
     return low, next(
         (full for full in (1.0, 255.0, _WORD_DN) if low == 0.0 and greatest <= full), max(greatest, low + 1e-9)
@@ -287,8 +296,8 @@ def float_span(least: float, greatest: float) -> tuple[float, float]:
 
 
 def taking_camera(page: TiffPage) -> str:
-    """The digital camera that took a picture, by maker, model and focal length; "" of a scanner's file, whose Exif
-    block says nothing of an exposure."""
+    """Digital camera of an image by maker, model and focal length; "" for a scanner's file, whose Exif block has no
+    exposure."""
     exif = exif_tags(page)
     if not any(tag in exif for tag in _EXPOSURE):
         return ""
@@ -303,13 +312,13 @@ def _words(tag: object) -> str:
 
 
 def exif_number(tag: object) -> float | None:
-    """A number of an Exif block, which has fractions; None of anything else, and of 0."""
+    """Number of an Exif tag, which may be a fraction; None for anything else and for 0."""
     if isinstance(tag, tuple) and len(tag) == 2:
         tag = tag[0] / tag[1] if tag[1] else 0.0
     return (round(tag, 3) or None) if isinstance(tag, float | int) and math.isfinite(tag) else None
 
 
 def exif_tags(page: TiffPage) -> Mapping[str, Any]:
-    """The Exif block of a page, empty without one."""
+    """Exif block of a page; empty without one."""
     exif = page.tags.valueof(_EXIF)
     return exif if isinstance(exif, dict) else {}

@@ -1,4 +1,4 @@
-"""Scans opened by the format of their first bytes, their heads alone, and scans that are made of a scan."""
+"""Opening of scans by their format, reading of their heads, and views of scans: windows and thumbnails."""
 
 import zlib
 from collections.abc import Sequence
@@ -31,27 +31,27 @@ from measure.tone.curve import Tone
 from measure.tone.declared import tone_of_tags
 
 Array = NDArray[np.float32]
-_HEADERS_BYTES = 1 << 18  # of a JPEG or PNG file, before its picture: profiles and Exif blocks take less
-_END_BYTES = 1 << 16  # in which nearly every JPEG or PNG file that is whole has its end marker
-_BAND_PX = 1 << 18  # of the window that are read at a time
+_HEADERS_BYTES = 1 << 18  # head of a JPEG or PNG file: profiles and Exif blocks are smaller
+_END_BYTES = 1 << 16  # end of a complete JPEG or PNG file, which holds the end marker
+_BAND_PX = 1 << 18  # pixels of a window read at a time
 _FULL_SCALE_DN = 65535.0  # of a thumbnail of 16 bits
-_GREY_BAND_PX = 1 << 20  # of the scan that is held in grey at a time, about
+_GREY_BAND_PX = 1 << 20  # approximate number of pixels held in grey at a time
 
 
 def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
-    """Opens a TIFF, BigTIFF, JPEG, JPEG 2000 or PNG file. Its first bytes give the format, not its name.
+    """Open a TIFF, BigTIFF, JPEG, JPEG 2000 or PNG file. The format is taken from its first bytes, not from its name.
 
     Parameters
     ----------
-    path : of a file, or an address as `Address` has it.
-    max_pixels : how many a scan may have; None: the limits of `check_size`.
+    path : of a file, or an address, see `Address`.
+    max_pixels : largest number of pixels; None: the limits of `check_size`.
 
     Raises
     ------
     MeasurementError
-        For a file that is missing, empty, truncated or no such picture; the message says what to do.
+        If the file is missing, empty, truncated or not an image; the message gives the remedy.
     UnreachableError
-        For an address that does not answer.
+        If an address does not answer.
 
     Examples
     --------
@@ -78,8 +78,8 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
 
 @dataclass(frozen=True)
 class ScanHead:
-    """file_format: TIFF, JPEG, JPEG 2000 or PNG; bits: of a sample, as they are measured; notes: what is unusual, a
-    sentence each; camera: the digital camera that took it, by its Exif block, "" of a scan."""
+    """Head of a scan file. file_format: TIFF, JPEG, JPEG 2000 or PNG; bits: per sample; notes: one sentence each;
+    camera: digital camera of the Exif block, "" for a scan."""
 
     file_format: str
     width_px: int
@@ -92,17 +92,17 @@ class ScanHead:
 
 
 def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
-    """Reads the head of a scan file: some kilobytes, however large the file is.
+    """Read the head of a scan file, some kilobytes for any file size.
 
     Parameters
     ----------
-    max_pixels : as `open_scan` takes it.
+    max_pixels : see `open_scan`.
 
     Raises
     ------
     MeasurementError
-        For a file that cannot be opened as a scan, as far as its head and its length show. Damage of a JPEG, JPEG 2000
-        or PNG picture shows only when it is decoded.
+        If head and length show that the file cannot be opened as a scan. Damage within a JPEG, JPEG 2000 or PNG image
+        is found only by decoding.
     """
     start = first_bytes(path)
     if start[:4] in TIFF_STARTS:
@@ -125,7 +125,7 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
     if form is None or 0 in form:
         raise damage_error(path, "its header is cut short")
     if marker not in end:
-        open_scan(path, max_pixels).close()  # which says whether it stands before something else
+        open_scan(path, max_pixels).close()  # fails unless the marker only precedes trailing data
     width, height, channels, bits = form
     check_size(path, "a picture", (width, height), width * height * channels, path.stat().st_size, max_pixels)
     camera = jpeg_camera(data) if file_format == "JPEG" else ""
@@ -133,12 +133,7 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
 
 
 def declared_tone(path: Path) -> Tone | None:
-    """The tone curve that a file declares.
-
-    Returns
-    -------
-    None where the file says nothing that can be used. Nothing is raised for what it holds.
-    """
+    """Tone curve declared by a file's tags; None if there is no usable one. File content never raises an error."""
     try:
         with path.open("rb") as opened:
             start = opened.read(16)
@@ -162,16 +157,16 @@ def _head_and_end(path: Path) -> tuple[bytes, bytes]:
 
 
 def crop_scan(scan: Scan, window: Window) -> Scan:
-    """A window of a scan as a scan of its own, whose pixels count from the window's first one.
+    """View a window of a scan as a scan, with pixels counted from the window's first one.
 
     Parameters
     ----------
-    scan : stays open as long as the window is read.
+    scan : must stay open while the window is read.
 
     Raises
     ------
     ValueError
-        For a window that does not lie in the scan.
+        If the window does not lie in the scan.
     """
     col, row, width, height = window
     if min(width, height) < 1 or min(col, row) < 0 or col + width > scan.width_px or row + height > scan.height_px:
@@ -185,7 +180,7 @@ def crop_scan(scan: Scan, window: Window) -> Scan:
 
 
 class WindowSegments(Segments):
-    """A window of a scan in bands of rows; the scan is another's to close."""
+    """A window of a scan in bands of rows; closing it does not close the scan."""
 
     def __init__(self, scan: Scan, window: Window) -> None:
         self._scan = scan
@@ -208,15 +203,15 @@ class WindowSegments(Segments):
         """Nothing is open."""
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
-        """A band of rows."""
+        """Read a band of rows."""
         first = row * self.segment_height_px
         height = min(self.segment_height_px, self.height_px - first)
         return self._scan.samples(self._col0, self._row0 + first, self.width_px, height)
 
 
 def thumbnail(scan: Scan, largest_px: int) -> Scan:
-    """The scan's grey values at 16 bits, area-averaged until no side is longer than largest_px. Its pitch is the
-    file's, times as much as a pixel has become longer."""
+    """Grey values of a scan with 16 bits, area-averaged so that no side exceeds largest_px; the pitch is scaled
+    accordingly."""
     shrunk = max(max(scan.width_px, scan.height_px) / largest_px, 1.0)
     grey, unit = _reduced(scan, int(shrunk)), _FULL_SCALE_DN / scan.full_scale_dn
     size = round(scan.width_px / shrunk), round(scan.height_px / shrunk)
@@ -228,7 +223,7 @@ def thumbnail(scan: Scan, largest_px: int) -> Scan:
 
 
 def _reduced(scan: Scan, factor: int) -> NDArray[np.uint16]:
-    """Grey values at 16 bits, averaged by a whole factor: band by band, so that colours are never held of all of it."""
+    """Grey values with 16 bits, averaged by an integer factor, band by band to limit memory."""
     unit = np.float32(_FULL_SCALE_DN / scan.full_scale_dn)
     grey = np.empty((scan.height_px // factor, scan.width_px // factor), np.uint16)
     rows = max(_GREY_BAND_PX // scan.width_px // factor, 1)

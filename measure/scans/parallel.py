@@ -1,4 +1,4 @@
-"""Work shared among processes or threads, or done here where there are none."""
+"""Parallel mapping over processes or threads, with a serial fallback."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
@@ -14,7 +14,7 @@ Made = TypeVar("Made")
 def map_items(
     workers: Executor | None, function: Callable[[Item], Made], items: Sequence[Item], chunk: int = 1
 ) -> Iterator[Made]:
-    """The function of every item, in their order. chunk: how many items a worker gets at a time."""
+    """Map a function over items, in their order. chunk: items per task."""
     return map(function, items) if workers is None else workers.map(function, items, chunksize=chunk)
 
 
@@ -25,8 +25,10 @@ def map_or_replace(
     lost: Callable[[Item, str], Made],
     chunk: int = 1,
 ) -> Iterator[Made]:
-    """Like `map_items`, but an item that ends its worker costs none of the others. lost: makes the result of such an
-    item, from it and the reason."""
+    """Map a function over items, in their order; an item that kills its worker does not affect the others.
+
+    lost: makes the result of such an item from it and the reason.
+    """
     if workers is None:
         yield from map(function, items)
         return
@@ -38,7 +40,7 @@ def map_or_replace(
         except BrokenExecutor as error:
             if len(part) == 1:
                 yield lost(part[0], str(error))
-            else:  # one of them did it
+            else:  # one of them killed the worker: find out which
                 yield from map_or_replace(workers, function, part, lost)
 
 
@@ -56,8 +58,8 @@ def _each(function: Callable[[Item], Made], part: Sequence[Item]) -> list[Made]:
 
 
 def map_in_threads(function: Callable[[Item], Made], items: Iterable[Item]) -> list[Made]:
-    """The function of every item, in their order, by as many threads as OpenCV may use. OpenCV's own threads rest
-    meanwhile: they would only take turns with these."""
+    """Map a function over items, in their order, in as many threads as OpenCV may use. OpenCV's own threads are
+    switched off meanwhile, since both would compete for the cores."""
     threads = cv2.getNumThreads()
     if threads <= 1:
         return [function(item) for item in items]
@@ -67,7 +69,7 @@ def map_in_threads(function: Callable[[Item], Made], items: Iterable[Item]) -> l
 
 @contextmanager
 def one_opencv_thread() -> Iterator[None]:
-    """OpenCV works in the calling thread alone, and afterwards with as many of its own as before."""
+    """Limit OpenCV to the calling thread, and restore its number of threads afterwards."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

@@ -24,28 +24,35 @@ Array = NDArray[np.float32]
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
 _GREEN = (0.0, 1.0, 0.0)
 SINGLE_CHANNELS = (1.0, 0.0, 0.0), _GREEN, (0.0, 0.0, 1.0)
-_BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
-_PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, about
-_LARGEST_PART_PX = 2048  # the side of a part in whole segments: beyond it segments are divided
-_COMPRESSION_PX = 256  # the side of the part in the middle that tells of an earlier compression: 1000 blocks
-_PLAINLY_COARSER = 1.5  # than what the file itself rounds to, which shows as well
-_OF_A_PX = 0.01  # that an overview is smaller by than a whole part of the scan, where its last pixel is a part of one
-_NAMED = 3  # damaged parts of a file: more are counted
-_LEAST_UNIT_DN = 16  # of 8 bits in a file of 16: as 12 bits stored from the top have it
+_BAND_PIXELS = 1 << 18  # averaged by a thread at a time: fits into the processor's cache
+_PART_PX = 512  # approximate side of the part that a thread reduces at a time, px of the scan
+_LARGEST_PART_PX = 2048  # largest side of a part in whole segments; larger segments are divided
+_COMPRESSION_PX = 256  # side of the central part tested for an earlier compression: 1000 blocks
+_PLAINLY_COARSER = 1.5  # least ratio to the file's own rounding step, which shows as well
+_OF_A_PX = 0.01  # tolerance of an overview's size, px, where its last pixel covers only a part
+_NAMED = 3  # damaged parts listed by name; more are counted
+_LEAST_UNIT_DN = 16  # least step of grey values of 8 bits stored in 16: 12 bits in the high bits have this step
 
 
 class Scan:
-    """An opened scan: its size, its pitch, and windows of grey values that grow with light on the scanner's sensor.
+    """An open scan: size, pitch, and windows of grey values.
 
-    width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows;
-    tone: the curve between light and these grey values, with its uncertainty.
-    pitch_um: (x, y) from the file's resolution tags, None where it has none that can be believed, and then pitch_note
-    says why. problems: what of the file needs a look, a sentence each; orientation: as `OpenedPicture` has it.
-    The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
+    Grey values increase with light on the scanner's sensor. Pixels are as stored in the file: an orientation tag is not
+    applied.
+
+    Attributes
+    ----------
+    width_px, height_px : int
+    channels : 1 or 3.
+    full_scale_dn : largest grey value of the bit depth.
+    tone : tone curve between light and grey values, with its uncertainty.
+    pitch_um : (x, y) from the resolution tags; None where there are no credible ones, for the reason in pitch_note.
+    problems : problems of the file, one sentence each.
+    orientation : see `OpenedPicture`.
     """
 
     def __init__(self, path: Path, segments: Segments, pitch: Pitch, opened: OpenedPicture | None = None) -> None:
-        """opened: what the file says beside its picture."""
+        """opened: metadata of the file."""
         opened = opened or OpenedPicture(segments, pitch)
         self.path = path
         self.name = path.stem
@@ -68,13 +75,12 @@ class Scan:
 
     @property
     def weights(self) -> Sequence[float]:
-        """What each channel counts in the grey values, (channels,)."""
+        """(channels,) weights of the channels in the grey values."""
         return self._grey_weights
 
     @cached_property
     def rounding_step_dn(self) -> float:
-        """To which a compression with loss rounded coarse detail, that of the file itself or an earlier one; 0 where
-        there was none."""
+        """Quantisation step of coarse detail by lossy compression, of the file or an earlier one; 0 without any."""
         return max(self._segments.rounding_step_dn, self._earlier_step_dn)
 
     @property
@@ -83,7 +89,7 @@ class Scan:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is unusual about the file, a sentence each."""
+        """Notes on the file, one sentence each."""
         if not self._earlier_step_dn:
             return self._file_notes
         return *self._file_notes, (
@@ -97,16 +103,16 @@ class Scan:
 
     @property
     def rows_kept(self) -> int:
-        """How many rows of the scan stay decoded for the next windows."""
+        """Number of rows that stay decoded for the next windows."""
         return self._cache.rows_kept
 
     @property
     def segment_px(self) -> tuple[int, int]:
-        """Height and width of what the file has in one piece."""
+        """Height and width of a tile or strip of the file."""
         return self._segments.segment_height_px, self._segments.segment_width_px
 
     def replace_name(self, name: str) -> "Scan":
-        """The scan under the name that a project has for it: files of several folders may have one name."""
+        """The scan under its name in a project: files in several folders may share a name."""
         scan = copy(self)
         scan.name = name
         return scan
@@ -118,24 +124,25 @@ class Scan:
         return scan
 
     def green_channel(self) -> "Scan":
-        """The same scan with its green for grey value, if it has colours. A lens draws red and blue at scales of their
-        own, some 1e-4 off; a mark in a mixture of all has no one place."""
+        """The scan with green as its grey value, if it has colours. Lateral chromatic aberration scales red and blue by
+        some 1e-4, so that a mark in a mixture of channels has no unique place."""
         scan = copy(self)
         if self.channels == len(_GREEN):
             scan._grey_weights = _GREEN
         return scan
 
     def window(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
-        """(height, width) float32 grey values; parts outside of the scan repeat its edge.
+        """(height, width) float32 grey values; outside of the scan its edge is repeated.
 
-        weights: what each channel counts, (channels,); None is the grey value itself, or the luminance of a colour.
+        weights: (channels,) of the channels; None: the grey value itself, or the luminance of a colour.
         """
         if width < 1 or height < 1:
             raise ValueError(f"a window has at least one pixel, not {width} x {height}")
         return weighted(self.samples(col0, row0, width, height), self._weights(weights))
 
     def light(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
-        """(height, width) as `window` has it, in light by the tone curve: what blurs linearly, and is fitted."""
+        """(height, width) window in linear light, by the tone curve: blur is linear in light, so marks are fitted
+        there."""
         if not self.tone.sharpening:
             samples = self.samples(col0, row0, width, height)
             light = samples if self.tone.is_identity else self.tone.light(samples, self.full_scale_dn)
@@ -148,9 +155,9 @@ class Scan:
         return weighted(light, self._weights(weights))
 
     def samples(self, col0: int, row0: int, width: int, height: int, out: Samples | None = None) -> Samples:
-        """(height, width, channels) values as the file stores them; parts outside of the scan repeat its edge.
+        """(height, width, channels) stored values; outside of the scan its edge is repeated.
 
-        out: an array of that shape and of samples_dtype that is filled, in place of a new one.
+        out: array of that shape and samples_dtype to fill instead of a new one.
         """
         samples = np.empty((height, width, self.channels), self.samples_dtype) if out is None else out
         top, bottom = (min(max(row, 0), self.height_px - 1) for row in (row0, row0 + height - 1))
@@ -164,8 +171,8 @@ class Scan:
         return samples
 
     def inside(self, col0: int, row0: int, width: int, height: int, is_read: bool = False) -> NDArray[np.bool_]:
-        """(height, width): which pixels of a window are the scan's: they do not repeat its edge, and were not lost by
-        the file. is_read: all of the window has been read before, and what is lost is known."""
+        """(height, width) mask of the pixels of a window that lie in the scan and could be decoded. is_read: the window
+        has been read before, so that its losses are known."""
         cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
         in_rows = (rows >= 0) & (rows < self.height_px)
         known = np.asarray(in_rows[:, None] & (cols >= 0) & (cols < self.width_px))
@@ -175,22 +182,22 @@ class Scan:
         return known
 
     def loss_reason(self, col0: int, row0: int, width: int, height: int) -> str:
-        """Why the file does not give some pixels of a window, a part of a sentence; empty where it gives all."""
+        """Why some pixels of a window could not be decoded, a part of a sentence; empty if all could."""
         return next((part.why for part in self._window_losses(col0, row0, width, height)), "")
 
     @property
     def lost(self) -> Sequence[LostPart]:
-        """What the file was found not to give so far."""
+        """Parts of the file found undecodable so far."""
         return self._segments.lost
 
     @property
     def is_lost(self) -> bool:
-        """Whether the file was found to give none of its pixels."""
+        """Whether no pixel of the file could be decoded."""
         return sum(part.width * part.height for part in self._segments.lost) == self.width_px * self.height_px
 
     @property
     def damage(self) -> str:
-        """What of the file was found to be damaged so far, a part of a sentence; empty where nothing was."""
+        """Damage of the file found so far, a part of a sentence; empty without any."""
         lost = self._segments.lost
         if not lost:
             return ""
@@ -204,10 +211,10 @@ class Scan:
         return f"the scan's file is damaged: {what}"
 
     def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Array:
-        """The whole scan, area-averaged by an integer factor: pixel (i, j) is the mean over factor x factor pixels,
-        its centre at column factor * j + (factor - 1) / 2. The last partial row and column are dropped.
+        """Reduce the whole scan by area averages over factor x factor pixels.
 
-        The scan is streamed by its segments: memory holds the result, all its channels for the next call, and some
+        The centre of pixel (i, j) lies at column factor * j + (factor - 1) / 2; partial rows and columns at the end are
+        dropped. The scan is streamed by segments: memory holds the result, all its channels for the next call, and some
         segments for each thread.
         """
         height, width = self.height_px // factor, self.width_px // factor
@@ -220,14 +227,14 @@ class Scan:
 
     @property
     def last_reduction(self) -> tuple[int, Array] | None:
-        """The factor and the grey values of the whole scan as it was reduced last; None before the first time."""
+        """Factor and grey values of the last reduction of the whole scan; None before the first one."""
         return next(((f, weighted(grey, self._grey_weights)) for f, grey in self._reduced.items()), None)
 
     def reduced_window(
         self, factor: int, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None
     ) -> Array:
-        """(height, width) pixels of the reduced scan from its column col0 and row row0 on, read from the file by
-        themselves; parts outside of the scan repeat its edge."""
+        """(height, width) window of the reduced scan from its column col0 and row row0, decoded on its own; outside of
+        the scan its edge is repeated."""
         return weighted(self._reduced_part(factor, col0, row0, width, height), self._weights(weights))
 
     def close(self) -> None:
@@ -242,7 +249,7 @@ class Scan:
         self.close()
 
     def _window_losses(self, col0: int, row0: int, width: int, height: int, is_read: bool = False) -> list[LostPart]:
-        """The parts of a window that the file does not give. What a file has in pieces is known once it is read."""
+        """Undecodable parts of a window; those of segments are known once they were read."""
         if self._source is self._cache and not is_read:
             self.samples(col0, row0, width, height)
         return [
@@ -256,8 +263,9 @@ class Scan:
 
     @cached_property
     def _earlier_step_dn(self) -> float:
-        """Of a compression before that of the file, as the luminance in the middle of the scan shows it; 0 where none
-        was plainly coarser. JPEG has 8 bits: in a file of 16 its grey values are multiples of a unit."""
+        """Quantisation step of an earlier JPEG compression, from the luminance in the centre of the scan; 0 if it is
+        not clearly coarser than the file's. JPEG has 8 bits: in a file of 16 bits its values are multiples of a
+        unit."""
         width, height = (min(side, _COMPRESSION_PX) for side in (self.width_px, self.height_px))
         samples = self.samples((self.width_px - width) // 2, (self.height_px - height) // 2, width, height)
         unit = 1 if samples.dtype == np.uint8 else int(np.gcd.reduce(samples, axis=None))
@@ -268,7 +276,7 @@ class Scan:
         return step_dn if step_dn > _PLAINLY_COARSER * self._segments.rounding_step_dn else 0.0
 
     def _reduced_channels(self, factor: int, width: int, height: int) -> Array:
-        """(height, width, channels): every segment is decoded once."""
+        """(height, width, channels) reduction of the whole scan; every segment is decoded once."""
         if overview := self._overview(factor):
             return overview._enlarged_to(self, factor, width, height)
         result = np.empty((height, width, self.channels), np.float32)
@@ -286,12 +294,12 @@ class Scan:
         return result
 
     def _overview(self, factor: int) -> "Scan | None":
-        """The smallest that is as large as the scan reduced by a factor, or larger."""
+        """Smallest overview that is at least as large as the scan reduced by a factor."""
         fine = [one for one in self._overviews if one.width_px * factor >= self.width_px]
         return min(fine, key=lambda one: one.width_px, default=None)
 
     def _reduced_part(self, factor: int, col0: int, row0: int, width: int, height: int) -> Array:
-        """(height, width, channels) pixels of the reduced scan, from the file."""
+        """(height, width, channels) window of the reduced scan."""
         if overview := self._overview(factor):
             whole, scale, shift = overview._steps_to(self, factor)
             first, last = np.array([col0, row0]), np.array([col0 + width, row0 + height]) - 1
@@ -302,14 +310,14 @@ class Scan:
         return means(self.samples(col0 * factor, row0 * factor, width * factor, height * factor), factor)
 
     def _enlarged_to(self, scan: "Scan", factor: int, width: int, height: int) -> Array:
-        """This overview of a scan as the scan is reduced by a factor."""
+        """Resample this overview to the size of its scan reduced by a factor."""
         whole, scale, shift = self._steps_to(scan, factor)
         means_ = self._reduced_channels(whole, self.width_px // whole, self.height_px // whole)
         return _interpolated(means_, scale, shift, width, height)
 
     def _steps_to(self, scan: "Scan", factor: int) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
-        """From this overview to its scan reduced by a factor: by how many whole pixels to average, and then how many of
-        these (x, y) a step is, and where the first pixel lies among them, to interpolate."""
+        """Resampling from this overview to its scan reduced by a factor: integer factor of averaging, then step (x, y)
+        and position (x, y) of the first pixel for the interpolation."""
         px = np.array([scan.width_px / self.width_px, scan.height_px / self.height_px])  # of the scan to one of these
         whole = max(int(factor / px.max() + _OF_A_PX), 1)
         scale = factor / (whole * px)
@@ -326,7 +334,7 @@ class Scan:
 def _interpolated(
     picture: Array, scale: NDArray[np.float64], shift: NDArray[np.float64], width: int, height: int
 ) -> Array:
-    """(height, width, channels) a picture (rows, columns, channels) in steps of scale (x, y) from shift (x, y) on."""
+    """(height, width, channels) image (rows, columns, channels) sampled in steps of scale (x, y) from shift (x, y)."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     matrix = np.column_stack([np.diag(scale), shift])
     warped = cv2.warpAffine(picture, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
@@ -334,15 +342,13 @@ def _interpolated(
 
 
 def _reduced_side(fine_px: int, factor: int, most_px: int) -> int:
-    """The side of a part of a reduced scan: about most_px of the scan, in whole segments if these are not much
-    larger."""
+    """Side of a part of a reduced scan: about most_px of the scan, in whole segments unless these are much larger."""
     unit = lcm(fine_px, factor)
     return max((unit * max(most_px // unit, 1) if unit <= _LARGEST_PART_PX else most_px) // factor, 1)
 
 
 def means(samples: Samples | Array, factor: int) -> Array:
-    """(height / factor, width / factor, channels) means of samples (height, width, channels), over squares of factor
-    x factor of them."""
+    """(height / factor, width / factor, channels) means of samples (height, width, channels) over squares."""
     height, width, channels = samples.shape
     result = np.empty((height // factor, width // factor, channels), np.float32)
     rows = max(_BAND_PIXELS // (width * factor), 1)
@@ -356,7 +362,7 @@ def means(samples: Samples | Array, factor: int) -> Array:
 
 
 def _reduction_steps(factor: int) -> tuple[int, ...]:
-    """Twos, which OpenCV averages fastest, and what is left."""
+    """Factors of two, which OpenCV averages fastest, then the remaining factor."""
     if factor % 2 == 0:
         return 2, *_reduction_steps(factor // 2)
     return (factor,) if factor > 1 else ()
