@@ -266,7 +266,8 @@ class MarkFit:
     of its range. edges: the mark's place by another method, to compare;
     sloping: an ellipse's, if its paint may grow lighter or darker from side to side. own_shape: what the picture says
     of rotation and scale, where the frame gave them; tone: and of a tone curve that is not known; sharpening: and of
-    a scan's sharpening.
+    a scan's sharpening. figures: what is compared with other frames: size_ratio and blur_ratio to the other marks,
+    turn_rad where the frame gave the rotation, arm1_ratio ... of a cross; size_sigma ...: of logarithms, of the turn.
     """
 
     converged: bool
@@ -293,6 +294,7 @@ class MarkFit:
     tone: MarkTone | None = None
     sharpening: SharpeningScore | None = None
     covariance: Array | None = None
+    figures: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def covariance_px2(self) -> Array:

@@ -15,6 +15,7 @@ from measure.array_types import Array
 from measure.fiducials.consistency import NAMED, FrameMarks, Hypothesis
 from measure.fiducials.misfits import Explanation, FrameMisfit, Frames, explain, explain_by_pattern
 from measure.fiducials.options import ANY_FILM, BelievedFilm
+from measure.fiducials.own_figures import check_own_figures
 from measure.fiducials.second_places import Doubt, add_doubts, check_second_places, observed_fiducials
 from measure.flags import FALSE_DOUBT, NO_REASON, Cause, Code, Reason
 from measure.geometry import up_from_camera
@@ -46,7 +47,7 @@ def check_frames(
     ----------
     pitches_um: of each scan, in x and y. film: what is believed of it beforehand.
     """
-    checked, films = check_second_places(frames), [film.sigma_mm] * len(frames)
+    checked, films = check_own_figures(check_second_places(frames)), [film.sigma_mm] * len(frames)
     found = {i: _misfit(*pair, layout, film.model) for i, pair in enumerate(zip(checked, pitches_um, strict=True))}
     misfits = {place: each for place, each in found.items() if each is not None}
     if misfits:

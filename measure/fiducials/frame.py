@@ -173,6 +173,11 @@ class Frame:
             return self
         return self.replace_fits({index: replace(fit, place_covariance=fit.place_covariance.plus(cause, px2))})
 
+    def add_figures(self, index: int, figures: Mapping[str, float]) -> "Frame":
+        """The frame with figures of a mark beside the others, if it was found."""
+        fit = self.detections[index].fit
+        return self if fit is None else self.replace_fits({index: replace(fit, figures={**fit.figures, **figures})})
+
     @property
     def fits(self) -> list[MarkFit | None]:
         """The fits of the inliers."""

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from measure.array_types import Array
-from measure.flags import MARK_UNLIKE_THE_OTHERS
+from measure.flags import MARK_UNLIKE_THE_OTHERS, Code, Reason
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.results import MarkFit
 
@@ -62,7 +62,7 @@ def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
     it is as theirs, or where they are too few."""
     own = np.array([_log_total_px(fit.blur_px) for fit in fits])
     sigma = np.array([fit.blur_sigma for fit in fits])
-    expected_blurs = _expect_from_others(own, sigma, _blur_spread, _FEWEST_BLURS)
+    expected_blurs = _expect_from_others(own, sigma, blur_spread, _FEWEST_BLURS)
     return [
         None
         if expected is None or not (expected.differs or own_sigma > _TELLING)
@@ -81,11 +81,6 @@ class SharedShape:
     sigma: Array
     differs: bool
 
-    @property
-    def ratio(self) -> float:
-        """How many times the others' size it has."""
-        return float(np.exp(self.off[0]))
-
     def touched(self, spread: float, is_damaged: bool) -> float:
         """The probability that something touches the mark on one side, by as much as its shape speaks for it more than
         for what may happen to any mark. spread: of the figures of marks that are touched; is_damaged: whether something
@@ -94,6 +89,21 @@ class SharedShape:
         touched = share * _density(self.off, np.hypot(self.sigma, spread))
         untouched = (1 - share) * _density(self.off, self.sigma)
         return max(touched / max(touched + untouched, 1e-300) - share, 0.0)
+
+
+def unlike_others(size_ratio: float, turn_rad: float | None) -> Reason:
+    """Why a mark is weak that has another size than the others, and another turn where the frame holds that."""
+    larger = f"{size_ratio:.2f} times as large as the other marks"
+    if turn_rad is None:
+        figure = f"it is {larger}"
+    else:
+        figure = f"its edges make it {larger}, and turned by {np.degrees(turn_rad):.1f} degrees"
+    return Reason(f"{figure}: something may cover or touch it", Code.SIZE, Code.COVERED)
+
+
+def unlike_blur(ratio: float) -> Reason:
+    """Why a mark is weak that has another blur than the others."""
+    return Reason(f"its blur is {ratio:.2f} times that of the other marks", Code.BLUR)
 
 
 def _density(off: Array, sigma: Array) -> float:
@@ -163,17 +173,19 @@ def shared_shapes(own: Array, sigma: Array) -> list[SharedShape | None]:
 def _expect_from_sound(own: Array, sigma: Array) -> "list[_Expected | None]":
     """For each mark what the others let expect of one figure of its shape: those alone that do not differ themselves,
     where these are enough."""
-    every = _expect_from_others(own, sigma, _size_spread, _FEWEST_SHAPES)
+    every = _expect_from_others(own, sigma, size_spread, _FEWEST_SHAPES)
     odd = np.array([each is not None and each.differs for each in every])
-    sound = _expect_from_others(own, np.where(odd, np.inf, sigma), _size_spread, _FEWEST_SHAPES)
+    sound = _expect_from_others(own, np.where(odd, np.inf, sigma), size_spread, _FEWEST_SHAPES)
     return [first if is_odd else again or first for first, again, is_odd in zip(every, sound, odd, strict=True)]
 
 
-def _blur_spread(shown: float, marks: int) -> float:
+def blur_spread(shown: float, marks: int) -> float:
+    """By which blurs differ, where so many of them show a variance beyond their own."""
     return float(np.hypot(np.sqrt(shown), _BLUR_SPREAD))
 
 
-def _size_spread(shown: float, marks: int) -> float:
+def size_spread(shown: float, marks: int) -> float:
+    """By which sizes and turns differ, where so many of them show a variance beyond their own."""
     return float(np.sqrt((_BEFORE * _SIZE_SPREAD**2 + (marks - 1) * shown) / (_BEFORE + marks - 1)))
 
 
@@ -207,14 +219,14 @@ def _expect_from_others(own: Array, sigma: Array, spread: _Spread, fewest: int) 
         if others.sum() < fewest:
             result.append(None)
             continue
-        mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
+        mean, mean_sigma, apart = mean_of_unlike(own[others], sigma[others], spread)
         predicted = float(np.hypot(mean_sigma, apart))
         off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
         result.append(_Expected(mean, predicted, bool(2 * ndtr(-off) * len(own) < MARK_UNLIKE_THE_OTHERS)))
     return result
 
 
-def _mean(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:
+def mean_of_unlike(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:
     """The weighted mean of values that differ by more than their standard deviations, its own standard deviation, and
     by how much more: by the moments of what they leave (DerSimonian and Laird, 1986)."""
     weights = 1 / sigma**2

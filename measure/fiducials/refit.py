@@ -16,15 +16,20 @@ from measure.fiducials.mark_comparison import (
     shared_shapes,
     touch_of_edges,
     touch_of_round,
+    unlike_blur,
+    unlike_others,
 )
 from measure.fiducials.mark_fit import detect_mark, is_held_by_frame, strain_error_px
-from measure.flags import LARGE_ERROR, Cause, Code, Reason
+from measure.flags import LARGE_ERROR, Cause
 from measure.geometry import linear_scale
 from measure.marks.rendering import extent_px, reach_px
 from measure.marks.shapes import Disk, FiducialLayout, FrameCorner, LayoutMark, Mark, MarkShape, Ring
+from measure.matching.arms import is_cross, measure_arms
 from measure.matching.frame_edge import Course, edge_along, pool_edge_tones
-from measure.matching.models import is_round
+from measure.matching.match import mark_window
+from measure.matching.models import PIXEL_VARIANCE_PX2, is_round
 from measure.matching.options import MatchOptions
+from measure.matching.window import read_window
 from measure.noise.noise_model import may_be_noise
 from measure.results import MarkFit
 from measure.scans.scan import Scan
@@ -166,17 +171,18 @@ def _refit_with_blur(frame: Frame) -> Frame:
     fits = {index: fit for index, fit in drawn.items() if index not in faint and frame.is_clear(index)} | faint
     shared = dict(zip(fits, shared_blurs(list(fits.values())), strict=True))
     options = {index: _set_blur(frame.options.match, blur) for index, blur in shared.items() if blur is not None}
-    if not options and not faint:
-        return frame
     matched = _refit(frame, {index: each for index, each in options.items() if index not in faint}, orient=False)
     for index, before in faint.items():
         fit = _fit_again(frame, index, options.get(index, frame.options.match))
         if fit is not None and _is_better(before, fit, shared[index]):
             matched = matched.replace_fits({index: fit})
+    total_px = {index: float(np.sqrt(fit.blur_px**2 + PIXEL_VARIANCE_PX2)) for index, fit in fits.items()}
     for index, blur in shared.items():
+        ratio = total_px[index] / float(np.median(list(total_px.values())))
+        if np.isfinite(fits[index].blur_sigma):
+            matched = matched.add_figures(index, {"blur_ratio": ratio, "blur_sigma": fits[index].blur_sigma})
         if blur is not None and blur.differs and index not in faint:
-            other = f"its blur is {fits[index].blur_px:.2f} px, where the other marks have {blur.blur_px:.2f}"
-            matched = matched.add_reason(index, Reason(other, Code.BLUR))
+            matched = matched.add_reason(index, unlike_blur(ratio))
     return orient_frame(matched)
 
 
@@ -209,10 +215,10 @@ def _compare_shapes(frame: Frame) -> Frame:
             groups[None].append(index)
     for drawn, indices in groups.items():
         figures = [_shape_figures(fits[index], frame.linear(index), drawn is None) for index in indices]
-        shapes = shared_shapes(*(np.array(each) for each in zip(*figures, strict=True)))
-        for index, shape in zip(indices, shapes, strict=True):
+        own, sigmas = (np.array(each) for each in zip(*figures, strict=True))
+        for index, shape, sigma in zip(indices, shared_shapes(own, sigmas), sigmas, strict=True):
             if shape is not None:
-                frame = _doubt_shape(frame, index, fits[index], shape)
+                frame = _doubt_shape(frame, index, fits[index], shape, sigma)
     return frame
 
 
@@ -223,26 +229,32 @@ def _shape_figures(fit: MarkFit, linear: Array, is_held: bool) -> tuple[Array, A
     return np.array([np.log(linear_scale(fit.pixel_from_mark) / linear_scale(linear))]), np.array([fit.size_sigma])
 
 
-def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape) -> Frame:
-    mark, is_damaged = frame.layout.marks[index].mark, fit.damaged_fraction > 0
-    larger, codes = f"{shape.ratio:.2f} times as large as the other marks", (Code.SIZE, Code.COVERED)
+def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sigma: Array) -> Frame:
+    """sigma (k,): standard deviations of the mark's own figures."""
+    mark, is_damaged, touch = frame.layout.marks[index].mark, fit.damaged_fraction > 0, None
+    figures = dict(
+        zip(("size_ratio", "turn_rad"), (float(np.exp(shape.off[0])), *shape.off[1:].tolist()), strict=False)
+    )
+    figures |= dict(zip(("size_sigma", "turn_sigma"), sigma.tolist(), strict=False))
+    if isinstance(mark, MarkShape) and is_cross(mark):
+        place = np.column_stack([frame.linear(index), fit.center_px])
+        window = read_window(frame.scan, mark_window(mark, place, frame.options.match.margin_px), frame.weights)
+        for number, (length, sigma_length) in enumerate(zip(*measure_arms(window, mark, place, fit), strict=True), 1):
+            figures |= {f"arm{number}_ratio": float(length), f"arm{number}_sigma": float(sigma_length)}
+    frame = frame.add_figures(index, figures)
+    unlike = unlike_others(figures["size_ratio"], figures.get("turn_rad"))
     if fit.own_shape is not None and is_held_by_frame(mark):
-        touch = touch_of_edges(
-            shape, fit.own_shape.on_place, reach_px(mark, fit.pixel_from_mark[:, :2]) / 2, is_damaged
-        )
-        other = f"its edges make it {larger}, and turned by {np.degrees(shape.off[1]):.1f} degrees"
-    else:
-        other = f"it is {larger}"
-        if not is_round(mark):
-            touch = None
-        else:
-            px_per_mm = linear_scale(fit.pixel_from_mark)
-            touch = touch_of_round(shape, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
+        middle_px = reach_px(mark, fit.pixel_from_mark[:, :2]) / 2
+        touch = touch_of_edges(shape, fit.own_shape.on_place, middle_px, is_damaged)
+    elif is_round(mark):
+        px_per_mm = linear_scale(fit.pixel_from_mark)
+        touch = touch_of_round(shape, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
     if shape.differs:
-        frame = frame.add_reason(index, Reason(f"{other}: something may cover or touch it", *codes))
+        frame = frame.add_reason(index, unlike)
     elif touch is not None and is_round(mark) and is_damaged and touch.exceedance(WRONG_PX) > LARGE_ERROR:
-        reason = f"{other}, and the picture next to it is damaged: something may touch it; error over {WRONG_PX} px"
-        frame = frame.add_reason(index, Reason(reason, *codes))
+        size = unlike.split(":")[0]
+        near = f"{size}, and the picture next to it is damaged: something may touch it; error over {WRONG_PX} px"
+        frame = frame.add_reason(index, unlike.reword(near))
     if touch is not None:
         frame = frame.add_covariance(index, Cause.TOUCHED, touch.variance_px2 * np.eye(2))
     return frame

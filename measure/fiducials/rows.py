@@ -136,6 +136,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
         "redundancy": float(fit.redundancy),
         "neighbour_correlation": fit.neighbour_correlation,
         **_edge_figures(fit.edges),
+        **fit.figures,
     }
     status, reason = frame.verdict(index)
     covariance = fit.place_covariance

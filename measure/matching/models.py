@@ -125,7 +125,7 @@ class PictureModel:
         self._mark_from_start = np.linalg.inv(start[:, :2])
         self._linearised: tuple[State, Array] | None = None  # the state that the design is of, and its residuals
         self.reach_px = reach_px(mark, start[:, :2])
-        self.ground = _planes(*grey.shape)
+        self.ground = background_planes(*grey.shape)
         self.design = np.zeros((moving + GREY, *grey.shape))
 
     def linearise(self, used: Mask) -> None:
@@ -322,7 +322,7 @@ class PictureModel:
         return shown.bent(change, place[:, 2], self.state.variance_px2 + PIXEL_VARIANCE_PX2) if change.any() else shown
 
 
-def _planes(height: int, width: int) -> Array:
+def background_planes(height: int, width: int) -> Array:
     """(3, height, width) offset and slopes of the background."""
     scale = max(height, width) / 2
     planes = np.ones((3, height, width))
