@@ -25,7 +25,8 @@ from measure.tone.estimate import FrameTone
 MANY = 6  # marks that agree and tell where a faint one must be
 CLEAR_LIKENESS = 0.5  # below it a mark's picture has more in it that is not the mark
 CLEAR_DAMAGE = 0.25  # of a mark: with more of it gone, what is left may be another's
-_CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak
+_CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak,
+_CLEAR_SIGNIFICANCE = 10.0  # unless its contrast is so many standard deviations of its own: texture feigns 4.5
 _AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit any similarity
 _CHECKED = 4  # marks that agree: an affine transformation through them has a check
 WRONG_PX = 0.5  # an error that a mark called measured must not have
@@ -322,7 +323,7 @@ class Frame:
         reasons = [self.detections[index].reason]
         if fit.likeness < CLEAR_LIKENESS:
             reasons.append(Reason(f"it correlates with its drawing by only {fit.likeness:.2f}", Code.LIKENESS))
-        if fit.snr < _CLEAR_SNR:
+        if fit.snr < _CLEAR_SNR and fit.significance < _CLEAR_SIGNIFICANCE:
             reasons.append(Reason(f"its contrast is only {fit.snr:.1f} times the noise", Code.CONTRAST))
         if fit.damaged_fraction > CLEAR_DAMAGE + min(self._unlike_drawing, _MOST_UNLIKE):
             reasons.append(Reason(f"{fit.damaged_fraction:.0%} of it is damaged", Code.COVERED))

@@ -81,7 +81,7 @@ def _search_frame(
     result = find_frame(scan, layout, hypotheses, pitch_um is not None, options)
     search, frame = result.search, result.frame
     if frame is None:
-        absent = absent_frame(scan, layout, result.misfit, options.rotation_deg)
+        absent = absent_frame(scan, layout, result.misfit, options.rotation_deg, pitch_um)
         return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
     found = [placement for placement in result.placements if placement.pitch_mm == frame.placement.pitch_mm]
     lines = _read(scan, layout, frame) if options.writing == "all" else None

@@ -9,11 +9,12 @@ import numpy as np
 from measure.fiducials.frame import Frame
 from measure.fiducials.options import AFFINITY_SIGMA
 from measure.flags import NO_REASON, Code, Reason, Status
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate, finest_detail_mm
 from measure.matching.covariance import honest_covariance
 from measure.results import FrameMeasurement, MarkMeasurement, Pose, SecondPlace
 from measure.scans.scan import Scan
 
+_PLAIN_PX = 3.0  # of the finest line of a mark: it shows its edges and what lies between them
 _FAINT = Reason("the frame was found only by the search for faint marks", Code.FAINT_FRAME)
 _ASSUMED = Reason(
     "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
@@ -28,9 +29,15 @@ def lost_frame(scan: Scan, layout: FiducialLayout) -> FrameMeasurement:
     return FrameMeasurement(scan.name, marks)
 
 
-def absent_frame(scan: Scan, layout: FiducialLayout, reason: Reason, rotation_deg: float) -> FrameMeasurement:
+def absent_frame(
+    scan: Scan,
+    layout: FiducialLayout,
+    reason: Reason,
+    rotation_deg: float,
+    pitch_um: tuple[float, float] | None,
+) -> FrameMeasurement:
     """Of a scan in which no frame was found; reason: why, a part of a sentence; rotation_deg: by how much turned it was
-    sought."""
+    sought; pitch_um: as given."""
     also = "; parts of the scan's file are damaged" if scan.damage else ""
     codes = dict.fromkeys((Code.NO_FRAME, *reason.codes, *([Code.DAMAGED_FILE] if scan.damage else [])))
     why = Reason(f"not found: {reason}{also}", *codes)
@@ -41,8 +48,22 @@ def absent_frame(scan: Scan, layout: FiducialLayout, reason: Reason, rotation_de
     )
     if Code.NO_FIT in reason.codes:
         remedy = "compare the drawings of these marks with the scan, or set tone under [measure] in the project"
-    problem = Reason(f"no fiducial was measured: {reason}; {remedy}.", Code.NO_FRAME)
+    coarse = _too_coarse(layout, max(pitch_um)) if pitch_um else NO_REASON
+    remedy += f". {coarse}" if coarse else "."
+    problem = Reason(f"no fiducial was measured: {reason}; {remedy}", Code.NO_FRAME, *coarse.codes)
     return FrameMeasurement(scan.name, marks, None, None, (problem,))
+
+
+def _too_coarse(layout: FiducialLayout, pitch_um: float) -> Reason:
+    """A sentence on pixels that are large for the marks' drawings; empty where they are not."""
+    finest_um = 1000 * min(finest_detail_mm(mark.mark) for mark in layout.marks)
+    if finest_um >= _PLAIN_PX * pitch_um:
+        return NO_REASON
+    return Reason(
+        f"The scan may be too coarse: at {pitch_um:.0f} µm a pixel the finest detail of the marks, {finest_um:.0f} µm, "
+        f"is {finest_um / pitch_um:.1f} px wide. Scan at {finest_um / _PLAIN_PX:.0f} µm or finer.",
+        Code.SMALL,
+    )
 
 
 def present_frame(

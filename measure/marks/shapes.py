@@ -274,3 +274,14 @@ def thinnest_mm(mark: Mark) -> float:
             vertices = np.asarray(part.vertices_mm)
             widths.append(float(np.ptp(vertices, axis=0).min()) / 3)
     return min(widths)
+
+
+def finest_detail_mm(mark: Mark) -> float:
+    """The width of the mark's thinnest line, or the shortest edge of its outline."""
+    edges = [
+        float(np.hypot(*(np.roll(vertices, -1, axis=0) - vertices).T).min())
+        for part in (mark.parts if isinstance(mark, MarkShape) else ())
+        if isinstance(part, Polygon)
+        for vertices in [np.asarray(part.vertices_mm)]
+    ]
+    return min([thinnest_mm(mark), *edges])

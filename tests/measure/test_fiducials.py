@@ -27,7 +27,7 @@ from studies import parametrize_with_studies
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Code, Status
 from measure.geometry import POSES
-from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross
+from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, Part, cross, dot, ring_cross
 from measure.marks.templates import cut, learn_template
 
 
@@ -94,6 +94,17 @@ def test_what_covers_a_dot_and_looks_like_a_smaller_one_is_doubted(tmp_path: Pat
     result = measured(frame_picture(layout_of([dot, dot, dot, speck]), matrix), given, tmp_path)
     assert [mark.status for mark in result.marks] == [Status.MEASURED] * 3 + [Status.WEAK]
     assert "0.85 times as large as the other marks" in result.marks[3].reason
+
+
+@pytest.mark.parametrize(("mark", "is_coarse"), [(ring_cross(0.5, 0.1, 0.8, 0.1), True), (dot(0.4), False)])
+def test_a_scan_without_a_frame_says_if_its_pixels_are_large_for_the_marks(
+    mark: tuple[Part, ...], is_coarse: bool, tmp_path: Path
+) -> None:
+    """Lines of 0.1 mm at 50 µm a pixel are 2 px wide, a dot of 0.8 mm is 16 px wide."""
+    grain = np.random.default_rng(5).normal(8000.0, 200.0, (400, 400))
+    (problem,) = measured(grain, layout_of([MarkShape(mark)] * 4), tmp_path).problems
+    coarse = "the finest detail of the marks, 100 µm, is 2.0 px wide. Scan at 33 µm or finer."
+    assert (coarse in problem, Code.SMALL in problem.codes) == (is_coarse, is_coarse)
 
 
 @pytest.mark.study

@@ -133,12 +133,12 @@ def test_a_frame_whose_marks_do_not_converge_says_so_and_not_that_camera_and_pit
     reason = refused.misfit("12345678")
     assert "only 2 of 8 marks" in reason
     assert "the fit of 3, 4, 5, 6, 7, 8 did not converge" in reason
-    (problem,) = absent_frame(frame.scan, frame.layout, reason, 6.0).problems
+    (problem,) = absent_frame(frame.scan, frame.layout, reason, 6.0, None).problems
     assert "set tone under [measure]" in problem
     assert "pitch" not in problem
     nothing = [replace(each, fit=None, reason=not_found(4.0)) for each in frame.detections[2:]]
     refused = orient_frame(replace(frame, detections=(*frame.detections[:2], *nothing)))
-    assert "pitch right" in absent_frame(frame.scan, frame.layout, refused.misfit("12345678"), 6.0).problems[0]
+    assert "pitch right" in absent_frame(frame.scan, frame.layout, refused.misfit("12345678"), 6.0, None).problems[0]
 
 
 def test_wings_of_three_marks_under_wrong_names_claim_no_more_than_the_stretch_that_these_make() -> None:
