@@ -122,7 +122,7 @@ SETS = {
         (640, 480), "opencv4", partial(measured, "circles/boofcv/*_Chess/frame*.jpg", ChessboardSpec(6, 4, 30.0))
     ),
     "carnd_34": BoardSet(
-        (1280, 720), "opencv5", partial(listed, DATA.parent / "reports" / "calibration" / "carnd_34", 0.01)
+        (1280, 960), "opencv5", partial(listed, DATA.parent / "reports" / "calibration" / "carnd_34", 0.01)
     ),
 }
 

@@ -37,8 +37,8 @@ Indices = NDArray[np.intp]
 _SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
 _MAX_ITERATIONS = 30  # of a stage
 _UNDAMAGED = 0.05  # the robust weight below which a pixel shows something else
-# Plain, then thrice robust: the scale of the residuals is taken once before each, so that it settles.
-_STAGES_TOLERANCE_PX = (0.05, 0.05, 0.01, 0.001)
+# Plain, then twice robust: the scale of the residuals is taken once before each, so that it settles.
+_STAGES_TOLERANCE_PX = (0.05, 0.01, 0.001)
 _SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
 _MOST_SHIFT = 0.6  # of the reach: farther off, another corner's edges are nearer
 _MOST_TURN_RAD = 0.35  # of an edge: twenty degrees, which no approximate place is wrong by
@@ -136,6 +136,8 @@ class _CornerFits:
         self.linear = np.zeros((len(starts), 5 if self.bends else 4))  # half the contrast, offset, gradient (2), bend
         self.unknowns = _SHAPE_UNKNOWNS + self.linear.shape[1]
         self._choose_pixels()
+        self.residuals = np.zeros(self.grey.shape, np.float32)
+        self.design = np.zeros((len(starts), self.unknowns, self.grey.shape[1]), np.float32)
         self.weights = self._area(np.arange(len(starts)))
         outside = Reason("too little of it is inside of the scan", Code.OUTSIDE)
         self.reasons = [NO_REASON if each.sum() > 2 * self.unknowns else outside for each in self.weights]
@@ -144,9 +146,10 @@ class _CornerFits:
         """The pixels of each corner's area and about it, as far as the corner may move; the lists are filled up."""
         self.shape = self.windows[0].grey.shape
         self.grey_size = self.windows[0].grey.size
-        row, col = np.indices(self.shape).reshape(2, -1).astype(float)
-        offset = np.stack([col, row]) - self.start[:, :, None]
-        near = np.abs(self.along_from_pixel @ offset) <= (self.reach + 0.5 + _SPARE_PX)[:, :, None]
+        row, col = np.indices(self.shape, np.float32).reshape(2, -1)
+        offset = np.stack([col, row]) - self.start[:, :, None].astype(np.float32)
+        along = np.abs(self.along_from_pixel.astype(np.float32) @ offset)
+        near = along <= (self.reach + 0.5 + _SPARE_PX)[:, :, None]
         lists = [np.flatnonzero(each) for each in near.all(axis=1)]
         self.counts = [len(each) for each in lists]
         self.pixels = np.zeros((len(lists), max(self.counts)), np.intp)
@@ -155,32 +158,32 @@ class _CornerFits:
             here, usable = (number, slice(len(chosen))), window.usable.ravel()[chosen]
             self.pixels[here], self.valid[here] = chosen, usable
             self.grey[here] = np.where(usable, window.grey.ravel()[chosen], 0.0)
-        self.col, self.row = (axis[self.pixels] for axis in (col, row))
+        self.places = np.stack([axis[self.pixels] for axis in (col, row)], axis=1)
 
     def run(self) -> list[Corner]:
         """Plain, then robust, until the corners stand still; or a reason why one does not."""
         scale = np.full(len(self.windows), np.inf)
+        self._linearise(np.arange(len(self.windows)), is_first=True)
         for stage, tolerance_px in enumerate(_STAGES_TOLERANCE_PX):
             moving = np.array([number for number, reason in enumerate(self.reasons) if not reason], np.intp)
-            state = self._linearise(moving)
             if stage:
-                scale[moving] = self._residual_scales(moving, state[1])
-            for left in reversed(range(_MAX_ITERATIONS)):
+                scale[moving] = self._residual_scales(moving)
+            for _ in range(_MAX_ITERATIONS):
                 if not len(moving):
                     break
-                moving = moving[self._step(moving, state, scale[moving]) >= tolerance_px]
-                moving = np.array([number for number in moving if not self.reasons[number]], np.intp)
-                if not left:
-                    self._refuse(moving, UNSETTLED)
-                state = self._linearise(moving)
-        return self._corners(*self._linearise(np.arange(len(self.windows))))
+                lengths_px = self._step(moving, scale[moving])
+                self._linearise(moving)
+                moving = moving[(lengths_px >= tolerance_px) & [not self.reasons[number] for number in moving]]
+            self._refuse(moving, UNSETTLED)
+        return self._corners()
 
     def _refuse(self, numbers: Indices, reason: Reason) -> None:
         for number in numbers:
             self.reasons[number] = self.reasons[number] or reason
 
-    def _corners(self, design: Single, residuals: Single) -> list[Corner]:
+    def _corners(self) -> list[Corner]:
         """The corners with their covariances, as the residuals' own autocovariances give them, and junctions."""
+        design, residuals = self.design, self.residuals
         area, used = self._area(np.arange(len(self.windows))), self.weights > _UNDAMAGED
         weighted = design * self.weights[:, None]
         normal = (weighted @ design.swapaxes(1, 2)).astype(float)
@@ -226,67 +229,60 @@ class _CornerFits:
     def _area(self, numbers: Indices) -> Single:
         """Weights 0 to 1 of a parallelogram about each corner; its border is smooth, and it moves with the corner: a
         window that is not centred would prefer one half of an edge."""
-        dx, dy = self.col[numbers] - self.center[numbers, :1], self.row[numbers] - self.center[numbers, 1:]
-        area = self.valid[numbers]
-        for axis in range(2):
-            by_col, by_row = self.along_from_pixel[numbers, axis].T[:, :, None]
-            along = np.abs(by_col * dx + by_row * dy)
-            area = area * np.clip(self.reach[numbers, axis, None] + 0.5 - along, 0.0, 1.0)
-        return area.astype(np.float32)
+        offset = self.places[numbers] - self.center[numbers, :, None].astype(np.float32)
+        along = self.along_from_pixel[numbers].astype(np.float32) @ offset
+        inside = (self.reach[numbers] + 0.5).astype(np.float32)[..., None] - np.abs(along, out=along)
+        return np.asarray(self.valid[numbers] * np.clip(inside, 0.0, 1.0, out=inside).prod(axis=1))
 
-    def _residual_scales(self, numbers: Indices, residuals: Single) -> Array:
+    def _residual_scales(self, numbers: Indices) -> Array:
         """(m,) under Tukey's weights."""
         floor = _SCALE_FLOOR * 2 * np.abs(self.linear[numbers, 0])
-        robust = [robust_scale(each[used]) for each, used in zip(residuals, self.weights[numbers] > 0, strict=True)]
+        robust = [robust_scale(self.residuals[number, self.weights[number] > 0]) for number in numbers]
         return np.asarray(np.maximum(np.maximum(robust, floor), 1e-9))
 
-    def _linearise(self, numbers: Indices) -> tuple[Single, Single]:
-        """(m, unknowns, p) derivatives and (m, p) residuals of some corners, at the best grey-value parameters."""
+    def _linearise(self, numbers: Indices, is_first: bool = False) -> None:
+        """Take derivatives and residuals of some corners; the first time at the best grey values."""
         sigma = np.sqrt(self.variance[numbers, None])
         normals = np.stack([np.cos(self.edges[numbers]), np.sin(self.edges[numbers])], axis=-1)  # (m, 2 edges, 2)
         tangents = np.stack([-normals[..., 1], normals[..., 0]], axis=-1)
-        dx = (self.col[numbers] - self.center[numbers, :1]).astype(np.float32)
-        dy = (self.row[numbers] - self.center[numbers, 1:]).astype(np.float32)
-
-        def along(direction: Array) -> Single:
-            across, down = (direction / sigma).astype(np.float32).T[:, :, None]
-            return np.asarray(across * dx + down * dy, np.float32)
-
-        u, v = (along(normals[:, edge]) for edge in range(2))
+        offset = self.places[numbers] - self.center[numbers, :, None].astype(np.float32)
+        directions = np.concatenate([normals, tangents], axis=1) / sigma[..., None]
+        u, v, *along = np.moveaxis(directions.astype(np.float32) @ offset, 1, 0)
         correlation = (normals[:, 0] * normals[:, 1]).sum(axis=1).astype(np.float32)[:, None]
         value, by_u, by_v, by_correlation = self.surface(u, v, correlation)
-        grey = np.stack([value, np.ones_like(dx), dx, dy, *([value**2 - 1] if self.bends else [])], axis=1)
-        self.linear[numbers] = linear = gauss_newton_step(
-            grey, self.grey[numbers], self.weights[numbers], _GREY_DAMPING
-        )
-        linear = linear.astype(np.float32)
+        design = np.empty((len(numbers), self.unknowns, u.shape[1]), np.float32)
+        grey = design[:, _SHAPE_UNKNOWNS:]
+        grey[:, 0], grey[:, 1], grey[:, 2:4] = value, 1.0, offset
+        if self.bends:
+            grey[:, 4] = value**2 - 1
+        if is_first:
+            self.linear[:] = gauss_newton_step(grey, self.grey, self.weights, _GREY_DAMPING)
+        linear = self.linear[numbers].astype(np.float32)
         slope = linear[:, :1] + (2 * linear[:, 4:] * value if self.bends else np.float32(0.0))
-        by_u, by_v, by_correlation = (np.asarray(by * slope, np.float32) for by in (by_u, by_v, by_correlation))
-        scaled = (normals / sigma[..., None]).astype(np.float32)[..., None]
-        turned = [
-            (tangents[:, edge] * normals[:, 1 - edge]).sum(axis=1).astype(np.float32)[:, None] for edge in range(2)
-        ]
-        shape = [
-            -(by_u * scaled[:, 0, 0] + by_v * scaled[:, 1, 0]),
-            -(by_u * scaled[:, 0, 1] + by_v * scaled[:, 1, 1]),
-            *(by * along(tangents[:, edge]) + by_correlation * turned[edge] for edge, by in enumerate((by_u, by_v))),
-            (by_u * u + by_v * v) * (-0.5 / sigma**2).astype(np.float32),
-        ]
-        residuals = np.asarray(self.grey[numbers] - (linear[:, None] @ grey)[:, 0], np.float32)
-        return np.asarray(np.concatenate([np.stack(shape, axis=1), grey], axis=1), np.float32), residuals
+        by_u, by_v, by_correlation = by_u * slope, by_v * slope, by_correlation * slope
+        scaled = directions.astype(np.float32)[..., None]
+        turned = np.einsum("nei,nei->en", tangents, normals[:, ::-1]).astype(np.float32)[..., None]
+        design[:, 0] = -(by_u * scaled[:, 0, 0] + by_v * scaled[:, 1, 0])
+        design[:, 1] = -(by_u * scaled[:, 0, 1] + by_v * scaled[:, 1, 1])
+        for edge, by in enumerate((by_u, by_v)):
+            design[:, 2 + edge] = by * along[edge] + by_correlation * turned[edge]
+        design[:, 4] = (by_u * u + by_v * v) * (-0.5 / sigma**2).astype(np.float32)
+        self.design[numbers] = design
+        self.residuals[numbers] = self.grey[numbers] - (linear[:, None] @ grey)[:, 0]
 
-    def _step(self, numbers: Indices, state: tuple[Single, Single], scale: Array) -> Array:
+    def _step(self, numbers: Indices, scale: Array) -> Array:
         """Take a Gauss-Newton step, shortened to what a linearisation can bear; (m,) its lengths in px."""
-        design, residuals = state
+        design, residuals = self.design[numbers], self.residuals[numbers]
         relative = np.asarray(residuals / scale[:, None], np.float32)
         self.weights[numbers] = weights = np.asarray(self._area(numbers) * tukey_weights(relative, 1.0), np.float32)
-        shown = np.abs(design * (weights > 0)[:, None]).max(axis=2) > 0
+        shown = (np.abs(design) @ weights[..., None])[..., 0] > 0
         step = gauss_newton_step(design, residuals, weights, _DAMPING)
         turn = np.abs(step[:, 2:4]).max(axis=1) / _LONGEST_TURN_RAD
         step /= np.maximum(np.maximum(np.hypot(step[:, 0], step[:, 1]), turn), 1.0)[:, None]
         step[~shown.all(axis=1)] = 0.0
         self.center[numbers] += step[:, :2]
         self.edges[numbers] += step[:, 2:4]
+        self.linear[numbers] += step[:, _SHAPE_UNKNOWNS:]
         before = self.variance[numbers]
         variance = np.clip(before + step[:, 4], before / 2, before * 2)
         self.variance[numbers] = np.clip(variance, _LEAST_BLUR_PX**2, self.max_variance[numbers])

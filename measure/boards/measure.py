@@ -37,7 +37,8 @@ _NEAREST_DOTS = 8  # whose places and shapes predict a missing one's
 _REACH = 0.3  # light, lens and paper change little over it
 _SHORTEST_REACH_PX = 5.0  # less shows too little of the edges...
 _FARTHEST_REACH = 0.6  # ...but beyond this share the neighbouring crossing begins to show
-_LONGEST_REACH_PX = 15.0  # enough for a few thousandths of a pixel, whatever the square
+_LONGEST_REACH_PX = 10.0  # enough for a hundredth of a pixel...
+_LARGE_REACH, _LARGEST_REACH_PX = 0.1, 15.0  # ...but squares this large may be blurred by some pixels
 _HALF_SIDE, _FREE_GAP = 0.5, 0.8  # of a square that stands alone, and of the gap beside it
 _MARKER_REACH = 0.8  # of a marker's black border, or of the gap beside it
 _WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out it is weak
@@ -173,7 +174,7 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
 
     def read(col: int, row: int, side: int) -> ScanWindow:
         place_px = col, row, side, side
-        return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px))
+        return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True))
 
     stands_alone = isinstance(spec, ArucoSpec | SquareGridSpec) and not isinstance(spec, AprilGridSpec)
     surface: Surface = quarter if stands_alone else crossing
@@ -184,10 +185,10 @@ def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:
     """(2,) how far along the sides (2,) of a square or marker grey values are used."""
     if isinstance(spec, ArucoSpec):
         free = min(spec.border_modules / spec.modules, spec.gap_mm / spec.marker_mm)
-        return np.asarray(np.minimum(_MARKER_REACH * free * sides_px, _LONGEST_REACH_PX))
+        return np.asarray(np.minimum(_MARKER_REACH * free * sides_px, _LARGEST_REACH_PX))
     if isinstance(spec, SquareGridSpec):  # to neither its next corner nor the next square
         free = min(_HALF_SIDE, _FREE_GAP * spec.gap_mm / spec.square_mm)
-        return np.asarray(np.minimum(free * sides_px, _LONGEST_REACH_PX))
+        return np.asarray(np.minimum(free * sides_px, _LARGEST_REACH_PX))
     farthest = _FARTHEST_REACH
     if isinstance(spec, CharucoSpec):  # not into a marker in one of the squares
         farthest = (spec.square_mm - spec.marker_mm) / (2 * spec.square_mm)
@@ -198,7 +199,9 @@ def _common_reach_px(corners: Iterable[FoundCorner]) -> float:
     """One reach for a whole board: what a camera's sharpening does to a corner depends on the window, and where all
     windows are alike it moves all corners alike, and not the near ones otherwise than the far ones."""
     sides = [float(np.hypot(*corner.steps_px).min()) for corner in corners]
-    return float(np.clip(_REACH * np.median(sides), _SHORTEST_REACH_PX, _LONGEST_REACH_PX))
+    side_px = float(np.median(sides))
+    longest_px = np.clip(_LARGE_REACH * side_px, _LONGEST_REACH_PX, _LARGEST_REACH_PX)
+    return float(np.clip(_REACH * side_px, _SHORTEST_REACH_PX, longest_px))
 
 
 def _named_by_colour(

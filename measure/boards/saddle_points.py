@@ -75,8 +75,12 @@ def _line_neighbours(points: SaddlePoints, near: NDArray[np.intp]) -> Mask:
 def _saddle_points(picture: Bytes, strength: Strength, known_strength: float) -> SaddlePoints:
     highest = cv2.dilate(strength, np.ones((2 * _APART_PX + 1, 2 * _APART_PX + 1)))
     is_top = (strength == highest) & (strength > _STRENGTH * known_strength)
+    rows, columns = np.nonzero(is_top)
     # One of equal neighbours: between four pixels a crossing is as strong in all of them.
-    columns, rows = cv2.connectedComponentsWithStats(is_top.astype(np.uint8))[3][1:].T
+    earlier = np.pad(is_top, 1)[:-1]
+    is_first = ~(earlier[rows, columns] | earlier[rows, columns + 1] | earlier[rows, columns + 2])
+    is_first &= ~earlier[1:][rows, columns]
+    rows, columns = rows[is_first], columns[is_first]
     angles = np.arange(_RING_PLACES) * 2 * np.pi / _RING_PLACES
     smooth = cv2.GaussianBlur(picture, (0, 0), _SMOOTHING_PX)
     ring = [
