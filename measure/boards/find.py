@@ -260,7 +260,7 @@ def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
     both = ((columns, rows), (rows, columns))  # nothing tells which are the rows
     columns, rows = min(both, key=lambda one: ((one[0] - spec.columns) ** 2 + (one[1] - spec.rows) ** 2, -one[0]))
     message += f"; one of {columns} x {rows} is"
-    if (columns, rows) == (spec.columns - 1, spec.rows - 1):
+    if pattern.is_bounded and (columns, rows) == (spec.columns - 1, spec.rows - 1):
         return f"{message}: squares may have been counted in place of inner corners, which columns and rows count"
     if columns > spec.columns or rows > spec.rows or pattern.is_bounded:
         return f"{message}. Set columns and rows to the count of the board's inner corners"

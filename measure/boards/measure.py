@@ -25,9 +25,9 @@ from measure.flags import NO_REASON, Code, Reason, Status
 from measure.matching.window import ScanWindow
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.scan import Scan
-from measure.targets.block_search import Candidate
+from measure.targets.block_search import Candidate, Patches
 from measure.targets.disk_detection import DiskSearch, disk_candidates
-from measure.targets.disks import FittedDisk, fit_disk
+from measure.targets.disks import FittedDisk, fit_plain_disks
 
 Array = NDArray[np.float64]
 
@@ -68,15 +68,12 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
     if grid.reason:
         absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, grid.reason) for name in names.values())
         return BoardMeasurement(tuple(absent), grid.reason)
-    detected = {
-        place: (patches[index].center_px, patches[index].pixel_from_disk) for place, index in grid.assignment.items()
-    }
+    detected = {place: patches[index] for place, index in grid.assignment.items()}
+    starts = [detected.get(place) or _predicted(place, detected) for place in names]
     gap = 1 - spec.diameter_mm / spec.shortest_distance_mm
-    marks = []
-    for place, name in names.items():
-        center, shape = detected[place] if place in detected else _predicted(place, detected)
-        margin = gap / (1 - gap) * 2 * float(np.linalg.svd(shape, compute_uv=False)[1])
-        marks.append(_dot_mark(name, fit_disk(scan, center, shape, longest_margin_px=margin), place in detected))
+    shorter_px = [float(np.linalg.svd(start.pixel_from_disk, compute_uv=False)[1]) for start in starts]
+    disks = fit_plain_disks(scan, starts, [2 * gap / (1 - gap) * axis_px for axis_px in shorter_px])
+    marks = [_dot_mark(names[place], disk, place in detected) for place, disk in zip(names, disks, strict=True)]
     measured = BoardMeasurement(tuple(marks), notes=grid.notes)
     return _unless_alone(measured, f"grids of {spec.columns} x {spec.rows} dots", grid.others_px)
 
@@ -95,14 +92,17 @@ def _largest_dot_px(scan: Scan, spec: CircleGridSpec) -> float:
     return max(2 * _SMALLEST_DOT_PX, share * max(scan.width_px, scan.height_px) / places)
 
 
-def _predicted(place: Place, detected: dict[Place, tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Centre and shape of a dot by a homography of its nearest neighbours; the shape is their mean one."""
+def _predicted(place: Place, detected: Mapping[Place, Candidate]) -> Candidate:
+    """A dot by a homography of its nearest neighbours; its shape and contrast are their mean ones."""
     others = sorted(detected, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
     nearest = others[: max(_NEAREST_DOTS, len(others) // 3)]
-    homography, _ = cv2.findHomography(np.array(nearest, float), np.array([detected[other][0] for other in nearest]))
+    homography, _ = cv2.findHomography(
+        np.array(nearest, float), np.array([detected[each].center_px for each in nearest])
+    )
     x, y, w = np.asarray(homography, float) @ (*place, 1.0)
-    squares = [detected[other][1] @ detected[other][1].T for other in nearest[:_NEAREST_DOTS]]
-    return np.array([x / w, y / w]), np.linalg.cholesky(np.mean(squares, axis=0))
+    alike = Patches.collect([detected[each] for each in nearest[:_NEAREST_DOTS]])
+    shape = np.linalg.cholesky((alike.shapes @ alike.shapes.swapaxes(1, 2)).mean(axis=0))
+    return Candidate(np.array([x / w, y / w]), shape, float(alike.contrasts.mean()))
 
 
 def _dot_mark(name: str, disk: FittedDisk, is_detected: bool) -> MarkMeasurement:

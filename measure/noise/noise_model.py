@@ -97,7 +97,9 @@ def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
     return replace(noise, autocovariance_dn2=lags * (noise.variance_dn2 / lags[REACH_PX, REACH_PX]))
 
 
-def influence_covariances(influences: Array, residuals: Array, used: Mask, unknowns: int) -> tuple[Array, Array]:
+def influence_covariances(
+    influences: NDArray[Real], residuals: NDArray[Real], used: Mask, unknowns: int
+) -> tuple[Array, Array]:
     """Covariances of linear estimates under their own correlated noise.
 
     Parameters
@@ -118,13 +120,13 @@ def influence_covariances(influences: Array, residuals: Array, used: Mask, unkno
     lags = _faded(autocovariance(kept, used, REACH_PX))
     lags *= (variances / np.maximum(lags[:, REACH_PX, REACH_PX], 1e-300))[:, None, None]
     lags[is_white] = np.where(np.add.outer(abs(index), abs(index)) == 0, variances[is_white, None, None], 0.0)
-    shape = padded(residuals.shape[1:], REACH_PX)
-    kernels = np.zeros((len(residuals), *shape), np.float32)
+    size: list[int] = padded(tuple(residuals.shape[1:]), REACH_PX)
+    kernels = np.zeros((len(residuals), *size), np.float32)
     kernels[:, index[:, None], index] = lags
-    weights = np.full(shape[1] // 2 + 1, 2.0)  # columns of a real transform also stand for their conjugates
-    weights[[0, *([-1] if shape[1] % 2 == 0 else [])]] = 1.0
-    weights = fft.rfft2(kernels).real * (weights / np.prod(shape)).astype(np.float32)
-    waves = fft.rfft2(influences.astype(np.float32), s=shape)
+    weights = np.full(size[1] // 2 + 1, 2.0)  # columns of a real transform also stand for their conjugates
+    weights[[0, *([-1] if size[1] % 2 == 0 else [])]] = 1.0
+    weights = fft.rfft2(kernels).real * (weights / np.prod(size)).astype(np.float32)
+    waves = fft.rfft2(influences.astype(np.float32), s=size)
     parts = [waves.real.reshape(*waves.shape[:2], -1), waves.imag.reshape(*waves.shape[:2], -1)]
     flat = weights.reshape(len(weights), 1, -1)
     real, imaginary = ((part * flat) @ part.swapaxes(1, 2) for part in parts)

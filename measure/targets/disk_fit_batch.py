@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from measure.noise.noise_model import influence_covariances
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION, gauss_newton_step, tukey_weights
 from measure.targets.block_search import Block, Patches, concatenate
 
@@ -25,6 +26,9 @@ _FIRST_BLUR_PX, _BLUR_PX = 1.0, (0.5, 8.0)  # initial value and limits, standard
 _FIRST_STEPS_ROBUST = False, False, True  # steps on a subset of pixels; one robust step on all of them follows
 _HOPELESS = 1.5  # times the allowed misfit: patches above it are dropped before the first step
 _LONGEST_STEP = 0.3  # in radii: the limit of linearisation
+_PLAIN_STEPS, _MOST_STEPS, _SETTLED_PX = 2, 30, 1e-3  # of a fit to convergence
+_UNDAMAGED = 0.05  # robust weight below which a pixel shows something else
+_APPEARANCE = [2, 3, 4, 6, 5]  # of the unknowns: size, stretch, shear, gain, blur
 _DAMPING = 1e-4  # the unknowns of a faint disk are nearly dependent
 _UNKNOWNS = 10  # place (2), size, stretch, shear, blur, gain, offset, slopes (2)
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale
@@ -57,14 +61,15 @@ def _fit_patches(
     """Fitted disks among the patches and their blurs (n,). strides (n,): spacing of the sampled pixels; most_misfits:
     allowed before and after the steps."""
     found, blurs_found = [Patches.collect(())], [np.zeros(0)]
-    for group in _groups(patches, strides):
-        own, fit = group, _Fit(block, patches.part(group), blurs[group], strides[group])
+    margins_px = _margins_px(patches)
+    for group in _groups(patches, strides, margins_px):
+        own, fit = group, _Fit(block, patches.part(group), blurs[group], strides[group], margins_px[group])
         is_promising = fit.misfit() < most_misfits[0]
         if not is_promising.all():  # the outline alone rules most patches out
             own = group[is_promising]
             if not len(own):
                 continue
-            fit = _Fit(block, patches.part(own), blurs[own], strides[own])
+            fit = _Fit(block, patches.part(own), blurs[own], strides[own], margins_px[own])
         for is_robust in steps_robust:
             fit.step(is_robust)
         is_disk = fit.is_disk(patches.part(own), most_misfits[1])
@@ -73,9 +78,43 @@ def _fit_patches(
     return concatenate(*found), np.concatenate(blurs_found)
 
 
-def _groups(patches: Patches, strides: Indices) -> Iterator[Indices]:
+@dataclass(frozen=True, eq=False)
+class PlacedDisk:
+    """A disk fitted to convergence. center_px (2,); covariance_px2 (2, 2) under the autocovariance of the residuals;
+    shape (2, 2) as a candidate's; blur_px: pixel width included; appearance_covariance (5, 5), see
+    `FittedDisk.appearance_covariance`, under white noise; is_disk: whether the fit converged and a disk explains it."""
+
+    center_px: Array
+    covariance_px2: Array
+    shape: Array
+    contrast_dn: float
+    noise_dn: float
+    blur_px: float
+    damaged_fraction: float
+    appearance_covariance: Array
+    is_disk: bool
+
+
+def place_disks(block: Block, patches: Patches, margins_px: Array) -> list[PlacedDisk]:
+    """Fit many disks at once to convergence, each with margins_px (n,) of background."""
+    strides, blurs = np.ones(len(patches.radii), np.intp), np.full(len(patches.radii), _FIRST_BLUR_PX)
+    placed: dict[int, PlacedDisk] = {}
+    for group in _groups(patches, strides, margins_px):
+        own = patches.part(group)
+        fit = _Fit(block, own, blurs[group], strides[group], margins_px[group])
+        for step in range(_MOST_STEPS):
+            before = fit.centers
+            fit.step(is_robust=step >= _PLAIN_STEPS)
+            is_settled = np.linalg.norm(fit.centers - before, axis=1) < _SETTLED_PX
+            if step > _PLAIN_STEPS and is_settled.all():
+                break
+        placed |= zip(group.tolist(), fit.placed(is_settled & fit.is_disk(own, 1.0)), strict=True)
+    return [placed[number] for number in range(len(blurs))]
+
+
+def _groups(patches: Patches, strides: Indices, margins_px: Array) -> Iterator[Indices]:
     """Indices of patches with windows of similar size, in groups of limited pixel count."""
-    sides = 2 * _half_sides(patches, strides) + 1
+    sides = 2 * _half_sides(patches, strides, margins_px) + 1
     rest = np.argsort(-sides, kind="stable")
     while len(rest):
         own = rest[: max(_GROUP_PIXELS // int(sides[rest[0]]) ** 2, 1)]
@@ -95,10 +134,10 @@ def _margins_px(patches: Patches) -> Array:
     return np.maximum(MARGIN * patches.radii, LEAST_MARGIN_PX)
 
 
-def _half_sides(patches: Patches, strides: Indices) -> Indices:
+def _half_sides(patches: Patches, strides: Indices, margins_px: Array) -> Indices:
     """(n,) sampled pixels on either side of the window's centre."""
     longest = np.linalg.norm(patches.shapes, 2, axis=(1, 2))
-    return np.asarray(np.ceil((longest + _margins_px(patches) + 0.5) / strides), np.intp)
+    return np.asarray(np.ceil((longest + margins_px + 0.5) / strides), np.intp)
 
 
 class _Fit:
@@ -106,8 +145,8 @@ class _Fit:
     greys (n, 4): gain, offset, slopes. Windows of side * side pixels: col, row (n, pixels) relative to their centres,
     grey (n, pixels), used (n, pixels): inside the ellipse and its margin."""
 
-    def __init__(self, block: Block, patches: Patches, blurs: Array, strides: Indices) -> None:
-        half, stride = int(_half_sides(patches, strides).max()), strides[:, None]
+    def __init__(self, block: Block, patches: Patches, blurs: Array, strides: Indices, margins_px: Array) -> None:
+        half, stride = int(_half_sides(patches, strides, margins_px).max()), strides[:, None]
         middles = np.rint(patches.centers).astype(np.intp)
         corners, self.side = middles - half * stride, 2 * half + 1
         along = stride * np.arange(self.side)
@@ -118,7 +157,7 @@ class _Fit:
         self.middles, self.radius = middles, patches.radii
         self.centers, self.shapes = patches.centers - middles, patches.shapes
         self.blur = blurs
-        near = _Edges.from_fit(self).distance >= -_margins_px(patches)[:, None]
+        near = _Edges.from_fit(self).distance >= -margins_px[:, None]
         self.used = near & (inside[:, 0, None] & inside[:, 1, :, None]).reshape(near.shape)
         design = _Edges.from_fit(self).design(self)
         self.greys = gauss_newton_step(design[:, 6:], self.grey, self.used.astype(np.float32), _DAMPING)
@@ -133,10 +172,7 @@ class _Fit:
 
     def step(self, is_robust: bool) -> None:
         """Take one Gauss-Newton step; a robust one down-weights dust and neighbours."""
-        weights = self.used.astype(np.float32)
-        if is_robust:
-            scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.greys[:, 0]) + 1e-6)
-            weights *= tukey_weights(self.residuals / scale[:, None].astype(np.float32), 1.0)
+        weights = self._weights() if is_robust else self.used.astype(np.float32)
         change = gauss_newton_step(self.design, self.residuals, weights, _DAMPING)
         form = change[:, :5] / np.maximum(np.abs(change[:, :5]).max(axis=1, keepdims=True) / _LONGEST_STEP, 1.0)
         self.centers = self.centers + (self.shapes @ form[:, :2, None])[..., 0]
@@ -146,6 +182,40 @@ class _Fit:
         self.blur = np.clip(self.blur + np.clip(change[:, 5], -0.5 * self.blur, self.blur), *_BLUR_PX)
         self.greys = self.greys + change[:, 6:]
         self.linearise(_Edges.from_fit(self).design(self))
+
+    def _weights(self) -> Image:
+        """(n, pixels), Tukey's."""
+        scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.greys[:, 0]) + 1e-6)
+        return np.asarray(self.used * tukey_weights(self.residuals / scale[:, None].astype(np.float32), 1.0))
+
+    def placed(self, is_disk: Mask) -> Iterator[PlacedDisk]:
+        """The disks in scan pixels, with covariances."""
+        weights, found = self._weights(), self.patches()
+        counted = weights > _UNDAMAGED
+        weighted = self.design * weights[:, None]
+        inverse = np.linalg.pinv((weighted @ self.design.swapaxes(1, 2)).astype(float), hermitian=True)
+        influence = self.shapes.astype(np.float32) @ (inverse[:, :2].astype(np.float32) @ weighted)
+        size = len(weights), -1, self.side, self.side
+        covariances, variances = influence_covariances(
+            influence.reshape(size), self.residuals.reshape(size)[:, 0], counted.reshape(size)[:, 0], _UNKNOWNS
+        )
+        appearances = inverse[:, _APPEARANCE][:, :, _APPEARANCE] * variances[:, None, None]
+        per = np.ones((len(weights), len(_APPEARANCE)))
+        per[:, 3], per[:, 4] = 1 / self.greys[:, 0], 2 * self.blur  # relative contrast, the blur's variance
+        appearances *= per[:, :, None] * per[:, None]
+        damaged = 1 - weights.sum(axis=1) / np.maximum(self.used.sum(axis=1), 1)
+        for number, center_px in enumerate(found.centers):
+            yield PlacedDisk(
+                center_px=center_px,
+                covariance_px2=covariances[number],
+                shape=found.shapes[number],
+                contrast_dn=float(found.contrasts[number]),
+                noise_dn=float(np.sqrt(variances[number])),
+                blur_px=float(self.blur[number]),
+                damaged_fraction=float(damaged[number]),
+                appearance_covariance=appearances[number],
+                is_disk=bool(is_disk[number]),
+            )
 
     def misfit(self) -> Array:
         """(n,) residual scale over its limit, which is lower where neighbouring residuals are correlated."""

@@ -11,7 +11,7 @@ from measure.flags import DISK_UNLIKE_THE_OTHERS, LARGE_ERROR, NO_REASON, Cause,
 from measure.geometry import linear_scale
 from measure.marks.shapes import Disk, MarkShape
 from measure.matching.match import MatchOptions, mark_window, match
-from measure.matching.models import GREY
+from measure.matching.models import GREY, PIXEL_VARIANCE_PX2
 from measure.matching.window import read_window
 from measure.noise.grain import BESIDE_PX
 from measure.noise.noise_model import may_be_noise
@@ -19,8 +19,17 @@ from measure.noise.robust_estimation import MEDIAN_EFFICIENCY, SIGMA_OF_DEVIATIO
 from measure.results import Covariance, MarkFit, SecondPlace
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
+from measure.targets.block_search import Block, Candidate, Patches
 from measure.targets.disk_detection import LEAST_SNR
-from measure.targets.disk_fit_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
+from measure.targets.disk_fit_batch import (
+    LEAST_MARGIN_PX,
+    MARGIN,
+    SMOOTH,
+    WORST_MISFIT,
+    WORST_SMOOTH_MISFIT,
+    PlacedDisk,
+    place_disks,
+)
 
 Array = NDArray[np.float64]
 
@@ -35,6 +44,7 @@ _LEAST_REACH_PX = 5.5  # from the centre: within less, the size and the blur of 
 _LEAST_SHIFT_PX = 2.0  # a small disk may have been detected this far off
 _FORM_SIGMA = 0.2  # standard deviation of the initial size and shear
 # Decisions.
+_PLAIN_SNR = 10.0  # contrast over noise of a disk that needs no closer look
 SMALLEST_RADIUS_PX = 1.2  # shorter half axis below which blur and size are not separable
 _SMALL_RADIUS_PX = 2.0  # shorter half axis below which a lone disk cannot be told from dust
 _WEAK_DAMAGE, _MOST_DAMAGE = 0.2, 0.35  # fraction of pixels that do not fit a disk
@@ -190,6 +200,44 @@ def fit_disk(
         return narrow
     agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
     return narrow if agree else replace(narrow, weakness=disk.reason.reword(f"with more ground: {disk.reason}"))
+
+
+def fit_plain_disks(
+    scan: Scan, candidates: Sequence[Candidate], longest_margins_px: Sequence[float]
+) -> list[FittedDisk]:
+    """Fit disks all at once, ten times as fast as `fit_disk`; doubtful ones are fitted again by that.
+
+    longest_margins_px : see `fit_disk`, of each.
+    """
+    patches = Patches.collect(candidates)
+    margins_px = np.clip(longest_margins_px, _NARROWEST_MARGIN_PX, PLAIN_MARGIN_PX)
+    reach_px = int(np.ceil(np.linalg.norm(patches.shapes, 2, axis=(1, 2)).max(initial=0) + PLAIN_MARGIN_PX)) + 1
+    col0, row0 = np.floor(patches.centers.min(axis=0)).astype(int) - reach_px
+    width, height = np.ceil(patches.centers.max(axis=0)).astype(int) + reach_px - (col0, row0)
+    block = Block(scan, (int(col0), int(row0)), 0, scan.samples(int(col0), int(row0), int(width), int(height)))
+    placed = place_disks(block, patches, margins_px)
+    return [
+        _plain_disk(scan, disk) or fit_disk(scan, start.center_px, start.pixel_from_disk, margin_px)
+        for disk, start, margin_px in zip(placed, candidates, longest_margins_px, strict=True)
+    ]
+
+
+def _plain_disk(scan: Scan, disk: PlacedDisk) -> FittedDisk | None:
+    """The disk as a result; None if it is doubtful."""
+    compression_px2 = covariance_of_compression(scan.rounding_step_dn, disk.contrast_dn)
+    fitted = FittedDisk(
+        center_px=disk.center_px,
+        covariance=Covariance.from_noise(disk.covariance_px2).plus(Cause.COMPRESSION, compression_px2),
+        pixel_from_disk=disk.shape,
+        contrast_dn=disk.contrast_dn,
+        noise_dn=disk.noise_dn,
+        blur_px=float(np.sqrt(max(disk.blur_px**2 - PIXEL_VARIANCE_PX2, 0.0))),
+        damaged_fraction=disk.damaged_fraction,
+        appearance_covariance=disk.appearance_covariance,
+    )
+    stands_out = disk.is_disk and abs(disk.contrast_dn) > _PLAIN_SNR * disk.noise_dn
+    is_clean = disk.damaged_fraction < _WEAK_DAMAGE and fitted.half_axes_px[1] >= _SMALL_RADIUS_PX
+    return fitted if stands_out and is_clean and not fitted.lone_doubt else None
 
 
 def _appearance_covariance(fit: MarkFit) -> Array:

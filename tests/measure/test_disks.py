@@ -8,9 +8,9 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure.scans.scan import Scan
-from measure.targets.block_search import search_blocks
+from measure.targets.block_search import Candidate, search_blocks
 from measure.targets.disk_detection import DiskSearch, disk_candidates, disk_octaves
-from measure.targets.disks import FittedDisk, fit_disk
+from measure.targets.disks import FittedDisk, fit_disk, fit_plain_disks
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 600.0, 12000.0
@@ -40,6 +40,25 @@ def test_errors_are_as_large_as_their_sigmas_say(radius_px: float, flatness: flo
             np.testing.assert_allclose(np.sort(disk.half_axes_px), [radius_px * flatness, radius_px], atol=0.25)
     assert 0.85 < np.sqrt(np.mean(np.square(errors))) < 1.15  # 96 numbers: 7.2 % standard deviation
     assert np.abs(np.mean(offsets, axis=0)).max() < 0.01
+
+
+def test_many_disks_at_once_are_placed_as_well_as_their_sigmas_say_and_odd_ones_looked_at_closer() -> None:
+    rng = np.random.default_rng(3)
+    picture, starts, true = np.full((240, 640), GROUND), [], []
+    for number in range(40):
+        corner = np.array([80 * (number % 8) + 8, 48 * (number // 8)])
+        place, shape = corner + rng.uniform(23.5, 24.5, 2), some_ellipse(rng, 9.0, 0.8)
+        window = picture[corner[1] : corner[1] + 48, corner[0] : corner[0] + 64]
+        window += CONTRAST * drawn(ellipse(place - corner, shape), 64, 48, 0.9)
+        starts.append(Candidate(place + rng.normal(0, 0.2, 2), shape * rng.uniform(0.95, 1.05), CONTRAST))
+        true.append(place)
+    covered = true[0] - 9.0
+    picture[max(round(covered[1]), 0) : round(covered[1]) + 9, round(covered[0]) : round(covered[0]) + 18] = GROUND
+    disks = fit_plain_disks(scan_of(picture + rng.normal(0, NOISE, picture.shape)), starts, [10.0] * len(starts))
+    errors = [whitened(disk.center_px - place, disk.covariance_px2) for disk, place in zip(disks, true, strict=True)]
+    assert 0.85 < np.sqrt(np.mean(np.square(errors[1:]))) < 1.15  # 78 numbers: 8 % standard deviation
+    assert all(not disk.reason and not disk.weakness for disk in disks[1:])
+    assert disks[0].reason or disks[0].weakness
 
 
 def test_dark_disks_at_the_edge_of_the_scan_and_large_coordinates() -> None:
