@@ -237,7 +237,7 @@ def _plain_disk(scan: Scan, disk: PlacedDisk) -> FittedDisk | None:
     )
     stands_out = disk.is_disk and abs(disk.contrast_dn) > _PLAIN_SNR * disk.noise_dn
     is_clean = disk.damaged_fraction < _WEAK_DAMAGE and fitted.half_axes_px[1] >= _SMALL_RADIUS_PX
-    return fitted if stands_out and is_clean and not fitted.lone_doubt else None
+    return fitted if stands_out and is_clean and not fitted.dust_reason else None
 
 
 def _appearance_covariance(fit: MarkFit) -> Array:
