@@ -155,6 +155,11 @@ LEARNED_NOTE = (
 OLD_WILD = "the corners: from two Wild frames of 1968 and 1972 that do not name their model"
 NEW_WILD = "the corners: from three Wild frames of 1985 to 1997 that do not name their model"
 UNKNOWN = "not known"
+NO_PICTURE = "not known, for sPyMicMac's gallery of fiducial patterns has no picture of such marks"
+T11_OR_T12 = (
+    "T-11 and T-12 have the same notches on three sides. The left one, larger in the picture of a T-11, does not tell",
+    "the two apart: a T-12 of 1968 has the T-11's. Where the left mark is not found, try the other file.",
+)
 K17 = ("K-17", "K-17 (modified)", "K-17B", "K-17B (modified)", "K-17C (modified)")
 KINDS = (
     Kind("wild-rc5", "Wild RC5", ("RC5", "RC5A", "RC5/8"), (153,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False,
@@ -174,14 +179,14 @@ KINDS = (
          "the sides: from a frame of 1978 with four notches 226 mm apart", False, ALIKE_SIDES, RMK,
          ("Many cameras have no corner marks; seven reports, rejected here, have them at 105.0 mm.",
           "The frame of 1978 ends 117 mm from the middle, 4 mm beyond its notches."), writing=OF_ZEISS),
-    Kind("zeiss-rmk-top", "Zeiss RMK TOP", ("RMK TOP",), (153, 305), 230.0, CORNERS + SIDES, 0.3, 0.02, UNKNOWN),
-    Kind("jena-lmk", "Jena LMK", ("LMK",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, UNKNOWN, writing=BY_FORM),
+    Kind("zeiss-rmk-top", "Zeiss RMK TOP", ("RMK TOP",), (153, 305), 230.0, CORNERS + SIDES, 0.3, 0.02, NO_PICTURE),
+    Kind("jena-lmk", "Jena LMK", ("LMK",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, NO_PICTURE, writing=BY_FORM),
     Kind("fairchild-k17", "Fairchild K-17", K17, (153, 210, 305), 228.6, SIDES, 2.0, 0.2, UNKNOWN, True),
     Kind("fairchild-t11", "Fairchild T-11", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1, UNKNOWN),
     Kind("fairchild-t12", "Fairchild T-12", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1, UNKNOWN, notes=(
         "Corner marks, where there are any, lie anywhere from 105.6 to 116.3 mm: none are given.",
         "Seven reports, rejected here, have the side marks at 110 mm.")),
-    Kind("fairchild-kc1", "Fairchild KC-1", ("KC-1", "KC-1A", "KC-1B"), (153,), 228.6, SIDES, 1.0, 0.1, UNKNOWN),
+    Kind("fairchild-kc1", "Fairchild KC-1", ("KC-1", "KC-1A", "KC-1B"), (153,), 228.6, SIDES, 1.0, 0.1, NO_PICTURE),
     Kind("fairchild-kc6a", "Fairchild KC-6A", ("KC-6A",), (152,), 228.6, SIDES, 1.0, 0.1, GALLERY, False, KC6A_SIDES,
          KC6A),
     Kind("wild-rc8-eight", "Wild RC8 with plain side crosses", ("RC8",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01,
@@ -196,11 +201,11 @@ KINDS = (
          EIGHT, PARK),
     Kind("fairchild-t5", "Fairchild T-5", ("T-5",), (153,), 229.8, SIDES, 2.0, 0.2, GALLERY, True, EACH_SIDE, T5),
     Kind("fairchild-t11-notch", "Fairchild T-11 with notches", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1, GALLERY,
-         False, NOTCHES, T11_NOTCH),
+         False, NOTCHES, T11_NOTCH, T11_OR_T12),
     Kind("fairchild-t11-check", "Fairchild T-11 with checked squares", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1,
          GALLERY, False, ALIKE_SIDES, CHECK),
     Kind("fairchild-t12-notch", "Fairchild T-12 with notches", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1,
-         GALLERY, False, NOTCHES, T12_NOTCH),
+         GALLERY, False, NOTCHES, T12_NOTCH, T11_OR_T12),
     Kind("fairchild-t12-cross", "Fairchild T-12 with crosses", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1,
          GALLERY, False, ALIKE_SIDES, T12_CROSS),
     *(Kind(f"fairchild-k17-{name}", f"Fairchild K-17, {words} wings", K17, (153, 210, 305), 228.6, SIDES, 2.0, 0.2,

@@ -216,27 +216,10 @@ def _compare_shapes(frame: Frame) -> Frame:
     for drawn, indices in groups.items():
         figures = [_shape_figures(fits[index], frame.linear(index), drawn is None) for index in indices]
         own, sigmas = (np.array(each) for each in zip(*figures, strict=True))
-        shapes = shared_shapes(own, sigmas)
-        for index, shape in zip(indices, shapes, strict=True) if drawn is not None else ():
-            if shape is not None and shape.differs:
-                fits[index] = _with_shared_size(frame, index, fits[index], shape)
-        frame = frame.replace_fits({index: fits[index] for index in indices})
-        figures = [_shape_figures(fits[index], frame.linear(index), drawn is None) for index in indices]
-        own, sigmas = (np.array(each) for each in zip(*figures, strict=True))
         for index, shape, sigma in zip(indices, shared_shapes(own, sigmas), sigmas, strict=True):
             if shape is not None:
                 frame = _doubt_shape(frame, index, fits[index], shape, sigma)
     return frame
-
-
-def _with_shared_size(frame: Frame, index: int, fit: MarkFit, shape: SharedShape) -> MarkFit:
-    """A mark of another size than the others fitted with theirs, where that shows no more damage and no worse a picture
-    of it: where the ends of a cross were cut out as damage, a smaller one fits what is left."""
-    sigma = float(np.sqrt(max(shape.sigma[0] ** 2 - fit.size_sigma**2, 0.0)))
-    again = _fit_again(frame, index, replace(frame.options.match, linear_sigma=sigma))
-    if again is None or again.likeness < fit.likeness or again.damaged_fraction > fit.damaged_fraction:
-        return fit
-    return replace(again, figures=fit.figures)
 
 
 def _shape_figures(fit: MarkFit, linear: Array, is_held: bool) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ Side = Literal["left", "right", "top", "bottom"]
 
 LEARNED_ORIGIN = 0.25  # of a learned mark's size: standard deviation of its template's origin about the mark
 MOST_GIVEN_SIGMA_MM = 0.1  # of a given place: a datum's sigma may be a millimetre, and its place is better than that
+_CORNER_RAD = np.deg2rad(30.0)  # of an outline: an arc is drawn by vertices of less
 _SEARCHED = 0.3  # of a frame corner's reach: the square that it is searched by
 
 
@@ -277,11 +278,17 @@ def thinnest_mm(mark: Mark) -> float:
 
 
 def finest_detail_mm(mark: Mark) -> float:
-    """The width of the mark's thinnest line, or the shortest edge of its outline."""
-    edges = [
-        float(np.hypot(*(np.roll(vertices, -1, axis=0) - vertices).T).min())
-        for part in (mark.parts if isinstance(mark, MarkShape) else ())
-        if isinstance(part, Polygon)
-        for vertices in [np.asarray(part.vertices_mm)]
-    ]
-    return min([thinnest_mm(mark), *edges])
+    """The width of the mark's thinnest line, or the shortest straight edge from corner to corner of its outline."""
+    if isinstance(mark, MarkTemplate):
+        return thinnest_mm(mark)
+    outlines = (np.asarray(part.vertices_mm) for part in mark.parts if isinstance(part, Polygon))
+    return min([thinnest_mm(mark), *(length for outline in outlines for length in _straight_edges_mm(outline))])
+
+
+def _straight_edges_mm(outline: Array) -> list[float]:
+    """Lengths of the edges of a polygon (n, 2) that end in corners, and do not go on as an arc."""
+    edges = np.roll(outline, -1, axis=0) - outline
+    angles = np.angle(edges @ (1, 1j))
+    turns = np.abs(np.angle(np.exp(1j * (angles - np.roll(angles, 1)))))  # at the beginning of each edge
+    is_corner = turns > _CORNER_RAD
+    return [float(np.hypot(*edge)) for edge in edges[is_corner & np.roll(is_corner, -1)]]

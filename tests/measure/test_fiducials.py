@@ -27,7 +27,18 @@ from studies import parametrize_with_studies
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Code, Status
 from measure.geometry import POSES
-from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, Part, cross, dot, ring_cross
+from measure.marks.shapes import (
+    Disk,
+    FiducialLayout,
+    LayoutMark,
+    MarkShape,
+    Part,
+    cross,
+    dot,
+    finest_detail_mm,
+    polygon,
+    ring_cross,
+)
 from measure.marks.templates import cut, learn_template
 
 
@@ -105,6 +116,13 @@ def test_a_scan_without_a_frame_says_if_its_pixels_are_large_for_the_marks(
     (problem,) = measured(grain, layout_of([MarkShape(mark)] * 4), tmp_path).problems
     coarse = "the finest detail of the marks, 100 µm, is 2.0 px wide. Scan at 33 µm or finer."
     assert (coarse in problem, Code.SMALL in problem.codes) == (is_coarse, is_coarse)
+
+
+def test_the_finest_detail_of_an_outline_is_an_edge_and_no_piece_of_an_arc() -> None:
+    arc = [(float(np.cos(t)), float(np.sin(t))) for t in np.linspace(0.0, np.pi, 31)]
+    assert finest_detail_mm(MarkShape(polygon(arc))) == pytest.approx(1 / 3, abs=1e-6)  # of its height of 1 mm
+    blunt = MarkShape(polygon([(0.0, 0.0), (2.0, 0.0), (1.0, 3.0), (0.8, 3.0)]))
+    assert finest_detail_mm(blunt) == pytest.approx(0.2)
 
 
 @pytest.mark.study

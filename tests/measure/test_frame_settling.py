@@ -141,6 +141,17 @@ def test_a_frame_whose_marks_do_not_converge_says_so_and_not_that_camera_and_pit
     assert "pitch right" in absent_frame(frame.scan, frame.layout, refused.misfit("12345678"), 6.0, None).problems[0]
 
 
+@pytest.mark.parametrize(("significance", "status"), [(9.0, Status.WEAK), (15.0, Status.MEASURED)])
+def test_a_contrast_within_that_of_the_texture_is_plain_where_all_of_the_mark_tells_it(
+    significance: float, status: Status
+) -> None:
+    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    fit = frame.detections[0].fit
+    assert fit is not None
+    on_texture = replace(fit, noise_dn=abs(fit.contrast_dn) / 2.0, significance=significance)
+    assert frame.replace_fits({0: on_texture}).verdict(0)[0] is status
+
+
 def test_wings_of_three_marks_under_wrong_names_claim_no_more_than_the_stretch_that_these_make() -> None:
     """Given coordinates are stretched by 1 % and the marks are not: three marks cannot tell it from film."""
     rng, kind, linear = np.random.default_rng(5), KIND["wing"], PX_PER_MM * np.diag([1.0, -1.0])
