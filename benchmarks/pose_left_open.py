@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.harness import Row, table
 from benchmarks.search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, Case, case_of, draw_case
+from measure.fiducials.across_frames import check_frames
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polarity, polygon, turned
@@ -126,11 +127,14 @@ def compared(case: Case, only_auto: bool) -> Row:
 
 
 def measured(case: Case, pose: str) -> FrameMeasurement:
-    """As a user would draw the marks: neither light nor dark."""
+    """As `reseau measure` has a frame that is its camera's only one, of marks as a user would draw them: neither light
+    nor dark."""
     pitch = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)
     marks = tuple(replace(mark, mark=replace(mark.mark, polarity="auto")) for mark in case.layout.marks)
     layout = replace(case.layout, marks=marks)
-    return measure_fiducials(case.scan.replace_tone(Tone.unknown()), layout, pitch, FiducialOptions(pose=pose))
+    frame = measure_fiducials(case.scan.replace_tone(Tone.unknown()), layout, pitch, FiducialOptions(pose=pose))
+    found_um = 1000 / (frame.px_per_mm or 1.0)
+    return check_frames([frame], layout, [pitch or (found_um, found_um)]).frames[0]
 
 
 def sigmas_off(case: Case, frame: FrameMeasurement, status: str) -> list[float]:

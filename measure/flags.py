@@ -167,6 +167,8 @@ class Cause(StrEnum):
     ROUNDING = "rounding"
     SECOND_ORDER = "second order"
     UNLIKE_DRAWING = "unlike drawing"
+    DAMAGE = "damage"
+    TEXTURE = "texture"
     TONE = "tone"
     SHARPENING = "sharpening"
     CHANGED_TONES = "changed tones"
@@ -187,6 +189,8 @@ CAUSE_MEANING = {
     Cause.ROUNDING: "The grey values are whole numbers.",
     Cause.SECOND_ORDER: "A soft and faint mark's picture bends within the errors of its place, blur and contrast.",
     Cause.UNLIKE_DRAWING: "At its edges the picture differs by more than noise: it is not quite as drawn.",
+    Cause.DAMAGE: "Damage that was cut out may go on about it, too faint to stand out.",
+    Cause.TEXTURE: "One side of its edges has texture that the other has not.",
     Cause.TONE: "The curve through which light was stored as grey values is not known well enough.",
     Cause.SHARPENING: "By how much the scan was sharpened is not known well enough.",
     Cause.CHANGED_TONES: "A learned mark's half tones may be others than where it was learned.",

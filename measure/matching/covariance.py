@@ -14,11 +14,17 @@ from measure.marks.shapes import MarkTemplate
 from measure.marks.shared_picture import SMOOTHED_PX2
 from measure.marks.templates import GRAIN_PX
 from measure.matching.models import GREY
-from measure.noise.noise_model import NoiseModel, autocovariance, combined, correlated, products
+from measure.noise.noise_model import SCALE_VARIANCE, NoiseModel, autocovariance, combined, correlated, faded, products
+from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkFit, OwnShape, SecondPlace
 
 _ALIKE_PX = 1.5  # standard deviation of the weights by distance of what neighbours leave alike
+_BESIDE_DAMAGE_PX = 1.0  # standard deviation of the weights by distance of what damage leaves beside itself
+_TEXTURE_PX = 8  # up to which texture is taken as alike
+_SMOOTH_PX = 0.8  # of residuals, by which texture is told from noise: as damage is
+_CUT_SIGMAS = 3.2  # of the noise: what stands out more is cut out as damage
 _LEAST_SLOPE = 1e-3  # of a clipped grey value: what tells less tells nothing
+_MOSTLY = 0.5  # of the light of a pixel, that is one side's
 _LEAST_PX = 400  # of the frame beside the notch: fewer do not tell how uneven it is
 # Of the contrast and the logarithm of its change, how much half tones are off: anything between nothing and what a glow
 # makes that stays as it is while the light changes, which is a half.
@@ -60,11 +66,59 @@ class LinearFit:
             place, left = correlated(place, self.noise, 0.5), correlated(left, self.noise, -0.5)
             expected = products(place, place)
         shares = place * left
-        about = gaussian_filter(shares, (0.0, _ALIKE_PX, _ALIKE_PX), mode="constant") * (2 * np.pi * _ALIKE_PX**2)
+        about = _about(shares, _ALIKE_PX) * (2 * np.pi * _ALIKE_PX**2)
         more = products(about, shares) - expected
         sizes, axes = eigh((more + more.T) / 2, by_noise)
         axes = by_noise @ axes
         return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
+
+    def damage_px2(self, damaged: Mask) -> Array:
+        """(2, 2) of the place, by damage (height, width) that was cut out: it goes on beside itself, too faintly to be
+        cut out there. Each of its regions is taken to leave any amount up to what is just not cut out, smoothed."""
+        about = _about(np.where(self.used, self.by_grey[:2], 0.0), _BESIDE_DAMAGE_PX)
+        _, regions = cv2.connectedComponents(damaged.astype(np.uint8), connectivity=4)
+        by_region = np.stack([np.bincount(regions.ravel(), each.ravel()) for each in about * self._uncut])[:, 1:]
+        return np.asarray(by_region @ by_region.T / 3)  # the variance of an even distribution from 0 to 1
+
+    def texture_px2(self, area: Mask) -> Array:
+        """(2, 2) of the place, by texture that one side of the mark's edges has, inside or outside, beyond the noise of
+        both together. area (height, width): the pixels about the mark; what was cut out of it as damage may be the
+        texture's blotches."""
+        shown = self.design[-GREY] / self.steadiness
+        return self._texture_px2(shown, area) + self._texture_px2(1 - shown, area)
+
+    def _texture_px2(self, share: Array, area: Mask) -> Array:
+        """Of one side; share (height, width): of that side in the light of each pixel."""
+        side = area & (share > _MOSTLY)
+        if not side.any():
+            return np.zeros((2, 2))
+        beyond_dn2 = self._texture_dn2(side)
+        texture = np.where(side, self._uncut, 0.0)
+        texture[side] -= texture[side].mean()
+        lags = faded(autocovariance(texture, side, _TEXTURE_PX))
+        alike = lags[_TEXTURE_PX, _TEXTURE_PX + 1]  # of neighbours: the noise of single pixels counts already
+        if beyond_dn2 == 0.0 or alike <= 0.0:
+            return np.zeros((2, 2))
+        lags[_TEXTURE_PX, _TEXTURE_PX] = alike
+        moved = self.by_grey[:2] * share
+        return _positive(products(moved, correlated(moved, NoiseModel(beyond_dn2, lags * (beyond_dn2 / alike), 1.0))))
+
+    def _texture_dn2(self, side: Mask) -> float:
+        """The variance of smoothed residuals, dust left out, beyond what the noise leaves of itself and chance."""
+        smooth = cv2.GaussianBlur(np.where(side, self.residuals, 0.0), (0, 0), _SMOOTH_PX)
+        reach = len(self.noise.autocovariance_dn2) // 2
+        lag2 = np.add.outer(*2 * [np.arange(-reach, reach + 1) ** 2])
+        pixels = 4 * np.pi * _SMOOTH_PX**2  # that are one, smoothed
+        noise_dn2 = float(np.sum(self.noise.autocovariance_dn2 * np.exp(-lag2 / (4 * _SMOOTH_PX**2))) / pixels)
+        chance = 3 * np.sqrt(2 * SCALE_VARIANCE * pixels / side.sum())
+        beyond_dn2 = robust_scale(smooth[side]) ** 2 - noise_dn2
+        return beyond_dn2 if beyond_dn2 > chance * noise_dn2 else 0.0
+
+    @property
+    def _uncut(self) -> Array:
+        """(height, width) residuals, at most as large as noise makes them: dust stands out more, texture hardly."""
+        limit_dn = _CUT_SIGMAS * np.sqrt(self.noise.variance_dn2)
+        return np.clip(self.residuals, -limit_dn, limit_dn)
 
 
 def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, priors_dn2: Array) -> float:
@@ -124,9 +178,18 @@ class Landscape:
         lags = autocovariance(uneven, self.frame_pixels, reach)
         # The noise of single pixels counts already; what neighbours have in common is the landscape.
         lags[reach, reach] = max(lags[reach, reach + 1], 0.0)
-        covariance = products(moved, correlated(moved, NoiseModel(float(lags[reach, reach]), lags, 1.0)))
-        sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
-        return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)  # far lags are chance, and may leave less than none
+        return _positive(products(moved, correlated(moved, NoiseModel(float(lags[reach, reach]), lags, 1.0))))
+
+
+def _about(images: Array, sigma_px: float) -> Array:
+    """Images (n, height, width), smoothed by a Gaussian, with nothing beyond their borders."""
+    return np.asarray(gaussian_filter(images, (0.0, sigma_px, sigma_px), mode="constant"))
+
+
+def _positive(covariance: Array) -> Array:
+    """(n, n) without its negative directions: far lags are chance, and may leave less than none."""
+    sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
+    return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
 
 def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_change: float) -> Array:

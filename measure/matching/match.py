@@ -213,6 +213,9 @@ def _add_precision(result: MarkFit, fit: PictureFit, noise: NoiseModel, about: t
         place = place.plus(Cause.CHANGED_TONES, covariance_of_changed_tone(model.half_tones, by_grey, change))
     place = place.plus(Cause.LANDSCAPE, landscape.covariance(by_grey[:2]))
     place = place.plus(Cause.UNLIKE_DRAWING, linear.unlike_drawing_px2(by_noise))
+    place = place.plus(Cause.DAMAGE, linear.damage_px2(fit.area & ~fit.used))
+    if not model.is_chip and model.background_px is None:
+        place = place.plus(Cause.TEXTURE, linear.texture_px2(fit.area & model.tells))
     freedom, has_blur = model.options.freedom, model.blur is not None and not model.blur_is_at_limit
     tells_shape = freedom in ("similarity", "affine") and not is_round(model.mark)
     shape, strain = slice(2, 4), slice(4, model.linear.stop)

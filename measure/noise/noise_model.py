@@ -20,7 +20,7 @@ _POWER, _POWER_SIGMA, _MOST = 0.4, 0.25, 1 - 1 / 2.2  # exponent of noise over l
 _OTHER, _SAME = 0.5, 0.15  # fractions of the largest change of log light: above, noise differs; below, it does not
 _GREATEST = 0.98  # quantile that counts as the largest change
 _FEWEST = 12  # pixels needed to estimate their noise
-_SCALE_VARIANCE = 1.36  # variance of the logarithm of a robust scale, times the number of values
+SCALE_VARIANCE = 1.36  # variance of the logarithm of a robust scale, times the number of values
 _LEAST = 0.1  # change of log light below which noise is constant
 _DARKEST = 5e-4  # of full scale: below it noise does not decrease further
 _ROUNDS = 8  # of conjugate gradients at most
@@ -93,7 +93,7 @@ def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
     noise, is_white = as_if_white(residuals, used, unknowns)
     if is_white:
         return noise
-    lags = _faded(autocovariance(np.where(used, residuals, 0.0), used, REACH_PX))
+    lags = faded(autocovariance(np.where(used, residuals, 0.0), used, REACH_PX))
     return replace(noise, autocovariance_dn2=lags * (noise.variance_dn2 / lags[REACH_PX, REACH_PX]))
 
 
@@ -117,7 +117,7 @@ def influence_covariances(
     correlation = _covariance_along(kept, used, 1) / np.maximum(squares / count, 1e-300)
     index = np.arange(-REACH_PX, REACH_PX + 1)
     is_white = np.abs(correlation) < 3 / np.sqrt(2 * count)
-    lags = _faded(autocovariance(kept, used, REACH_PX))
+    lags = faded(autocovariance(kept, used, REACH_PX))
     lags *= (variances / np.maximum(lags[:, REACH_PX, REACH_PX], 1e-300))[:, None, None]
     lags[is_white] = np.where(np.add.outer(abs(index), abs(index)) == 0, variances[is_white, None, None], 0.0)
     size: list[int] = padded(tuple(residuals.shape[1:]), REACH_PX)
@@ -133,10 +133,11 @@ def influence_covariances(
     return np.asarray(real + imaginary, float), variances
 
 
-def _faded(lags: Array) -> Array:
-    """Taper the far lags, which are dominated by noise."""
-    index = np.arange(-REACH_PX, REACH_PX + 1)
-    return np.asarray(lags * np.clip(REACH_PX + 1 - np.hypot(index[:, None], index), 0.0, 1.0))
+def faded(lags: Array) -> Array:
+    """Taper the far lags of autocovariances (..., lags, lags), which are dominated by noise."""
+    reach = lags.shape[-1] // 2
+    index = np.arange(-reach, reach + 1)
+    return np.asarray(lags * np.clip(reach + 1 - np.hypot(index[:, None], index), 0.0, 1.0))
 
 
 def as_if_white(
@@ -252,7 +253,7 @@ def steadiness(residuals: Array, light: Array, ground: Mask, used: Mask) -> Arra
     if same.sum() >= _FEWEST and other.sum() >= _FEWEST:
         scales = [max(robust_scale(residuals[group]), 1e-9) for group in (other, same)]
         apart = float(np.mean(change[other]) - np.mean(change[same]))
-        precision = apart**2 / (_SCALE_VARIANCE * (1 / same.sum() + 1 / other.sum()))
+        precision = apart**2 / (SCALE_VARIANCE * (1 / same.sum() + 1 / other.sum()))
         power = (weight * power + precision * float(np.log(scales[0] / scales[1])) / apart) / (weight + precision)
     return np.asarray(np.exp(-np.clip(power, 0.0, _MOST) * change))
 

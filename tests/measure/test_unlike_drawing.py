@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 from true_marks import KIND, Kind, some_mark, whitened_rms
 
 from measure.flags import Cause
-from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross
+from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross, polygon
 from measure.matching.covariance import LinearFit
 from measure.matching.match import MatchOptions, match
 from measure.matching.window import ScanWindow
@@ -58,6 +59,37 @@ def test_ragged_lines_are_known_as_badly_as_they_are() -> None:
         by_noise.append(fit.place_covariance.parts[Cause.NOISE])
     assert whitened_rms(errors, by_noise) > 2.3
     assert whitened_rms(errors, known) < 1.7
+
+
+def test_a_mark_in_a_textured_border_is_known_as_badly_as_it_is() -> None:
+    """Its blotches are cut out as damage, and bend its edges all the same; outside of it there is hardly any noise."""
+    rng, errors, known, without = np.random.default_rng(6), [], [], []
+    block = MarkShape(polygon(((0.0, 0.0), (1.2, 1.2), (3.0, 1.2), (3.0, -1.2), (1.2, -1.2))))
+    for _ in range(8):
+        mark = some_mark(Kind("block", block), 0.8, rng)
+        texture = gaussian_filter(rng.normal(size=(mark.size, mark.size)), 2.0)
+        light = 1.0 - mark.picture * (1.0 + 0.1 * texture / texture.std())
+        fit = match(ScanWindow(20000 * light + rng.normal(0, 300, light.shape)), block, mark.place, MatchOptions())
+        errors.append(fit.center_px - mark.place[:, 2])
+        known.append(fit.covariance_px2)
+        without.append(fit.covariance_px2 - fit.place_covariance.parts[Cause.TEXTURE])
+    assert whitened_rms(errors, without) > 2.0
+    assert 0.6 < whitened_rms(errors, known) < 1.3
+
+
+def test_what_damage_leaves_beside_itself_is_a_cause_of_a_marks_covariance() -> None:
+    """A region of 4 x 4 px on a line, of which the pixels about it may have any amount up to what is cut out."""
+    line = -np.gradient(np.exp(-((np.mgrid[0:40, 0:40][1] - 19.5) ** 2) / 2), axis=1)
+    design, used = np.stack([line, line.T, np.ones_like(line)]), np.ones(line.shape, dtype=bool)
+    damaged = np.zeros_like(used)
+    damaged[10:14, 20:24] = True
+    by_grey = combined(np.asarray(np.linalg.inv(products(design, design)), np.float64), design)
+    noise = NoiseModel(4.0, np.full((1, 1), 4.0), 0.0)
+    fit = LinearFit(np.where(damaged, 1000.0, 0.0), used & ~damaged, design, by_grey, noise, np.ones_like(line))
+    beside = gaussian_filter(damaged * 3.2 * 2.0, 1.0, mode="constant")
+    moved = (by_grey[:2] * beside * fit.used).sum(axis=(1, 2))
+    np.testing.assert_allclose(fit.damage_px2(damaged), np.outer(moved, moved) / 3, rtol=1e-6)
+    assert not fit.damage_px2(np.zeros_like(used)).any()
 
 
 def ragged(axis: int, rng: np.random.Generator) -> list[Bar]:
