@@ -1,6 +1,7 @@
-"""Film photographed by a tilted camera, measured as projective and as affine: errors and claims of its marks."""
+"""Film photographed by a tilted camera with a lens, measured as projective and as affine: errors and claims."""
 
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,6 +16,8 @@ from measure.flags import Status
 from measure.marks.shapes import Bar, FiducialLayout, LayoutMark, MarkShape, Ring
 from measure.scans.opening import open_scan
 from measure.tone.curve import LINEAR
+from pipeline.files.taking_lens import read_lens
+from pipeline.rendered.scene_project import taking_camera_yaml
 from synthetic_images.render import render_scene
 from synthetic_images.scene import (
     DiskField,
@@ -26,10 +29,13 @@ from synthetic_images.scene import (
     SceneCamera,
     SceneFiducial,
     SceneImage,
+    TakingLens,
     Tones,
 )
 
 TILTS_DEG = (0.5, 1.0, 2.0, 5.0)
+K1 = (0.0, -0.1)  # of a normal lens, whose focal length is about the diagonal of the picture
+FOCAL_PX = 6000.0
 HALF_MM, PITCH_UM = 106.0, 60.0
 PLACES = [(HALF_MM * x, HALF_MM * y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
 MARK = MarkShape(
@@ -41,18 +47,18 @@ LAYOUT = FiducialLayout(
 
 
 COLUMNS = {
-    "tilt_deg": "g", "model": "", "measured": "d", "of": "d", "largest_px": ".3f", "error_over_claim": ".2f",
+    "tilt_deg": "g", "k1": "g", "model": "", "measured": "d", "of": "d", "largest_px": ".3f", "error_over_claim": ".2f",
     "problems": "",
 }  # fmt: skip
 
 
 def cells(frames: int = 4) -> Iterator[Row]:
-    for tilt_deg in TILTS_DEG:
-        yield from ({"tilt_deg": tilt_deg, "model": model, "frames": frames} for model in ("projective", "affine"))
+    every = product(TILTS_DEG, K1, ("projective", "affine"))
+    yield from ({"tilt_deg": tilt, "k1": k1, "model": model, "frames": frames} for tilt, k1, model in every)
 
 
-def case(tilt_deg: float, model: str, frames: int, seed: int) -> Row:
-    rows = [photographed(seed + number, tilt_deg, 40.0 * number, model) for number in range(frames)]
+def case(tilt_deg: float, k1: float, model: str, frames: int, seed: int) -> Row:
+    rows = [photographed(seed + number, tilt_deg, 40.0 * number, k1, model) for number in range(frames)]
     errors, sigmas = (np.concatenate([row[k] for row in rows]) for k in (0, 1))
     return {
         "measured": sum(row[2] for row in rows),
@@ -64,22 +70,25 @@ def case(tilt_deg: float, model: str, frames: int, seed: int) -> Row:
 
 
 def photographed(
-    seed: int, tilt_deg: float, direction_deg: float, model: str
+    seed: int, tilt_deg: float, direction_deg: float, k1: float, model: str
 ) -> tuple[np.ndarray, np.ndarray, int, tuple[str, ...]]:
     """Errors and standard deviations of coordinates, px, how many marks are measured, and the frame's problems."""
     fiducials = tuple(SceneFiducial(str(k), place, CROSS) for k, place in enumerate(PLACES))
     camera = SceneCamera("film", (228.0, 228.0), 150.0, (0.0, 0.0), Distortion("torlegard", {}), fiducials)
-    scanner = Scanner((PITCH_UM, PITCH_UM), margin_mm=6.0, noise=0.01)
+    taken_by = TakingLens(FOCAL_PX, k1=k1)
+    scanner = Scanner((PITCH_UM, PITCH_UM), margin_mm=6.0, noise=0.01, lens=taken_by)
     film = Film("projective", tilt_deg=tilt_deg, tilt_direction_deg=direction_deg)
     targets = DiskField((DiskTarget("1", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),), 0.001)
     image = SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
     scene = Scene("film", seed, camera, targets, (image,), scanner, film, Tones(contrast=0.0))
     with TemporaryDirectory() as folder:
         truth = render_scene(scene, Path(folder)).frames[0]
+        (Path(folder) / "lens.yaml").write_text(taking_camera_yaml(scene, taken_by), encoding="utf-8")
+        lens = read_lens(Path(folder) / "lens.yaml", PITCH_UM)
         with open_scan(next(Path(folder).rglob("*.tif"))) as scan:
-            options = FiducialOptions("0", film_model=model)
+            options = FiducialOptions("0", film_model=model, lens=lens)
             frame = measure_fiducials(scan.replace_tone(LINEAR), LAYOUT, (PITCH_UM, PITCH_UM), options)
-    checked = check_frames([frame], LAYOUT, [(PITCH_UM, PITCH_UM)], BelievedFilm(model=model)).frames[0]
+    checked = check_frames([frame], LAYOUT, [(PITCH_UM, PITCH_UM)], BelievedFilm(model=model, lens=lens)).frames[0]
     errors, sigmas = [], []
     for mark in checked.marks:
         if mark.status is Status.MEASURED and mark.center_px is not None and mark.covariance is not None:

@@ -65,6 +65,7 @@ class Code(StrEnum):
     OTHER_FRAME = "other-frame"
     BENT_FRAME = "bent-frame"
     BENT_SCANS = "bent-scans"
+    PERSPECTIVE = "perspective"
     PITCH = "pitch"
     NO_CHECK = "no-check"
     NO_BOARD = "no-board"
@@ -110,6 +111,7 @@ CODE_MEANING = {
     Code.OTHER_FRAME: "The scan shows another frame as well.",
     Code.BENT_FRAME: "No affine transformation takes the given coordinates to the marks of this frame.",
     Code.BENT_SCANS: "All scans are bent alike in the scanner's axes.",
+    Code.PERSPECTIVE: "The film was photographed obliquely: no affine transformation fits.",
     Code.PITCH: "The marks want another pixel pitch.",
     Code.NO_CHECK: "There are no more marks than the transformation needs.",
     Code.NO_BOARD: "The board, or a part of its markers, was not found.",
@@ -182,6 +184,7 @@ class Cause(StrEnum):
     OTHER_FRAMES = "other frames"
     INTERPOLATION = "interpolation"
     CLICK = "click"
+    LENS = "taking lens"
 
 
 CAUSE_MEANING = {
@@ -204,6 +207,7 @@ CAUSE_MEANING = {
     Cause.OTHER_FRAMES: "It contradicts the camera's other frames.",
     Cause.INTERPOLATION: "Two scans have their pixels at other places, and between these no picture is sure.",
     Cause.CLICK: "A person pointed at it, and nothing could be matched there.",
+    Cause.LENS: "The lens of the camera that photographed the film is not known better than its calibration says.",
 }
 
 

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from synthetic_images.areas import Area
 from synthetic_images.bend import Bend
 from synthetic_images.projection import camera_from_object
-from synthetic_images.scene import Film, Scene, SceneImage
+from synthetic_images.scene import Film, Scene, SceneImage, TakingLens
 
 Array = NDArray[np.float64]
 
 WAVES = 6  # of the smooth deformation
+LENS_STEPS = 12  # of the inversion of a taking lens, each a tenth of the one before or less
 INVERSION_STEPS = 5  # of the smooth deformation, each a ten-thousandth of the one before
 
 
@@ -22,7 +23,7 @@ class FrameGeometry:
     """Where things of one frame come to lie in its scan.
 
     width_px, height_px: of the scan. comparator_from_camera: (3, 3), of homogeneous coordinates, exact where film has
-    no smooth deformation and the scanner no bend.
+    no smooth deformation and the scanner no bend and no lens.
     amplitudes_mm, waves_per_mm (WAVES, 2), phases_rad (WAVES,): the smooth deformation, a sum of sines.
     """
 
@@ -41,7 +42,20 @@ class FrameGeometry:
         comparator = _projected(self.comparator_from_camera, film)
         if self.bend.terms_um:
             comparator = self.bend.scan_from_bed(comparator)
-        return np.asarray(comparator * self._pixel_per_mm, np.float64)
+        pixels = np.asarray(comparator * self._pixel_per_mm, np.float64)
+        lens = self.scene.scanner.lens
+        return pixels if lens is None else self._distort(lens, pixels)
+
+    def _distort(self, lens: TakingLens, pixels: Array) -> Array:
+        """(n, 2) where the lens puts pixels (n, 2) of a picture without distortion."""
+        middle = (self.width_px - 1) / 2, (self.height_px - 1) / 2
+        center = np.asarray(lens.center_px or middle)
+        x, y = ((pixels - center) / lens.focal_px).T
+        r2 = x * x + y * y
+        radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+        distorted_x = x * radial + 2 * lens.p1 * x * y + lens.p2 * (r2 + 2 * x * x)
+        distorted_y = y * radial + lens.p1 * (r2 + 2 * y * y) + 2 * lens.p2 * x * y
+        return np.asarray(np.stack([distorted_x, distorted_y], axis=1) * lens.focal_px + center, np.float64)
 
     def pixel_from_object(self, points: Array) -> Array:
         """(n, 2) column and row of object points (n, 3); nan where they cannot be imaged."""
@@ -49,6 +63,10 @@ class FrameGeometry:
 
     def camera_from_scan(self, pixels: Array) -> Array:
         """(n, 2) points of the camera frame from column and row (n, 2), the inverse of `pixel_from_camera`."""
+        lens, seen = self.scene.scanner.lens, pixels
+        if lens is not None:
+            for _ in range(LENS_STEPS):
+                pixels = pixels + seen - self._distort(lens, pixels)
         if self.bend.terms_um:
             pixels = self.bend.bed_from_scan(pixels / self._pixel_per_mm) * self._pixel_per_mm
         film = self.straight_camera_from_scan(pixels)

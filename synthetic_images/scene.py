@@ -306,6 +306,25 @@ class UnsharpMask:
 
 
 @dataclass(frozen=True)
+class TakingLens:
+    """The lens of a digital camera that takes the scans, by OpenCV's formulas (calib3d, "detailed description").
+
+    focal_px: principal distance; center_px: the axis in the picture, None in its middle.
+    """
+
+    focal_px: float
+    center_px: Point | None = None
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    def __post_init__(self) -> None:
+        positive("focal_px", self.focal_px)
+
+
+@dataclass(frozen=True)
 class Scanner:
     """The scanner and its file.
 
@@ -313,7 +332,8 @@ class Scanner:
     area; noise: rms as a share of full scale, white; tile_px: edge of the file's tiles, 0 for strips.
     white_is_zero: only how the file keeps the same picture; negative: the picture is a negative. tone: the gamma by
     which light is coded, or one of TONES. bend_um: what the scanner bends in all scans alike, by the names of
-    `bend.Bend`. sharpen: the unsharp mask by which the codes are sharpened thereafter.
+    `bend.Bend`. sharpen: the unsharp mask by which the codes are sharpened thereafter. lens: of a digital camera that
+    takes the scans.
     """
 
     pitch_um: Point
@@ -329,6 +349,7 @@ class Scanner:
     tone: float | str = 1.0
     bend_um: Mapping[str, float] = field(default_factory=dict)
     sharpen: UnsharpMask = UnsharpMask()
+    lens: TakingLens | None = None
 
     def __post_init__(self) -> None:
         positive("pitch_um", *self.pitch_um)

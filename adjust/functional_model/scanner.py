@@ -7,17 +7,21 @@ is how far the scanner puts a point beside its place; all parameters are in mm. 
 can take, its scanner's bend cannot be told from: only terms that no transformation takes are offered. A term `a21` is
 one product alone; `stretch`, `shear`, `tilt_x` and `tilt_y` are the combinations that a similarity, or a projective
 transformation, leaves of products of which it takes others (see `polynomial_sets`).
+
+A digital camera that took the scan has a lens besides. It is known, and comes first: S(x_s, y_s) takes the lens's
+distortion out of the comparator coordinates, which are those of its picture, and then the bend.
 """
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from adjust.array_types import Array, Mask
-from adjust.functional_model.correction import Correction
+from adjust.functional_model.correction import Correction, no_correction
+from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.polynomial_sets import (
     SHEAR,
     STRETCH,
@@ -29,7 +33,7 @@ from adjust.functional_model.polynomial_sets import (
     summed,
 )
 from adjust.functional_model.transformation import polynomial_order
-from adjust.linear_algebra.small_matrices import determinant, solved
+from adjust.linear_algebra.small_matrices import determinant, product, solved
 
 SMOOTH = (2, 3)  # degrees of the products that a bend consists of
 ALONG = (4, 5, 6)  # degrees of those along one axis alone, the carriage's, which tests may ask for
@@ -94,31 +98,49 @@ def is_term(name: str) -> bool:
 class Bend:
     """The formula of S: its terms in their order, the middle and half the extent of the scan in x and y, mm.
 
-    Without a term it is x = x_s, y = y_s.
+    lens: of the digital camera that took the scan, its interior orientation in the comparator; None of a scanner.
+    Without a term and a lens it is x = x_s, y = y_s.
     """
 
     terms: tuple[str, ...] = ()
     center_mm: tuple[float, float] = (0.0, 0.0)
     half_mm: tuple[float, float] = (1.0, 1.0)
+    lens: Lens | None = None
+
+    @property
+    def is_identity(self) -> bool:
+        return not self.terms and self.lens is None
 
     def displacement(self, parameters: Array, scan_mm: Array) -> Correction:
         """How far (n, 2) the scanner puts points beside their places, at the coordinates (n, 2) that it gives them."""
-        return summed(self._polynomial_set, np.array(self.half_mm), scan_mm, np.array(self.center_mm), parameters)
+        if self.lens is None:
+            return self._bend_displacement(parameters, scan_mm)
+        straight_mm, by_scan = _remove_distortion(self.lens, scan_mm)
+        bend = self._bend_displacement(parameters, straight_mm)
+        gradient = product(np.eye(2) - bend.xy_jacobian, by_scan)
+        value = scan_mm - straight_mm + bend.value
+        return replace(bend, value=value, xy_jacobian=np.eye(2) - gradient)
+
+    def _bend_displacement(self, parameters: Array, straight_mm: Array) -> Correction:
+        """Likewise, of coordinates (n, 2) that are free of a lens's distortion."""
+        if not self.terms:
+            return no_correction(Distortion(), straight_mm, np.zeros(2), parameters)
+        return summed(self._polynomial_set, np.array(self.half_mm), straight_mm, np.array(self.center_mm), parameters)
 
     def apply(self, parameters: Array, scan_mm: Array) -> Array:
         """The places (n, 2) of points whose coordinates in the scan (n, 2) are given, mm."""
-        return scan_mm - self.displacement(parameters, scan_mm).value if self.terms else scan_mm
+        return scan_mm if self.is_identity else scan_mm - self.displacement(parameters, scan_mm).value
 
     def gradient(self, parameters: Array, scan_mm: Array) -> Array:
         """Their derivatives (n, 2, 2) by the coordinates in the scan."""
-        if not self.terms:
+        if self.is_identity:
             return np.broadcast_to(np.eye(2), (*scan_mm.shape, 2))
         return np.asarray(np.eye(2) - self.displacement(parameters, scan_mm).xy_jacobian)
 
     def inverse(self, parameters: Array, xy_mm: Array) -> tuple[Array, Mask]:
         """The coordinates in the scan (n, 2) of places (n, 2), and which were found: where the bend folds none are."""
         found = np.ones(len(xy_mm), dtype=bool)
-        if not self.terms:
+        if self.is_identity:
             return xy_mm, found
         scan_mm = xy_mm
         with np.errstate(over="ignore", invalid="ignore"):
@@ -139,6 +161,17 @@ class Bend:
         terms: dict[str, Term] = {name: COMBINED.get(name) or _product(name) for name in self.terms}
         degrees = [2 if isinstance(term, str) else max(term[1:]) for term in terms.values()]
         return legendre_terms(terms, max(degrees))
+
+
+def _remove_distortion(lens: Lens, scan_mm: Array) -> tuple[Array, Array]:
+    """Places (n, 2) in a lens's picture free of its distortion, and their derivatives (n, 2, 2) by those in it.
+
+    By the implicit function theorem, the lens's equations having no value. Nan where the lens folds over.
+    """
+    straight_mm, found = lens.ideal_from_observed(scan_mm)
+    at = lens.equations(scan_mm, (straight_mm - lens.interior[1:]) / lens.interior[0])
+    by_scan = lens.interior[0] * np.linalg.solve(-at.ray_jacobian, at.xy_jacobian)
+    return np.where(found[:, None], straight_mm, np.nan), by_scan
 
 
 NO_BEND = Bend()

@@ -48,15 +48,17 @@ def bent_network(network: Network, terms: Sequence[str] | None = None, sigma_mm:
 
 def network_with_terms(network: Network, terms: Mapping[str, Sequence[str]], sigma_mm: float = np.inf) -> Network:
     """The network with these terms of the bends of the scanners that its images name, each given as 0; terms: by
-    scanner, none of one that is not among them."""
+    scanner, none of one that is not among them. Lenses of cameras that are scanners stay."""
     scanners = []
+    lenses = {scanner.name: scanner.lens for scanner in network.scanners}
     for name in _scanners(network):
         scanned = np.array([image.scanner == name for image in network.images])[network.image_numbers]
         lowest, highest = (edge(network.observations.xy_mm[scanned], axis=0) for edge in (np.min, np.max))
         x, y = (lowest + highest) / 2.0
         half_x, half_y = np.maximum(highest - lowest, 1e-3) / 2.0
         priors = dict.fromkeys(terms.get(name, ()), Prior(0.0, sigma_mm))
-        scanners.append(Scanner(name, priors, (float(x), float(y)), (float(half_x), float(half_y))))
+        extent = (float(x), float(y)), (float(half_x), float(half_y))
+        scanners.append(Scanner(name, priors, *extent, lenses.get(name)))
     return replace(network, scanners=tuple(scanners))
 
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from adjust.array_types import Array, Indices
 from adjust.functional_model.board import board_form
-from adjust.functional_model.lens import Prior
+from adjust.functional_model.lens import Lens, Prior
 from adjust.functional_model.line_of_sight import STRAIGHT as STRAIGHT
 from adjust.functional_model.line_of_sight import LineOfSight as LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.functional_model.scanner import NO_BEND, Bend, is_term
+from adjust.functional_model.scanner import Bend, is_term
 from adjust.functional_model.transformation import film_kind
 from adjust.problem.camera import Camera, FiducialDistance
 from adjust.problem.observations import Calibration, Distance, Observations
@@ -62,13 +62,15 @@ class Exterior:
 class Scanner:
     """A scanner as all its scans have it: the terms of its bend with their priors, see `functional_model.scanner`.
 
-    center_mm, half_mm: middle and half the extent of the scans, in the comparator.
+    center_mm, half_mm: middle and half the extent of the scans, in the comparator. lens: of a digital camera that is
+    the scanner, its interior orientation in the comparator; None of any other.
     """
 
     name: str
     terms: Mapping[str, Prior] = field(default_factory=dict)
     center_mm: tuple[float, float] = (0.0, 0.0)
     half_mm: tuple[float, float] = (1.0, 1.0)
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         unknown = sorted(name for name in self.terms if not is_term(name))
@@ -82,7 +84,7 @@ class Scanner:
 
     @property
     def bend(self) -> Bend:
-        return Bend(tuple(self.terms), self.center_mm, self.half_mm) if self.terms else NO_BEND
+        return Bend(tuple(self.terms), self.center_mm, self.half_mm, self.lens)
 
     @property
     def given(self) -> Array:
@@ -186,7 +188,8 @@ class Network:
     def rows_by_scanner(self) -> dict[str, Indices]:
         """The observations in the scans of every scanner that bends them."""
         names = np.array([image.scanner for image in self.images])[self.image_numbers]
-        return {scanner.name: np.flatnonzero(names == scanner.name) for scanner in self.scanners if scanner.terms}
+        bending = (scanner.name for scanner in self.scanners if not scanner.bend.is_identity)
+        return {name: np.flatnonzero(names == name) for name in bending}
 
     @cached_property
     def straight_xy_mm(self) -> Array:

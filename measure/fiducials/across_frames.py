@@ -48,7 +48,7 @@ def check_frames(
     pitches_um: of each scan, in x and y. film: what is believed of it beforehand.
     """
     checked, films = check_own_figures(check_second_places(frames)), [film.sigma_mm] * len(frames)
-    found = {i: _misfit(*pair, layout, film.model) for i, pair in enumerate(zip(checked, pitches_um, strict=True))}
+    found = {i: _misfit(*pair, layout, film) for i, pair in enumerate(zip(checked, pitches_um, strict=True))}
     misfits = {place: each for place, each in found.items() if each is not None}
     if misfits:
         shared, problem = _explain_together(misfits, layout, film.sigma_mm)
@@ -61,7 +61,7 @@ def check_frames(
 
 
 def _misfit(
-    frame: FrameMeasurement, pitch_um: tuple[float, float], layout: FiducialLayout, model: str
+    frame: FrameMeasurement, pitch_um: tuple[float, float], layout: FiducialLayout, film: BelievedFilm
 ) -> FrameMisfit | None:
     """None of a frame of fewer than three marks, or of marks in a line."""
     number = {mark.id: place for place, mark in enumerate(layout.marks)}
@@ -71,10 +71,11 @@ def _misfit(
     if frame.pixel_from_camera is None or np.linalg.matrix_rank(given - given.mean(axis=0)) < 2:
         return None
     mm = np.diag([pitch_um[0], -pitch_um[1]]) / 1000
-    measured = np.array([mm @ np.asarray(mark.center_px) for mark in marks])
+    places = np.array([mark.center_px for mark in marks])
+    measured = (places if film.lens is None else film.lens.ideal_px(places)) @ mm
     covariances = np.array([mm @ np.asarray(mark.covariance_px2) @ mm.T for mark in marks])
     pose = frame.pose.name if frame.pose else "0"
-    return FrameMisfit(FrameMarks.from_places(given, measured, covariances, model), sites, pose)
+    return FrameMisfit(FrameMarks.from_places(given, measured, covariances, film.model), sites, pose)
 
 
 def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) -> tuple[Explanation, Reason]:
@@ -149,7 +150,8 @@ def _add_findings(
     known_um = 1000 * float(np.sqrt(max(variances.max(), film_mm**2)))  # with what is added when it is adjusted
     problem = _problem(own, shared, names, suspects, known_um)
     is_known = own.hypothesis is Hypothesis.PITCH and any(Code.PITCH in each.codes for each in frame.problems)
-    problems = (*frame.problems, problem) if problem and not is_known else frame.problems
+    said = [each for each in frame.problems if not {*each.codes} & {*problem.codes} & {Code.PERSPECTIVE}]
+    problems = (*said, problem) if problem and not is_known else frame.problems
     return replace(add_doubts(frame, bent), problems=problems), film_mm
 
 
@@ -186,6 +188,7 @@ def _problem(
             f'{p_value}. The film was photographed obliquely: set transformation = "projective" under [adjust]. '
             f"{widened}",
             Code.BENT_FRAME,
+            Code.PERSPECTIVE,
         )
     if not own.marks.redundancy:
         return Reason(

@@ -33,7 +33,8 @@ def clicked_frame(
     unless they lie on a line, or the project sets it."""
     camera, clicked = _clicked_places(layout, options.clicks)
     pixel_mm = np.array(pitch_um or (1.0, 1.0)) / 1000.0
-    up_mm = clicked * pixel_mm * (1.0, -1.0)
+    ideal = clicked if options.lens is None else options.lens.ideal_px(clicked)
+    up_mm = ideal * pixel_mm * (1.0, -1.0)
     pose, up = _clicked_pose(camera, up_mm, POSES if options.pose == "auto" else (options.pose,))
     if pitch_um is None:  # then it is what the marks' separations say
         pixel_mm = pixel_mm / linear_scale(up)
@@ -41,7 +42,9 @@ def clicked_frame(
     matrix = np.diag([1.0, -1.0]) @ up / pixel_mm[:, None]
     pitch_mm = (float(pixel_mm[0]), float(pixel_mm[1]))
     polarities = (1, -1) if any(mark.mark.polarity == "auto" for mark in layout.marks) else (1,)
-    placements = [Placement(pose, matrix, 0.0, len(camera), polarity, 1, pitch_mm) for polarity in polarities]
+    placements = [
+        Placement(pose, matrix, 0.0, len(camera), polarity, 1, pitch_mm, lens=options.lens) for polarity in polarities
+    ]
     frames = [measure_frame(scan, layout, placement, options) for placement in placements]
     frame = max(frames, key=lambda one: (one.measured_count, int(one.inliers.sum())))
     tells = options.pose != "auto" or not are_collinear(camera)

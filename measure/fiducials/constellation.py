@@ -14,6 +14,8 @@ from scipy.spatial import cKDTree
 from measure.array_types import Array
 from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.responses import LEAST_TOLERANCE_PX, ResponseMap, Responses, narrow_tolerance_px
+from measure.fiducials.interior_orientation import FilmFit
+from measure.fiducials.options import TakingLens
 from measure.geometry import linear_scale, up_from_camera
 from measure.marks.shapes import LayoutMark, Mark
 
@@ -31,6 +33,7 @@ _SAME_PX = 10  # of the reduced scan: placements no farther apart put a mark on 
 _SAME_SIZE = 0.01  # the same at the frame's edge, a thousand of these pixels off the middle
 _SAME = 0.1  # of the tolerance: orientations whose marks lie so near to one another's have the same placements
 _OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
+_STEP_MM = 0.01  # of derivatives
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,9 @@ class Bounds:
 class Placement:
     """A frame in its scan. score: how much of the constellation answers; supported: how many marks do.
 
-    pixel_from_camera: (2, 3). polarity: of the marks that are not drawn with one, +1 lighter than their surroundings,
-    -1 darker. reduction: of the scan, and pitch_mm and surroundings that it was found with.
+    pixel_from_camera: (2, 3), to ideal pixels where the scan was taken through a lens. polarity: of the marks that are
+    not drawn with one, +1 lighter than their surroundings, -1 darker. reduction: of the scan, and pitch_mm and
+    surroundings that it was found with. film: what a film model adds to pixel_from_camera, None of an affine one.
     """
 
     pose: str
@@ -59,6 +63,8 @@ class Placement:
     reduction: int
     pitch_mm: tuple[float, float]
     surroundings: Surroundings = WIDE
+    lens: TakingLens | None = None
+    film: FilmFit | None = None
 
     def same_place(self, other: "Placement") -> bool:
         """Whether both put the frame at the same place and size, however its marks are named."""
@@ -68,7 +74,22 @@ class Placement:
 
     def places_px(self, camera_mm: Array) -> Array:
         """(n, 2) where it puts marks at camera_mm (n, 2)."""
+        ideal = self._ideal_px(camera_mm)
+        return ideal if self.lens is None else self.lens.scan_px(ideal)
+
+    def _ideal_px(self, camera_mm: Array) -> Array:
+        """(n, 2) likewise, in the picture that a lens without distortion would have taken."""
+        if self.film is not None:
+            return np.asarray(self.film.places_mm(camera_mm) * (1.0, -1.0) / self.pitch_mm)
         return np.asarray(camera_mm @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2])
+
+    def linear(self, place_mm: Array) -> Array:
+        """(2, 2) derivatives of places_px at a place (2,) of the camera, px per mm."""
+        if self.film is None and self.lens is None:
+            return self.pixel_from_camera[:, :2]
+        steps = place_mm + _STEP_MM * np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+        right, left, up, down = self.places_px(steps)
+        return np.column_stack([right - left, up - down]) / (2 * _STEP_MM)
 
     def names(self, places_px: Array, camera_mm: Array) -> NDArray[np.intp]:
         """(k,) which mark lies at each of places_px (k, 2): the nearest one, -1 where it is as far as half way to the
@@ -86,13 +107,14 @@ class Placement:
         coordinates (n, 2) of the marks differ that lie at the same places."""
         turn = np.linalg.inv(up_from_camera(self.pose)) @ up_from_camera(pose)
         linear, shift = self.pixel_from_camera[:, :2] @ turn, self.pixel_from_camera[:, 2]
-        renamed = replace(self, pose=pose, pixel_from_camera=np.column_stack([linear, shift]))
-        places = self.places_px(camera_mm)
-        names = renamed.names(places, camera_mm)
-        if np.any(names < 0):
+        film = None if self.film is None else replace(self.film, turn=up_from_camera(pose))
+        renamed = replace(self, pose=pose, pixel_from_camera=np.column_stack([linear, shift]), film=film)
+        names = renamed.names(self.places_px(camera_mm), camera_mm)
+        if film is not None or np.any(names < 0):
             return renamed
         pitch = np.array(self.pitch_mm)
-        to, from_ = ((each * pitch) @ (1.0, 1.0j) for each in (places, renamed.places_px(camera_mm)[names]))
+        own, other = self._ideal_px(camera_mm), renamed._ideal_px(camera_mm)[names]
+        to, from_ = ((each * pitch) @ (1.0, 1.0j) for each in (own, other))
         mean_to, mean_from = to.mean(), from_.mean()
         scale = np.vdot(from_ - mean_from, to - mean_to) / np.vdot(from_ - mean_from, from_ - mean_from)
         similarity = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]])
@@ -154,8 +176,10 @@ class PlacementSearch:
         pitch_mm: tuple[float, float],
         bounds: Bounds,
         all_orientations: bool = True,
+        lens: TakingLens | None = None,
     ) -> None:
         self.marks, self.responses, self.bounds, self.all_orientations = marks, responses, bounds, all_orientations
+        self.lens = lens
         self.camera_mm = np.array([mark.xy_mm for mark in marks])
         self.pitch = np.asarray(pitch_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
@@ -238,6 +262,7 @@ class _Constellation:
                 self.responses.reduction,
                 (float(self.pitch[0]), float(self.pitch[1])),
                 self.responses.surroundings,
+                self.search.lens,
             )
             for a, b, score, count in zip(
                 scale.tolist(), offset.tolist(), scores.tolist(), supported.tolist(), strict=True
@@ -258,11 +283,12 @@ class _Constellation:
         return scale[: len(best)], offset[: len(best)]
 
     def _complex(self, scan_px: Array) -> Complex:
-        scaled = scan_px * self.pitch
+        scaled = (scan_px if self.search.lens is None else self.search.lens.ideal_px(scan_px)) * self.pitch
         return np.asarray(scaled[..., 0] - 1j * scaled[..., 1])
 
     def _scan_px(self, places: Complex) -> Array:
-        return np.asarray(np.stack([places.real, -places.imag], axis=-1) / self.pitch)
+        ideal = np.asarray(np.stack([places.real, -places.imag], axis=-1) / self.pitch)
+        return ideal if self.search.lens is None else self.search.lens.scan_px(ideal)
 
     def _hypotheses(self) -> tuple[Complex, Complex]:
         """Every similarity within bounds that takes two marks to two of their candidates."""

@@ -74,9 +74,8 @@ class Frame:
         places = placement.places_px(np.array([mark.xy_mm for mark in layout.marks]))
         detections = tuple(Detection(place, False, None) for place in places)
         tone = FrameTone(scan.tone.prior)
-        return cls(
-            scan, layout, options, placement, placement.pixel_from_camera, detections, none, none.copy(), tone=tone
-        )
+        start, film = placement.pixel_from_camera, placement.film
+        return cls(scan, layout, options, placement, start, detections, none, none.copy(), tone=tone, film=film)
 
     @cached_property
     def camera_mm(self) -> Array:
@@ -111,21 +110,23 @@ class Frame:
     @cached_property
     def predicted_px(self) -> Array:
         """(n, 2) where the interior orientation puts the marks."""
-        if self.film is not None:
-            return self.film.places_mm(self.camera_mm) * (1.0, -1.0) / self.pitch_mm
-        return np.asarray(self.camera_mm @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2])
+        return self.fitted_placement.places_px(self.camera_mm)
 
     def linear(self, index: int) -> Array:
         """(2, 2) the derivatives of the interior orientation at a mark, px per mm."""
-        if self.film is None:
-            return self.pixel_from_camera[:, :2]
-        return np.asarray(np.diag([1.0, -1.0] / self.pitch_mm) @ self.film.linear(self.camera_mm[index]))
+        return self.fitted_placement.linear(self.camera_mm[index])
 
     @cached_property
     def misfit_mm(self) -> Array:
         """(n,) how far each mark found is from where the frame puts it, nan without one."""
         places = [np.full(2, np.nan) if each.fit is None else each.fit.center_px for each in self.detections]
         return np.asarray(np.hypot(*((np.array(places) - self.predicted_px) * self.pitch_mm).T))
+
+    def up_mm(self, scan_px: Array) -> Array:
+        """Places (n, 2) of the scan in its mm, right and up, free of a taking lens's distortion."""
+        lens = self.options.lens
+        ideal = scan_px if lens is None else lens.ideal_px(scan_px)
+        return np.asarray(ideal * self.pitch_mm * (1.0, -1.0))
 
     @property
     def scatter_mm(self) -> float:
@@ -189,10 +190,10 @@ class Frame:
         fits = {int(index): self.fits[index] for index in indices}
         return {index: fit.center_px for index, fit in fits.items() if fit}
 
-    @property
+    @cached_property
     def fitted_placement(self) -> Placement:
         """Where the inliers put the frame."""
-        return replace(self.placement, pixel_from_camera=self.pixel_from_camera)
+        return replace(self.placement, pixel_from_camera=self.pixel_from_camera, film=self.film)
 
     @property
     def all_clear(self) -> bool:
@@ -356,7 +357,7 @@ def orient_frame(frame: Frame) -> Frame:
         return replace(frame, inliers=inliers)
     index = np.flatnonzero(found)
     fits = [frame.detections[i].fit for i in index]
-    up = np.array([fit.center_px for fit in fits if fit]) * frame.pitch_mm * (1.0, -1.0)
+    up = frame.up_mm(np.array([fit.center_px for fit in fits if fit]))
     scaled = np.diag(frame.pitch_mm)
     covariances = np.array([scaled @ fit.covariance_px2 @ scaled for fit in fits if fit])
     given = np.array([min(*frame.layout.marks[i].sigma_mm, MOST_GIVEN_SIGMA_MM) for i in index])

@@ -12,7 +12,6 @@ from measure.fiducials.options import AFFINITY_SIGMA
 _LINEAR = [0, 1, 4, 5]  # of the unknowns: all but the shift
 _FREE = 0.03  # standard deviation of stretch, shear and film terms that are free, as shares of the frame's radius
 _INVERSIONS = 6  # of a perspective, each a fiftieth of the one before
-_STEP_MM = 0.01  # of derivatives
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +52,6 @@ class FilmFit:
         for _ in range(_INVERSIONS):
             places = straight + (film_terms(self.model, given, places) @ self.terms).reshape(-1, 2)
         return np.asarray(places * self.radius_mm + self.center_mm)
-
-    def linear(self, place_mm: Array) -> Array:
-        """(2, 2) derivatives at a place (2,) of the camera."""
-        steps = place_mm + _STEP_MM * np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
-        right, left, up, down = self.places_mm(steps)
-        return np.column_stack([right - left, up - down]) / (2 * _STEP_MM)
 
 
 def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, model: str = "affine") -> FrameFit:

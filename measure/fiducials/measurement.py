@@ -30,6 +30,11 @@ from measure.scans.scan import Scan
 
 _SET = ("set in the project.",)
 _UNSURE = Reason("none of the marks is measured without blemish: the frame may lie elsewhere.", Code.CHANCE)
+_OBLIQUE = Reason(
+    "only a perspective fits its marks: the film was photographed obliquely. Set transformation = "
+    '"projective" under [adjust].',
+    Code.PERSPECTIVE,
+)
 _BESIDE = 0.95  # of the frame's size: a rival farther off is another photograph
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 _ROOM = 0.9  # of the frame's sides that are free beside it: less shows no whole frame
@@ -99,6 +104,8 @@ def _search_frame(
     doubts = problems if frame.measured_count else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
+    if frame.options.film_model != options.film_model:
+        problems.append(_OBLIQUE)
     return replace(present_frame(scan, layout, frame, pose, pitch_um, problems, chance), writing=lines)
 
 
@@ -200,7 +207,8 @@ def second_frame(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, op
     pitch_um = 1000.0 / frame.px_per_mm
     alone = replace(options, clicks=(), writing="none", known_lines=())
     for rest in _rests(scan, first):
-        found = measure_fiducials(crop_scan(scan, rest), layout, (pitch_um, pitch_um), alone)
+        lens = None if options.lens is None else options.lens.crop(*rest[:2])
+        found = measure_fiducials(crop_scan(scan, rest), layout, (pitch_um, pitch_um), replace(alone, lens=lens))
         measured = sum(mark.status is Status.MEASURED for mark in found.marks)
         if measured >= max(_FEWEST_MARKS, _MOST_MARKS * len(layout.marks)) and found.pixel_from_camera is not None:
             second = _outline(found, layout) + np.array(rest[:2] * 2)

@@ -1,11 +1,12 @@
 """What a user may set about the measurement of fiducial marks, and prior knowledge of film and scanner."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
 from measure.annotations.fields import KnownLine
+from measure.array_types import Array
 from measure.fiducials.film_model import film_terms
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
@@ -20,15 +21,33 @@ Reads = Literal["none", "pose", "all"]
 CLICK_SIGMA_PX = 0.5  # of a place at which a person points, in a picture that is enlarged for it
 
 
+class TakingLens(Protocol):
+    """The lens of a digital camera that photographed the film, as calibrated: between pixels of the scan, which is its
+    picture, and the ideal pixels of a picture without distortion."""
+
+    def ideal_px(self, scan_px: Array) -> Array:
+        """Pixels (..., 2) of the scan in the ideal picture."""
+
+    def scan_px(self, ideal_px: Array) -> Array:
+        """Pixels (..., 2) of the ideal picture in the scan."""
+
+    def covariance_px2(self, scan_px: Array) -> Array:
+        """(2n, 2n) of ideal pixels, by what is not known of the lens, all of pixels (n, 2) together."""
+
+    def crop(self, col: int, row: int) -> "TakingLens":
+        """The lens of a part of the scan that begins at a pixel."""
+
+
 @dataclass(frozen=True)
 class BelievedFilm:
     """The scatter of marks by film and scanner, along an axis. is_stated: somebody says so, and adds it to every mark
     where it is adjusted; else a frame that scatters more has to bring all of its scatter along. model: the film
-    deformation model that the project states."""
+    deformation model that the project states. lens: of the camera that photographed the film, None of a scanner."""
 
     sigma_mm: float = SCATTER_MM
     is_stated: bool = False
     model: str = "affine"
+    lens: TakingLens | None = None
 
     @property
     def added_later_mm(self) -> float:
@@ -61,7 +80,8 @@ class FiducialOptions:
     "none", where nothing else decides the "pose", or in "all". known_lines: of the same roll; where one of them is read
     at its place, the pose asks for no more. part: the scan shows a part of its frame, that about the scan's middle: two
     marks are enough then, for the other parts check them. clicks: where a person sees marks: they are matched from
-    there, and three or more say where the frame is. Raises ValueError, naming the option, for a value that is none.
+    there, and three or more say where the frame is. lens: of the camera that photographed the film, None of a scanner.
+    Raises ValueError, naming the option, for a value that is none.
     """
 
     pose: str = "auto"
@@ -78,6 +98,7 @@ class FiducialOptions:
     known_lines: tuple[KnownLine, ...] = ()
     part: bool = False
     clicks: tuple[Click, ...] = ()
+    lens: TakingLens | None = None
 
     def __post_init__(self) -> None:
         if self.pose != "auto" and self.pose not in POSES:

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from measure.array_types import Array
+from measure.fiducials.constellation import Placement
+from measure.fiducials.film_model import film_terms, interleaved
 from measure.fiducials.frame import CLEAR_LIKENESS, WRONG_PX, Frame, orient_frame
 from measure.fiducials.mark_comparison import (
     SharedBlur,
@@ -62,7 +64,7 @@ def refit_frame(frame: Frame) -> Frame:
     if frame.inliers.sum() >= 2:
         frame = _refit_with_tone(frame)
         frame = _refit_with_blur(frame)
-    return _compare_shapes(_add_tone_covariance(frame))
+    return _compare_shapes(_add_lens_covariance(_add_tone_covariance(frame)))
 
 
 def sharpen_frame(frame: Frame) -> Frame:
@@ -119,8 +121,8 @@ def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
 
 def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
     """Whether a fit changes with the frame's rotation and scale, or with its stretch and shear: on film that is more
-    than affinely deformed every one does, for there marks look otherwise at each place."""
-    if frame.film is not None:
+    than affinely deformed, or seen through a lens, every one does, for there marks look otherwise at each place."""
+    if frame.film is not None or frame.options.lens is not None:
         return True
     mark, linear = frame.layout.marks[index].mark, frame.linear(index)
     error_px = strain_error_px(mark, fit.pixel_from_mark[:, :2], linear, _linear_sigma(frame))
@@ -139,7 +141,7 @@ def _edges(frame: Frame) -> Sequence[ToneInformation]:
     rounds away is alike all along an edge, and looks like a curve."""
     if frame.scan.is_lossy or not _depends_on_tone(frame):
         return []
-    return edge_tone_information(frame.scan, frame.layout, frame.pixel_from_camera, frame.weights)
+    return edge_tone_information(frame.scan, frame.layout, frame.fitted_placement, frame.weights)
 
 
 def _depends_on_tone(frame: Frame) -> bool:
@@ -160,6 +162,23 @@ def _add_tone_covariance(frame: Frame) -> Frame:
         if detection.fit is not None and detection.fit.sharpening is not None and frame.scan.tone.sharpening:
             unknown = detection.fit.sharpening.covariance_px2(frame.scan.tone.sharpening)
             frame = frame.add_covariance(index, Cause.SHARPENING, unknown)
+    return frame
+
+
+def _add_lens_covariance(frame: Frame) -> Frame:
+    """What is not known of the taking lens and the film model does not take, in the covariance of each mark."""
+    fits, lens = _inlier_fits(frame), frame.options.lens
+    if lens is None or not fits:
+        return frame
+    covariance = lens.covariance_px2(np.array([fit.center_px for fit in fits.values()]))
+    given = frame.camera_mm[list(fits)] / np.abs(frame.camera_mm).max()
+    (x, y), one, none = given.T, np.ones(len(given)), np.zeros(len(given))
+    affine = interleaved((x, none), (y, none), (one, none), (none, x), (none, y), (none, one))
+    free = np.hstack([affine, film_terms(frame.options.film_model, given)])
+    left = np.eye(len(free)) - free @ np.linalg.pinv(free)
+    parts = (left @ covariance @ left).reshape(len(fits), 2, len(fits), 2)
+    for number, index in enumerate(fits):
+        frame = frame.add_covariance(index, Cause.LENS, parts[number, :, number])
     return frame
 
 
@@ -321,22 +340,22 @@ def _fit_again(frame: Frame, index: int, options: MatchOptions) -> MarkFit | Non
 
 
 def edge_tone_information(
-    scan: Scan, layout: FiducialLayout, pixel_from_camera: Array, weights: Sequence[float] | None
+    scan: Scan, layout: FiducialLayout, placement: Placement, weights: Sequence[float] | None
 ) -> list[ToneInformation]:
-    """None or one, of all pieces of edge that are seen as straight lines; pixel_from_camera (2, 3): of the frame."""
-    linear = pixel_from_camera[:, :2]
-    px_per_mm = linear_scale(linear)
+    """None or one, of all pieces of the frame's edge that are seen as straight lines."""
+    px_per_mm = linear_scale(placement.pixel_from_camera)
     tones = []
     pieces = list(_pieces(layout))
     for start_mm, along_mm, inwards_mm, length_mm in pieces[:: max(len(pieces) // _PIECES, 1)]:
         count = int(length_mm * px_per_mm / _SHARE_PX)
         if count < _FEWEST:
             continue
+        linear = placement.linear(start_mm)
         along, across = linear @ along_mm, linear @ inwards_mm
         across = across - along * (across @ along) / (along @ along)
         course = Course(
             scan,
-            linear @ start_mm + pixel_from_camera[:, 2],
+            placement.places_px(start_mm[None])[0],
             along / np.hypot(*along),
             across / np.hypot(*across),
             weights,

@@ -135,7 +135,7 @@ class _Named:
     ) -> "_Named | None":
         """None where the pose names fewer than two of the marks found, having two, or gives two the same name."""
         pitch, camera = np.asarray(placement.pitch_mm), np.array([mark.xy_mm for mark in layout.marks])
-        predicted = camera @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
+        predicted = placement.places_px(camera)
         centers = np.array([*(fit.center_px for fit in fits), *missed])
         distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
         nearest = distance.argmin(axis=0)
@@ -151,7 +151,8 @@ class _Named:
         given = np.array([_given_sigma_mm(layout.marks[name]) for name in own])
         measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in fits])[near] * pitch.mean()
         sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
-        up = centers[near] * pitch * (1.0, -1.0)
+        ideal = centers[near] if options.lens is None else options.lens.ideal_px(centers[near])
+        up = ideal * pitch * (1.0, -1.0)
         fit = fit_frame(camera[own], up, sigma, up_from_camera(placement.pose), options.film_model)
         return cls(placement.pose, tuple(names.tolist()), fit)
 

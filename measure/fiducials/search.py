@@ -195,6 +195,12 @@ class FrameSearch:
         search.scan, search.among = self.scan.replace_tone(tone), self.unsettled
         return search
 
+    def replace_film_model(self, model: str) -> "FrameSearch":
+        """The same search of a film of another deformation model, in the same responses."""
+        search = copy(self)
+        search.options, search._searches, search._found = replace(self.options, film_model=model), {}, {}
+        return search
+
     def search_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
         """The placements of a frame that lies about in the middle of the scan, best first. Only the windows are read
         in which its marks lie then."""
@@ -262,7 +268,9 @@ class FrameSearch:
             return 0.0
         pitch = np.asarray(placement.pitch_mm)
         given = self._camera_mm[list(found_px)] @ placement.pixel_from_camera[:, :2].T
-        given, found = ((each - each.mean(axis=0)) * pitch for each in (given, np.array([*found_px.values()])))
+        found = np.array([*found_px.values()])
+        found = found if placement.lens is None else placement.lens.ideal_px(found)
+        given, found = ((each - each.mean(axis=0)) * pitch for each in (given, found))
         longer = np.stack([1 + stretches / 2, 1 - stretches / 2], axis=-1)
         given, found = (given * longer[:, None]) @ (1, 1j), found @ (1, 1j)
         turns = (given.conj() @ found) / np.maximum((np.abs(given) ** 2).sum(axis=1), 1e-12)
@@ -324,6 +332,7 @@ class FrameSearch:
                 each.mm,
                 Bounds(each.tolerance, rotation_rad, misfit_mm),
                 self._effort.all_orientations,
+                self.options.lens,
             )
             for each in hypotheses
         }

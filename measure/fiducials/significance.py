@@ -122,7 +122,7 @@ def _neighbouring_places(scan: Scan, frame: Frame, inside: Sequence[int], radius
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     size = np.array([scan.width_px, scan.height_px])
     every = [
-        (index, np.asarray(frame.pixel_from_camera @ (*frame.camera_mm[index], 1.0) + off * radius_px * direction))
+        (index, np.asarray(frame.predicted_px[index] + off * radius_px * direction))
         for off in _OFFSETS
         for direction in directions
         for index in inside

@@ -32,6 +32,8 @@ Result = tuple[list[Placement], list[tuple[float, Frame]]]
 
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _NOTHING = Reason("no two of the camera's marks were found in the scan", Code.NO_FRAME)
+_GAINED = 3  # marks: one more than what a perspective has of parameters may fit besides by chance
+_OBLIQUE = 6  # marks that a perspective is shown by: four fit any, and two more check it
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 
 
@@ -53,6 +55,11 @@ class Found:
     @property
     def is_complete(self) -> bool:
         return self.frame is not None and self.frame.is_complete
+
+    @property
+    def lacks_few_marks(self) -> bool:
+        """Whether a frame is taken that lacks no more marks than another film model has to find besides."""
+        return self.is_taken and self.frame is not None and self.frame.inside - self.frame.measured_count < _GAINED
 
     @property
     def is_undoubted(self) -> bool:
@@ -123,16 +130,23 @@ def _is_taken_if_given(result: tuple[float, Frame], attempt: Attempt, at_given: 
 
 
 def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: bool) -> list[Attempt]:
-    """In the middle of a large scan where the pitch is given, then anywhere; where what is found may be a false alarm,
-    under other pitches; where nothing is, at a closer look: less of what lies beside a mark counts there, for the
-    frame's edge may drown it else, and then less of what grain hides."""
+    """In the middle of a large scan where the pitch is given, then anywhere; where marks are missed, as film that was
+    photographed obliquely; where what is found may be a false alarm, under other pitches; where nothing is, at a closer
+    look: less of what lies beside a mark counts there, for the frame's edge may drown it else, and then less of what
+    grain hides."""
     given, *others = hypotheses
     closer = [wide.with_surroundings(surroundings) for surroundings in (CLOSE, GRAINY)]
+    oblique = wide.replace_film_model("projective")
     near, nearly = slightly_longer(given[0], _STRETCH) if is_given else ([], given)
     in_windows = is_given and not wide.options.part and is_searched_by_windows(wide.scan, wide.layout, given[0].mm)
     return [
         *([Attempt(wide, given, _search_middle, lambda _: False, True)] if in_windows else []),
         *_through_tone_curves(Attempt(wide, given, _search_scan, lambda found: found.is_complete, True)),
+        *(
+            [Attempt(oblique, given, _search_oblique, lambda found: found.lacks_few_marks, at_given=True)]
+            if wide.options.film_model == "affine" and len(wide.layout.marks) >= _OBLIQUE
+            else []
+        ),
         *(
             each
             for group in others
@@ -218,6 +232,18 @@ def _measure_in_its_pose(search: FrameSearch, placement: Placement) -> Frame:
     if not pose.decided or pose.name == placement.pose:
         return frame
     return rename_frame(search.scan, frame, pose.name)
+
+
+def _search_oblique(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
+    """The frame of film that was photographed obliquely, in the best placement: nearly all marks of the scan have to
+    be measured, for so much freedom fits some of any frame."""
+    found = search.search_scan(hypotheses)
+    if not found or found[0].supported < _OBLIQUE:
+        return found, []
+    frame = _measure_in_its_pose(search, found[0])
+    if not frame.accepted or frame.measured_count < max(_OBLIQUE, frame.inside - _GAINED + 1):
+        return found, []
+    return found, [(tried * false_frames(search, frame, frame.centers_px(frame.unblemished)), frame)]
 
 
 def _search_other_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:

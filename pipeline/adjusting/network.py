@@ -12,7 +12,7 @@ from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import fewest_marks, marks_needed
 from adjust.initial_values.joined_frames import FEWEST_COMMON
 from adjust.problem.camera import Camera
-from adjust.problem.network import Board, Image, LineOfSight, Network, ObjectPoint, Transformation
+from adjust.problem.network import Board, Image, LineOfSight, Network, ObjectPoint, Scanner, Transformation
 from adjust.problem.observations import Calibration, Distance, Observations
 from measure.results import ON_FILM
 from pipeline.adjusting.turned_pictures import rotate_to_sensor
@@ -102,6 +102,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         points=_points(project, used),
         observations=_observations(project.adjust, used),
         distances=distances,
+        scanners=_taking_cameras(project, images),
         boards=_boards(project),
         transparent=project.transparent or (project.targets is not None and project.targets.transparent),
         calibrations=calibrations,
@@ -110,6 +111,14 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         ),
     )
     return network, (*unjoined, *lonely, *left_out, *without_end)
+
+
+def _taking_cameras(project: Project, images: Sequence[Image]) -> tuple[Scanner, ...]:
+    """The digital cameras that photographed the film, with their lens; none where a scanner scanned it."""
+    if project.lens is None:
+        return ()
+    names = dict.fromkeys(image.scanner for image in images if image.scanner)
+    return tuple(Scanner(name, lens=project.lens.lens) for name in names)
 
 
 def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bool:
@@ -274,7 +283,7 @@ def _image(project: Project, name: str) -> Image:
     camera = project.image_camera(name)
     exterior = project.given_images.exterior.get(name) if project.given_images else None
     transformation = _transformation(project, camera)
-    bends = project.adjust.scanner != "none" and transformation != "none"
+    bends = (project.adjust.scanner != "none" or project.lens is not None) and transformation != "none"
     scanner = project.image_scanner(name) if bends else ""
     return Image(name, camera.name, transformation, exterior, scanner, project.scanned_frame(name))
 

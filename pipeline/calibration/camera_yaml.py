@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pipeline.calibration.intrinsics import CameraIntrinsics
+from pipeline.files.opencv_file import COVARIANCE
 from pipeline.results.pixel_intrinsics import CENTRE
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
@@ -30,6 +31,8 @@ def opencv_yaml(camera: CameraIntrinsics) -> str:
     if camera.is_fisheye:
         lines.append('distortion_model: "fisheye"')
     lines += _opencv_matrix("std_deviations_fx_fy_cx_cy", 1, [camera.values[name].sigma for name in CENTRE])
+    order = [*CENTRE, *(FISHEYE_ORDER if camera.is_fisheye else OPENCV_ORDER)[: len(distortion)]]
+    lines += _opencv_matrix(COVARIANCE, len(order), camera.covariance_matrix(order).ravel().tolist())
     return "\n".join([*lines, f"avg_reprojection_error: {camera.rms_px:.10g}", ""])
 
 

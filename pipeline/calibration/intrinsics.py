@@ -47,7 +47,8 @@ class Intrinsic:
 class CameraIntrinsics:
     """Intrinsics in px from the centre of the top left pixel, x right, y down, as OpenCV has them.
 
-    values: fx, fy, cx, cy, then the distortion's. correlations: pairs above HIGHLY_CORRELATED. left_out: of its
+    values: fx, fy, cx, cy, then the distortion's. covariance: of these, with the standard deviations to use.
+    correlations: pairs above HIGHLY_CORRELATED. left_out: of its
     pictures, why. used: number of pictures. known_share: how far out the lens was observed, of the way to the corner.
     lens: how its model was chosen; None where it was given. pitch_um: of a pixel, None if unknown.
     """
@@ -55,6 +56,7 @@ class CameraIntrinsics:
     pictures: CameraPictures
     family: str
     values: Mapping[str, Intrinsic]
+    covariance: Array
     correlations: tuple[tuple[str, str, float], ...]
     left_out: Mapping[str, str]
     used: int
@@ -70,6 +72,12 @@ class CameraIntrinsics:
     @property
     def is_fisheye(self) -> bool:
         return self.family == "opencv_fisheye"
+
+    def covariance_matrix(self, names: Sequence[str]) -> Array:
+        """(n, n) of some values; 0 of those that were not estimated."""
+        rows = [list(self.values).index(name) if name in self.values else -1 for name in names]
+        known = np.pad(self.covariance, (0, 1))
+        return np.asarray(known[np.ix_(rows, rows)])
 
     def __repr__(self) -> str:
         centre = ", ".join(
@@ -191,6 +199,8 @@ def camera_intrinsics(
     given_mm2 = np.trace(adjustment.network.observations.covariance_mm2, axis1=1, axis2=2) / 2.0 - unmodelled_mm**2
     v_px = adjustment.residuals.v_mm / pixel_mm
     reach = adjustment.lens_reach(camera, (pictures.width_px * pixel_mm, pictures.height_px * pixel_mm))
+    correlation = covariance / np.outer(sigmas, sigmas)
+    usable = sigmas if scatter is None else np.maximum(sigmas, scatter)
     return CameraIntrinsics(
         pictures=pictures,
         family=camera.distortion.family,
@@ -198,7 +208,8 @@ def camera_intrinsics(
             name: Intrinsic(value, float(sigmas[row]), None if scatter is None else float(scatter[row]))
             for row, (name, value) in enumerate(values.items())
         },
-        correlations=tuple(_high_correlations(list(values), covariance / np.outer(sigmas, sigmas))),
+        covariance=correlation * np.outer(usable, usable),
+        correlations=tuple(_high_correlations(list(values), correlation)),
         left_out=left_out,
         used=len(adjustment.network.images),
         rms_px=float(np.sqrt((v_px**2).sum(axis=1).mean())),

@@ -2,33 +2,25 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
-from adjust.functional_model.families import parameter_names
-from pipeline.errors import InputError
 from pipeline.exchange.block import Block
 from pipeline.exchange.fitted_lens import BROWN, PRISMS
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ForeignPose, ImportOptions, Incoming, foreign_pose, opencv_camera
 from pipeline.exchange.pinhole import PinholeFrame, pinhole_frames, pinholes_written
 from pipeline.files.camera_file import CameraFile
+from pipeline.files.opencv_file import FISHEYE, read_pixel_camera
 from pipeline.opencv_check.opencv_model import NAMES
 from pipeline.text.names import image_name
-from pipeline.text.text_file import read_bytes
 
 CONVENTION = Convention(
     (0.0, 0.0),
     "column right, row down; camera x right, y down, z forward; camera = R X + t",
     "OpenCV, calib3d: projectPoints, and undistort, whose maps count from the first pixel's centre",
 )
-MOST_MB = 4
-FISHEYE = "fisheye"  # of cv2.fisheye, as ROS and others call the key and the model ("equidistant" too)
-_MATRIX = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix", "M1")
-_LENS = ("distortion_coefficients", "D", "Distortion_Coefficients", "distCoeffs", "D1")
-_WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 
 
 def write(block: Block, options: ExportOptions) -> Written:
@@ -63,49 +55,18 @@ def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Files of cv2.FileStorage: matrix, distortion and size as camera files; R and t, where there are, as poses."""
-    found = [_read(path, options) for path in paths]
+    found = [_camera_and_pose(path, options) for path in paths]
     poses = tuple(pose for _, pose in found if pose is not None)
     return Incoming(cameras=tuple(camera for camera, _ in found), poses=poses)
 
 
-def _read(path: Path, options: ImportOptions) -> tuple[CameraFile, ForeignPose | None]:
-    try:
-        return _camera_and_pose(path, options)
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: there is no such file.") from None
-    except (UnicodeDecodeError, cv2.error, SystemError):
-        raise InputError(
-            f"{path}: is no YAML, XML or JSON file of OpenCV (cv2.FileStorage) with a camera in it. Name one."
-        ) from None
-
-
 def _camera_and_pose(path: Path, options: ImportOptions) -> tuple[CameraFile, ForeignPose | None]:
-    text = read_bytes(path, MOST_MB).decode("utf-8")
-    storage: Any = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-
-    def first(names: Sequence[str]) -> Any:
-        nodes = (storage.getNode(name) for name in names)
-        return next((node for node in nodes if not node.empty()), None)
-
-    matrix, lens, size = (first(names) for names in (_MATRIX, _LENS, _WIDTH))
-    if matrix is None or matrix.mat() is None or matrix.mat().shape != (3, 3):
-        raise InputError(f"{path}: has no 3 x 3 matrix {_MATRIX[0]} (or {', '.join(_MATRIX[1:])}).")
-    k = np.array(matrix.mat(), dtype=float)
-    values = np.zeros(0) if lens is None else np.ravel(lens.mat()).astype(float)
-    if values.size > len(NAMES[4:]) or not (np.isfinite(values).all() and np.isfinite(k).all() and k[0, 0] > 0.0):
-        raise InputError(f"{path}: the camera matrix and up to {len(NAMES[4:])} distortion values are to be finite.")
-    height = first(_HEIGHT)
-    pixels = (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
-    extent = (size.real(), height.real()) if size is not None and height is not None else None
+    found, storage = read_pixel_camera(path)
     name = storage.getNode("camera").string() or path.stem
     picture = image_name(storage.getNode("image").string() or path.stem)
-    is_fisheye = storage.getNode("distortion_model").string() in (FISHEYE, "equidistant")
-    names = parameter_names("opencv_fisheye")[:4] if is_fisheye else NAMES[4:]
-    if is_fisheye and values.size > len(names):
-        raise InputError(f"{path}: a fisheye has {len(names)} distortion values, not {values.size}.")
-    given = dict(zip(names, values.tolist(), strict=False)) | {"b2": k[0, 1] / k[1, 1]}
-    family = "opencv_fisheye" if is_fisheye else "opencv"
-    camera = opencv_camera(path, name, pixels, given, extent, options, CONVENTION, family)
+    camera = opencv_camera(
+        path, name, found.interior_px, found.distortion, found.size_px, options, CONVENTION, found.family
+    )
     turn, shift = storage.getNode("R").mat(), storage.getNode("t").mat()
     if turn is None or shift is None:
         return camera, None

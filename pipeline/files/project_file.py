@@ -33,6 +33,7 @@ from pipeline.text.tables import Table, read_toml
 
 if TYPE_CHECKING:
     from measure.scans.scan import Scan
+    from pipeline.files.taking_lens import CalibratedLens
 
 ASSUMED_PITCH_UM = 5.0  # of digital cameras where nobody says it: results are in pixels, and it cancels
 DEFAULT_SCANNER = "1"  # the name of that of all images that name none
@@ -55,6 +56,7 @@ class Project:
     crs: what the object coordinates are, as "EPSG:25832"; empty where nobody says it.
     writing: in which scans is read what is written about the frame, as in `FiducialOptions`.
     missing_camera: the default camera's file where it is still to be drawn; then there are no cameras.
+    lens: of the digital camera that photographed the film, None where a scanner scanned it.
     """
 
     path: Path
@@ -83,6 +85,7 @@ class Project:
     decisions_hash: str = ""
     decisions_cut_short: int = 0
     missing_camera: str = ""
+    lens: "CalibratedLens | None" = None
 
     def open_scan(self, name: str) -> "Scan":
         """The scan of an image. Raises MeasurementError where it cannot be read."""
@@ -101,7 +104,7 @@ class Project:
         """What film and scanner scatter a mark by, and how film is deformed, as the project says it, or else as it is
         believed of any film."""
         stated_mm, model = self.adjust.film_sigma_um / 1000.0, self.adjust.transformation or ANY_FILM.model
-        return BelievedFilm(stated_mm, True, model) if stated_mm else replace(ANY_FILM, model=model)
+        return BelievedFilm(stated_mm or ANY_FILM.sigma_mm, bool(stated_mm), model, self.lens)
 
     @property
     def list_pitch_um(self) -> tuple[float, float] | None:
@@ -276,6 +279,7 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
         crs=given.object.crs,
         board_bend_sigma=given.object.board_bend,
         transparent=given.object.transparent,
+        lens=_taking_lens(table, given),
     )
     project = reload_decisions(project)
     if not project.scans and not project.comparator.exists():
@@ -285,6 +289,24 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
         )
     _check_written(table, project, named)
     return project
+
+
+def _taking_lens(table: Table, given: ProjectTable) -> "CalibratedLens | None":
+    """Raises InputError where a lens cannot be that of film which was photographed."""
+    name, scanner = given.scanner.lens, table.table("scanner")
+    if name is None:
+        return None
+    if given.adjust.transformation == "none":
+        raise scanner.error(
+            "lens", 'is of a camera that photographed film: with transformation "none" there is no film.'
+        )
+    if given.pitch_um is None or given.pitch_um[0] != given.pitch_um[1]:
+        raise scanner.error(
+            "lens", "goes with pitch_um, one number: how many µm of film a pixel shows. A photograph does not say it."
+        )
+    from pipeline.files.taking_lens import read_lens  # and OpenCV, which few projects need so early
+
+    return read_lens(table.file.parent / name, given.pitch_um[0])
 
 
 def reload_decisions(project: Project) -> Project:

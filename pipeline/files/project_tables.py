@@ -40,6 +40,15 @@ class MeasureTable:
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
+class ScannerTable:
+    """The table [scanner]."""
+
+    lens: Annotated[str | None, PATH] = Field(
+        default=None, description="camera.yaml of the digital camera that photographed the film; goes with pitch_um."
+    )
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
 class ObjectTable:
     """The table [object]."""
 
@@ -80,6 +89,9 @@ class ProjectTable:
     measure: Annotated[MeasureTable, subtable(MeasureTable)] = Field(
         default=MeasureTable(), description="How to measure."
     )
+    scanner: Annotated[ScannerTable, subtable(ScannerTable)] = Field(
+        default=ScannerTable(), description="What took the scans."
+    )
     targets: Annotated[TargetSettings | None, Key("table", lambda table, key: read_targets(table.table(key)))] = Field(
         default=None, description="What the targets are; absent: only fiducials are measured."
     )
@@ -106,6 +118,7 @@ def keys_text() -> str:
     tables: list[tuple[str, type]] = [
         ("project.toml", ProjectTable),
         ("[measure]", MeasureTable),
+        ("[scanner]", ScannerTable),
         ("[object]", ObjectTable),
         *((f'[targets], kind = "{kind}"', model) for kind, model in TARGET_TABLES.items()),
         ("[ties]", TieTable),

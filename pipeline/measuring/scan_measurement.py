@@ -22,6 +22,7 @@ from measure.scans.opening import crop_scan
 from measure.scans.remote import TRAFFIC, ScanPart, Window, public_text, scan_path
 from measure.scans.scan import Scan
 from pipeline.errors import InputError, what_to_do
+from pipeline.files.taking_lens import CalibratedLens
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.measuring.target_stage import measure_targets
@@ -113,7 +114,9 @@ def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
 
 def _opened_and_measured(task: ScanTask, look: SecondPass | None) -> MeasuredScan:
     with task.opened() as scan:
-        window = scan.path.window if isinstance(scan.path, ScanPart) else None
+        window, lens = scan.path.window if isinstance(scan.path, ScanPart) else None, task.options.fiducials.lens
+        if isinstance(lens, CalibratedLens) and (misfit := lens.misfit(scan)):
+            raise MeasurementError(misfit)
         measured = _measure_window(task, scan, window) if window else _measure(task, scan, task.options)
         if look is not None:
             look(scan, measured)
@@ -129,7 +132,8 @@ def _measure_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
     first = np.array(window[:2], float)
     fiducials = task.options.fiducials
     clicks = (replace(one, col_px=one.col_px - first[0], row_px=one.row_px - first[1]) for one in fiducials.clicks)
-    options = replace(task.options, fiducials=replace(fiducials, clicks=tuple(clicks)))
+    lens = None if fiducials.lens is None else fiducials.lens.crop(*window[:2])
+    options = replace(task.options, fiducials=replace(fiducials, clicks=tuple(clicks), lens=lens))
     measured = _measure(task, cropped, options)
     frame = moved_frame(measured.frame, first)
     return replace(measured, width_px=scan.width_px, height_px=scan.height_px, frame=frame)
@@ -145,7 +149,7 @@ def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     frame = replace(frame, problems=(*of_file, *frame.problems, *problems))
     curve = (frame.tone.note,) if frame.tone else ()
     file_notes = (f"{note[0].upper()}{note[1:]}." for note in scan.notes)
-    notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame))
+    notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame), *_unknown_lens(options))
     measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, notes)
     if misplaced := misplaced_principal_point(options.camera, measured):
         measured = replace(
@@ -188,6 +192,17 @@ def _missed_reading(options: ScanOptions, frame: FrameMeasurement) -> tuple[str,
     undecided = writing == "pose" and frame.pose is not None and not frame.pose.decided
     is_requested = writing == "all" or undecided
     return (f"{MISSING[0].upper()}{MISSING[1:]}.",) if is_requested and networks() is None else ()
+
+
+def _unknown_lens(options: ScanOptions) -> tuple[str, ...]:
+    """A note where the taking lens is taken as known exactly."""
+    lens = options.fiducials.lens
+    if not isinstance(lens, CalibratedLens) or lens.is_covariance_known:
+        return ()
+    return (
+        "The calibration of the taking lens gives no covariance: the lens is taken as exact. `reseau calibrate` "
+        "writes one into camera.yaml.",
+    )
 
 
 def _add_sizes(

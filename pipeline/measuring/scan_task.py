@@ -142,7 +142,12 @@ def image_options(project: Project, said: Mapping[str, tuple[ToneInformation, ..
         if key not in shared:
             film = project.film
             options = FiducialOptions(
-                pose, film_sigma_mm=film.sigma_mm, film_model=film.model, writing=project.reads, part=part
+                pose,
+                film_sigma_mm=film.sigma_mm,
+                film_model=film.model,
+                writing=project.reads,
+                part=part,
+                lens=film.lens,
             )
             camera = cameras[key_of[id(given)]]
             shared[key] = ScanOptions(

@@ -189,7 +189,18 @@ def _scanner(table: Table) -> scene.Scanner:
         tone=table.number_or_text("tone", 1.0, scene.TONES, above=0.0),
         bend_um=bend_um,
         sharpen=_unsharp_mask(table.table("sharpen")),
+        lens=_taking_lens(table.table("lens")) if "lens" in table else None,
     )
+
+
+def _taking_lens(table: Table) -> scene.TakingLens:
+    lens = scene.TakingLens(
+        focal_px=table.number("focal_px", above=0.0),
+        center_px=table.pair("center_px") if "center_px" in table else None,
+        **{name: table.number(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")},
+    )
+    table.done()
+    return lens
 
 
 def _unsharp_mask(table: Table) -> scene.UnsharpMask:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,11 +19,22 @@ from pipeline.files.project_tables import UNITS_MM
 from pipeline.rendered.design_table import DesignSettings
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
-from synthetic_images.scene import BoardField, CrossFigure, DiskField, FilmKind, RingFigure, Scene, SceneImage
+from synthetic_images.film import frame_geometry
+from synthetic_images.scene import (
+    BoardField,
+    CrossFigure,
+    DiskField,
+    FilmKind,
+    RingFigure,
+    Scene,
+    SceneImage,
+    TakingLens,
+)
 from synthetic_images.targets import Target, field_targets
 
 Array = NDArray[np.float64]
 
+TAKING_CAMERA = "taking-camera.yaml"
 NEGATIVE: Mapping[shapes.Polarity, shapes.Polarity] = {"light": "dark", "dark": "light", "auto": "auto"}
 
 
@@ -71,6 +83,22 @@ def write_project(scene_file: SceneFile, out_dir: Path) -> None:
     middle = _middle(scene_file.scene, targets)
     write_atomically(out_dir / "images.csv", _images_csv(scene_file, middle, generator))
     write_atomically(out_dir / "project.toml", _project_text(scene_file))
+    if scene_file.scene.scanner.lens is not None:
+        write_atomically(out_dir / TAKING_CAMERA, taking_camera_yaml(scene_file.scene, scene_file.scene.scanner.lens))
+
+
+def taking_camera_yaml(scene: Scene, lens: TakingLens) -> str:
+    """The true lens that took the scans, for cv2.FileStorage."""
+    geometry = frame_geometry(scene, 0)
+    size = geometry.width_px, geometry.height_px
+    center = lens.center_px or ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
+    f, (cx, cy) = lens.focal_px, center
+    storage = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
+    storage.write("image_width", size[0])
+    storage.write("image_height", size[1])
+    storage.write("camera_matrix", np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]]))
+    storage.write("distortion_coefficients", np.array([[lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]]))
+    return str(storage.releaseAndGetString())
 
 
 def _middle(scene: Scene, targets: tuple[Target, ...]) -> Array:
@@ -174,7 +202,7 @@ camera = "camera.toml"
 scans = [{names}]
 comparator = "comparator.csv"
 output = "out"
-
+{_taking_camera_text(scene_file.scene)}
 {_targets_text(scene_file)}
 [object]
 {_points_text(scene_file)}images = "images.csv"
@@ -183,6 +211,13 @@ unit = "{scene_file.unit}"
 [adjust]
 transformation = "{film_transformation(scene_file)}"
 {_datum_text(scene_file)}{_scanner_text(scene_file)}"""
+
+
+def _taking_camera_text(scene: Scene) -> str:
+    """Of a photograph, whose file does not tell how much of the film a pixel shows."""
+    if scene.scanner.lens is None:
+        return ""
+    return f'pitch_um = {scene.scanner.pitch_um[0]!r}\n\n[scanner]\nlens = "{TAKING_CAMERA}"\n'
 
 
 def _scanner_text(scene_file: SceneFile) -> str:

@@ -70,8 +70,9 @@ def image_chain(
     return FrameChain(pitch_um, image.transformation.film(middle_mm), *bend, lens)
 
 
-def measured_chain(measured: MeasuredScan) -> FrameChain | None:
-    """The chain by the fiducials of a scan alone, None where too few were found."""
+def measured_chain(measured: MeasuredScan, taking_lens: Lens | None = None) -> FrameChain | None:
+    """The chain by the fiducials of a scan alone, None where too few were found. taking_lens: of the camera that
+    photographed the film."""
     matrix = measured.frame.pixel_from_camera
     if matrix is None:
         return None
@@ -81,7 +82,7 @@ def measured_chain(measured: MeasuredScan) -> FrameChain | None:
     a, b = ([shift[axis], *inverse[axis]] for axis in (0, 1))
     order = {"a1": a[0], "a2": a[1], "a3": a[2], "b1": b[0], "b2": b[1], "b3": b[2]}
     parameters = np.array([order[name] for name in film_parameter_names("affine")])
-    return FrameChain(measured.pitch_um, Film("affine", parameters, _middle_mm(measured)))
+    return FrameChain(measured.pitch_um, Film("affine", parameters, _middle_mm(measured)), Bend(lens=taking_lens))
 
 
 def _middle_mm(measured: MeasuredScan) -> Array:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from adjust.functional_model.lens import Lens
 from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
@@ -71,9 +72,10 @@ class ResampleTask:
         numbers = [*chain.film.parameters, *chain.bend_parameters, *chain.pitch_um, self.pitch_mm, float(self.degree)]
         words: list[Any] = [self.image, self.camera, self.pose, chain.film.transformation, chain.film.mirrored]
         words += [chain.bend.terms, chain.bend.center_mm, chain.bend.half_mm]
-        if chain.lens is not None:
-            numbers += [*chain.lens.interior, *chain.lens.parameters]
-            words += [chain.lens.distortion.family, chain.lens.distortion.decentering, chain.lens.distortion.r0_mm]
+        for lens in (chain.lens, chain.bend.lens):
+            if lens is not None:
+                numbers += [*lens.interior, *lens.parameters]
+                words += [lens.distortion.family, lens.distortion.decentering, lens.distortion.r0_mm]
         file = file_state(scan, Path())
         words += [file.bytes, file.mtime_ns, file.etag, [float(number).hex() for number in numbers]]
         return hashlib.sha256(json.dumps(words).encode()).hexdigest()
@@ -124,7 +126,8 @@ def resample_tasks(
     for measured in read_measurement(project.measurement_path):
         image = measured.frame.image
         frame = project.scanned_frame(image) or image
-        chain = _chain(measured, adjustment, with_lens, is_part=frame != image)
+        taking_lens = None if project.lens is None else project.lens.lens
+        chain = _chain(measured, adjustment, with_lens, frame != image, taking_lens)
         if isinstance(chain, str):
             failed.append(Resampled(image, None, problem=chain))
             continue
@@ -149,7 +152,11 @@ def resample_tasks(
 
 
 def _chain(
-    measured: MeasuredScan, adjustment: AdjustmentRecord | None, with_lens: bool, is_part: bool
+    measured: MeasuredScan,
+    adjustment: AdjustmentRecord | None,
+    with_lens: bool,
+    is_part: bool,
+    taking_lens: Lens | None = None,
 ) -> FrameChain | str:
     """The adjusted chain of an image, or that of its fiducials; else why there is none."""
     if adjustment is not None and adjustment.converged and measured.frame.image in adjustment.images:
@@ -161,7 +168,8 @@ def _chain(
             "it is a part of a frame, and no adjustment says how it lies to the other scans: run `reseau adjust`, and "
             "see what it says of this one"
         )
-    return measured_chain(measured) or "too few of its fiducial marks were found to say where its frame lies"
+    why_not = "too few of its fiducial marks were found to say where its frame lies"
+    return measured_chain(measured, taking_lens) or why_not
 
 
 def resampled(task: ResampleTask) -> Resampled:

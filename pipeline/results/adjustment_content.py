@@ -41,6 +41,7 @@ from pipeline.results.adjustment_record import (
     Quantity,
     ScannerRecord,
     Sigma0Record,
+    TakingLensRecord,
 )
 from pipeline.results.assessment_record import (
     ContradictionDirection,
@@ -116,6 +117,7 @@ def adjustment_record(
                 each.center_mm,
                 each.half_mm,
                 *_terms(adjustment, "scanner", each.name, each.terms),
+                None if each.lens is None else TakingLensRecord.from_lens(each.lens),
             )
             for each in network.scanners
         },

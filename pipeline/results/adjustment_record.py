@@ -212,13 +212,34 @@ class CameraRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class TakingLensRecord:
+    """The lens of a digital camera that photographed the film; interior_mm: c, x0', y0' in the comparator."""
+
+    family: str
+    interior_mm: tuple[float, float, float]
+    parameters: Mapping[str, float]
+
+    @classmethod
+    def from_lens(cls, lens: Lens) -> "TakingLensRecord":
+        c, x0, y0 = lens.interior.tolist()
+        names = parameter_names(lens.distortion.family)
+        return cls(lens.distortion.family, (c, x0, y0), dict(zip(names, lens.parameters.tolist(), strict=True)))
+
+    def lens(self) -> Lens:
+        values = [self.parameters.get(name, 0.0) for name in parameter_names(self.family)]
+        return Lens(Distortion(self.family), np.array(self.interior_mm), np.array(values, dtype=float))
+
+
+@dataclass(frozen=True, slots=True)
 class ScannerRecord:
-    """How far a scanner puts a point off its place, mm, as products of Legendre polynomials over an extent."""
+    """How far a scanner puts a point off its place, mm, as products of Legendre polynomials over an extent; lens: of
+    the digital camera that is the scanner."""
 
     center_mm: tuple[float, float]
     half_mm: tuple[float, float]
     terms: Mapping[str, Quantity]
     significance: tuple[GroupTestRecord, ...] = ()
+    lens: TakingLensRecord | None = None
 
     def __post_init__(self) -> None:
         """Raises ValueError for a term that there is not."""
@@ -229,7 +250,8 @@ class ScannerRecord:
     def bend(self) -> tuple[Bend, Array]:
         """The bend with the values (k,) of its terms."""
         values = np.array([term.value for term in self.terms.values()], dtype=float)
-        return Bend(tuple(self.terms), self.center_mm, self.half_mm), values
+        lens = None if self.lens is None else self.lens.lens()
+        return Bend(tuple(self.terms), self.center_mm, self.half_mm, lens), values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

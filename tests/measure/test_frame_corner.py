@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
+from measure.fiducials.constellation import Placement
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.refit import edge_tone_information
@@ -121,10 +122,11 @@ def test_the_frames_edges_beside_its_marks_tell_the_curve(gamma: float) -> None:
     )
     scan = scan_of(65535 * (picture(5) / 65535) ** (1 / gamma))
     by_truth = Tone(power(gamma), covariance=np.eye(5))
-    (said,) = edge_tone_information(scan.replace_tone(by_truth), marks, MATRIX, None)
+    placement = Placement("0", MATRIX, 1.0, 4, 1, 1, (0.05, 0.05))
+    (said,) = edge_tone_information(scan.replace_tone(by_truth), marks, placement, None)
     assert said.sum_of_squares < 25  # of 5 figures
     other = by_truth.shift_to_power(gamma + 0.5)
-    (said,) = edge_tone_information(scan.replace_tone(other), marks, MATRIX, None)
+    (said,) = edge_tone_information(scan.replace_tone(other), marks, placement, None)
     prior = Tone(power(gamma + 0.5), covariance=4 * np.eye(5))
     found = prior.estimate([said]).tone
     value, sigma = found.equivalent_power(0.2, 0.5)

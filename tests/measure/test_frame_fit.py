@@ -5,6 +5,7 @@ import pytest
 from brute_marks import Array
 
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
+from measure.fiducials.constellation import Placement
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.options import AFFINITY_SIGMA
 from measure.geometry import POSES, up_from_camera
@@ -113,9 +114,10 @@ def test_a_perspective_is_fitted_without_residuals(pose: str) -> None:
     around = np.array([(50.0 + step, 30.0), (50.0 - step, 30.0)])
     x, y = around.T
     moved = seen(np.column_stack([x * np.cos(tilt), y]) / (1 + x * np.sin(tilt) / 600.0)[:, None], turn)
-    np.testing.assert_allclose(
-        fit.film.linear(np.array([50.0, 30.0]))[:, 0], (moved[0] - moved[1]) / (2 * step), atol=1e-4
-    )
+    np.testing.assert_allclose(fit.film.places_mm(around), moved, atol=5e-4)
+    placement = Placement(pose, np.eye(2, 3), 1.0, 8, 1, 1, (0.05, 0.05), film=fit.film)
+    linear = np.diag([0.05, -0.05]) @ placement.linear(np.array([50.0, 30.0]))
+    np.testing.assert_allclose(linear[:, 0], (moved[0] - moved[1]) / (2 * step), atol=1e-4)
     marks = FrameMarks.from_places(EIGHT, up, np.tile(1e-6 * np.eye(2), (8, 1, 1)), "projective")
     assert not gross_errors(marks, Scatter(0.005, 4.0), 0.3).any()
     assert np.sqrt(marks.film_variance_mm2()) < 1e-4

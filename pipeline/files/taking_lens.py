@@ -1,0 +1,101 @@
+"""The lens of a digital camera that photographed the film: `[scanner] lens`, a calibration in OpenCV's YAML."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Lens
+from measure.scans.scan import Scan
+from pipeline.errors import InputError
+from pipeline.files.opencv_file import read_pixel_camera
+from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
+from pipeline.types import Array
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedLens:
+    """A lens in the comparator of scans that its camera took: its interior orientation in mm at their pitch, with its
+    covariance where the calibration gives one. size_px: of its pictures, width and height."""
+
+    lens: Lens
+    pitch_um: tuple[float, float]
+    size_px: tuple[int, int]
+
+    @property
+    def is_covariance_known(self) -> bool:
+        return self.lens.covariance.size > 0
+
+    def ideal_px(self, scan_px: Array) -> Array:
+        """Pixels (..., 2) of the scan in a picture without distortion; as they are where the lens shows nothing."""
+        scan_mm = comparator_from_pixel(np.reshape(scan_px, (-1, 2)), self.pitch_um)
+        ideal_mm, found = self.lens.ideal_from_observed(scan_mm)
+        return self._px(np.where(found[:, None], ideal_mm, scan_mm), np.shape(scan_px))
+
+    def scan_px(self, ideal_px: Array) -> Array:
+        """The other way."""
+        ideal_mm = comparator_from_pixel(np.reshape(ideal_px, (-1, 2)), self.pitch_um)
+        scan_mm, found = self.lens.camera_from_ray((ideal_mm - self.lens.interior[1:]) / self.lens.interior[0])
+        return self._px(np.where(found[:, None], scan_mm, ideal_mm), np.shape(ideal_px))
+
+    def covariance_px2(self, scan_px: Array) -> Array:
+        """(2n, 2n) of ideal pixels of pixels (n, 2), all together; 0 where the calibration gives none."""
+        if not self.is_covariance_known:
+            return np.zeros((scan_px.size, scan_px.size))
+        scan_mm = comparator_from_pixel(scan_px, self.pitch_um)
+        c, point = self.lens.interior[0], self.lens.interior[1:]
+        ray = (self.lens.ideal_from_observed(scan_mm)[0] - point) / c
+        at = self.lens.equations(scan_mm, ray)
+        by_lens = c * np.linalg.solve(-at.ray_jacobian, np.dstack([at.interior_jacobian, at.parameter_jacobian]))
+        by_lens[:, :, 0] += ray
+        by_lens[:, :, 1:3] += np.eye(2)
+        by_lens = (by_lens * np.array([1000.0, -1000.0])[:, None] / np.array(self.pitch_um)[:, None]).reshape(
+            scan_px.size, -1
+        )
+        return np.asarray(by_lens @ self.lens.covariance @ by_lens.T)
+
+    def crop(self, col: int, row: int) -> "CalibratedLens":
+        """The lens of a part of the scan that begins at a pixel."""
+        interior = self.lens.interior.copy()
+        interior[1:] -= comparator_from_pixel(np.array([col, row], float), self.pitch_um)
+        return replace(self, lens=replace(self.lens, interior=interior))
+
+    def misfit(self, scan: Scan) -> str:
+        """A sentence where a scan cannot be a picture of the lens's camera, for its size; else empty."""
+        size = scan.width_px, scan.height_px
+        if size == self.size_px:
+            return ""
+        width, height = self.size_px
+        turned = " Turn it back, as the sensor saw it." if size == (height, width) else ""
+        return (
+            f"{scan.path}: has {size[0]} x {size[1]} px, and the lens under [scanner] was calibrated for {width} x "
+            f"{height} px: nobody knows where its axis lies in this picture.{turned or ' Give the picture uncropped.'}"
+        )
+
+    def _px(self, mm: Array, shape: tuple[int, ...]) -> Array:
+        return pixel_from_comparator(mm, self.pitch_um).reshape(shape)
+
+
+def read_lens(path: Path, pitch_um: float) -> CalibratedLens:
+    """The lens of camera.yaml, as `reseau calibrate` or OpenCV writes it, for scans of a pitch. Raises InputError."""
+    camera, _ = read_pixel_camera(path)
+    if camera.size_px is None:
+        raise InputError(f"{path}: does not say the picture's size. Give image_width and image_height in px.")
+    (fx, fy, cx, cy), pitch_mm = camera.interior_px, pitch_um / 1000.0
+    names = parameter_names(camera.family)
+    given = {"b1": fx / fy - 1.0, **camera.distortion}
+    interior = np.array([fy, cx, -cy]) * pitch_mm
+    parameters = np.array([given.get(name, 0.0) for name in names])
+    covariance = np.empty((0, 0))
+    if camera.covariance is not None:
+        by_px = np.zeros((len(interior) + len(names), len(camera.covariance)))
+        by_px[0, 1] = by_px[1, 2] = pitch_mm
+        by_px[2, 3] = -pitch_mm
+        count = len(camera.covariance) - 4
+        by_px[3 : 3 + count, 4:] = np.eye(count)
+        by_px[3 + names.index("b1"), :2] = 1.0 / fy, -fx / fy**2
+        covariance = by_px @ camera.covariance @ by_px.T
+    lens = Lens(Distortion(camera.family), interior, parameters, covariance)
+    width, height = (round(side) for side in camera.size_px)
+    return CalibratedLens(lens, (pitch_um, pitch_um), (width, height))
