@@ -1,5 +1,6 @@
 """Own figures of a plate's marks: a cross of short arms in all frames is not damaged, one covered in a frame is."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +10,9 @@ from brute_marks import brute_picture
 from drawn_frames import frame_picture, layout_of, measured, pixel_from_camera
 
 from measure.fiducials.across_frames import check_frames
+from measure.fiducials.mark_comparison import unlike_blur, unlike_others
 from measure.fiducials.own_figures import OwnFigure, check_own_figures
-from measure.flags import Cause, Code, Status
+from measure.flags import Cause, Code, Reason, Status
 from measure.marks.shapes import Bar, MarkShape, cross
 from measure.matching.arms import measure_arms
 from measure.matching.match import match
@@ -81,3 +83,41 @@ def test_a_turn_is_compared_as_the_camera_has_it(poses: tuple[str, ...], agree: 
         mark = MarkMeasurement("1", "fiducial", np.zeros(2), place, Status.MEASURED, quality=quality)
         frames.append(FrameMeasurement(pose, (mark,), Pose(pose, True)))
     assert [frame.marks[0].status is Status.MEASURED for frame in check_own_figures(frames)] == [True, True, agree]
+
+
+def frames_with(figures: Sequence[Mapping[str, float]], doubt: Reason) -> list[FrameMeasurement]:
+    """A frame for each of these figures of a mark, weak for that doubt, beside two crosses as drawn."""
+    place, arms = Covariance({Cause.NOISE: 0.01 * np.eye(2)}), {f"arm{k}_ratio": 1.0 for k in range(1, 5)}
+    sigmas = {f"{name}_sigma": 0.01 for name in ("size", "blur", "arm1", "arm2", "arm3", "arm4")}
+    frames = []
+    for number, own in enumerate(figures):
+        longer = own.get("arm1_ratio", 1.0) if own.get("arm1_ratio", 1.0) > 1 else 1.0
+        others = {"size_ratio": 1.0, "blur_ratio": 1.0, **dict.fromkeys(arms, longer)}
+        marks = [
+            MarkMeasurement("1", "fiducial", np.zeros(2), place, Status.WEAK, doubt, {**others, **own, **sigmas}),
+            *(
+                MarkMeasurement(name, "fiducial", np.ones(2), place, Status.MEASURED, quality={**others, **sigmas})
+                for name in "23"
+            ),
+        ]
+        frames.append(FrameMeasurement(str(number), tuple(marks), Pose("0", True)))
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("figures", "doubt", "status"),
+    [
+        # Its arms are as drawn in all frames: they do not explain a small cross, which another thing makes then.
+        ([{"size_ratio": 0.83}] * 3, unlike_others(0.83, None), Status.WEAK),
+        ([{"size_ratio": 0.9, "arm2_ratio": 0.88}] * 3, unlike_others(0.9, None), Status.MEASURED),
+        ([{"blur_ratio": 1.6}] * 3, unlike_blur(1.6), Status.MEASURED),
+        ([{"blur_ratio": 1.6}, {}, {}], unlike_blur(1.6), Status.WEAK),
+        # More light makes the arms of a whole frame longer.
+        ([{"size_ratio": 0.9, "arm1_ratio": 1.1, "arm2_ratio": 0.97}, *[{"arm2_ratio": 0.88}] * 2],
+         unlike_others(0.9, None), Status.MEASURED),
+    ],
+)  # fmt: skip
+def test_a_doubt_is_dropped_where_the_plate_explains_it(
+    figures: Sequence[Mapping[str, float]], doubt: Reason, status: Status
+) -> None:
+    assert check_own_figures(frames_with(figures, doubt))[0].marks[0].status is status
