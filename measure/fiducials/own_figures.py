@@ -1,5 +1,4 @@
-"""The own figures of a camera's marks, by all of its frames: the arms of each cross, the size of each other mark, its
-turn where the frame holds that, and how broad its lines look, beside the other marks of its frame.
+"""Arms of crosses, sizes, turns and blurs of a camera's marks by all of its frames.
 
 A cross of a réseau plate one arm of which is short looks covered in every frame. What is alike in all frames is the
 plate's: from three frames on a mark is tested against what it is in the others, and no longer against the other marks.
@@ -103,7 +102,9 @@ def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasureme
             finding, reason = findings[place][point], _unlike_frames(kind, off) if p_value < FALSE_DOUBT else NO_REASON
             finding[speaks_for] = finding.get(speaks_for) or reason
     return [
-        replace(frame, marks=tuple(_judged(mark, found.get(mark.point, {}), arms[mark.point]) for mark in frame.marks))
+        replace(
+            frame, marks=tuple(_assess_mark(mark, found.get(mark.point, {}), arms[mark.point]) for mark in frame.marks)
+        )
         for frame, found in zip(frames, findings, strict=True)
     ]
 
@@ -121,7 +122,7 @@ def _unlike_frames(kind: str, off: float) -> Reason:
     return Reason(f"{figure}: {covered}", Code.SIZE, Code.COVERED)
 
 
-def _judged(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequence[float]) -> MarkMeasurement:
+def _assess_mark(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequence[float]) -> MarkMeasurement:
     """The mark with what the other frames say; findings: why shape and blur are not as there, empty where they are;
     arms: of its plate, which explain the size of a cross if one of them has it."""
     quality, unlike = mark.quality, findings.get(_SHAPE, NO_REASON)

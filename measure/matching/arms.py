@@ -1,4 +1,4 @@
-"""The arms of a cross as a scan shows them: how long each is beside the drawing."""
+"""Lengths of the arms of a cross, over those drawn."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
     changes = [
         (picture(more, place, width, height, fit.blur_px) - picture(less, place, width, height, fit.blur_px))
         / (2 * _CHANGE)
-        for more, less in _changed(mark)
+        for more, less in _arm_variants(mark)
     ]
     used = window.usable & (window.sides == 0)
     design = np.stack([*changes, drawn, *background_planes(height, width)])[:, used]
@@ -61,7 +61,7 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
     return 1 + solution[: len(changes)] / gain, sigmas
 
 
-def _changed(mark: MarkShape) -> list[tuple[MarkShape, MarkShape]]:
+def _arm_variants(mark: MarkShape) -> list[tuple[MarkShape, MarkShape]]:
     """Of each arm the mark with a longer and with a shorter one."""
     pairs = list[tuple[MarkShape, MarkShape]]()
     for index, bar in enumerate(mark.parts):

@@ -85,7 +85,7 @@ def test_a_turn_is_compared_as_the_camera_has_it(poses: tuple[str, ...], agree: 
     assert [frame.marks[0].status is Status.MEASURED for frame in check_own_figures(frames)] == [True, True, agree]
 
 
-def frames_with(figures: Sequence[Mapping[str, float]], doubt: Reason) -> list[FrameMeasurement]:
+def make_frames(figures: Sequence[Mapping[str, float]], doubt: Reason) -> list[FrameMeasurement]:
     """A frame for each of these figures of a mark, weak for that doubt, beside two crosses as drawn."""
     place, arms = Covariance({Cause.NOISE: 0.01 * np.eye(2)}), {f"arm{k}_ratio": 1.0 for k in range(1, 5)}
     sigmas = {f"{name}_sigma": 0.01 for name in ("size", "blur", "arm1", "arm2", "arm3", "arm4")}
@@ -120,4 +120,4 @@ def frames_with(figures: Sequence[Mapping[str, float]], doubt: Reason) -> list[F
 def test_a_doubt_is_dropped_where_the_plate_explains_it(
     figures: Sequence[Mapping[str, float]], doubt: Reason, status: Status
 ) -> None:
-    assert check_own_figures(frames_with(figures, doubt))[0].marks[0].status is status
+    assert check_own_figures(make_frames(figures, doubt))[0].marks[0].status is status
