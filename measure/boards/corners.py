@@ -194,7 +194,8 @@ class _CornerFits:
         covariances = (covariances + covariances.swapaxes(1, 2)) / 2
         fails = np.array([bool(reason) for reason in self.reasons]) | (used.sum(axis=1) <= self.unknowns)
         covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
-        faint = ~fails & ~(np.abs(self.linear[:, 0]) > 2 * noise_dn)
+        rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # of an even window, whose noise is none
+        faint = ~fails & ~(np.abs(self.linear[:, 0]) > 2 * np.maximum(noise_dn, rounding_dn))
         self._refuse(np.flatnonzero(faint), Reason("no edges stand out from the noise", Code.CONTRAST))
         junctions_px = np.full((len(self.windows), 2), np.nan)
         if self.bends:  # damage is painted over with what was fitted
