@@ -46,7 +46,9 @@ def case(frame: str, seed: int, rounds: int = 3) -> Row:
             tifffile.imwrite(path, np.rint(65535 * light).astype(np.uint16), tile=(256, 256), compression="lzw")
             curve = LINEAR
         else:
-            tifffile.imwrite(path, np.rint(255 * coded(light, 2.2)).astype(np.uint8), tile=(256, 256))
+            tifffile.imwrite(
+                path, np.rint(255 * coded(light.astype(np.float32), 2.2)).astype(np.uint8), tile=(256, 256)
+            )
             curve = Tone(power(2.2)) if tone == "known" else Tone.unknown()
 
         def measure() -> FrameMeasurement:

@@ -5,7 +5,7 @@ coordinates and scanners that are; and how often it tells what is not.
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from test_judgement import EIGHT, FILM_MM, FOUR, PX_PER_MM, SIGMA_PX, frames_of, layout_of, moved, weak
+from test_judgement import EIGHT, FILM_MM, FOUR, PX_PER_MM, SIGMA_PX, make_frames, make_layout, shift_mark, weak
 
 from benchmarks.harness import Row
 from measure.fiducials.across_frames import CheckedFrames, check_frames
@@ -31,7 +31,7 @@ def case(kind: str, cameras: int, seed: int) -> Row:
     _, places, sigma_mm, made = next(each for each in kinds() if each[0] == kind)
     rng, row = np.random.default_rng(seed), {}
     for count in COUNTS:
-        outcomes = [outcome(made, layout_of(places, sigma_mm), count, rng) for _ in range(cameras)]
+        outcomes = [outcome(made, make_layout(places, sigma_mm), count, rng) for _ in range(cameras)]
         row[f"{count} frames"] = f"{sum(right for right, _ in outcomes)}/{sum(wrong for _, wrong in outcomes)}"
     return row
 
@@ -81,17 +81,17 @@ def causes(result: CheckedFrames) -> set[str]:
 
 
 def good(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
-    return frames_of(layout, count, rng, camera_mm=0.005, poses=POSES), ""
+    return make_frames(layout, count, rng, camera_mm=0.005, poses=POSES), ""
 
 
 def scattering(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
-    return frames_of(layout, count, rng, camera_mm=0.005, film_mm=0.01, poses=POSES), ""
+    return make_frames(layout, count, rng, camera_mm=0.005, film_mm=0.01, poses=POSES), ""
 
 
 def one_mark(off_px: float) -> Made:
     def made(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
         frames, angle = good(layout, count, rng)[0], rng.uniform(0, 2 * np.pi)
-        frames[0] = moved(frames[0], 2, (off_px * np.cos(angle), off_px * np.sin(angle)))
+        frames[0] = shift_mark(frames[0], 2, (off_px * np.cos(angle), off_px * np.sin(angle)))
         return frames, "mark"
 
     return made
@@ -99,7 +99,7 @@ def one_mark(off_px: float) -> Made:
 
 def bent(layout: FiducialLayout, count: int, rng: np.random.Generator, film_mm: float = 0.03) -> tuple[Frames, str]:
     frames = good(layout, count, rng)[0]
-    frames[0] = frames_of(layout, 1, rng, film_mm=film_mm)[0]
+    frames[0] = make_frames(layout, 1, rng, film_mm=film_mm)[0]
     return frames, "frame"
 
 
@@ -108,12 +108,12 @@ def strongly_bent(layout: FiducialLayout, count: int, rng: np.random.Generator) 
 
 
 def wrong_places(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
-    return frames_of(layout, count, rng, camera_mm=0.4, poses=POSES), "places"
+    return make_frames(layout, count, rng, camera_mm=0.4, poses=POSES), "places"
 
 
 def slightly_wrong_places(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
-    return frames_of(layout, count, rng, camera_mm=0.05, poses=POSES), "places"
+    return make_frames(layout, count, rng, camera_mm=0.05, poses=POSES), "places"
 
 
 def scanner(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
-    return frames_of(layout, count, rng, camera_mm=0.005, scanner_mm=0.05, poses=POSES), "scanner"
+    return make_frames(layout, count, rng, camera_mm=0.005, scanner_mm=0.05, poses=POSES), "scanner"

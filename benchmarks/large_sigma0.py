@@ -11,7 +11,7 @@ import sys
 import time
 from collections import Counter
 
-from misfits import KINDS, MANY, NOTHING, drawn, outcome, said
+from misfits import KINDS, MANY, NOTHING, describe, draw_network, outcome
 
 SOUND = 5  # times as many networks with nothing planted
 
@@ -24,9 +24,9 @@ def main() -> None:
     for name in sys.argv[3:] or KINDS:
         count, sizes, spent = Counter[str](), [], 0.0
         for seed in range(networks * (SOUND if name == NOTHING else 1)):
-            network = drawn(name, seed, many)
+            network = draw_network(name, seed, many)
             begun = time.process_time()
-            sentences, sigma0 = said(network)
+            sentences, sigma0 = describe(network)
             spent += time.process_time() - begun
             found = outcome(name, sentences)
             count[found] += 1

@@ -10,7 +10,7 @@ import sys
 import time
 from collections import Counter
 
-from planted import KINDS, network, outcome, said
+from planted import KINDS, describe, network, outcome
 
 
 def main() -> None:
@@ -20,7 +20,7 @@ def main() -> None:
     for name, kind in KINDS.items():
         begun, count = time.process_time(), Counter[str]()
         for seed in range(networks):
-            count[outcome(kind, said(kind.spoil(network(seed, kind.oriented))))] += 1
+            count[outcome(kind, describe(kind.spoil(network(seed, kind.oriented))))] += 1
         spent = (time.process_time() - begun) / networks
         print(
             f"{name:58} {count['named']:6d} {count['unnamed']:8d} {count['misleading']:11d} {spent:11.1f}", flush=True

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 
 import numpy as np
-from bent_scans import MIDDLE_MM, films, in_a_bent_scanner
+from bent_scans import MIDDLE_MM, bend_in_scanner, films
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
@@ -80,7 +80,7 @@ def _start(turns: tuple[float, ...]) -> Approximations:
 def photographs(rng: np.random.Generator, free: Mapping[str, Prior]) -> tuple[Network, Approximations]:
     points = field_points(np.random.default_rng(5), 40)
     network, start = simulated(rng, Truth(middle_mm=MIDDLE_MM), points=points)
-    return in_a_bent_scanner(network, BEND_MM, free), start
+    return bend_in_scanner(network, BEND_MM, free), start
 
 
 def _ratios(count: int, terms: Sequence[str], made: Made) -> str:

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from test_judgement import FOUR, PX_PER_MM, layout_of
+from test_judgement import FOUR, PX_PER_MM, make_layout
 
 from measure.fiducials.across_frames import check_frames
 from measure.flags import Status
@@ -59,7 +59,7 @@ def outcome(
         mark.point, "fiducial", np.asarray(mark.center_px) + error_px, mark.covariance, mark.status
     )
     frames[0] = replace(frames[0], marks=tuple(marks))
-    checked = check_frames(frames, layout_of(FOUR), [(1000 / PX_PER_MM,) * 2] * count).frames
+    checked = check_frames(frames, make_layout(FOUR), [(1000 / PX_PER_MM,) * 2] * count).frames
     named = {(f.image, m.point) for f in checked for m in f.marks if m.status is not Status.MEASURED}
     own = ("0", mark.point)
     known = checked[0].marks[wrong].covariance

@@ -40,8 +40,8 @@ def chessboard(number: int, columns: int = 5, rows: int = 4) -> Any:
     turn = 0.45 * np.array([np.cos(1.3 * number), np.sin(1.3 * number), 0.1 * number])
     camera = np.array([[420.0, 0.0, 200.0], [0.0, 420.0, 160.0], [0.0, 0.0, 1.0]])
     shift = np.array([[-180.0], [-160.0], [600.0]])
-    seen = camera @ np.column_stack([np.asarray(cv2.Rodrigues(turn)[0])[:, :2], shift])
-    return cv2.warpPerspective(flat, seen, (400, 320), flags=cv2.INTER_AREA, borderValue=(210,))
+    view = camera @ np.column_stack([np.asarray(cv2.Rodrigues(turn)[0])[:, :2], shift])
+    return cv2.warpPerspective(flat, view, (400, 320), flags=cv2.INTER_AREA, borderValue=(210,))
 
 
 def calls(folder: Path) -> Iterator[tuple[str, Sequence[str | Path]]]:

@@ -50,8 +50,8 @@ def range_server(folder: Path) -> Iterator[RangeServer]:
             body = data[first : last + 1]
             counted.gets += 1
             counted.sent_bytes += len(body)
-            told = {"Content-Range": f"bytes {first}-{last}/{len(data)}"} if part else {}
-            return self._answer(206 if part else 200, body, told)
+            result = {"Content-Range": f"bytes {first}-{last}/{len(data)}"} if part else {}
+            return self._answer(206 if part else 200, body, result)
 
         def _data(self) -> bytes | None:
             """None where the refusal was sent."""

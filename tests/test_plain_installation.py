@@ -21,9 +21,9 @@ READS_WRITING = "rapidocr-onnxruntime"  # installed for the files that it carrie
 def found_there() -> dict[str, Any]:
     """What `every_command.py` says in the plain environment."""
     with TemporaryDirectory() as folder:
-        told = _run("-P", str(Path(__file__).with_name("every_command.py")), folder)
-    assert told.returncode == 0, told.stderr
-    return dict(json.loads(told.stdout))
+        result = _run("-P", str(Path(__file__).with_name("every_command.py")), folder)
+    assert result.returncode == 0, result.stderr
+    return dict(json.loads(result.stdout))
 
 
 def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -35,13 +35,13 @@ def test_every_command_works_or_names_the_extra_that_it_needs(found_there: dict[
     calls = found_there["calls"]
     assert {call["arguments"][0] for call in calls} == set().union(*GROUPS.values())
     for call in calls:
-        told = f"{call['arguments']}: {call['messages']}"
+        result = f"{call['arguments']}: {call['messages']}"
         if call["extra"]:
-            assert call["code"] == WRONG_INPUT, told
-            assert f"'reseau[{call['extra']}]'" in call["messages"], told
-            assert call["messages"].count("reseau: ") == 1, told
+            assert call["code"] == WRONG_INPUT, result
+            assert f"'reseau[{call['extra']}]'" in call["messages"], result
+            assert call["messages"].count("reseau: ") == 1, result
         else:
-            assert call["code"] in (DONE, LOOK), told
+            assert call["code"] in (DONE, LOOK), result
 
 
 def test_every_command_ends_with_its_next_steps(found_there: dict[str, Any]) -> None:

@@ -65,7 +65,7 @@ def bent(terms: Mapping[str, float], xy_mm: Array) -> Array:
     return scan_mm
 
 
-def in_a_bent_scanner(network: Network, truth: Mapping[str, float], terms: Mapping[str, Prior]) -> Network:
+def bend_in_scanner(network: Network, truth: Mapping[str, float], terms: Mapping[str, Prior]) -> Network:
     """A network of straight scans as a scanner S that bends them would have it, which is to find some terms."""
     observations = replace(network.observations, xy_mm=bent(truth, network.observations.xy_mm))
     images = tuple(replace(image, scanner="S") for image in network.images)
@@ -123,7 +123,7 @@ def films(
             np.broadcast_to(SIGMA_MM**2 * np.eye(2), (len(names), 2, 2)),
         ),
     )
-    network = in_a_bent_scanner(network, truth, terms)
+    network = bend_in_scanner(network, truth, terms)
     if rng is None:
         return network
     noise = rng.normal(0.0, SIGMA_MM, straight_mm.shape)

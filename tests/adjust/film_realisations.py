@@ -50,20 +50,20 @@ def frames(
     ids = tuple(str(i + 1) for i in range(marks))
     films = tuple(drawn_film(kind, rng) for _ in range(count))
     rows, values = [], dict[str, float]()
-    for name, film in zip(names_of(count), films, strict=True):
+    for name, film in zip(make_names(count), films, strict=True):
         source, regular = film.comparator_from_camera(places)
         assert regular.all()
         rows.append(source + noise * NOISE_MM * rng.standard_normal(places.shape))
         values |= {f"T.{name}.{p}": float(v) for p, v in zip(film_parameter_names(kind), film.parameters, strict=True)}
     for id_, place in zip(ids, places, strict=True):
         values |= {f"FID.{CAMERA}.{id_}.{axis}": float(v) for axis, v in zip("xy", place, strict=True)}
-    return Frames(network_of(kind, given, stated_mm, np.array(rows)), places, films, values)
+    return Frames(make_network(kind, given, stated_mm, np.array(rows)), places, films, values)
 
 
-def network_of(kind: Transformation, given_mm: Array, stated_mm: float, comparator_mm: Array) -> Network:
+def make_network(kind: Transformation, given_mm: Array, stated_mm: float, comparator_mm: Array) -> Network:
     """Of marks (m, 2) as given, and as measured in n frames (n, m, 2)."""
     count, marks = comparator_mm.shape[:2]
-    ids, images = tuple(str(i + 1) for i in range(marks)), names_of(count)
+    ids, images = tuple(str(i + 1) for i in range(marks)), make_names(count)
     fiducials = {i: Fiducial(Prior(x, stated_mm), Prior(y, stated_mm)) for i, (x, y) in zip(ids, given_mm, strict=True)}
     kinds: tuple[ObservationKind, ...] = tuple("fiducial" for _ in range(count * marks))
     return Network(
@@ -80,7 +80,7 @@ def network_of(kind: Transformation, given_mm: Array, stated_mm: float, comparat
     )
 
 
-def names_of(count: int) -> tuple[str, ...]:
+def make_names(count: int) -> tuple[str, ...]:
     return tuple(f"f{i}" for i in range(count))
 
 
@@ -116,9 +116,9 @@ def errors(result: Adjustment, truth: Frames) -> Iterator[tuple[str, float, floa
     """Kind of quantity, error and standard deviation of every unknown."""
     for name in result.names:
         if name in truth.values:
-            kind = "fiducials" if name.startswith("FID.") else _kind_of(name)
+            kind = "fiducials" if name.startswith("FID.") else _film_kind(name)
             yield kind, result.value(name) - truth.values[name], result.sigma(name)
 
 
-def _kind_of(name: str) -> str:
+def _film_kind(name: str) -> str:
     return "shifts" if name.endswith((".a1", ".b1")) else "other film parameters"

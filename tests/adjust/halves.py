@@ -53,12 +53,12 @@ def halves(
     films: dict[str, Array] = {}
     joins: dict[tuple[str, str], Array] = {}
     for i in range(len(truth.stations)):
-        seen: list[tuple[ObservationKind, str, Array, float]] = [
+        view: list[tuple[ObservationKind, str, Array, float]] = [
             ("fiducial", id_, np.array(xy), FIDUCIAL_SIGMA) for id_, xy in FIDUCIALS.items()
         ]
-        seen += [("target", str(j), xy, TARGET_SIGMA) for j, xy in enumerate(camera_point(truth, i, points))]
+        view += [("target", str(j), xy, TARGET_SIGMA) for j, xy in enumerate(camera_point(truth, i, points))]
         common = rng.uniform([-overlap_mm / 2, -100.0], [overlap_mm / 2, 100.0], (join_count, 2))
-        seen += [("join", f"j{j}", xy, join_sigma) for j, xy in enumerate(common)]
+        view += [("join", f"j{j}", xy, join_sigma) for j, xy in enumerate(common)]
         joins |= {(f"f{i}", f"j{j}"): xy for j, xy in enumerate(common)}
         for half, side in (("left", -1.0), ("right", 1.0)):
             name = f"f{i}.{half}"
@@ -68,7 +68,7 @@ def halves(
                 film = film * (-1.0 if turned else 1.0)
                 film[[0, 3]] *= -1.0 if turned else 1.0
             films[name] = film
-            own = [mark for mark in seen if side * mark[2][0] > -overlap_mm / 2]
+            own = [mark for mark in view if side * mark[2][0] > -overlap_mm / 2]
             observed = comparator_point("affine", film, False, np.array([mark[2] for mark in own]))
             for (kind, id_, _, sigma), xy in zip(own, observed, strict=True):
                 rows.append((name, id_, kind, xy + rng.normal(0.0, sigma, 2), sigma))
@@ -99,7 +99,7 @@ def halves(
     return Halves(network, films, joins, truth)
 
 
-def without(network: Network, drop: str) -> Network:
+def drop_images(network: Network, drop: str) -> Network:
     """The network without the observations of a kind."""
     kept = np.flatnonzero([kind != drop for kind in network.observations.kind])
     return replace(network, observations=network.observations.only(kept))

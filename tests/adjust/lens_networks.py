@@ -30,7 +30,7 @@ def scene_camera(name: str) -> SceneCamera:
     return SceneCamera("L", (80.0, 80.0), c, (0.12, -0.07), SceneDistortion(name, values, R0_MM))  # type: ignore[arg-type]
 
 
-def network_of(name: str, rng: np.random.Generator | None = None) -> Network:
+def make_network(name: str, rng: np.random.Generator | None = None) -> Network:
     """Six views of a deep field, 36 mm x 24 mm, known points; the lens free and unknown, c given roughly."""
     camera, (c, values) = scene_camera(name), LENSES[name]
     half = np.array([18.0, 12.0])
@@ -39,8 +39,8 @@ def network_of(name: str, rng: np.random.Generator | None = None) -> Network:
     rows = []
     for i, angles in enumerate(POSES):
         back = rotation_from_angles(np.array(angles)).T @ np.array([0.0, 0.0, 1.3])
-        seen = camera_from_object(camera, (*back, *angles), field)
-        rows += [(f"i{i}", f"t{k}", seen[k]) for k in np.flatnonzero((np.abs(seen) < half).all(axis=1))]
+        projected = camera_from_object(camera, (*back, *angles), field)
+        rows += [(f"i{i}", f"t{k}", projected[k]) for k in np.flatnonzero((np.abs(projected) < half).all(axis=1))]
     if rng is not None:
         noise = rng.normal(0.0, SIGMA_MM, (len(rows), 2))
         rows = [(*row[:2], row[2] + error) for row, error in zip(rows, noise, strict=True)]

@@ -103,10 +103,10 @@ def network(made: Scene, effects: Effects, kind: Kind, rng: np.random.Generator 
     """The network as it is given: square pixels, one c, one size, the lens of `kind.free`; rng None: no noise."""
     names, places = [], []
     for i, (rotation, station) in enumerate(zip(made.rotations, made.stations, strict=True)):
-        seen = _projected(made, effects, kind, i, rotation, station)
-        inside = np.flatnonzero((np.abs(seen - MIDDLE_MM) < HALF_MM).all(axis=1))
+        projected = _projected(made, effects, kind, i, rotation, station)
+        inside = np.flatnonzero((np.abs(projected - MIDDLE_MM) < HALF_MM).all(axis=1))
         names += [(f"im{i:02d}", f"p{k}") for k in inside]
-        places.append(seen[inside])
+        places.append(projected[inside])
     xy_mm = np.concatenate(places)
     if rng is not None:
         xy_mm = xy_mm + rng.normal(0.0, SIGMA_MM * effects.noise, xy_mm.shape)
@@ -194,7 +194,7 @@ KINDS = {
 }  # fmt: skip
 
 
-def drawn(name: str, seed: int, many: float = MANY) -> Network:
+def draw_network(name: str, seed: int, many: float = MANY) -> Network:
     """A network of a kind, its effect so many times what its test detects, with either sign."""
     kind = KINDS[name]
     flat = kind.boards and (seed % 2 == 0 or not kind.fields)
@@ -218,7 +218,7 @@ def _size(name: str, kind: Kind, made: Scene, many: float) -> float:
     return size
 
 
-def said(given: Network) -> tuple[list[str], float]:
+def describe(given: Network) -> tuple[list[str], float]:
     """What a user is told to look at, and sigma0; nan where nothing is adjusted."""
     try:
         result = adjust(given)

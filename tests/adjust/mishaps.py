@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from setups import CONVERGENT, FREE, HEIGHT, LEVEL_STATIONS, UNKNOWN, Setup, given, vertical
+from setups import CONVERGENT, FREE, HEIGHT, LEVEL_STATIONS, UNKNOWN, Setup, give_values, vertical
 from simulated import STATIONS, field_points
 
 from adjust.problem.network import Approximations, Network
@@ -52,19 +52,19 @@ _narrow = Setup(
 )
 
 
-def _on_a_line() -> tuple[Network, Approximations]:
+def _collinear_stations() -> tuple[Network, Approximations]:
     """All targets of image f3 on a line, those of the others not."""
     points = np.vstack([field_points(np.random.default_rng(1), 9), _line])
     network, start = replace(_good, points=points).network()
-    return _kept(network, lambda image, point, kind: not (image == "f3" and kind == "target" and int(point) < 9)), start
+    return _keep(network, lambda image, point, kind: not (image == "f3" and kind == "target" and int(point) < 9)), start
 
 
 def _one_ray() -> tuple[Network, Approximations]:
     network, start = _all_unknown.network()
-    return _kept(network, lambda image, point, kind: point != "3" or kind == "fiducial" or image == "f1"), start
+    return _keep(network, lambda image, point, kind: point != "3" or kind == "fiducial" or image == "f1"), start
 
 
-def _in_line() -> tuple[Network, Approximations]:
+def _line_of_sight() -> tuple[Network, Approximations]:
     """Point 0 in line with the two stations that show it."""
     points = field_points(np.random.default_rng(1), 14)
     first, second = np.array(STATIONS[0]), np.array([120.0, 40.0, 500.0])
@@ -72,12 +72,12 @@ def _in_line() -> tuple[Network, Approximations]:
     setup = replace(_all_unknown, points=points, stations=(STATIONS[0], tuple(second), *STATIONS[2:]), noise=False)
     setup = replace(setup, attitudes=((0.0, 0.0, 0.1), (0.0, 0.0, 1.6), *CONVERGENT[2:]))
     network, start = setup.network()
-    return _kept(network, lambda image, point, kind: point != "0" or kind == "fiducial" or image < "f2"), start
+    return _keep(network, lambda image, point, kind: point != "0" or kind == "fiducial" or image < "f2"), start
 
 
 def _three_targets() -> tuple[Network, Approximations]:
     network, start = _good.network()
-    return _kept(
+    return _keep(
         network, lambda image, point, kind: not (image == "f3" and kind == "target" and point not in ("0", "1", "2"))
     ), start
 
@@ -93,7 +93,7 @@ def _swapped() -> tuple[Network, Approximations]:
     return replace(network, observations=replace(rows, point=points)), start
 
 
-def _kept(network: Network, keep: Callable[[str, str, str], bool]) -> Network:
+def _keep(network: Network, keep: Callable[[str, str, str], bool]) -> Network:
     """The network with some of its observations."""
     rows = network.observations
     kept = [i for i, row in enumerate(zip(rows.image, rows.point, rows.kind, strict=True)) if keep(*row)]
@@ -128,14 +128,14 @@ MISHAPS: dict[str, Mishap] = {
         ("Shift x", "Shift y", "Rotation", "Scale", "Tilt x", "Tilt y"),
     ),
     "targets-on-a-line": Mishap(
-        "One image whose targets all lie on a line", _on_a_line, ("all its targets lie on one line",)
+        "One image whose targets all lie on a line", _collinear_stations, ("all its targets lie on one line",)
     ),
     "one-ray": Mishap(
         "An unknown point in one image only", _one_ray, ("Only image f1 shows point 3",), Options(datum="minimal")
     ),
     "in-line": Mishap(
         "An unknown point in line with its stations",
-        _in_line,
+        _line_of_sight,
         ("lies in line with the stations",),
         Options(datum="minimal"),
     ),
@@ -152,7 +152,7 @@ MISHAPS: dict[str, Mishap] = {
     ),
     "nearly-flat": Mishap(
         "Relief of 2 cm under 1500 m, vertical to 0.00001 rad, c and principal point without priors",
-        lambda: (given(_near.network()[0], {"x": 1.0, "y": 1.0}), _near.network()[1]),
+        lambda: (give_values(_near.network()[0], {"x": 1.0, "y": 1.0}), _near.network()[1]),
         ("did not stand still", "principal point's x0'", "principal point's y0'", "principal distance of camera K can"),
         Options(iteration_limit=5),
     ),

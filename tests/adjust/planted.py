@@ -44,7 +44,7 @@ def network(seed: int, oriented: Array | None = None, relief: float = 200.0) -> 
     return replace(made, images=tuple(replace(image, exterior=each) for image, each in images))
 
 
-def with_points(given: Network, changed: Callable[[Array], Array], sigma: float = 1.0) -> Network:
+def change_points(given: Network, changed: Callable[[Array], Array], sigma: float = 1.0) -> Network:
     points = []
     for point in given.points:
         priors = [prior for prior in (point.X, point.Y, point.Z) if prior]
@@ -92,17 +92,17 @@ class Kind:
 
 
 KINDS = {
-    "sign of X": Kind(None, lambda n: with_points(n, lambda p: p * [-1, 1, 1]), (MIRRORS,)),
-    "sign of Z": Kind(None, lambda n: with_points(n, lambda p: p * [1, 1, -1]), (MIRRORS,)),
-    "X and Y exchanged": Kind(None, lambda n: with_points(n, lambda p: p[[1, 0, 2]]), (MIRRORS,)),
+    "sign of X": Kind(None, lambda n: change_points(n, lambda p: p * [-1, 1, 1]), (MIRRORS,)),
+    "sign of Z": Kind(None, lambda n: change_points(n, lambda p: p * [1, 1, -1]), (MIRRORS,)),
+    "X and Y exchanged": Kind(None, lambda n: change_points(n, lambda p: p[[1, 0, 2]]), (MIRRORS,)),
     "sign of X, approximate orientations": Kind(
-        APPROXIMATE, lambda n: with_points(n, lambda p: p * [-1, 1, 1]), ("The sign of X of all points is wrong. ",)
+        APPROXIMATE, lambda n: change_points(n, lambda p: p * [-1, 1, 1]), ("The sign of X of all points is wrong. ",)
     ),
     "X and Y exchanged, approximate orientations": Kind(
-        APPROXIMATE, lambda n: with_points(n, lambda p: p[[1, 0, 2]]), ("X and Y of all points are exchanged. ",)
+        APPROXIMATE, lambda n: change_points(n, lambda p: p[[1, 0, 2]]), ("X and Y of all points are exchanged. ",)
     ),
     "sign of Z, observed orientations": Kind(
-        EXACT, lambda n: with_points(n, lambda p: p * [1, 1, -1]), ("The sign of Z of all points is wrong. ",)
+        EXACT, lambda n: change_points(n, lambda p: p * [1, 1, -1]), ("The sign of Z of all points is wrong. ",)
     ),
     "y of the camera down": Kind(None, y_down, ("y' axis of the camera's fiducial marks points down",)),
     "y of the camera down, approximate orientations": Kind(
@@ -111,10 +111,10 @@ KINDS = {
     "c 10 mm too long": Kind(None, other_c, ("principal distance of camera K is not the 163 mm",)),
     "targets of two frames exchanged": Kind(None, exchanged, ("targets of the frames f1 and f3 are exchanged",)),
     "mm for m, approximate orientations": Kind(
-        APPROXIMATE, lambda n: with_points(n, lambda p: 1000.0 * p, 1000.0), ("points are 1000 times too large",)
+        APPROXIMATE, lambda n: change_points(n, lambda p: 1000.0 * p, 1000.0), ("points are 1000 times too large",)
     ),
     "mm for m, observed orientations": Kind(
-        EXACT, lambda n: with_points(n, lambda p: 1000.0 * p, 1000.0), ("points are 1000 times too large",)
+        EXACT, lambda n: change_points(n, lambda p: 1000.0 * p, 1000.0), ("points are 1000 times too large",)
     ),
     "names of two frames exchanged, approximate orientations": Kind(
         APPROXIMATE, lambda n: exchanged(n, with_fiducials=True), ("their names are exchanged",)
@@ -125,7 +125,7 @@ KINDS = {
 }  # fmt: skip
 
 
-def said(spoilt: Network) -> list[str]:
+def describe(spoilt: Network) -> list[str]:
     """What a user is told: the message, or the warnings and what is called suspect."""
     try:
         result = adjust(spoilt)

@@ -48,11 +48,11 @@ def simulated(
         image = f"f{number + 1}"
         rotation = Rotation.from_euler("XYZ", station[3:]).as_matrix().T
         rotations[image], centers[image] = rotation, np.array(station[:3])
-        seen = camera_coordinates(xyz, rotation, centers[image], distortion)
+        projected = camera_coordinates(xyz, rotation, centers[image], distortion)
         marks = np.array(list(MARKS_MM.values()))
         scan = scan_from_camera(kind, mirrored, rng)
-        inside = np.flatnonzero((np.abs(seen) < 115.0).all(axis=1))
-        targets = seen[inside] @ scan[0].T + scan[1] + rng.normal(0.0, noise_mm, (len(inside), 2))
+        inside = np.flatnonzero((np.abs(projected) < 115.0).all(axis=1))
+        targets = projected[inside] @ scan[0].T + scan[1] + rng.normal(0.0, noise_mm, (len(inside), 2))
         wrong = rng.random(len(inside)) < outliers
         targets[wrong] += rng.uniform(-40.0, 40.0, (int(wrong.sum()), 2))
         fiducials = marks @ scan[0].T + scan[1] + rng.normal(0.0, noise_mm, marks.shape)

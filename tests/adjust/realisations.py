@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from reference_cases import CAMERA, Case, approximations_of, network_of, own_name
+from reference_cases import CAMERA, Case, case_approximations, case_network, own_name
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera, Fiducial
@@ -31,8 +31,8 @@ def exact(case: Case, fiducial_sigma_mm: float | None = None, control_sigma: flo
     The observations are those that the functions give for the truth; the reference adjustments prove the functions.
     """
     truth = {own_name(name): value for name, value in case["truth"].items()}
-    start = approximations_of(case, dict(case["truth"]))
-    given = network_of(case)
+    start = case_approximations(case, dict(case["truth"]))
+    given = case_network(case)
     points = tuple(_true_point(point, truth, control_sigma) for point in given.points)
     network = replace(given, cameras=(_true_camera(given.cameras[0], truth, fiducial_sigma_mm),), points=points)
     problem = number(network, start)
@@ -85,21 +85,21 @@ def realisation(without_errors: Network, rng: np.random.Generator) -> Network:
     root = np.linalg.cholesky(observations.covariance_mm2)
     noise = (root @ rng.normal(size=(len(observations), 2, 1)))[..., 0]
 
-    def drawn(prior: Prior | None) -> Prior | None:
+    def draw(prior: Prior | None) -> Prior | None:
         if prior is None or not 0.0 < prior.sigma < np.inf:
             return prior
         return Prior(prior.value + prior.sigma * rng.normal(), prior.sigma)
 
     def drawn_camera(camera: Camera) -> Camera:
-        parameters = {name: drawn(prior) or prior for name, prior in camera.distortion.parameters.items()}
+        parameters = {name: draw(prior) or prior for name, prior in camera.distortion.parameters.items()}
         return replace(
             camera,
-            principal_distance_mm=drawn(camera.principal_distance_mm),
-            x0_mm=drawn(camera.x0_mm),
-            y0_mm=drawn(camera.y0_mm),
+            principal_distance_mm=draw(camera.principal_distance_mm),
+            x0_mm=draw(camera.x0_mm),
+            y0_mm=draw(camera.y0_mm),
             distortion=replace(camera.distortion, parameters=parameters),
             fiducials={
-                id_: Fiducial(drawn(mark.x_mm) or mark.x_mm, drawn(mark.y_mm) or mark.y_mm)
+                id_: Fiducial(draw(mark.x_mm) or mark.x_mm, draw(mark.y_mm) or mark.y_mm)
                 for id_, mark in camera.fiducials.items()
             },
         )
@@ -108,7 +108,7 @@ def realisation(without_errors: Network, rng: np.random.Generator) -> Network:
         without_errors,
         cameras=tuple(drawn_camera(camera) for camera in without_errors.cameras),
         points=tuple(
-            ObjectPoint(point.id, drawn(point.X), drawn(point.Y), drawn(point.Z)) for point in without_errors.points
+            ObjectPoint(point.id, draw(point.X), draw(point.Y), draw(point.Z)) for point in without_errors.points
         ),
         observations=replace(observations, xy_mm=observations.xy_mm + noise),
     )

@@ -46,7 +46,7 @@ def load(name: str) -> Case:
     return case
 
 
-def network_of(case: Case) -> Network:
+def case_network(case: Case) -> Network:
     """The case's input. Names are the case's numbers."""
     given = case["input"]
     interior = dict(zip(case["io_names"], map(prior, given["io_obs"], given["io_sigma"]), strict=True))
@@ -87,10 +87,10 @@ def prior(value: float, sigma: float | None) -> Prior:
     return Prior(value, np.inf if sigma is None else sigma)
 
 
-def approximations_of(case: Case, values: dict[str, float]) -> Approximations:
+def case_approximations(case: Case, values: dict[str, float]) -> Approximations:
     """Approximations by the case's own names; a given value where the case names none."""
     given = case["input"]
-    network = network_of(case)
+    network = case_network(case)
     interior = dict(zip(case["io_names"], given["io_obs"], strict=True))
     start = {
         f"PT{i}.{axis}": x for i, row in enumerate(given["pts_obs"], 1) for axis, x in zip("XYZ", row, strict=True)

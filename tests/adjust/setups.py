@@ -58,11 +58,11 @@ class Setup:
             f"f{i}": np.array([*station, *attitude])
             for i, (station, attitude) in enumerate(zip(self.stations, self.attitudes, strict=True))
         }
-        network = replace(network, points=tuple(with_sigma(point, self.sigma) for point in network.points))
-        return with_prior(network, self.prior), replace(start, exterior=exact)
+        network = replace(network, points=tuple(set_sigma(point, self.sigma) for point in network.points))
+        return set_prior(network, self.prior), replace(start, exterior=exact)
 
 
-def with_sigma(point: ObjectPoint, sigma: Triple) -> ObjectPoint:
+def set_sigma(point: ObjectPoint, sigma: Triple) -> ObjectPoint:
     x, y, z = (
         None if prior is None else replace(prior, sigma=s)
         for prior, s in zip((point.X, point.Y, point.Z), sigma, strict=True)
@@ -70,12 +70,12 @@ def with_sigma(point: ObjectPoint, sigma: Triple) -> ObjectPoint:
     return replace(point, X=x, Y=y, Z=z)
 
 
-def with_prior(network: Network, sigma: float) -> Network:
+def set_prior(network: Network, sigma: float) -> Network:
     """All of F5 to F9 with one standard deviation."""
-    return given(network, dict.fromkeys(("x", "y", "c", "x0", "y0"), sigma))
+    return give_values(network, dict.fromkeys(("x", "y", "c", "x0", "y0"), sigma))
 
 
-def given(network: Network, sigmas: Mapping[str, float], marks: int | None = None) -> Network:
+def give_values(network: Network, sigmas: Mapping[str, float], marks: int | None = None) -> Network:
     """Standard deviations for c, x0, y0 and for x and y of the first (None: all) fiducials, the others as they are."""
     camera = network.cameras[0]
     fiducials = {
@@ -87,16 +87,16 @@ def given(network: Network, sigmas: Mapping[str, float], marks: int | None = Non
     }
     changed = Camera(
         camera.name,
-        _given(camera.principal_distance_mm, sigmas.get("c")),
-        _given(camera.x0_mm, sigmas.get("x0")),
-        _given(camera.y0_mm, sigmas.get("y0")),
+        _draw_given(camera.principal_distance_mm, sigmas.get("c")),
+        _draw_given(camera.x0_mm, sigmas.get("x0")),
+        _draw_given(camera.y0_mm, sigmas.get("y0")),
         camera.distortion,
         {**camera.fiducials, **fiducials},
     )
     return replace(network, cameras=(changed,))
 
 
-def _given(prior: Prior | None, sigma: float | None) -> Prior | None:
+def _draw_given(prior: Prior | None, sigma: float | None) -> Prior | None:
     return prior if prior is None or sigma is None else replace(prior, sigma=sigma)
 
 

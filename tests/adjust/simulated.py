@@ -192,7 +192,7 @@ def digital_network(
     )
 
 
-def joined(*parts: Observations) -> Observations:
+def join_observations(*parts: Observations) -> Observations:
     """Observations behind one another."""
     return Observations(
         tuple(chain.from_iterable(each.image for each in parts)),

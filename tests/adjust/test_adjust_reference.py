@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_cases import CAMERA, Case, approximations_of, load, network_of, own_name
+from reference_cases import CAMERA, Case, case_approximations, case_network, load, own_name
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Network
@@ -23,9 +23,9 @@ CASES = (
 )
 
 
-def adjusted(case: Case, network: Network | None = None) -> Adjustment:
-    network = network or network_of(case)
-    return adjust(network, approximations_of(case, case["input"]["initial_approximations"]), Options())
+def adjust_network(case: Case, network: Network | None = None) -> Adjustment:
+    network = network or case_network(case)
+    return adjust(network, case_approximations(case, case["input"]["initial_approximations"]), Options())
 
 
 def differences(case: Case, result: Adjustment) -> np.ndarray:
@@ -40,7 +40,7 @@ def differences(case: Case, result: Adjustment) -> np.ndarray:
 def test_reference_case(name: str) -> None:
     case = load(name)
     reference = case["result"]
-    result = adjusted(case)
+    result = adjust_network(case)
 
     assert result.converged
     counts = (result.conditions, result.unknowns, result.redundancy)
@@ -65,7 +65,7 @@ def test_reference_case(name: str) -> None:
 def test_juhls_table_of_standard_deviations() -> None:
     """The paper's own figures, to the digits that it prints; its simulated points are others than the case's."""
     case = load("ii_juhl_3photos")
-    result = adjusted(case)
+    result = adjust_network(case)
     for name, printed_um in case["paper_table_rmse_um"].items():
         assert result.sigma(f"IO.{CAMERA}.{name}") == pytest.approx(printed_um, rel=0.2)
 
@@ -73,7 +73,7 @@ def test_juhls_table_of_standard_deviations() -> None:
 @pytest.mark.parametrize("name", ["i_five_images_affine_reduced", "iii_selfcal_mixed"])
 def test_the_order_of_inputs_does_not_matter(name: str) -> None:
     case = load(name)
-    network = network_of(case)
+    network = case_network(case)
     order = list(range(len(network.observations)))
     random.Random(7).shuffle(order)
     shuffled = Network(
@@ -82,7 +82,7 @@ def test_the_order_of_inputs_does_not_matter(name: str) -> None:
         tuple(sorted(network.points, key=lambda point: point.id[::-1])),
         network.observations.only(np.array(order)),
     )
-    plain, other = adjusted(case), adjusted(case, shuffled)
+    plain, other = adjust_network(case), adjust_network(case, shuffled)
     for i, unknown in enumerate(plain.names):
         sigma = max(np.sqrt(plain.cofactor.variances[i]), 1e-30)
         assert abs(plain.values[i] - other.value(unknown)) <= 1e-9 * sigma
@@ -104,7 +104,7 @@ def test_poor_approximations_lead_to_the_same_result(seed: int) -> None:
         else:
             size = 0.0
         start[name] = value + rng.uniform(-size, size)
-    result = adjust(network_of(case), approximations_of(case, start))
+    result = adjust(case_network(case), case_approximations(case, start))
     assert result.converged
     assert np.abs(differences(case, result)).max() < 1e-7
     assert result.iterations < 20
@@ -113,8 +113,8 @@ def test_poor_approximations_lead_to_the_same_result(seed: int) -> None:
 def test_elements_are_the_combined_model_when_axes_are_parallel_and_distortion_small() -> None:
     """Torlegård's special case, A near I, as good as true of this case's 0.1 mm of distortion and 5 um of noise."""
     case = load("i_five_images_affine_reduced")
-    start = approximations_of(case, case["input"]["initial_approximations"])
-    result = adjust(network_of(case), start, Options(method="elements"))
+    start = case_approximations(case, case["input"]["initial_approximations"])
+    result = adjust(case_network(case), start, Options(method="elements"))
     assert result.converged
     assert np.abs(differences(case, result)).max() < 0.05
     assert result.vpv == pytest.approx(case["result"]["vpv"], rel=0.01)
@@ -122,22 +122,22 @@ def test_elements_are_the_combined_model_when_axes_are_parallel_and_distortion_s
 
 def test_history_ends_at_the_result() -> None:
     case = load("i_five_images_affine_reduced")
-    result = adjusted(case)
+    result = adjust_network(case)
     assert len(result.history) == result.iterations
     assert result.history[-1][0] == pytest.approx(result.vpv)
     assert result.history[-1][1] < 1e-6
 
 
-def test_an_iteration_limit_is_told() -> None:
+def test_an_iteration_limit_is_reported() -> None:
     case = load("i_five_images_affine_reduced")
-    start = approximations_of(case, case["input"]["initial_approximations"])
-    result = adjust(network_of(case), start, Options(iteration_limit=2))
+    start = case_approximations(case, case["input"]["initial_approximations"])
+    result = adjust(case_network(case), start, Options(iteration_limit=2))
     assert result.termination == "iteration limit"
     assert not result.converged
     assert "not final" in " ".join(result.warnings)
 
 
-def with_distortion(network: Network, distortion: Distortion) -> Network:
+def set_distortion(network: Network, distortion: Distortion) -> Network:
     return replace(network, cameras=(replace(network.cameras[0], distortion=distortion),))
 
 
@@ -145,10 +145,10 @@ def test_brown_is_torlegards_without_r0() -> None:
     """The planar board with the same polynomial under Brown's names: the reference's result again."""
     case = load("iv_planar_board")
     names = {"k1": "k3", "k2": "k5", "k3": "k7", "p1": "p1", "p2": "p2"}
-    network = network_of(case)
+    network = case_network(case)
     given = network.cameras[0].distortion.parameters
-    result = adjusted(
-        case, with_distortion(network, Distortion("brown", {brown: given[name] for brown, name in names.items()}))
+    result = adjust_network(
+        case, set_distortion(network, Distortion("brown", {brown: given[name] for brown, name in names.items()}))
     )
     assert result.vpv == pytest.approx(case["result"]["vpv"], rel=1e-9)
     for brown, name in names.items():
@@ -164,7 +164,7 @@ def test_opencvs_own_calibration_of_the_planar_board() -> None:
     opencv, pixel_mm = case["opencv"], case["pixels"]["pixel_mm"]
     names = ("k1", "k2", "p1", "p2", "k3")
     free = {name: Prior(0.0, np.inf) for name in names}
-    result = adjusted(case, with_distortion(network_of(case), Distortion("opencv", free)))
+    result = adjust_network(case, set_distortion(case_network(case), Distortion("opencv", free)))
     assert result.converged
 
     half_width, half_height = (case["pixels"]["width"] - 1) / 2, (case["pixels"]["height"] - 1) / 2

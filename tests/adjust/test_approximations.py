@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from projected import C_MM, CONVERGENT, MARKS_MM, VERTICAL, Truth, field, simulated
-from reference_cases import load, network_of
+from reference_cases import case_network, load
 from scipy.spatial.transform import Rotation
 
 from adjust.errors import AdjustmentError
@@ -64,7 +64,7 @@ def test_unknown_distortion_leaves_a_usable_start() -> None:
 
 def test_unknown_principal_distance_from_a_deep_field() -> None:
     truth = simulated(field(300.0), CONVERGENT, outliers=0.05)
-    found = approximate(without_interior(truth.network))
+    found = approximate(drop_interior(truth.network))
     assert abs(found.interior["rc20"][0] - C_MM) < 0.3
     assert_near(found, truth, meters=5.0, radians=5e-3)
 
@@ -79,23 +79,21 @@ def test_unknown_principal_distance_from_twenty_boards() -> None:
         stations.append((*center, *direction.as_euler("XYZ")))
     truth = simulated(board, stations, kind="none", outliers=0.05, distortion=(-0.05, 0.01, 0.0, 0.0))
     camera = replace(truth.network.cameras[0], distortion=Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
-    found = approximate(
-        replace(without_interior(truth.network), cameras=(replace(camera, principal_distance_mm=None),))
-    )
+    found = approximate(replace(drop_interior(truth.network), cameras=(replace(camera, principal_distance_mm=None),)))
     assert abs(found.interior["rc20"][0] / C_MM - 1) < 0.05
     assert_near(found, truth, meters=80.0, radians=0.05)
 
 
-def test_a_principal_distance_that_nothing_shows_is_asked_for() -> None:
+def test_a_principal_distance_that_nothing_shows_is_requested() -> None:
     station = [(0.0, 0.0, 1500.0, 0.0, 0.0, 0.3)]
     truth = simulated(field(0.0), station)
     with pytest.raises(
         AdjustmentError, match=r"principal distance of camera rc20 cannot be found .* give principal_distance_mm"
     ):
-        approximate(without_interior(truth.network))
+        approximate(drop_interior(truth.network))
 
 
-def without_interior(network: Network) -> Network:
+def drop_interior(network: Network) -> Network:
     camera = replace(network.cameras[0], principal_distance_mm=None, x0_mm=None, y0_mm=None)
     return replace(network, cameras=(camera,))
 
@@ -103,7 +101,7 @@ def without_interior(network: Network) -> Network:
 def test_unknown_points_and_images_that_see_few_known_ones() -> None:
     truth = simulated(field(300.0, n=60), CONVERGENT)
     known_by_first_two = {f"t{k}" for k in range(8)}
-    network = with_unknown(truth.network, {p for p in truth.points if p not in known_by_first_two})
+    network = free_points(truth.network, {p for p in truth.points if p not in known_by_first_two})
     rows = [
         i
         for i, (image, point) in enumerate(zip(network.observations.image, network.observations.point, strict=True))
@@ -117,7 +115,7 @@ def test_unknown_points_and_images_that_see_few_known_ones() -> None:
 def test_given_orientations_are_kept_where_points_do_not_contradict_them() -> None:
     truth = simulated(field(300.0), CONVERGENT)
     wrong = np.array([50.0, 50.0, 50.0, 0.1, 0.1, 0.1])
-    exact = {name: exterior_of(truth, name) for name in truth.centers}
+    exact = {name: true_exterior(truth, name) for name in truth.centers}
     images = tuple(
         replace(image, exterior=Exterior(exact[image.name] + (wrong if image.name == "f2" else 1e-9)))
         for image in truth.network.images
@@ -130,7 +128,7 @@ def test_given_orientations_are_kept_where_points_do_not_contradict_them() -> No
     np.testing.assert_allclose(found.exterior["f2"], exact["f2"] + wrong, rtol=0, atol=1e-9)
 
 
-def exterior_of(truth: Truth, image: str) -> Array:
+def true_exterior(truth: Truth, image: str) -> Array:
     angles = Rotation.from_matrix(truth.rotations[image].T).as_euler("XYZ")
     return np.concatenate([truth.centers[image], angles])
 
@@ -138,7 +136,7 @@ def exterior_of(truth: Truth, image: str) -> Array:
 @pytest.mark.study
 def test_the_order_of_things_does_not_matter() -> None:
     truth = simulated(field(30.0), CONVERGENT[:3], outliers=0.05)
-    network = without_interior(truth.network)
+    network = drop_interior(truth.network)
     rng = np.random.default_rng(0)
     shuffled = replace(
         network,
@@ -153,18 +151,18 @@ def test_the_order_of_things_does_not_matter() -> None:
 
 def test_too_few_known_points_are_named() -> None:
     truth = simulated(field(300.0), CONVERGENT[:1])
-    network = with_unknown(truth.network, {f"t{k}" for k in range(2, 40)})
-    seen = sum(point in {"t0", "t1"} for point in network.observations.point)
-    with pytest.raises(AdjustmentError, match=f"image f1 sees {seen} known points, no other image"):
+    network = free_points(truth.network, {f"t{k}" for k in range(2, 40)})
+    observed = sum(point in {"t0", "t1"} for point in network.observations.point)
+    with pytest.raises(AdjustmentError, match=f"image f1 sees {observed} known points, no other image"):
         approximate(network)
 
 
 def test_an_image_that_the_others_do_not_help_is_named() -> None:
     truth = simulated(field(300.0), CONVERGENT)
     observations = truth.network.observations
-    seen = zip(observations.image, observations.point, observations.kind, strict=True)
-    of_f3 = sorted(point for image, point, kind in seen if image == "f3" and kind == "target")
-    network = with_unknown(truth.network, {of_f3[2]})  # seen nowhere else, and so no help
+    observed = zip(observations.image, observations.point, observations.kind, strict=True)
+    of_f3 = sorted(point for image, point, kind in observed if image == "f3" and kind == "target")
+    network = free_points(truth.network, {of_f3[2]})  # seen nowhere else, and so no help
     rows = [
         row
         for row, (image, point) in enumerate(zip(observations.image, observations.point, strict=True))
@@ -186,9 +184,9 @@ def test_misnumbered_points_are_not_believed() -> None:
         approximate(network)
 
 
-def test_a_point_seen_once_and_too_few_marks_are_named() -> None:
+def test_a_point_viewed_once_and_too_few_marks_are_named() -> None:
     truth = simulated(field(300.0), CONVERGENT)
-    network = with_unknown(truth.network, {"t0"})
+    network = free_points(truth.network, {"t0"})
     rows = [i for i, point in enumerate(network.observations.point) if point != "t0"]
     once = network.observations.point.index("t0")
     with pytest.raises(AdjustmentError, match=r"point t0 is unknown and measured in image f. only"):
@@ -204,7 +202,7 @@ def test_a_point_seen_once_and_too_few_marks_are_named() -> None:
         approximate(replace(network, observations=subset(network.observations, rows)))
 
 
-def with_unknown(network: Network, names: set[str]) -> Network:
+def free_points(network: Network, names: set[str]) -> Network:
     points = (ObjectPoint(p.id, None, None, None) if p.id in names else p for p in network.points)
     return replace(network, points=tuple(points))
 
@@ -255,7 +253,7 @@ def heights_only(network: Network, planimetry: set[str]) -> Network:
 )
 def test_reference_cases_from_their_observations_alone(case_name: str, meters: float, radians: float) -> None:
     case = load(case_name)
-    network = from_observations_alone(network_of(case))
+    network = from_observations_alone(case_network(case))
     found = approximate(network)
     truth = case["truth"] if "truth" in case else case["state"]
     for image in found.exterior:

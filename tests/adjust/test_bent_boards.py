@@ -45,7 +45,7 @@ def bent_board() -> Array:
     return board
 
 
-def network_of(rng: np.random.Generator | None, turned: Array | None = None, bent: bool = True) -> Network:
+def make_network(rng: np.random.Generator | None, turned: Array | None = None, bent: bool = True) -> Network:
     """Six views by OpenCV of the bent board; turned (3, 3): how the board lies in the object's axes."""
     turn = np.eye(3) if turned is None else turned
     flat, real = flat_board(), bent_board()
@@ -55,8 +55,8 @@ def network_of(rng: np.random.Generator | None, turned: Array | None = None, ben
         rotation = Rotation.from_euler("xyz", angles).as_matrix()
         shift = np.array([0.0, 0.0, 420.0]) - rotation @ middle
         matrix = np.array([[C_MM, 0.0, 0.1], [0.0, C_MM, 0.05], [0.0, 0.0, 1.0]])
-        seen, _ = cv2.projectPoints(real, cv2.Rodrigues(rotation)[0], shift, matrix, np.array([K1, 0.0, 0.0, 0.0]))
-        places.append(np.reshape(seen, (-1, 2)) * [1.0, -1.0])
+        projected, _ = cv2.projectPoints(real, cv2.Rodrigues(rotation)[0], shift, matrix, np.array([K1, 0.0, 0.0, 0.0]))
+        places.append(np.reshape(projected, (-1, 2)) * [1.0, -1.0])
     xy = np.concatenate(places)
     xy = xy if rng is None else xy + rng.normal(0.0, SIGMA_MM, xy.shape)
     names = [f"p{k}" for k in range(len(flat))]
@@ -83,13 +83,13 @@ def bends(found: Adjustment) -> Array:
 
 
 def test_the_bends_of_exact_views_are_found() -> None:
-    network = network_of(None)
+    network = make_network(None)
     found = adjust(network, approximate(network))
     assert found.converged
     np.testing.assert_allclose(bends(found), BENDS_MM, atol=1e-7)
     assert found.value("IO.C.c") == pytest.approx(C_MM, abs=1e-7)
     np.testing.assert_allclose(adjusted_places(found, [f"p{k}" for k in range(70)]), bent_board(), atol=1e-6)
-    flat = adjust(network_of(None, bent=False), approximate(network))
+    flat = adjust(make_network(None, bent=False), approximate(network))
     assert flat.sigma0 > 5.0  # without them the board does not fit
 
 
@@ -97,11 +97,11 @@ def test_the_bends_of_exact_views_are_found() -> None:
 def test_claimed_sigmas_of_bends_are_realised() -> None:
     """Thirty sets of errors: chi-square per degree of freedom of both bends, c and k1 within three sigmas of 1."""
     rng = np.random.default_rng(8)
-    start = approximate(network_of(None))
+    start = approximate(make_network(None))
     names = ["BD.board.bend_x", "BD.board.bend_y", "IO.C.c", "IO.C.k1"]
     squares = []
     for _ in range(30):
-        found = adjust(network_of(rng), start)
+        found = adjust(make_network(rng), start)
         errors = np.array([found.value(name) for name in names]) - [*BENDS_MM, C_MM, K1]
         squares.append(errors @ np.linalg.solve(found.cofactor_of(names), errors))
     assert abs(np.mean(squares) / 4.0 - 1.0) < 3.0 * np.sqrt(2.0 / (4.0 * len(squares)))
@@ -111,14 +111,14 @@ def test_claimed_sigmas_of_bends_are_realised() -> None:
 def test_a_board_lies_anyhow_in_the_object(turn: tuple[float, float, float]) -> None:
     """The same images, the board on another plane and turned in it: the same places but for that turn."""
     turned = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
-    found = adjust(network_of(None, turned), approximate(network_of(None, turned)))
+    found = adjust(make_network(None, turned), approximate(make_network(None, turned)))
     places = adjusted_places(found, [f"p{k}" for k in range(70)])
     np.testing.assert_allclose(places, bent_board() @ turned.T, atol=1e-6)
     assert found.vpv < 1e-10
 
 
 def test_derivatives_by_the_bends_are_differences_of_the_functions() -> None:
-    network = network_of(None)
+    network = make_network(None)
     problem = number(network, approximate(network))
     state = problem.start()
     at = derivatives(problem, state, compute(problem, state))  # type: ignore[arg-type]
@@ -148,7 +148,7 @@ def test_what_is_no_board_is_refused() -> None:
     line = {str(k): np.array([float(k), 0.0, 0.0]) for k in range(5)}
     with pytest.raises(ValueError, match="at least four points about in a plane"):
         Board("b", line)
-    network = network_of(None)
+    network = make_network(None)
     unknown = replace(network, points=(ObjectPoint("p0", None, None, None), *network.points[1:]))
     with pytest.raises(AdjustmentError, match="point p0 of board board is not known"):
         adjust(unknown, approximate(network))
@@ -159,7 +159,7 @@ def test_what_is_no_board_is_refused() -> None:
 
 def test_bends_that_heights_can_take_are_named() -> None:
     """Where every height is free to 100 m, the bends are the heights' own."""
-    network = network_of(None)
+    network = make_network(None)
     vague = tuple(replace(point, Z=Prior(0.0, 1e5)) for point in network.points)
     found = adjust(replace(network, points=vague), approximate(network))
     assert found.singular or found.sigma("BD.board.bend_x") / found.sigma0 > 10.0
@@ -168,7 +168,7 @@ def test_bends_that_heights_can_take_are_named() -> None:
 @pytest.mark.study
 def test_a_choice_of_models_knows_the_bend() -> None:
     """k1 is chosen, and left-out points are predicted where the bent board has them."""
-    own = adjust(network_of(np.random.default_rng(3)), approximate(network_of(None)))
+    own = adjust(make_network(np.random.default_rng(3)), approximate(make_network(None)))
     chosen = choose(own).chosen
     assert chosen is not None
     assert chosen.model.parameters == ("k1",)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import KINDS, exchanged, network, outcome, said, with_points
+from planted import KINDS, change_points, describe, exchanged, network, outcome
 from studies import parametrize_with_studies
 
 from adjust.errors import AdjustmentError
@@ -26,7 +26,7 @@ FAST = (
 )
 def test_what_is_wrong_with_all_is_named(name: str) -> None:
     kind = KINDS[name]
-    sentences = said(kind.spoil(network(0, kind.oriented)))
+    sentences = describe(kind.spoil(network(0, kind.oriented)))
     assert outcome(kind, sentences) == "named", sentences
 
 
@@ -40,14 +40,16 @@ def test_targets_of_exchanged_frames_are_named(options: Options) -> None:
 @pytest.mark.parametrize("options", [Options(robust=True), Options(snooping=True)])
 def test_robust_methods_do_not_hide_a_slip_of_the_whole(options: Options) -> None:
     with pytest.raises(AdjustmentError, match="The points are mirrored"):
-        adjust(with_points(network(2), lambda xyz: xyz * [1.0, 1.0, -1.0]), options=options)
+        adjust(change_points(network(2), lambda xyz: xyz * [1.0, 1.0, -1.0]), options=options)
 
 
 def test_flat_fields_are_mirrored_by_their_stations_alone() -> None:
     """Their residuals are those of the true field: cameras behind it see it so."""
     given = network(3, np.full(6, np.inf), relief=0.0)
-    told = [each for each in adjust(with_points(given, lambda xyz: xyz[[1, 0, 2]])).warnings if "nowhere near" in each]
-    assert ["X and Y of all points are exchanged" in each for each in told] == [True]
+    finding = [
+        each for each in adjust(change_points(given, lambda xyz: xyz[[1, 0, 2]])).warnings if "nowhere near" in each
+    ]
+    assert ["X and Y of all points are exchanged" in each for each in finding] == [True]
     assert not [each for each in adjust(given).warnings if "nowhere near" in each]
 
 

@@ -37,11 +37,11 @@ def published() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def adjustment(published: dict[str, Any]) -> Adjustment:
-    network = network_of(published)
+    network = make_network(published)
     return adjust(network, approximate(network))
 
 
-def network_of(published: dict[str, Any]) -> Network:
+def make_network(published: dict[str, Any]) -> Network:
     free = {name: Prior(0.0, np.inf) for name in ("k1", "k2", "p1", "p2", "b1")}
     camera = Camera("camera", None, None, None, Distortion("opencv", free), center_mm=(3.195, -2.395))
     corners_px = np.concatenate([published[f"x_{image}"].T for image in IMAGES])
@@ -62,7 +62,7 @@ def network_of(published: dict[str, Any]) -> Network:
     )
 
 
-def in_pixels(adjustment: Adjustment) -> tuple[Array, Array]:
+def pixel_intrinsics(adjustment: Adjustment) -> tuple[Array, Array]:
     """fx, fy, cx, cy, k1, k2, p1, p2 and their standard deviations."""
     names = [f"IO.camera.{name}" for name in ("c", "b1", "x0", "y0", "k1", "k2", "p1", "p2")]
     rows = [adjustment.index(name) for name in names]
@@ -79,13 +79,13 @@ def in_pixels(adjustment: Adjustment) -> tuple[Array, Array]:
 def test_published_values_within_a_tenth_of_the_published_sigmas(
     published: dict[str, Any], adjustment: Adjustment
 ) -> None:
-    values, _ = in_pixels(adjustment)
+    values, _ = pixel_intrinsics(adjustment)
     expected = np.concatenate([published[name].ravel() for name in ("fc", "cc", "kc")])[:8]
     assert (np.abs(values - expected) < 0.1 * published_sigmas(published)).all()
 
 
 def test_standard_deviations_are_the_published_ones(published: dict[str, Any], adjustment: Adjustment) -> None:
-    _, sigmas = in_pixels(adjustment)
+    _, sigmas = pixel_intrinsics(adjustment)
     np.testing.assert_allclose(sigmas, published_sigmas(published), rtol=0.02)
 
 

@@ -45,7 +45,7 @@ def calibration(values: Array, marks: dict[str, Array] | None = None) -> CameraC
     )
 
 
-def drawn(rng: np.random.Generator, change: Array | float = 0.0) -> CameraCalibration:
+def draw_calibration(rng: np.random.Generator, change: Array | float = 0.0) -> CameraCalibration:
     error = rng.multivariate_normal(np.zeros(18), covariance())
     marks = {id: xy + error[10 + 2 * i : 12 + 2 * i] for i, (id, xy) in enumerate(MARKS.items())}
     return calibration(TRUE + change + error[AT], marks)
@@ -53,7 +53,9 @@ def drawn(rng: np.random.Generator, change: Array | float = 0.0) -> CameraCalibr
 
 def test_false_alarms_come_as_often_as_stated() -> None:
     rng = np.random.default_rng(1)
-    probabilities = np.array([compare([drawn(rng), drawn(rng)], HALF).same.probability for _ in range(160)])
+    probabilities = np.array(
+        [compare([draw_calibration(rng), draw_calibration(rng)], HALF).same.probability for _ in range(160)]
+    )
     for level in (0.05, 0.5):
         expected = 160 * level
         assert abs(int((probabilities < level).sum()) - expected) < 3.5 * np.sqrt(expected * (1 - level))
@@ -63,7 +65,7 @@ def test_false_alarms_come_as_often_as_stated() -> None:
 def test_a_trend_is_tested_at_its_level_and_found() -> None:
     rng = np.random.default_rng(2)
     years, drift = np.array([1952.0, 1955.0, 1961.0, 1970.0]), np.zeros(7)
-    series = [compare([drawn(rng) for _ in years], HALF, years) for _ in range(100)]
+    series = [compare([draw_calibration(rng) for _ in years], HALF, years) for _ in range(100)]
     for alarms in (
         sum(each.trend is not None and each.trend.probability < 0.05 for each in series),
         sum(each.probability < 0.05 for each in series),
@@ -75,7 +77,7 @@ def test_a_trend_is_tested_at_its_level_and_found() -> None:
     standardised = np.linalg.solve(roots, np.array([each.trend_um[corners] for each in series])[..., None])
     assert np.sqrt(np.mean(standardised**2)) == pytest.approx(1.0, abs=0.15)
     drift[3] = 4e-9  # k3 a year
-    moving = compare([drawn(rng, drift * (year - years[0])) for year in years], HALF, years)
+    moving = compare([draw_calibration(rng, drift * (year - years[0])) for year in years], HALF, years)
     assert moving.trend is not None
     assert moving.trend.freedom == moving.same.freedom / 3
     assert moving.probability < 1e-3
@@ -87,12 +89,12 @@ def test_a_trend_is_tested_at_its_level_and_found() -> None:
 @pytest.mark.study
 def test_the_sigmas_of_the_field_hold() -> None:
     rng = np.random.default_rng(3)
-    compared = [compare([drawn(rng), drawn(rng)], HALF) for _ in range(200)]
+    compared = [compare([draw_calibration(rng), draw_calibration(rng)], HALF) for _ in range(200)]
     claimed = sigmas(compared[0].field_covariance_um2[0])
     realised = np.std([each.field_um[0] for each in compared], axis=0)
-    seen = claimed > 0.1
-    assert seen.sum() > 60
-    assert np.median(realised[seen] / claimed[seen]) == pytest.approx(1.0, abs=0.06)
+    view = claimed > 0.1
+    assert view.sum() > 60
+    assert np.median(realised[view] / claimed[view]) == pytest.approx(1.0, abs=0.06)
     of_marks = np.std([each.fiducials_um[0] for each in compared], axis=0)
     assert np.median(of_marks / sigmas(compared[0].fiducials_covariance_um2[0])) == pytest.approx(1.0, abs=0.08)
 
@@ -102,7 +104,9 @@ def test_a_change_is_found_the_oftener_the_larger_it_is(sigmas: float, least: fl
     rng = np.random.default_rng(4)
     change = np.zeros(7)
     change[4] = sigmas * np.sqrt(2 * (1 - 0.81)) * SIGMAS[4]  # of k5, of which k3 can take up most
-    found = [compare([drawn(rng), drawn(rng, change)], HALF).same.probability < 0.05 for _ in range(60)]
+    found = [
+        compare([draw_calibration(rng), draw_calibration(rng, change)], HALF).same.probability < 0.05 for _ in range(60)
+    ]
     assert np.mean(found) >= least
 
 

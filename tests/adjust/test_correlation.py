@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mishaps import MISHAPS, sentences
-from setups import CONVERGENT, FREE, Setup, given, vertical
+from setups import CONVERGENT, FREE, Setup, give_values, vertical
 from simulated import STATIONS
 
 from adjust.solution.adjustment import adjust
@@ -13,10 +13,10 @@ from adjust.solution.adjustment import adjust
 LOW_RELIEF = Setup(vertical(0.0, 0.0, 0.0, 0.0), relief=20.0, prior=1.0)
 
 
-def test_flying_height_and_principal_distance_are_told() -> None:
+def test_flying_height_and_principal_distance_are_reported() -> None:
     """With fixed fiducials nothing is taken out: the correlation is that of the cofactor matrix."""
     network, start = LOW_RELIEF.network()
-    result = adjust(given(network, {"x": 0.0, "y": 0.0}), start)
+    result = adjust(give_values(network, {"x": 0.0, "y": 0.0}), start)
     first = result.correlations[0]
     assert [each.text for each in first.parameters] == ["IO.K.c", "EO.*.Z0"]
     assert "c of camera K and Z0 of all images are correlated by" in first.cause
@@ -33,7 +33,7 @@ def test_the_datum_of_the_fiducials_does_not_hide_a_correlation() -> None:
     """Priors of 1 mm, of 0.1 mm or of 10 mm on fiducials that no image contradicts: the same correlations."""
     network, start = LOW_RELIEF.network()
     found = [
-        adjust(given(network, {"x": s, "y": s, "c": FREE, "x0": FREE, "y0": FREE}), start).correlations
+        adjust(give_values(network, {"x": s, "y": s, "c": FREE, "x0": FREE, "y0": FREE}), start).correlations
         for s in (0.1, 1.0, 10.0)
     ]
     assert [each.parameters for each in found[0]] == [each.parameters for each in found[2]]
@@ -45,15 +45,15 @@ def test_the_datum_of_the_fiducials_does_not_hide_a_correlation() -> None:
 def test_the_remedy_lowers_the_correlation() -> None:
     """Relief of 500 m, and images tilted by 20 degrees: c and Z0 are no longer told."""
     tilted = replace(LOW_RELIEF, attitudes=CONVERGENT, relief=500.0)
-    for setup, told in ((LOW_RELIEF, True), (tilted, False)):
+    for setup, result in ((LOW_RELIEF, True), (tilted, False)):
         pairs = [each.parameters[0].text for each in adjust(*setup.network()).correlations]
-        assert ("IO.K.c" in pairs) == told
+        assert ("IO.K.c" in pairs) == result
 
 
 def test_a_wider_field_tells_the_principal_point_from_tilts_and_decentering() -> None:
-    said = " ".join(sentences(adjust(*MISHAPS["narrow-field"].network())))
-    assert "x0' and p1 of camera K are correlated by" in said
-    assert "Targets out to the corners of the frame" in said
+    text = " ".join(sentences(adjust(*MISHAPS["narrow-field"].network())))
+    assert "x0' and p1 of camera K are correlated by" in text
+    assert "Targets out to the corners of the frame" in text
     points = np.random.default_rng(4).uniform(-1.0, 1.0, (20, 3)) * [1100.0, 1100.0, 300.0]
     free = {"k3": FREE, "p1": FREE, "p2": FREE}
     wide = Setup(vertical(0.0, 0.0, 0.0, 0.0), prior=10.0, points=points, distortion=free)
@@ -70,7 +70,7 @@ def test_a_turn_of_the_camera_about_its_axis_changes_nothing() -> None:
     assert [each.parameters[1].text for each in by_x0] == ["EO.f0.X0", "EO.f0.Y0"]
 
 
-def test_powers_of_the_radius_and_decentering_are_told() -> None:
+def test_powers_of_the_radius_and_decentering_are_reported() -> None:
     setup = Setup(CONVERGENT, prior=1.0, distortion={"k3": FREE, "k5": FREE, "k7": FREE})
     found = adjust(*setup.network()).correlations
     powers = [each for each in found if each.parameters[0].text.startswith("IO.K.k")]
@@ -79,5 +79,5 @@ def test_powers_of_the_radius_and_decentering_are_told() -> None:
     assert all("Compare the curve" in each.remedy for each in powers)
 
 
-def test_nothing_is_told_without_a_solution() -> None:
+def test_nothing_is_reported_without_a_solution() -> None:
     assert adjust(*Setup(CONVERGENT).network()).correlations == ()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference_cases import approximations_of, load, network_of
+from reference_cases import case_approximations, case_network, load
 from simulated import Truth, rotation, simulated
 
 from adjust.errors import AdjustmentError
@@ -181,7 +181,7 @@ def test_a_flat_field_of_heights_needs_a_fourth_chosen_coordinate() -> None:
     for row, sigma in zip(case["input"]["pts_obs"], case["input"]["pts_sigma"], strict=True):
         row[2] += rng.normal(0.0, 0.02)
         sigma[2] = 0.02
-    network, start = network_of(case), approximations_of(case, case["state"])
+    network, start = case_network(case), case_approximations(case, case["state"])
     first, last = network.points[0].id, network.points[-1].id
     with pytest.raises(AdjustmentError, match="leave datum defects of the object space"):
         adjust(network, start, Options("minimal", (f"{first}.X", f"{first}.Y", f"{last}.X")))
@@ -239,16 +239,16 @@ def test_inner_constraints_have_the_least_trace_and_leave_centre_turn_and_size(c
 def test_minimal_datum_of_the_reference_case() -> None:
     """The reference's network with nothing fixed by hand gives the reference's camera."""
     case = load("iii_selfcal_all_unknown_datum_A")
-    start = approximations_of(case, case["input"]["initial_approximations"])
+    start = case_approximations(case, case["input"]["initial_approximations"])
     case["input"]["pts_sigma"] = [[None] * 3 for _ in case["input"]["pts_sigma"]]
-    result = adjust(network_of(case), start, Options(datum="minimal"))
+    result = adjust(case_network(case), start, Options(datum="minimal"))
     assert result.vpv == pytest.approx(case["result"]["vpv"], rel=1e-8)
     reference = case["result"]["parameters"]["IO.c"]
     assert result.value("IO.K.c") == pytest.approx(reference["value"], abs=1e-6 * reference["std_apriori"])
     assert result.sigma("IO.K.c") == pytest.approx(reference["std_aposteriori"], rel=1e-7)
 
 
-def with_exteriors(network: Network, sigmas: Array, truth: Truth) -> Network:
+def set_exteriors(network: Network, sigmas: Array, truth: Truth) -> Network:
     """The network with observed exterior orientations."""
     values = np.hstack([np.array(truth.stations), np.array(truth.attitudes)])
     images = tuple(
@@ -265,7 +265,7 @@ def test_observed_and_fixed_angles(observed: tuple[float, float, float]) -> None
     """Each angle is observed, fixed or free by itself; the result is that of minimising over the angles directly."""
     truth = Truth()
     network, start = simulated(np.random.default_rng(7), truth)
-    result = adjust(with_exteriors(network, np.array([np.inf] * 3 + list(observed)), truth), start)
+    result = adjust(set_exteriors(network, np.array([np.inf] * 3 + list(observed)), truth), start)
     assert result.converged
     for i, attitude in enumerate(truth.attitudes):
         for name, value, sigma in zip(EXTERIOR_NAMES[3:], attitude, observed, strict=True):
@@ -331,7 +331,7 @@ def test_fiducials_alone_are_adjusted(held: bool) -> None:
             for id_, m in camera.fiducials.items()
         }
         network = replace(network, cameras=(replace(camera, fiducials=free),))
-    result = adjust(with_exteriors(network, np.zeros(6), truth), start)
+    result = adjust(set_exteriors(network, np.zeros(6), truth), start)
     if held:
         assert result.converged
         assert result.groups["fiducial"].redundancy == pytest.approx(4 * 10 - 4 * 6 - 10 + 6, abs=0.1)

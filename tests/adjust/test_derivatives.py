@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bent_scans import MIDDLE_MM, in_a_bent_scanner
+from bent_scans import MIDDLE_MM, bend_in_scanner
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from simulated import KINDS, Truth, simulated
@@ -120,7 +120,7 @@ def test_functions_by_differences_of_computed_observations(kind: Transformation,
     middle_mm = MIDDLE_MM if kind != "none" else (0.0, 0.0)
     truth = Truth(mirrored=(False, kind != "none", False, False), middle_mm=middle_mm)
     network, start = simulated(rng, truth, kind, point_sigma=np.inf, free={"k3": np.inf, "k5": np.inf})
-    network = in_a_bent_scanner(network, {}, BEND)
+    network = bend_in_scanner(network, {}, BEND)
     network = replace(network, images=(replace(network.images[0], scanner=""), *network.images[1:]))
     problem = number(network, start, by_elements)
     every = np.where(problem.unknowns.sigma > 0.0, problem.unknowns.sigma, np.inf)
@@ -132,8 +132,8 @@ def test_functions_by_differences_of_computed_observations(kind: Transformation,
     by_unknowns = -np.linalg.solve(at.by_observation, at.by_unknowns)
     names, columns = [each.text for each in problem.unknowns.parameters], problem.columns
     for alike in apart(problem):
-        sizes = np.array([step_of(names[position]) for position in alike])
-        numeric = (moved(problem, alike, sizes) - moved(problem, alike, -sizes)) / (2 * sizes[0])
+        sizes = np.array([choose_step(names[position]) for position in alike])
+        numeric = (shift_unknowns(problem, alike, sizes) - shift_unknowns(problem, alike, -sizes)) / (2 * sizes[0])
         is_moved = np.isin(columns, alike)
         analytic = (by_unknowns * is_moved[:, None, :]).sum(axis=2)
         assert is_moved.sum(axis=1).max() <= 1
@@ -154,7 +154,7 @@ def apart(problem: Problem) -> list[list[int]]:
     return list(groups.values())
 
 
-def step_of(name: str) -> float:
+def choose_step(name: str) -> float:
     """A step that moves the image by some micrometres."""
     owner, quantity = name.split(".")[0], name.rsplit(".", 1)[1]
     if owner in ("EO", "PT"):
@@ -165,7 +165,7 @@ def step_of(name: str) -> float:
     return powers.get(quantity, 1e-3)
 
 
-def moved(problem: Problem, positions: list[int], sizes: Array) -> Array:
+def shift_unknowns(problem: Problem, positions: list[int], sizes: Array) -> Array:
     step = np.zeros(len(problem.unknowns))
     step[positions] = sizes
     computed = computed_observations(problem, problem.step_state(problem.start(), step))

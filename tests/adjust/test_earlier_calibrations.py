@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from simulated import field_points, joined, simulated
+from simulated import field_points, join_observations, simulated
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Prior
@@ -42,7 +42,7 @@ def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, App
         )
         networks.append((network, replace(start, exterior=exterior, transformation=films, points=known)))
     (a, start_a), (b, start_b) = networks
-    rows = joined(a.observations, b.observations)
+    rows = join_observations(a.observations, b.observations)
     joint = replace(a, images=a.images + b.images, points=a.points + b.points, observations=rows)
     start_joint = replace(
         start_a,
@@ -53,13 +53,13 @@ def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, App
     return (a, start_a), (b, start_b), (joint, start_joint)
 
 
-def calibration_of(result: Adjustment, fiducials: bool) -> Calibration:
+def make_calibration(result: Adjustment, fiducials: bool) -> Calibration:
     kinds = ("interior", "fiducial") if fiducials else ("interior",)
     taken = [each for each in result.parameters if each.kind in kinds and result.cofactor_of([each])[0, 0] > 0.0]
     return Calibration(tuple(taken), result.values_of(taken), result.cofactor_of(taken))
 
 
-def with_calibration(network: Network, calibration: Calibration) -> Network:
+def set_calibration(network: Network, calibration: Calibration) -> Network:
     """The network with that calibration in the place of the camera's priors."""
     value = dict(zip((each.text for each in calibration.parameters), calibration.values.tolist(), strict=True))
 
@@ -96,7 +96,7 @@ def test_an_earlier_calibration_stands_for_its_observations(kind: Transformation
     for noise in (1.0, 1e-3):
         (a, start_a), (b, start_b), (joint, start_joint) = two_networks(kind, noise)
         first, both = adjust(a, start_a), adjust(joint, start_joint)
-        second = adjust(with_calibration(b, calibration_of(first, kind != "none")), start_b)
+        second = adjust(set_calibration(b, make_calibration(first, kind != "none")), start_b)
         assert second.converged
         names = [name for name in second.names if both.cofactor_of([name])[0, 0] > 0.0]
         sigmas = np.sqrt([both.cofactor_of([name])[0, 0] for name in names])
@@ -114,10 +114,10 @@ def test_an_earlier_calibration_stands_for_its_observations(kind: Transformation
 def test_a_fiducial_that_no_image_shows_has_no_part_in_a_calibration() -> None:
     """It is not tied to its calibrated place, which would hold the others as well."""
     (a, start_a), (b, start_b), _ = two_networks("affine", 1.0)
-    calibration = calibration_of(adjust(a, start_a), fiducials=True)
+    calibration = make_calibration(adjust(a, start_a), fiducials=True)
     rows = b.observations
     keep = [i for i, (p, k) in enumerate(zip(rows.point, rows.kind, strict=True)) if (p, k) != ("5", "fiducial")]
-    result = adjust(with_calibration(replace(b, observations=rows.only(np.array(keep))), calibration), start_b)
+    result = adjust(set_calibration(replace(b, observations=rows.only(np.array(keep))), calibration), start_b)
     assert not any(".5." in row.name for row in result.further)
     assert len(result.further) == len(calibration.parameters) - 2
 
@@ -132,12 +132,12 @@ def test_a_fiducial_that_no_image_shows_has_no_part_in_a_calibration() -> None:
             ["q of camera K", "no camera has"],
         ),
         (lambda n, c: replace(n, calibrations=(c,)), ["c of camera K", "standard deviation of its own (1)", "twice"]),
-        (lambda n, c: replace(with_calibration(n, c), calibrations=(c, c)), ["c of camera K", "another calibration"]),
+        (lambda n, c: replace(set_calibration(n, c), calibrations=(c, c)), ["c of camera K", "another calibration"]),
         (
-            lambda n, c: with_calibration(n, replace(c, covariance=np.ones_like(c.covariance))),
+            lambda n, c: set_calibration(n, replace(c, covariance=np.ones_like(c.covariance))),
             ["not positive definite", "c, x0 and y0 of camera K"],
         ),
-        (lambda n, c: with_calibration(n, replace(c, covariance=c.covariance[:2])), ["shape (2, 5)"]),
+        (lambda n, c: set_calibration(n, replace(c, covariance=c.covariance[:2])), ["shape (2, 5)"]),
     ],
 )
 def test_a_calibration_that_cannot_be_is_refused(
@@ -165,9 +165,9 @@ def noisy(network: Network, rng: np.random.Generator, scale: float) -> Network:
 def test_an_earlier_calibration_is_tested_as_a_whole() -> None:
     """Against the calibration of the new images alone: d' (C_old + C_new)^-1 d, their sigma0, and d itself."""
     (a, start_a), (b, start_b), _ = two_networks("none", 1.0)
-    calibration = calibration_of(adjust(a, start_a), False)
+    calibration = make_calibration(adjust(a, start_a), False)
     changed = replace(calibration, values=calibration.values + 2.0 * np.sqrt(np.diag(calibration.covariance)))
-    network = with_calibration(b, changed)
+    network = set_calibration(b, changed)
     alone = adjust(replace(network, calibrations=()), start_b)
     (found,) = adjust(network, start_b).contradictions
     names = list(calibration.parameters)
@@ -187,40 +187,40 @@ def contradicted(sigmas: float, draws: int, level: float = 0.05) -> float:
     """The share of calibrations that are told to be contradicted, of cameras whose c has changed by so many sigmas."""
     (a, start_a), (b, start_b), _ = two_networks("none", 1e-6)
     rng = np.random.default_rng(4)
-    told = []
+    result = []
     for _ in range(draws):
-        calibration = calibration_of(adjust(noisy(a, rng, 1e6), start_a), False)
+        calibration = make_calibration(adjust(noisy(a, rng, 1e6), start_a), False)
         c = calibration.parameters.index(Parameter.interior("K", "c"))
         values = calibration.values.copy()
         values[c] += sigmas * np.sqrt(2.0 * calibration.covariance[c, c])
-        network = with_calibration(noisy(b, rng, 1e6), replace(calibration, values=values))
+        network = set_calibration(noisy(b, rng, 1e6), replace(calibration, values=values))
         (found,) = adjust(network, start_b).contradictions
-        told.append(found.probability < level)
-    return float(np.mean(told))
+        result.append(found.probability < level)
+    return float(np.mean(result))
 
 
 @pytest.mark.study
 @pytest.mark.parametrize(("sigmas", "draws", "least", "most"), [(0.0, 40, 0.005, 0.13), (4.0, 16, 0.5, 1.0)])
-def test_a_contradiction_is_told_as_often_as_stated(sigmas: float, draws: int, least: float, most: float) -> None:
+def test_a_contradiction_is_reported_as_often_as_stated(sigmas: float, draws: int, least: float, most: float) -> None:
     """At a level of 5 %: of calibrations of the same camera, and of ones whose c has changed by so many sigmas."""
     assert least < contradicted(sigmas, draws) <= most
 
 
-def test_a_contradiction_is_told_beside_what_the_marks_show() -> None:
+def test_a_contradiction_is_reported_next_to_what_the_marks_show() -> None:
     """Fiducials, films and camera together can shift, turn and grow, of which images alone say nothing: what is told is
     what is left where the marks lie over one another."""
     (a, start_a), (b, start_b), _ = two_networks("affine", 1.0)
-    calibration = calibration_of(adjust(a, start_a), True)
+    calibration = make_calibration(adjust(a, start_a), True)
     c, x0 = (calibration.parameters.index(Parameter.interior("K", name)) for name in ("c", "x0"))
     along_x = np.array([each.quantity in ("x0", "x") for each in calibration.parameters])
 
-    def found(change: NDArray[np.float64]) -> CalibrationTest:
-        given = with_calibration(b, replace(calibration, values=calibration.values + change))
-        (told,) = adjust(given, start_b).contradictions
-        return told
+    def find(change: NDArray[np.float64]) -> CalibrationTest:
+        given = set_calibration(b, replace(calibration, values=calibration.values + change))
+        (finding,) = adjust(given, start_b).contradictions
+        return finding
 
-    same, shifted = found(0.0 * along_x), found(0.05 * along_x)
-    longer = found(0.3 * (np.arange(len(along_x)) == c))
+    same, shifted = find(0.0 * along_x), find(0.05 * along_x)
+    longer = find(0.3 * (np.arange(len(along_x)) == c))
     assert same.freedom == len(same.parameters) - 4
     assert same.probability > 1e-3
     assert np.isfinite(same.difference).all()

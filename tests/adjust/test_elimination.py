@@ -122,13 +122,13 @@ def cost(monkeypatch: pytest.MonkeyPatch) -> Callable[[Network, Approximations],
     monkeypatch.setattr(elimination, "qr_triangle", counted)
     monkeypatch.setattr(multifrontal, "qr_triangle", counted)
 
-    def of(network: Network, start: Approximations) -> float:
+    def log_determinant(network: Network, start: Approximations) -> float:
         costs.clear()
         result = adjust(network, start)
         assert result.converged
         return sum(costs) / result.iterations
 
-    return of
+    return log_determinant
 
 
 def test_the_cost_is_linear_in_the_images(cost: Callable[[Network, Approximations], float]) -> None:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from misfits import KINDS, NOTHING, Effects, Kind, drawn, network, outcome, said, scene
+from misfits import KINDS, NOTHING, Effects, Kind, describe, draw_network, network, outcome, scene
 from simulated import with_errors
 
 from adjust.errors import AdjustmentError
@@ -20,14 +20,14 @@ SOUND = KINDS[NOTHING]
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.study) for name in KINDS]
 )
 def test_what_the_model_lacks_is_named(name: str) -> None:
-    sentences, _ = said(drawn(name, 4))
+    sentences, _ = describe(draw_network(name, 4))
     assert outcome(name, sentences) == "named", sentences
 
 
 @pytest.mark.study
 @pytest.mark.parametrize("name", list(KINDS))
 def test_what_the_model_of_a_deep_field_lacks_is_named(name: str) -> None:
-    sentences, _ = said(drawn(name, 5))
+    sentences, _ = describe(draw_network(name, 5))
     assert outcome(name, sentences) == "named", sentences
 
 
@@ -58,27 +58,27 @@ def sound(frame_mm: tuple[float, float] = (12.8, 9.6), seed: int = 6) -> Network
 
 @pytest.mark.study
 def test_a_sound_network_has_nothing_implausible() -> None:
-    assert said(sound())[0] == []
+    assert describe(sound())[0] == []
 
 
 @pytest.mark.study
 def test_a_board_that_is_transparent_shows_from_both_sides() -> None:
     kind = replace(KINDS["one image mirrored, frame_mm"])
     given = network(scene(6, flat=True), Effects(mirrored=True), kind, np.random.default_rng(1))
-    (told,) = adjust(given).misread
-    assert "is mirrored" in told
-    assert "With it mirrored, all stations lie on one side" in told
+    (finding,) = adjust(given).misread
+    assert "is mirrored" in finding
+    assert "With it mirrored, all stations lie on one side" in finding
     assert adjust(replace(given, transparent=True)).misread == ()
 
 
 @pytest.mark.study
 def test_marks_outside_the_picture_are_named() -> None:
     given = sound()
-    assert any("marks lie outside the picture" in each for each in said(sound((10.0, 9.6)))[0])
+    assert any("marks lie outside the picture" in each for each in describe(sound((10.0, 9.6)))[0])
     centered = given.observations.xy_mm - [6.4, -4.8]
     camera = replace(given.cameras[0], center_mm=(0.0, 0.0))
     moved = replace(given, cameras=(camera,), observations=replace(given.observations, xy_mm=centered))
-    assert said(moved)[0] == []  # coordinates that count from the middle of the picture
+    assert describe(moved)[0] == []  # coordinates that count from the middle of the picture
 
 
 @pytest.mark.study
@@ -89,7 +89,7 @@ def test_marks_outside_the_picture_are_named() -> None:
 def test_a_principal_point_far_from_where_it_is_given_is_named(given_mm: tuple[float, float], words: str) -> None:
     given = sound()
     x0, y0 = (Prior(value + 0.0, 0.2 if not words else 0.05) for value in given_mm)
-    sentences, _ = said(replace(given, cameras=(replace(given.cameras[0], x0_mm=x0, y0_mm=y0),)))
+    sentences, _ = describe(replace(given, cameras=(replace(given.cameras[0], x0_mm=x0, y0_mm=y0),)))
     named = [each for each in sentences if "principal point" in each.lower() and words in each]
     assert bool(named) == bool(words), sentences
 
@@ -100,12 +100,12 @@ def test_a_principal_point_outside_the_picture_is_named() -> None:
     given = sound()
     kept = given.observations.only(np.flatnonzero(given.observations.xy_mm[:, 0] < 5.5))
     camera = replace(given.cameras[0], frame_mm=(5.6, 9.6))
-    sentences, _ = said(replace(given, observations=kept, cameras=(camera,)))
+    sentences, _ = describe(replace(given, observations=kept, cameras=(camera,)))
     assert any("outside the picture (x from 0 to 5.6" in each for each in sentences), sentences
 
 
 @pytest.mark.study
-def test_images_that_look_straight_at_a_board_are_named() -> None:
+def test_images_that_point_straight_at_a_board_are_named() -> None:
     made = scene(6, flat=True)
     count = len(made.rotations)
     stations = np.column_stack([made.stations[:, :2] * 0.1 + 60.0, 330.0 + 20.0 * np.arange(count)])

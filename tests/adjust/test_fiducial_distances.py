@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 SIGMA_MM = 0.004
 
 
-def with_distances(drawn: Frames, rng: np.random.Generator, noise: float = 1.0, sigma_mm: float = np.inf) -> Frames:
+def observe_distances(drawn: Frames, rng: np.random.Generator, noise: float = 1.0, sigma_mm: float = np.inf) -> Frames:
     """Frames whose marks are given with a standard deviation, and all distances between them."""
     camera = drawn.network.cameras[0]
     pairs = combinations(range(len(drawn.places_mm)), 2)
@@ -43,7 +43,7 @@ def with_distances(drawn: Frames, rng: np.random.Generator, noise: float = 1.0, 
     return replace(drawn, network=replace(drawn.network, cameras=cameras))
 
 
-def held(marks: int) -> list[int]:
+def hold_marks(marks: int) -> list[int]:
     """Which of all coordinates the distances leave open, as a frame of four corners or eight marks has them: both of
     the first of the two marks farthest apart, and the one across of the other."""
     first, last = max(
@@ -60,16 +60,16 @@ def written_out(drawn: Frames, similar: bool) -> tuple[Array, Array, float]:
     observed = network.observations.xy_mm.reshape(-1, marks, 2)
     distances = network.cameras[0].distances
     pairs = np.array([(int(each.start) - 1, int(each.end) - 1) for each in distances])
-    free = np.setdiff1d(np.arange(2 * marks), held(marks))
+    free = np.setdiff1d(np.arange(2 * marks), hold_marks(marks))
     of_film = 4 if similar else 6
 
-    def places_of(x: Array) -> Array:
+    def split_places(x: Array) -> Array:
         places = NOMINAL_MM[:marks].ravel().copy()
         places[free] = x[: len(free)]
         return places.reshape(-1, 2)
 
     def weighted(x: Array) -> Array:
-        places, rows = places_of(x), []
+        places, rows = split_places(x), []
         for own, p in zip(observed, x[len(free) :].reshape(len(observed), of_film), strict=True):
             matrix = np.array([[p[2], -p[3]], [p[3], p[2]]]) if similar else p[2:].reshape(2, 2)
             rows.append(((places @ matrix.T + p[:2]) - own).ravel() / NOISE_MM)
@@ -85,7 +85,7 @@ def written_out(drawn: Frames, similar: bool) -> tuple[Array, Array, float]:
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     sigmas = np.zeros(2 * marks)
     sigmas[free] = np.sqrt(np.diag(covariance))[: len(free)]
-    return places_of(x), sigmas.reshape(-1, 2), float(weighted(x) @ weighted(x))
+    return split_places(x), sigmas.reshape(-1, 2), float(weighted(x) @ weighted(x))
 
 
 def places(result: Adjustment, marks: int) -> tuple[Array, Array]:
@@ -98,7 +98,7 @@ def places(result: Adjustment, marks: int) -> tuple[Array, Array]:
 @pytest.mark.parametrize(("marks", "kind"), [(4, "affine"), (8, "affine"), (4, "similarity"), (8, "similarity")])
 def test_places_by_distances_are_those_of_the_adjustment_written_out(marks: int, kind: str) -> None:
     rng = np.random.default_rng(marks)
-    drawn = with_distances(frames(kind, 3, marks, 1.0, 0.05, rng), rng)
+    drawn = observe_distances(frames(kind, 3, marks, 1.0, 0.05, rng), rng)
     result = adjust(drawn.network, drawn.start)
     assert result.converged
     expected, sigmas, vpv = written_out(drawn, kind == "similarity")
@@ -114,10 +114,10 @@ def test_places_by_distances_are_those_of_the_adjustment_written_out(marks: int,
     )
 
 
-def in_datum(true: Array) -> Array:
+def shift_datum(true: Array) -> Array:
     """True places (m, 2) moved to where the held coordinates have them."""
-    first, last = held(len(true))[0] // 2, held(len(true))[2] // 2
-    axis = held(len(true))[2] % 2
+    first, last = hold_marks(len(true))[0] // 2, hold_marks(len(true))[2] // 2
+    axis = hold_marks(len(true))[2] % 2
     off = true - true[first]
     radius, wanted = np.linalg.norm(off[last]), (NOMINAL_MM[last] - NOMINAL_MM[first])[axis]
     direction = np.arcsin(wanted / radius) if axis else np.arccos(wanted / radius)
@@ -132,11 +132,11 @@ def test_claimed_standard_deviations_hold(count: int) -> None:
     rng = np.random.default_rng(5)
     normalised, sigma0 = [], []
     for _ in range(count):
-        drawn = with_distances(frames("affine", 2, 4, 1.0, 0.05, rng), rng)
+        drawn = observe_distances(frames("affine", 2, 4, 1.0, 0.05, rng), rng)
         result = adjust(drawn.network, drawn.start)
         values, claimed = places(result, 4)
         free = claimed > 0.0
-        errors = (values - in_datum(drawn.places_mm))[free]
+        errors = (values - shift_datum(drawn.places_mm))[free]
         normalised += list(errors / claimed[free] * result.sigma0)
         sigma0.append(result.sigma0**2)
     chance = 3.0 / np.sqrt(2.0 * count)  # the coordinates of one network are correlated
@@ -147,7 +147,7 @@ def test_claimed_standard_deviations_hold(count: int) -> None:
 def test_given_coordinates_and_distances_weigh_together() -> None:
     """Coordinates to 1 mm place the marks, distances to 4 um give their form."""
     rng = np.random.default_rng(6)
-    drawn = with_distances(frames("affine", 3, 4, 1.0, 0.3, rng), rng, sigma_mm=1.0)
+    drawn = observe_distances(frames("affine", 3, 4, 1.0, 0.3, rng), rng, sigma_mm=1.0)
     result = adjust(drawn.network, drawn.start)
     values, _ = places(result, 4)
     for i, j in combinations(range(4), 2):
@@ -159,7 +159,7 @@ def test_given_coordinates_and_distances_weigh_together() -> None:
 
 def test_a_plan_expects_the_form_of_the_distances_and_the_datum_of_the_coordinates() -> None:
     rng = np.random.default_rng(10)
-    drawn = with_distances(frames("affine", 3, 4, 1.0, 0.0, rng, 0.0), rng, 0.0, sigma_mm=1.0)
+    drawn = observe_distances(frames("affine", 3, 4, 1.0, 0.0, rng, 0.0), rng, 0.0, sigma_mm=1.0)
     planned, result = plan(drawn.network, drawn.start), adjust(drawn.network, drawn.start)
     parameters = [Parameter.fiducial(CAMERA, str(i + 1), axis) for i in range(4) for axis in "xy"]
     form = np.array([[1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])  # x of the first less that of the second
@@ -170,9 +170,9 @@ def test_a_plan_expects_the_form_of_the_distances_and_the_datum_of_the_coordinat
     np.testing.assert_allclose(list(redundancy.values()), [row.redundancy for row in result.further], atol=1e-4)
 
 
-def test_a_wrong_distance_is_told() -> None:
+def test_a_wrong_distance_is_reported() -> None:
     rng = np.random.default_rng(7)
-    drawn = with_distances(frames("affine", 3, 8, 1.0, 0.05, rng), rng)
+    drawn = observe_distances(frames("affine", 3, 8, 1.0, 0.05, rng), rng)
     camera = drawn.network.cameras[0]
     wrong = replace(camera.distances[5], value_mm=camera.distances[5].value_mm + 0.05)
     distances = (*camera.distances[:5], wrong, *camera.distances[6:])
@@ -186,7 +186,7 @@ def test_a_wrong_distance_is_told() -> None:
 
 def test_a_distance_to_a_mark_that_no_image_shows_says_nothing() -> None:
     rng = np.random.default_rng(8)
-    drawn = with_distances(frames("affine", 2, 4, 1.0, 0.05, rng), rng)
+    drawn = observe_distances(frames("affine", 2, 4, 1.0, 0.05, rng), rng)
     camera = drawn.network.cameras[0]
     unseen = replace(camera, fiducials={**camera.fiducials, "5": Fiducial(Prior(0.0, np.inf), Prior(112.0, np.inf))})
     farther = replace(unseen, distances=(*camera.distances, FiducialDistance("1", "5", 100.0, SIGMA_MM)))

@@ -15,7 +15,7 @@ MARKS_MM = 106.0 * np.array([(1, -1), (-1, -1), (-1, 1), (1, 1), (0, -1), (-1, 0
 RESEAU_MM = 50.0 * np.array([(x, y) for x in range(-2, 3) for y in range(-2, 3)])
 
 
-def seen(kind: Transformation, mirrored: bool, marks_mm: Array) -> tuple[Array, Array, Array]:
+def view_marks(kind: Transformation, mirrored: bool, marks_mm: Array) -> tuple[Array, Array, Array]:
     """The transformation's parameters, marks in a scan about (120, -110) mm, and where they are in the camera."""
     parameters = film_parameters(Truth(middle_mm=(120.0, -110.0), mirrored=4 * (mirrored,)), 1, kind)
     comparator = [120.0, -110.0] + marks_mm[:, ::-1] + np.random.default_rng(1).uniform(-1.0, 1.0, marks_mm.shape)
@@ -30,7 +30,7 @@ def seen(kind: Transformation, mirrored: bool, marks_mm: Array) -> tuple[Array, 
 @pytest.mark.parametrize("wrong", [(), (2,), (1, 6)], ids=["clean", "one gross error", "two exchanged"])
 def test_the_applied_transformation_is_found(kind: Transformation, mirrored: bool, wrong: tuple[int, ...]) -> None:
     """Eight marks can tell two wrong ones from eight parameters; twenty-five from twelve."""
-    parameters, comparator, camera = seen(kind, mirrored, RESEAU_MM if kind == "polynomial(2)" else MARKS_MM)
+    parameters, comparator, camera = view_marks(kind, mirrored, RESEAU_MM if kind == "polynomial(2)" else MARKS_MM)
     if wrong:
         camera[list(wrong)] = camera[list(reversed(wrong))] if len(wrong) > 1 else camera[list(wrong)] + 20.0
     found, is_mirrored = fit_transformation(kind, comparator, camera)
@@ -56,7 +56,7 @@ def test_few_marks_give_the_simpler_transformation(
     kind: Transformation, simpler: Transformation, count: int, mirrored: bool
 ) -> None:
     """In the parameters of the one that was asked for."""
-    _, comparator, camera = seen(simpler, mirrored, MARKS_MM[:count])
+    _, comparator, camera = view_marks(simpler, mirrored, MARKS_MM[:count])
     found, is_mirrored = fit_transformation(kind, comparator, camera)
     np.testing.assert_allclose(film_kind(kind, is_mirrored).apply(found, comparator), camera, atol=1e-9)
     plain, _ = fit_transformation(simpler, comparator, camera)
@@ -83,7 +83,7 @@ def test_marks_on_a_line_do_not_tell_a_mirror(seed: int) -> None:
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_film_that_shrank_unevenly_is_told_from_a_mirror(mirrored: bool) -> None:
+def test_film_that_shrank_unevenly_is_distinguished_from_a_mirror(mirrored: bool) -> None:
     """By three tenths of a per cent, as no similarity fits, upright or mirrored, and with a mark 0.08 mm off."""
     camera = MARKS_MM @ [[1.003, 0.0], [0.0, 1.0]] + np.random.default_rng(3).normal(0.0, 0.005, MARKS_MM.shape)
     camera[4, 0] += 0.08

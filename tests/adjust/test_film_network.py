@@ -67,7 +67,7 @@ def test_targets_determine_what_too_few_marks_leave_open(kind: Transformation, m
     network, _ = simulated(
         np.random.default_rng(4), Truth(), kind, field_points(np.random.default_rng(5), 25), noise=False
     )
-    network = with_marks(network, marks)
+    network = add_marks(network, marks)
     result = adjust(network, approximate(network))
     assert result.converged
     assert result.vpv < 1e-12
@@ -77,7 +77,7 @@ def test_targets_determine_what_too_few_marks_leave_open(kind: Transformation, m
     )
 
 
-def with_marks(network: Network, count: int, images_of_marks_alone: tuple[str, ...] = ()) -> Network:
+def add_marks(network: Network, count: int, images_of_marks_alone: tuple[str, ...] = ()) -> Network:
     """The network with the first marks only, and some images without targets."""
     rows = network.observations
     keep = [
@@ -91,12 +91,12 @@ def with_marks(network: Network, count: int, images_of_marks_alone: tuple[str, .
 def test_an_image_without_targets_needs_all_marks_of_its_own() -> None:
     network, _ = simulated(np.random.default_rng(4), Truth(), "projective", noise=False)
     with pytest.raises(AdjustmentError, match=r"image f2 shows 3 fiducial marks; its projective .* needs 4\. Measure"):
-        approximate(with_marks(network, 3, ("f2",)))
-    result = adjust(enough := with_marks(network, 4, ("f2",)), approximate(enough))
+        approximate(add_marks(network, 3, ("f2",)))
+    result = adjust(enough := add_marks(network, 4, ("f2",)), approximate(enough))
     assert result.converged
 
 
-def test_a_film_that_folds_over_is_told() -> None:
+def test_a_film_that_folds_over_is_reported() -> None:
     network, start = simulated(np.random.default_rng(4), Truth(), "polynomial(2)", noise=False)
     folded = start.transformation["f1"].copy()
     folded[3] = 0.02  # x' turns back at some 15 mm from the middle

@@ -33,13 +33,13 @@ def board_network(seed: int, free: tuple[str, ...], noise: bool = True, images: 
     x, y = np.meshgrid(np.arange(9.0), np.arange(6.0))
     board = 25.0 * np.stack([x.ravel() - 4.0, y.ravel() - 2.5, np.zeros(54)], axis=1)
     matrix = np.array([[C, 0.0, CX], [0.0, C, CY], [0.0, 0.0, 1.0]])
-    seen = []
+    view = []
     for i in range(images):
         azimuth, tilt = 2.0 * np.pi * i / images, np.radians(rng.uniform(20.0, 40.0))
         turn = np.array([np.cos(azimuth) * tilt, np.sin(azimuth) * tilt, 0.2 * rng.normal()])
         shift = np.array([*rng.uniform(-60.0, 60.0, 2), rng.uniform(550.0, 800.0)])
-        seen.append(cv2.projectPoints(board, turn, shift, matrix, LENS)[0].reshape(-1, 2) * [1.0, -1.0])
-    places = np.concatenate(seen)
+        view.append(cv2.projectPoints(board, turn, shift, matrix, LENS)[0].reshape(-1, 2) * [1.0, -1.0])
+    places = np.concatenate(view)
     count = len(places)
     camera = Camera(
         "cam",

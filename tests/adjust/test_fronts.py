@@ -49,13 +49,13 @@ def strip(sigma: float) -> tuple[Network, Approximations]:
     along = np.linspace(-200.0, 500.0 * LENGTH - 300.0, count)
     points = np.column_stack([along, rng.uniform(-600.0, 600.0, count), rng.uniform(-150.0, 150.0, count)])
     network, start = simulated(rng, truth, points=points, point_sigma=sigma, free={"k3": np.inf})
-    seen = network.observations
+    observed = network.observations
     stations = {f"f{i}": 500.0 * i for i in range(LENGTH)}
     near = [
         kind == "fiducial" or abs(points[int(point), 0] - stations[image]) < 600.0
-        for image, point, kind in zip(seen.image, seen.point, seen.kind, strict=True)
+        for image, point, kind in zip(observed.image, observed.point, observed.kind, strict=True)
     ]
-    return replace(network, observations=seen.only(np.flatnonzero(near))), start
+    return replace(network, observations=observed.only(np.flatnonzero(near))), start
 
 
 def sparse_rows(rows: WhitenedRows, weights: Array) -> csc_array:
@@ -205,7 +205,7 @@ def test_what_a_front_leaves_is_held_by_the_next_one_that_it_meets(
 
 
 @pytest.mark.usefixtures("finely")
-def test_the_many_ways_in_which_a_strip_can_bend_are_told_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_many_ways_in_which_a_strip_can_bend_are_reported_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is known well stands at one end: the other end is weak in as many ways as one cares to count."""
     monkeypatch.setattr(diagnosis, "WEAK", 0.02)
     network, start = strip(50.0)

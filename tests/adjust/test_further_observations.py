@@ -24,7 +24,7 @@ ANTENNA = (0.4, -1.1, 2.3)
 EO_SIGMAS = np.array([0.3, 0.3, 0.4, 2e-4, 2e-4, 3e-4])
 
 
-def between(a: Array | tuple[float, ...], b: Array | tuple[float, ...]) -> float:
+def relative_rotation(a: Array | tuple[float, ...], b: Array | tuple[float, ...]) -> float:
     return float(np.linalg.norm(np.asarray(a) - np.asarray(b)))
 
 
@@ -43,10 +43,10 @@ def observed_network(rng: np.random.Generator) -> tuple[Network, Array]:
     )
     images = tuple(replace(image, exterior=e) for image, e in zip(network.images, exteriors_given, strict=True))
     distances = (
-        Distance("0", "1", between(points[0], points[1]) + 0.02, 0.02),
-        Distance("2", "4", between(points[2], points[4]) - 0.03, 0.05),
-        Distance("f0", "f2", between(STATIONS[0], STATIONS[2]) + 0.1, 0.1),
-        Distance("5", "f3", between(points[5], STATIONS[3]), 0.1),
+        Distance("0", "1", relative_rotation(points[0], points[1]) + 0.02, 0.02),
+        Distance("2", "4", relative_rotation(points[2], points[4]) - 0.03, 0.05),
+        Distance("f0", "f2", relative_rotation(STATIONS[0], STATIONS[2]) + 0.1, 0.1),
+        Distance("5", "f3", relative_rotation(points[5], STATIONS[3]), 0.1),
     )
     cameras = (replace(network.cameras[0], fiducials={}),)
     return replace(network, cameras=cameras, images=images, distances=distances), points
@@ -80,7 +80,7 @@ class Dense:
                 observed = np.append(row[:3] + rotation(*row[3:]).T @ image.exterior.antenna, row[3:])
                 result.append((observed - image.exterior.values) / image.exterior.sigmas)
         place = {f"f{i}": row[:3] for i, row in enumerate(exterior)} | {str(i): xyz for i, xyz in enumerate(points)}
-        result += [[(between(place[d.start], place[d.end]) - d.value) / d.sigma] for d in network.distances]
+        result += [[(relative_rotation(place[d.start], place[d.end]) - d.value) / d.sigma] for d in network.distances]
         return np.concatenate(result)
 
 
@@ -122,7 +122,9 @@ def scaled_by_bars(count: int) -> tuple[Network, Array]:
     rng = np.random.default_rng(5)
     points = field_points(rng, count)
     network, _ = simulated(rng, points=points, point_sigma=np.inf)
-    bars = tuple(Distance(a, b, between(points[int(a)], points[int(b)]), 0.01) for a, b in (("0", "1"), ("2", "3")))
+    bars = tuple(
+        Distance(a, b, relative_rotation(points[int(a)], points[int(b)]), 0.01) for a, b in (("0", "1"), ("2", "3"))
+    )
     return replace(network, distances=bars), points
 
 
@@ -160,7 +162,7 @@ def test_a_scale_bar_removes_the_scale_defect(count: int) -> None:
     assert (one.further[0].w, one.further[0].detectable) == (0.0, np.inf)
     assert two.redundancy == free.redundancy + 1
     assert camera(one) == pytest.approx(camera(free), rel=1e-9)
-    size = between(*(np.array([one.value(f"PT.{id}.{axis}") for axis in "XYZ"]) for id in "01"))
+    size = relative_rotation(*(np.array([one.value(f"PT.{id}.{axis}") for axis in "XYZ"]) for id in "01"))
     assert size == pytest.approx(network.distances[0].value, abs=1e-7)
 
 
@@ -186,11 +188,13 @@ def test_approximations_of_a_model_have_the_size_of_the_distances() -> None:
     unknown = tuple(ObjectPoint(point.id, None, None, None) for point in network.points)
     network = replace(network, points=unknown)
     start = approximate(network)
-    assert between(start.points["4"], start.points["5"]) == pytest.approx(between(points[4], points[5]), rel=0.02)
+    assert relative_rotation(start.points["4"], start.points["5"]) == pytest.approx(
+        relative_rotation(points[4], points[5]), rel=0.02
+    )
     result = adjust(network, start, Options("free"))
     assert result.converged
-    found = between(*(np.array([result.value(f"PT.{id}.{axis}") for axis in "XYZ"]) for id in "45"))
-    assert found == pytest.approx(between(points[4], points[5]), abs=0.1)
+    found = relative_rotation(*(np.array([result.value(f"PT.{id}.{axis}") for axis in "XYZ"]) for id in "45"))
+    assert found == pytest.approx(relative_rotation(points[4], points[5]), abs=0.1)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mishaps import MISHAPS, sentences
 from null_directions import AXES, CATALOGUE, DEFORMATIONS, DISTANCE
-from setups import CONVERGENT, Setup, given
+from setups import CONVERGENT, Setup, give_values
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import Approximations, Exterior, Network, Transformation
@@ -16,18 +16,18 @@ from adjust.solution.result import Adjustment
 
 GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
     "Shift x": [
-        ("x' of one fiducial mark (F5)", lambda network: given(network, {"x": 1.0}, 1)),
-        ("x0' (F7)", lambda network: given(network, {"x0": 1.0})),
+        ("x' of one fiducial mark (F5)", lambda network: give_values(network, {"x": 1.0}, 1)),
+        ("x0' (F7)", lambda network: give_values(network, {"x0": 1.0})),
     ],
     "Shift y": [
-        ("y' of one fiducial mark (F6)", lambda network: given(network, {"y": 1.0}, 1)),
-        ("y0' (F8)", lambda network: given(network, {"y0": 1.0})),
+        ("y' of one fiducial mark (F6)", lambda network: give_values(network, {"y": 1.0}, 1)),
+        ("y0' (F8)", lambda network: give_values(network, {"y0": 1.0})),
     ],
-    "Rotation": [("one coordinate of a fiducial mark", lambda network: given(network, {"y": 1.0}, 1))],
-    "Scale": [("the principal distance (F9)", lambda network: given(network, {"c": 1.0}))],
-    "principal point's x0'": [("x0' (F7)", lambda network: given(network, {"x0": 1.0}))],
-    "principal point's y0'": [("y0' (F8)", lambda network: given(network, {"y0": 1.0}))],
-    "principal distance of camera K can change": [("it (F9)", lambda network: given(network, {"c": 1.0}))],
+    "Rotation": [("one coordinate of a fiducial mark", lambda network: give_values(network, {"y": 1.0}, 1))],
+    "Scale": [("the principal distance (F9)", lambda network: give_values(network, {"c": 1.0}))],
+    "principal point's x0'": [("x0' (F7)", lambda network: give_values(network, {"x0": 1.0}))],
+    "principal point's y0'": [("y0' (F8)", lambda network: give_values(network, {"y0": 1.0}))],
+    "principal distance of camera K can change": [("it (F9)", lambda network: give_values(network, {"c": 1.0}))],
 }
 
 DEAR = ("nearly-flat", "swapped")
@@ -53,7 +53,7 @@ def test_number_words_and_changes_of_the_network_that_mend_it(name: str) -> None
 
 
 @pytest.mark.parametrize("name", list(CATALOGUE))
-def test_each_prior_that_is_asked_for_ends_one_direction(name: str) -> None:
+def test_each_prior_that_is_requested_ends_one_direction(name: str) -> None:
     """The four of the camera's axes in two networks, all others in theirs."""
     failure = CATALOGUE[name]
     network, start = failure.setup.network()
@@ -73,16 +73,16 @@ def test_fiducials_with_priors_end_what_they_are_to_end(name: str) -> None:
     failure = CATALOGUE[name]
     network, start = failure.setup.network()
     for marks, gone in ((2, AXES), (3, AXES + DEFORMATIONS)):
-        mended = adjust(given(network, {"x": 1.0, "y": 1.0}, marks), start, failure.options)
+        mended = adjust(give_values(network, {"x": 1.0, "y": 1.0}, marks), start, failure.options)
         assert not causes(mended, gone)
 
 
 @pytest.mark.parametrize("name", [n if n not in DEAR else pytest.param(n, marks=pytest.mark.study) for n in MISHAPS])
-def test_other_mishaps_are_told_in_words(name: str) -> None:
+def test_other_mishaps_are_reported_in_words(name: str) -> None:
     mishap = MISHAPS[name]
-    said = sentences(adjust(*mishap.network(), mishap.options))
-    assert len(said) == len(mishap.words)
-    for sentence, words in zip(said, mishap.words, strict=True):
+    text = sentences(adjust(*mishap.network(), mishap.options))
+    assert len(text) == len(mishap.words)
+    for sentence, words in zip(text, mishap.words, strict=True):
         assert words in sentence
 
 
@@ -101,7 +101,7 @@ def test_priors_that_are_dropped_leave_the_directions_that_they_end(kind: Transf
         (marks, ()),
         ({**marks, **c, **point}, ()),
     ):
-        singular = adjust(given(network, kept), start).singular
+        singular = adjust(give_values(network, kept), start).singular
         assert tuple(each.cause.split(":")[0] for each in singular) == words
 
 
@@ -115,12 +115,12 @@ def test_priors_that_are_dropped_leave_the_directions_that_they_end(kind: Transf
         (("0.X", "0.Y", "1.X", "1.Y"), ("shift in X", "shift in Y", "turn about Z", "grow or shrink")),
     ],
 )
-def test_coordinates_that_are_asked_for_end_their_part_of_the_datum(
+def test_coordinates_that_are_requested_end_their_part_of_the_datum(
     known: tuple[str, ...], gone: tuple[str, ...]
 ) -> None:
     """Point 7 lies in the middle: a coordinate of a far point ends a turn or the scale as well as a shift."""
     network, start = MISHAPS["no-datum"].network()
-    left = [each.cause for each in adjust(with_known(network, start, known), start).singular]
+    left = [each.cause for each in adjust(fix_stations(network, start, known), start).singular]
     assert len(left) == 7 - len(gone)
     assert not [cause for cause in left if any(words in cause for words in gone)]
 
@@ -128,7 +128,7 @@ def test_coordinates_that_are_asked_for_end_their_part_of_the_datum(
 def test_images_and_points_are_mended_as_advised() -> None:
     network, start = MISHAPS["one-ray"].network()
     known = tuple(f"{point}.{axis}" for point in "0123" for axis in "XYZ")
-    assert adjust(with_known(network, start, known), start).converged
+    assert adjust(fix_stations(network, start, known), start).converged
     network, start = MISHAPS["targets-on-a-line"].network()
     oriented = tuple(
         replace(image, exterior=Exterior(start.exterior["f3"], np.array([1.0] * 3 + [1e-3] * 3)))
@@ -139,7 +139,7 @@ def test_images_and_points_are_mended_as_advised() -> None:
     assert adjust(replace(network, images=oriented), start).converged
 
 
-def with_known(network: Network, start: Approximations, names: tuple[str, ...]) -> Network:
+def fix_stations(network: Network, start: Approximations, names: tuple[str, ...]) -> Network:
     """The network with some coordinates given as they are, with a standard deviation of a centimetre."""
     points = []
     for point in network.points:

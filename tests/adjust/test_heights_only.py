@@ -21,7 +21,7 @@ TILTED = Truth(
 )
 
 
-def with_heights_alone(seed: int) -> Network:
+def make_heights_network(seed: int) -> Network:
     """100 points of a field with 8 m of relief, their heights known to 2 cm, and a camera of which little is known."""
     rng = np.random.default_rng(seed)
     free = dict.fromkeys(TILTED.distortion, np.inf)
@@ -43,7 +43,7 @@ def with_heights_alone(seed: int) -> Network:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_tilted_frames_are_oriented_and_calibrate_the_camera(seed: int) -> None:
     """They start as if they looked straight down, where heights do not tell the principal distance."""
-    network = with_heights_alone(seed)
+    network = make_heights_network(seed)
     result = adjust(network, approximate(network), Options(datum="minimal"))
     assert result.converged
     assert result.sigma0 < 1.1

@@ -22,7 +22,7 @@ def scatter(result: Adjustment) -> np.ndarray:
     return np.asarray(np.sqrt(np.diagonal(covariance)))[:-1]
 
 
-def without(network: Network, image: str) -> Network:
+def drop_image(network: Network, image: str) -> Network:
     rows = np.flatnonzero([name != image for name in network.observations.image])
     left = network.observations.only(rows)
     return replace(network, images=tuple(each for each in network.images if each.name != image), observations=left)
@@ -34,7 +34,7 @@ def values(result: Adjustment) -> list[float]:
 
 def test_it_is_the_jackknife_of_adjustments_without_one_picture_each() -> None:
     network = board_network(np.random.default_rng(3), 6, 5e-4)
-    left = np.array([values(adjust(without(network, image.name))) for image in network.images])
+    left = np.array([values(adjust(drop_image(network, image.name))) for image in network.images])
     spread = np.sqrt(5 / 6 * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
     np.testing.assert_allclose(scatter(adjust(network)), spread, rtol=0.03)
 
@@ -46,20 +46,20 @@ def test_prediction_errors_are_those_of_adjustments_without_a_fold() -> None:
     assert predicted is not None
     names = [image.name for image in network.images]
     for fold in (names[first::3] for first in range(3)):
-        fitted = values(adjust(without(without(network, fold[0]), fold[1])))
+        fitted = values(adjust(drop_image(drop_image(network, fold[0]), fold[1])))
         priors = {name: Prior(value, 0.0) for name, value in zip(QUANTITIES, fitted, strict=True)}
         lens = Distortion("opencv", {name: priors[name] for name in ("k1", "k2")})
         (camera,) = network.cameras
         known = replace(camera, principal_distance_mm=priors["c"], x0_mm=priors["x0"], y0_mm=priors["y0"])
         for name in fold:
-            one = without_others(replace(network, cameras=(replace(known, distortion=lens),)), name)
+            one = keep_image(replace(network, cameras=(replace(known, distortion=lens),)), name)
             squares = (adjust(one).residuals.v_mm ** 2).sum(axis=1) / 5e-4**2
             assert predicted[names.index(name)] == pytest.approx(squares.mean(), rel=0.01)
 
 
-def without_others(network: Network, image: str) -> Network:
+def keep_image(network: Network, image: str) -> Network:
     for each in network.images:
-        network = network if each.name == image else without(network, each.name)
+        network = network if each.name == image else drop_image(network, each.name)
     return network
 
 

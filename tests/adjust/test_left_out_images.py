@@ -27,7 +27,7 @@ BOARD = np.array([[25.0 * (i - 4), 25.0 * (j - 2.5), 0.0] for j in range(ROWS) f
 EIGHTEEN = list(range(0, 54, 3))
 
 
-def seen(turn: Array, shift: Array) -> Array:
+def view_points(turn: Array, shift: Array) -> Array:
     return np.asarray(cv2.projectPoints(BOARD, turn, shift, MATRIX, LENS)[0].reshape(-1, 2) * [1.0, -1.0])
 
 
@@ -36,11 +36,13 @@ def good_images(count: int, rng: np.random.Generator, nearest: float = 350.0) ->
     for i in range(count):
         azimuth, tilt = 2.4 * i, np.radians(rng.uniform(15.0, 35.0))
         turn = np.array([np.cos(azimuth) * tilt, np.sin(azimuth) * tilt, 0.1 * rng.normal()])
-        images[f"good{i}"] = seen(turn, np.array([*rng.uniform(-40.0, 40.0, 2), nearest * rng.uniform(1.0, 1.4)]))
+        images[f"good{i}"] = view_points(
+            turn, np.array([*rng.uniform(-40.0, 40.0, 2), nearest * rng.uniform(1.0, 1.4)])
+        )
     return images
 
 
-def network_of(
+def make_network(
     images: dict[str, Array], rng: np.random.Generator, points: dict[str, list[int]] | None = None
 ) -> Network:
     """points: of some images, the corners that they show; all 54 of the others."""
@@ -58,7 +60,7 @@ def network_of(
 def test_an_image_with_wrong_names_is_left_out(robust: bool) -> None:
     rng = np.random.default_rng(1)
     images = good_images(8, rng)
-    network = network_of({**images, "shuffled": rng.permutation(images["good0"])}, rng, {"shuffled": EIGHTEEN})
+    network = make_network({**images, "shuffled": rng.permutation(images["good0"])}, rng, {"shuffled": EIGHTEEN})
     with pytest.raises(AdjustmentError, match="image shuffled sees 18 known points, but no orientation"):
         approximate(network)
     result = adjust(network, options=Options(robust=robust))
@@ -66,7 +68,7 @@ def test_an_image_with_wrong_names_is_left_out(robust: bool) -> None:
     assert list(result.left_out) == ["shuffled"]
     (warning,) = [each for each in result.warnings if "shuffled" in each]
     assert warning.startswith("Left out of the adjustment: image shuffled sees 18 known points")
-    alone = adjust(network_of(images, np.random.default_rng(1)))
+    alone = adjust(make_network(images, np.random.default_rng(1)))
     assert {image.name for image in result.network.images} == set(images)
     assert abs(result.value("IO.cam.c") - C) < 4.0 * result.sigma("IO.cam.c")
     assert result.redundancy == alone.redundancy
@@ -75,7 +77,7 @@ def test_an_image_with_wrong_names_is_left_out(robust: bool) -> None:
 def test_an_image_whose_points_lie_on_a_line_is_left_out() -> None:
     rng = np.random.default_rng(2)
     images = good_images(6, rng)
-    network = network_of({**images, "line": images["good0"]}, rng, {"line": [0, 2, 5, 8]})
+    network = make_network({**images, "line": images["good0"]}, rng, {"line": [0, 2, 5, 8]})
     result = adjust(network)
     assert result.converged
     assert list(result.left_out) == ["line"]
@@ -85,8 +87,8 @@ def test_an_image_of_the_lens_far_outside_comes_in_with_the_adjusted_lens() -> N
     """Taken for a pinhole's it leaves more than a twentieth of the principal distance."""
     rng = np.random.default_rng(3)
     images = good_images(8, rng, nearest=120.0)
-    wide = seen(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 60.0]))
-    network = network_of({**images, "wide": wide}, rng)
+    wide = view_points(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 60.0]))
+    network = make_network({**images, "wide": wide}, rng)
     with pytest.raises(AdjustmentError, match="image wide sees"):
         approximate(network)
     result = adjust(network)
@@ -102,7 +104,7 @@ def test_where_half_of_the_images_fail_it_is_no_single_one() -> None:
     rng = np.random.default_rng(4)
     images = good_images(2, rng)
     bad = {f"bad{i}": rng.permutation(images["good0"]) for i in range(2)}
-    network = network_of({**images, **bad}, rng, dict.fromkeys(bad, EIGHTEEN))
+    network = make_network({**images, **bad}, rng, dict.fromkeys(bad, EIGHTEEN))
     with pytest.raises(AdjustmentError, match="image bad0 sees 18 known points"):
         adjust(network)
 
@@ -114,9 +116,9 @@ def test_an_image_with_a_point_behind_its_camera_is_left_out(robust: bool, monke
     monkeypatch.setitem(globals(), "BOARD", np.vstack([BOARD, [10.0, 5.0, -170.0]]))
     rng = np.random.default_rng(6)
     images = good_images(8, rng)
-    near = seen(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 120.0]))
+    near = view_points(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 120.0]))
     near[-1] = 0.5, 0.3
-    result = adjust(network_of({**images, "near": near}, rng), options=Options(robust=robust))
+    result = adjust(make_network({**images, "near": near}, rng), options=Options(robust=robust))
     assert result.converged
     assert result.left_out["near"].startswith("point c54 lies behind the camera in image near.")
     assert list(result.left_out) == ["near"]
@@ -129,7 +131,7 @@ def test_an_image_with_a_point_behind_its_camera_is_left_out(robust: bool, monke
 def test_points_that_only_a_left_out_image_shows_go_with_it() -> None:
     rng = np.random.default_rng(5)
     images = good_images(6, rng)
-    network = network_of(
+    network = make_network(
         {**images, "shuffled": rng.permutation(images["good0"])}, rng, {f"good{i}": list(range(45)) for i in range(6)}
     )
     unknown = tuple(replace(each, X=None, Y=None, Z=None) if each.id == "c50" else each for each in network.points)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from lens_networks import LENSES, network_of
+from lens_networks import LENSES, make_network
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
@@ -62,10 +62,10 @@ def test_the_ideal_point_in_mm_and_without_units() -> None:
         v * (1 + radial) + 2 * given["b1"] * u * v + given["b2"] * (r2 + 2 * v * v),
     ]
     matrix = np.diag([c, c, 1.0])
-    seen, _ = cv2.projectPoints(
+    projected, _ = cv2.projectPoints(
         np.array([[0.3, -0.2, 1.0]]), np.zeros(3), np.zeros(3), matrix, np.array([k1, k2, p1, p2])
     )
-    np.testing.assert_allclose(np.ravel(seen) * [1, -1], by_hand, rtol=1e-12)
+    np.testing.assert_allclose(np.ravel(projected) * [1, -1], by_hand, rtol=1e-12)
 
 
 def test_frasers_terms_are_browns_with_the_other_sign() -> None:
@@ -92,9 +92,9 @@ def test_what_is_0_and_uncertain_has_its_counterpart() -> None:
 def test_covariance_is_that_of_the_same_data_adjusted_in_the_other_family() -> None:
     """Values to a millionth of their sigmas, the covariance to a millionth: aicon with r0 as OpenCV's."""
     rng = np.random.default_rng(2)
-    first = adjusted(network_of("aicon", rng), ("a1", "a2", "b1", "b2"))
+    first = adjust_network(make_network("aicon", rng), ("a1", "a2", "b1", "b2"))
     network = first.network
-    second = adjusted(in_family(network, "opencv"), ("k1", "k2", "p1", "p2"))
+    second = adjust_network(set_family(network, "opencv"), ("k1", "k2", "p1", "p2"))
     source, names = quantities("aicon"), quantities("opencv")
     values = np.array([first.value(name) for name in source])
     lens = Lens(network.cameras[0].distortion, values[:3], values[3:], first.cofactor_of(source))
@@ -114,18 +114,18 @@ def quantities(family: str) -> list[str]:
     return [f"IO.L.{name}" for name in ("c", "x0", "y0", *parameter_names(family))]
 
 
-def in_family(network: Network, family: str) -> Network:
+def set_family(network: Network, family: str) -> Network:
     return replace(network, cameras=(replace(network.cameras[0], distortion=Distortion(family)),))
 
 
-def adjusted(network: Network, free: tuple[str, ...]) -> Adjustment:
+def adjust_network(network: Network, free: tuple[str, ...]) -> Adjustment:
     camera = network.cameras[0]
     distortion = replace(camera.distortion, parameters={name: Prior(0.0, np.inf) for name in free})
     network = replace(network, cameras=(replace(camera, distortion=distortion),))
     return adjust(network, approximate(network))
 
 
-def test_what_no_family_takes_is_told_by_its_residual() -> None:
+def test_what_no_family_takes_is_known_by_its_residual() -> None:
     """A correction of the observed point as one of the ideal point: 0.7 um are left."""
     lens = values("torlegard", k3=1e-4, k5=-1e-7, p1=5e-6, p2=-8e-6)
     found = convert_lens(Lens(Distortion("torlegard"), INTERIOR, lens), Distortion("opencv"), CORNERS_MM)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lens_networks import LENSES, R0_MM, network_of
+from lens_networks import LENSES, R0_MM, make_network
 from studies import parametrize_with_studies
 
 from adjust.functional_model.families import family, parameter_names
@@ -16,7 +16,7 @@ from adjust.solution.adjustment import adjust
 @pytest.mark.parametrize("name", list(LENSES))
 def test_a_lens_is_found_from_exact_images(name: str) -> None:
     """From start values that the points give, with nothing known of the lens."""
-    network = network_of(name)
+    network = make_network(name)
     found = adjust(network, approximate(network))
     assert found.converged
     assert found.vpv < 1e-10
@@ -28,7 +28,7 @@ def test_a_lens_is_found_from_exact_images(name: str) -> None:
 @parametrize_with_studies("name", list(LENSES))
 def test_nothing_but_the_points_has_to_be_known(name: str) -> None:
     """Neither c nor the principal point; of the fisheye points up to 80 degrees off the axis."""
-    network = network_of(name, np.random.default_rng(1))
+    network = make_network(name, np.random.default_rng(1))
     camera = replace(network.cameras[0], principal_distance_mm=None, x0_mm=None, y0_mm=None)
     network = replace(network, cameras=(camera,))
     start = approximate(network)
@@ -43,13 +43,13 @@ def test_nothing_but_the_points_has_to_be_known(name: str) -> None:
 def test_claimed_sigmas_are_realised(name: str) -> None:
     """Twelve sets of errors, pooled over the parameters: chi-square per degree of freedom within three sigmas of 1."""
     rng = np.random.default_rng(5)
-    first = network_of(name)
+    first = make_network(name)
     c, values = LENSES[name]
     true = values | {"c": c, "x0": 0.12, "y0": -0.07}
     start = approximate(first)
     squares = []
     for _ in range(12):
-        found = adjust(network_of(name, rng), start)
+        found = adjust(make_network(name, rng), start)
         names = [f"IO.L.{each}" for each in true]
         errors = np.array([found.value(each) for each in names]) - list(true.values())
         squares.append(errors @ np.linalg.solve(found.cofactor_of(names), errors))
@@ -63,9 +63,9 @@ def test_r0_balances_the_ideal_point_and_not_the_observed_one() -> None:
     rays = R0_MM / 30.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     interior, values = np.array([30.0, 0.5, -0.2]), np.array([-1e-4, 1e-7, 0.0, 0.0, 0.0, 0.0, 0.0])
     balanced = Distortion("aicon", r0_mm=R0_MM)
-    seen, found = Lens(balanced, interior, values).camera_from_ray(rays)
+    projected, found = Lens(balanced, interior, values).camera_from_ray(rays)
     assert found.all()
-    np.testing.assert_allclose(seen, interior[1:] + 30.0 * rays, atol=1e-13)
+    np.testing.assert_allclose(projected, interior[1:] + 30.0 * rays, atol=1e-13)
     inner, _ = Lens(balanced, interior, values).camera_from_ray(0.5 * rays)
     half = R0_MM / 2.0
     expected = half * (1.0 - 1e-4 * (half**2 - R0_MM**2) + 1e-7 * (half**4 - R0_MM**4))

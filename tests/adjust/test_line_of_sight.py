@@ -115,13 +115,13 @@ def test_derivatives(setting: LineOfSight) -> None:
     """Against differences: near the nadir, far away, above the tropopause, at the height of the station."""
     stations = np.array([[0.0, 0.0, 3000.0], [10.0, 20.0, 9000.0], [0.0, 0.0, 13000.0], [0.0, 0.0, 800.0]])
     xyz = np.array([[1.0, 2.0, 100.0], [9000.0, 7000.0, 600.0], [9e4, 1e4, 11500.0], [500.0, 0.0, 797.0]])
-    seen = sight_vectors(setting, stations, xyz)
+    view = sight_vectors(setting, stations, xyz)
     for axis in range(3):
         step = np.zeros(3)
         step[axis] = 2.0
         for analytic, one, other in (
-            (seen.by_point, (stations, xyz + step), (stations, xyz - step)),
-            (seen.by_station, (stations + step, xyz), (stations - step, xyz)),
+            (view.by_point, (stations, xyz + step), (stations, xyz - step)),
+            (view.by_station, (stations + step, xyz), (stations - step, xyz)),
         ):
             difference = sight_vectors(setting, *one).vector - sight_vectors(setting, *other).vector
             np.testing.assert_allclose(analytic[:, :, axis], difference / 4.0, atol=2e-8)
@@ -156,7 +156,7 @@ def apparent(station: tuple[float, float, float], xyz: Array, refraction: bool) 
     return np.array(station) + 4000.0 * np.array([*(np.tan(nadir) * plan / arc), -1.0])
 
 
-def test_a_block_seen_through_the_air_over_a_round_earth() -> None:
+def test_a_block_viewed_through_the_air_over_a_round_earth() -> None:
     """Exact observations: with the corrections the truth comes out, without them heights are wrong by a metre."""
     network, truth = bent_network()
     points = np.array([[p.value for p in (point.X, point.Y, point.Z) if p] for point in network.points])
@@ -171,10 +171,10 @@ def test_a_block_seen_through_the_air_over_a_round_earth() -> None:
     straight = adjust(replace(network, line_of_sight=LineOfSight()), start)
     assert straight.vpv > 5.0
     assert abs(straight.value("EO.f0.Z0") - 5000.0) > 0.5
-    seen, visible = adjusted_image(result, "f0").camera_from_object(points)
+    projected, visible = adjusted_image(result, "f0").camera_from_object(points)
     assert visible.all()
     rows = np.array(network.observations.image) == "f0"
-    np.testing.assert_allclose(seen, network.observations.xy_mm[rows], atol=1e-3)
+    np.testing.assert_allclose(projected, network.observations.xy_mm[rows], atol=1e-3)
 
 
 def test_a_free_network_under_bent_lines_of_sight() -> None:

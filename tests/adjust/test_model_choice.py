@@ -30,7 +30,7 @@ LENSES: dict[str, tuple[str, dict[str, float]]] = {
 }
 
 
-def network_of(seed: int, lens: str, film: Transformation, points: int = 40) -> Network:
+def make_network(seed: int, lens: str, film: Transformation, points: int = 40) -> Network:
     """Four convergent frames of a field with relief, whose lens and film are known; adjusted without any distortion."""
     rng = np.random.default_rng(seed)
     family, parameters = LENSES[lens]
@@ -64,8 +64,8 @@ def chosen(network: Network) -> Choice:
     return choose(own, half_mm={"K": (HALF_MM, HALF_MM)})
 
 
-def test_the_true_lens_is_chosen_and_the_simpler_ones_are_told_to_be_too_simple() -> None:
-    choice = chosen(network_of(2, "k3 k5", "none", points=16))
+def test_the_true_lens_is_chosen_and_the_simpler_ones_are_reported_to_be_too_simple() -> None:
+    choice = chosen(make_network(2, "k3 k5", "none", points=16))
     assert choice.chosen is not None
     assert choice.chosen.model == Model("none", "torlegard", ("k3", "k5"))
     assert choice.verdict.startswith("The data ask for torlegard k3 k5.")
@@ -88,7 +88,7 @@ def test_a_scanners_bend_is_chosen_and_not_taken_for_a_richer_film() -> None:
 
 
 @pytest.mark.study
-def test_a_straight_scanner_gets_no_bend_and_what_is_not_told_is_said() -> None:
+def test_a_straight_scanner_gets_no_bend_and_what_is_not_reported_is_stated() -> None:
     few = {name: MARKS_MM[name] for name in "1234"}
     network = films([0.0] * 3, {}, {}, np.random.default_rng(2), marks_mm=few)
     choice = choose(adjust(network, approximate(films([0.0] * 3, {}, {}, marks_mm=few))))
@@ -108,7 +108,7 @@ def test_the_true_model_is_chosen_nearly_always_and_no_strong_effect_is_ever_mis
     true = Model(film, *(("none", ()) if lens == "none" else lens_model(lens, film)))
     right = 0
     for seed in range(runs):
-        choice = chosen(network_of(seed, lens, film))
+        choice = chosen(make_network(seed, lens, film))
         assert choice.chosen is not None
         found = choice.chosen.model
         assert found == true or found.contains(true) or found.family == "legendre(3)", found.name
@@ -179,7 +179,7 @@ def test_akaikes_criteria_in_closed_form() -> None:
 
 
 def test_the_ladder_is_of_the_cameras_own_family_and_the_networks_own_model_is_on_it() -> None:
-    network = network_of(1, "none", "affine", points=10)
+    network = make_network(1, "none", "affine", points=10)
     brown = Distortion("brown", {name: Prior(0.0, np.inf) for name in ("k1", "b1")})
     own = replace(network, cameras=(replace(network.cameras[0], distortion=brown),))
     names = [model.name for model in lenses(own, "congruent", with_sets=True)]
@@ -191,7 +191,7 @@ def test_the_ladder_is_of_the_cameras_own_family_and_the_networks_own_model_is_o
 
 @pytest.mark.parametrize("family", ["brown", "opencv"])
 def test_digital_cameras_may_have_unequal_scales_in_x_and_y(family: str) -> None:
-    network = network_of(1, "none", "affine", points=10)
+    network = make_network(1, "none", "affine", points=10)
     lens = Distortion(family, {"k1": Prior(0.0, np.inf)})
     digital = replace(network, cameras=(replace(network.cameras[0], distortion=lens),))
     names = [each.name for each in lenses(digital, "none", with_sets=False)]
@@ -201,7 +201,7 @@ def test_digital_cameras_may_have_unequal_scales_in_x_and_y(family: str) -> None
 @pytest.mark.parametrize("robust", ["huber", "igg3"])
 def test_all_candidates_get_the_weights_of_the_networks_own_adjustment(robust: WeightFunction) -> None:
     """Held, these weights lead to the very same result."""
-    network = network_of(1, "none", "none", points=12)
+    network = make_network(1, "none", "none", points=12)
     xy = network.observations.xy_mm.copy()
     xy[5] += 0.06
     spoiled = replace(network, observations=replace(network.observations, xy_mm=xy))
@@ -253,7 +253,7 @@ def test_few_known_points_stay_in_every_fold() -> None:
 
 def test_predictions_of_known_points_err_by_noise_and_by_what_predicts() -> None:
     """Of 40 points in 5 folds the camera and stations add little to the noise of 4 um that the images have."""
-    network = network_of(4, "k3", "none")
+    network = make_network(4, "k3", "none")
     model = Model("none", "torlegard", ("k3",))
     fitted = model.build_network(network, {}, {})
     result = adjust(fitted, approximate(fitted))

@@ -22,11 +22,11 @@ def photographed(xyz: Array, rng: np.random.Generator, share: float = 0.2) -> tu
     camera = xyz @ rotation.T - (0.02, -0.03, 1.7)
     p = camera[:, :2] / -camera[:, 2:]
     xy = 1.02 * C_MM * p * (1.0 - 0.1 * (p**2).sum(axis=1, keepdims=True)) + rng.normal(0.0, SIGMA_MM, p.shape)
-    seen = np.flatnonzero((np.abs(xy) < HALF_MM).all(axis=1) & (rng.random(len(xy)) >= share))
+    view = np.flatnonzero((np.abs(xy) < HALF_MM).all(axis=1) & (rng.random(len(xy)) >= share))
     false = rng.uniform(-HALF_MM, HALF_MM, (round(share * len(xyz)), 2))
-    order = rng.permutation(len(seen) + len(false))
-    point = np.append(seen, np.full(len(false), -1))[order]
-    return np.concatenate([xy[seen], false])[order], point
+    order = rng.permutation(len(view) + len(false))
+    point = np.append(view, np.full(len(false), -1))[order]
+    return np.concatenate([xy[view], false])[order], point
 
 
 def named(xyz: Array, xy_mm: Array, normals: Array | None = None) -> Names | str:
@@ -85,7 +85,7 @@ def test_a_regular_grid_has_no_names_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.study) for seed in (1, 2))])
-def test_a_grid_off_by_a_twentieth_of_its_step_is_told_by_how_closely_its_marks_agree(seed: int) -> None:
+def test_a_grid_off_by_a_twentieth_of_its_step_is_known_by_how_closely_its_marks_agree(seed: int) -> None:
     """Moved on or turned, it agrees with most of the marks as well, but not as closely."""
     rng = np.random.default_rng([9, seed])
     xyz = lattice(6, 6, 0.05, rng) * 0.9
@@ -104,7 +104,7 @@ def test_marks_left_out_do_not_tell_where_a_regular_grid_begins() -> None:
 
 
 @pytest.mark.study
-def test_a_field_seen_from_behind_is_no_other_naming() -> None:
+def test_a_field_viewed_from_behind_is_no_other_naming() -> None:
     """A lattice that is its own mirror image may be seen from either side, unless it is known where its points face."""
     rng = np.random.default_rng(6)
     half = lattice(6, 5, 0.3, rng)

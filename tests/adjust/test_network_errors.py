@@ -22,14 +22,14 @@ def rows(network: Network, keep: list[int]) -> Network:
     return replace(network, observations=network.observations.only(np.array(keep, dtype=np.intp)))
 
 
-def without(network: Network, image: str, kind: str, left: int) -> Network:
+def drop_observations(network: Network, image: str, kind: str, left: int) -> Network:
     """All but some marks of a kind in an image."""
     observations = network.observations
     places = [i for i in range(len(observations)) if (observations.image[i], observations.kind[i]) == (image, kind)]
     return rows(network, [i for i in range(len(observations)) if i not in places[left:]])
 
 
-def without_fiducial(network: Network) -> Network:
+def drop_fiducial(network: Network) -> Network:
     camera = network.cameras[0]
     marks = {id_: mark for id_, mark in camera.fiducials.items() if id_ != "3"}
     return replace(network, cameras=(replace(camera, fiducials=marks),))
@@ -58,14 +58,17 @@ GALLERY: dict[str, tuple[Change, list[str]]] = {
     ),
     "unknown image": (lambda n: replace(n, images=n.images[1:]), ["image f0", "Add the image"]),
     "unknown point": (lambda n: replace(n, points=n.points[1:]), ["target 0", "image f0", "Add it to the points"]),
-    "unknown fiducial": (without_fiducial, ["fiducial 3", "image f0", "camera K"]),
+    "unknown fiducial": (drop_fiducial, ["fiducial 3", "image f0", "camera K"]),
     "observed twice": (lambda n: rows(n, [*range(len(n.observations)), 7]), ["point 2", "2 times", "image f0"]),
     "covariance": (bad_covariance, ["target 3", "image f0", "not positive definite"]),
     "nan": (lambda n: with_errors(n, {9: np.array([0.0, np.nan])}), ["target 4", "image f0", "not a finite number"]),
-    "two targets": (lambda n: without(n, "f1", "target", 2), ["image f1", "2 object points", "needs 3"]),
-    "two fiducials": (lambda n: without(n, "f3", "fiducial", 2), ["image f3", "2 fiducial", "affine", "needs 3"]),
+    "two targets": (lambda n: drop_observations(n, "f1", "target", 2), ["image f1", "2 object points", "needs 3"]),
+    "two fiducials": (
+        lambda n: drop_observations(n, "f3", "fiducial", 2),
+        ["image f3", "2 fiducial", "affine", "needs 3"],
+    ),
     "two of four": (
-        lambda n: without(
+        lambda n: drop_observations(
             replace(n, images=tuple(replace(each, transformation="projective") for each in n.images)),
             "f3",
             "fiducial",
@@ -73,7 +76,7 @@ GALLERY: dict[str, tuple[Change, list[str]]] = {
         ),
         ["image f3", "2 fiducial", "projective transformation needs 3", "4 where its targets tell nothing of it"],
     ),
-    "no fiducials": (lambda n: without(n, "f3", "fiducial", 0), ["image f3", "0 fiducial", "needs 3"]),
+    "no fiducials": (lambda n: drop_observations(n, "f3", "fiducial", 0), ["image f3", "0 fiducial", "needs 3"]),
     "parameter": (strange_parameter, ["camera K", "torlegard", "k9", "k3, k5"]),
     "rows do not go together": (
         lambda n: replace(n, observations=replace(n.observations, point=n.observations.point[:-1])),
@@ -128,7 +131,7 @@ def test_an_image_with_two_targets_and_a_known_orientation_is_adjusted() -> None
     network, start = simulated(np.random.default_rng(1), truth)
     known = Exterior(np.array([*truth.stations[1], *truth.attitudes[1]]), np.full(6, 0.01))
     images = tuple(replace(image, exterior=known) if image.name == "f1" else image for image in network.images)
-    result = adjust(without(replace(network, images=images), "f1", "target", 2), start)
+    result = adjust(drop_observations(replace(network, images=images), "f1", "target", 2), start)
     assert result.converged
 
 

@@ -20,7 +20,7 @@ def triangle(rng: np.random.Generator, singular: Array) -> Array:
     return np.asarray(np.linalg.qr(left @ np.diag(singular) @ right, mode="r"))
 
 
-def factor_of(shared: Array, *blocks: BlockFactors) -> Factor:
+def factorise(shared: Array, *blocks: BlockFactors) -> Factor:
     count = len(shared) + sum(block.own.size for block in blocks)
     dense = Triangle(Fronts.single(len(shared)), (shared,), (np.zeros((len(shared), 0)),))
     return Factor(DenseBlocks(blocks), dense, np.zeros(len(shared)), np.ones(count))
@@ -36,11 +36,11 @@ def test_small_singular_values_are_found_one_and_all(small: tuple[float, ...], b
     count = 2 * null_space.DENSE
     singular = np.array([*small, *np.geomspace(2e-3, 1.0, count - len(small))])
     shared = triangle(rng, singular)
-    vectors, seen = null_space.null_space(factor_of(shared), [], below)
+    vectors, view = null_space.null_space(factorise(shared), [], below)
     expected = np.sort(singular[singular <= below])
-    assert len(seen) == len(expected)
-    np.testing.assert_allclose(np.sort(seen), expected, rtol=0.02, atol=1e-14)
-    np.testing.assert_allclose(vectors.T @ vectors, np.eye(len(seen)), atol=1e-12)
+    assert len(view) == len(expected)
+    np.testing.assert_allclose(np.sort(view), expected, rtol=0.02, atol=1e-14)
+    np.testing.assert_allclose(vectors.T @ vectors, np.eye(len(view)), atol=1e-12)
     assert np.linalg.norm(shared @ vectors, axis=0).max(initial=0.0) <= below
 
 
@@ -50,7 +50,7 @@ def test_a_block_without_its_own_determination_lends_its_rows_to_the_shared() ->
     own = np.array([[1.0, 0.0], [0.0, 0.0]])
     border = np.array([[0.0, 0.5], [0.7, 0.0]])
     block = BlockFactors(np.array([[2, 3]]), np.array([[0, 1]]), own[None], border[None], np.zeros((1, 2)))
-    found = null_space.null_vectors(factor_of(shared, block))
+    found = null_space.null_vectors(factorise(shared, block))
     np.testing.assert_allclose(np.abs(found), [[0.0], [0.0], [0.0], [1.0]], atol=1e-12)
 
 

@@ -107,10 +107,10 @@ def test_skew_and_fisheye_are_opencvs(
     rays = np.vstack([np.random.default_rng(3).uniform(-largest, largest, (60, 2)) / np.sqrt(2.0), np.zeros(2)])
     interior = np.array([FY, CX, -CY]) * PIXEL_MM
     values = np.array([*lens, FX / FY - 1.0, SKEW / FY])
-    seen, found = Lens(Distortion(family), interior, values).camera_from_ray(rays)
+    projected, found = Lens(Distortion(family), interior, values).camera_from_ray(rays)
     assert found.all()
-    np.testing.assert_allclose(seen, mm(pixels(rays)), atol=1e-11)
-    ideal, found = Lens(Distortion(family), interior, values).ideal_from_observed(seen)
+    np.testing.assert_allclose(projected, mm(pixels(rays)), atol=1e-11)
+    ideal, found = Lens(Distortion(family), interior, values).ideal_from_observed(projected)
     assert found.all()
     np.testing.assert_allclose((ideal - interior[1:]) / interior[0], rays, atol=1e-12)
 
@@ -181,7 +181,7 @@ def test_torlegard_is_inverted() -> None:
     )
 
 
-def test_what_has_no_image_is_told() -> None:
+def test_what_has_no_image_is_reported() -> None:
     """Behind the camera, and beyond the radius where a polynomial folds the image over."""
     fold = Distortion("torlegard")
     parameters = np.array([4e-5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # x - k3 x³ turns back at 91 mm
@@ -237,8 +237,8 @@ def wide_network(seed: int, lens: Array = WIDE) -> Network:
         rows += [(f"i{i}", str(j), mm(pixels[j]) + rng.normal(0.0, noise_mm, 2)) for j in shown]
     c, x0, y0 = (Prior(value * PIXEL_MM, np.inf) for value in (WIDE_FX, CX, -CY))
     wide = Camera("D", c, x0, y0, Distortion("opencv", {name: Prior(0.0, np.inf) for name in RATIONAL}))
-    seen = {row[1] for row in rows}
-    return digital_network(wide, rows, {k: v for k, v in numbered(xyz).items() if k in seen}, noise_mm)
+    found = {row[1] for row in rows}
+    return digital_network(wide, rows, {k: v for k, v in numbered(xyz).items() if k in found}, noise_mm)
 
 
 @pytest.mark.parametrize("seed", [0, 2])

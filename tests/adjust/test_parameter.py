@@ -38,7 +38,7 @@ def test_ordinary_names_are_written_as_they_always_were() -> None:
     assert parameters_from_texts(list(keys)) == tuple(keys.values())
 
 
-def test_a_dot_in_the_second_of_two_names_is_told_from_that_between_them() -> None:
+def test_a_dot_in_the_second_of_two_names_is_distinguished_from_that_between_them() -> None:
     one, other = Parameter.fiducial("A", "B.1", "x"), Parameter.fiducial("A.B", "1", "x")
     assert (one.text, other.text) == ("FID.A.B%2E1.x", "FID.A.B.1.x")
     assert [parameter_from_text(each.text) for each in (one, other)] == [one, other]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_cases import CAMERA, approximations_of, load, network_of, own_name
+from reference_cases import CAMERA, case_approximations, case_network, load, own_name
 from simulated import simulated
 
 from adjust.errors import AdjustmentError
@@ -24,7 +24,7 @@ DRAWS = 60
 def test_a_priori_sigmas_of_the_reference(name: str) -> None:
     """At the true values: those of a case with noise were computed a little beside them."""
     case = load(name)
-    expected = plan(network_of(case), approximations_of(case, case["truth"]))
+    expected = plan(case_network(case), case_approximations(case, case["truth"]))
     sigmas = {own_name(key): row["std_apriori"] for key, row in case["result"]["parameters"].items()}
     planned = [expected.sigma(key) for key in sigmas]
     tolerance = 1e-7 if case["result"]["vpv"] < 1e-12 else 2e-3
@@ -45,13 +45,13 @@ def test_what_was_measured_does_not_matter() -> None:
 @pytest.mark.study
 def test_simulated_measurements_scatter_as_planned() -> None:
     network, values = simulated(np.random.default_rng(0), noise=False, free={"k3": np.inf})
-    network = with_interior(network, np.inf)
+    network = set_interior(network, np.inf)
     names = ["IO.K.c", "IO.K.x0", "IO.K.k3", "FID.K.1.x", "FID.K.4.y", "EO.f1.Z0", "EO.f2.kappa"]
     expected = plan(network, values)
     rng = np.random.default_rng(11)
     found = []
     for _ in range(DRAWS):
-        result = adjust(measured(network, rng), values)
+        result = adjust(measure_picture(network, rng), values)
         found.append([result.value(name) for name in names])
     ratio = np.std(found, axis=0) / [expected.sigma(name) for name in names]
     assert np.abs(ratio - 1.0).max() < 4.0 / np.sqrt(2 * DRAWS)
@@ -60,7 +60,7 @@ def test_simulated_measurements_scatter_as_planned() -> None:
 def test_twice_as_large_errors_give_twice_as_large_sigmas() -> None:
     """Of what observations alone determine: no prior has a say."""
     network, values = simulated(np.random.default_rng(5), noise=False, fiducial_sigma=0.0)
-    network = with_interior(network, np.inf)
+    network = set_interior(network, np.inf)
     rows = network.observations
     coarse = replace(network, observations=replace(rows, covariance_mm2=4.0 * rows.covariance_mm2))
     fine, doubled, factor = plan(network, values), plan(coarse, values), plan(network, values, sigma0=2.0)
@@ -73,8 +73,8 @@ def test_twice_as_large_errors_give_twice_as_large_sigmas() -> None:
 def test_a_singular_network_still_determines_the_rest() -> None:
     """Juhl's field of known heights: not c, x0', y0', but all nine deformations as if these were known."""
     case = load("ii_juhl_3photos")
-    network, values = network_of(case), approximations_of(case, case["truth"])
-    regular, singular = plan(network, values), plan(with_interior(network, np.inf), values)
+    network, values = case_network(case), case_approximations(case, case["truth"])
+    regular, singular = plan(network, values), plan(set_interior(network, np.inf), values)
     assert regular.singular == ()
     assert len(singular.singular) == 3
     for name in (f"IO.{CAMERA}.c", f"IO.{CAMERA}.x0", f"IO.{CAMERA}.y0", "EO.1.Z0"):
@@ -133,14 +133,14 @@ def test_a_fiducial_of_a_known_image_is_a_regression() -> None:
         assert planned.sigma(f"FID.K.m.{axis}") == pytest.approx(np.sqrt(variance), rel=1e-7)
 
 
-def test_a_point_behind_the_camera_is_told() -> None:
+def test_a_point_behind_the_camera_is_reported() -> None:
     network, values = simulated(np.random.default_rng(1))
     away = {**values.exterior, "f2": values.exterior["f2"] + np.array([0.0, 0.0, 0.0, np.pi, 0.0, 0.0])}
     with pytest.raises(AdjustmentError, match=r"cannot be planned: point \d+ lies behind the camera in image f2"):
         plan(network, replace(values, exterior=away))
 
 
-def with_interior(network: Network, sigma: float) -> Network:
+def set_interior(network: Network, sigma: float) -> Network:
     """The same with one standard deviation for c, x0' and y0'."""
     camera = network.cameras[0]
     c, x0, y0 = (
@@ -149,13 +149,11 @@ def with_interior(network: Network, sigma: float) -> Network:
     return replace(network, cameras=(replace(camera, principal_distance_mm=c, x0_mm=x0, y0_mm=y0),))
 
 
-def measured(network: Network, rng: np.random.Generator) -> Network:
+def measure_picture(network: Network, rng: np.random.Generator) -> Network:
     """A network without errors, its observations and given fiducials with noise."""
     rows, camera = network.observations, network.cameras[0]
     sigmas = np.sqrt(np.diagonal(rows.covariance_mm2, axis1=1, axis2=2))
-    fiducials = {
-        id_: Fiducial(_drawn(mark.x_mm, rng), _drawn(mark.y_mm, rng)) for id_, mark in camera.fiducials.items()
-    }
+    fiducials = {id_: Fiducial(_draw(mark.x_mm, rng), _draw(mark.y_mm, rng)) for id_, mark in camera.fiducials.items()}
     return replace(
         network,
         cameras=(replace(camera, fiducials=fiducials),),
@@ -163,5 +161,5 @@ def measured(network: Network, rng: np.random.Generator) -> Network:
     )
 
 
-def _drawn(prior: Prior, rng: np.random.Generator) -> Prior:
+def _draw(prior: Prior, rng: np.random.Generator) -> Prior:
     return replace(prior, value=float(rng.normal(prior.value, prior.sigma)))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_cases import approximations_of, load, network_of, own_name
+from reference_cases import case_approximations, case_network, load, own_name
 from simulated import Truth, field_points, simulated
 from studies import parametrize_with_studies
 
@@ -29,8 +29,8 @@ def spoilt(start: Approximations, distance: float, rng: np.random.Generator) -> 
 @pytest.mark.parametrize("seed", range(4))
 def test_five_images_on_control(seed: int) -> None:
     case = load("i_five_images_affine_reduced")
-    start = approximations_of(case, case["input"]["initial_approximations"])
-    result = adjust(network_of(case), spoilt(start, 1500.0, np.random.default_rng(seed)))
+    start = case_approximations(case, case["input"]["initial_approximations"])
+    result = adjust(case_network(case), spoilt(start, 1500.0, np.random.default_rng(seed)))
     assert result.converged
     for name, row in case["result"]["parameters"].items():
         difference = result.value(own_name(name)) - row["value"]

@@ -55,13 +55,13 @@ def places_after_alignment(projected: Projection, in_camera: Array, fitted: Arra
 
     scale = float(np.abs(in_camera).max())
 
-    def moved(vector: Array, points: Array) -> Array:
+    def shift(vector: Array, points: Array) -> Array:
         return projected(points @ rotation_from_vector(vector[:3]).T + scale * vector[3:])
 
     def misses(vector: Array) -> Array:
-        return (moved(vector, in_camera) - fitted).ravel()
+        return (shift(vector, in_camera) - fitted).ravel()
 
-    return moved(np.asarray(least_squares(misses, np.zeros(6), method="lm").x), fixed)
+    return shift(np.asarray(least_squares(misses, np.zeros(6), method="lm").x), fixed)
 
 
 def board_sample(
@@ -90,8 +90,8 @@ def film_sample(rng: np.random.Generator, points: Array, distance: float) -> tup
     true_marks = np.column_stack([np.array(list(FIDUCIALS.values())), np.ones(len(FIDUCIALS))])
     film = np.linalg.lstsq(true_marks, marks, rcond=None)[0]
     stations, attitudes = np.array(truth.stations), [rotation(*each) for each in truth.attitudes]
-    seen = zip(stations, attitudes, strict=True)
-    in_camera = np.concatenate([(points - station) @ turn.T for station, turn in seen])
+    view = zip(stations, attitudes, strict=True)
+    in_camera = np.concatenate([(points - station) @ turn.T for station, turn in view])
     fitted = np.concatenate(
         [adjusted_image(result, f"f{i}").camera_from_object(points)[0] for i in range(len(stations))]
     )
@@ -183,7 +183,7 @@ def test_the_larger_of_both_standard_deviations_is_shown() -> None:
     ("camera", "distance", "message"),
     [("desks", 1.0, "There is no calibrated camera 'desks'. Name one of: desk"), ("", 0.0, "must be positive")],
 )
-def test_what_cannot_be_projected_is_said(camera: str, distance: float, message: str) -> None:
+def test_what_cannot_be_projected_is_stated(camera: str, distance: float, message: str) -> None:
     with pytest.raises(AdjustmentError, match=message):
         true_board(4).projection_uncertainty(camera, distance)
 

@@ -28,7 +28,7 @@ def small_network(sigma: float = 0.0) -> tuple[Network, Approximations]:
     return simulated(np.random.default_rng(3), Truth(stations=stations), points=points, point_sigma=sigma, free=free)
 
 
-def on_grid(network: Network) -> Network:
+def round_network(network: Network) -> Network:
     return replace(network, points=tuple(shifted_point(point, np.zeros(3)) for point in network.points))
 
 
@@ -55,7 +55,7 @@ def sigmas_apart(here: Adjustment, there: Adjustment) -> float:
 
 @parametrize_with_studies(("sigma", "datum"), [(0.0, "control"), (0.0005, "control"), (np.inf, "free")])
 def test_a_network_with_seven_digits_comes_to_the_same_result(sigma: float, datum: Datum) -> None:
-    network = on_grid(small_network(sigma)[0])
+    network = round_network(small_network(sigma)[0])
     here = adjust(network, options=Options(datum=datum))
     there = adjust(shifted(network, FAR), options=Options(datum=datum))
     assert here.converged
@@ -68,7 +68,7 @@ def test_a_network_with_seven_digits_comes_to_the_same_result(sigma: float, datu
 
 def test_given_approximations_are_reduced_too() -> None:
     network, start = small_network()
-    network, start = on_grid(network), raised(start)
+    network, start = round_network(network), raised(start)
     here = adjust(network, start)
     there = adjust(shifted(network, FAR), Reduction(-FAR).approximations(start))
     assert here.converged

@@ -40,31 +40,31 @@ def exact_network() -> tuple[Network, Approximations]:
     return replace(network, images=images, observations=observations), start
 
 
-def reliability_of(result: Adjustment) -> Reliability:
+def assess_reliability(result: Adjustment) -> Reliability:
     assert result.reliability is not None
     return result.reliability
 
 
-def with_control(network: Network, error: float) -> Network:
-    def moved(prior: Prior | None) -> Prior | None:
+def spoil_control(network: Network, error: float) -> Network:
+    def spoil(prior: Prior | None) -> Prior | None:
         return prior and Prior(prior.value + error, prior.sigma)
 
-    points = tuple(replace(point, Z=moved(point.Z)) if point.id == "5" else point for point in network.points)
+    points = tuple(replace(point, Z=spoil(point.Z)) if point.id == "5" else point for point in network.points)
     return replace(network, points=points)
 
 
-def with_fiducial(network: Network, error: float) -> Network:
+def spoil_fiducial(network: Network, error: float) -> Network:
     camera = network.cameras[0]
     mark = camera.fiducials["3"]
     wrong = replace(mark, y_mm=Prior(mark.y_mm.value + error, mark.y_mm.sigma))
     return replace(network, cameras=(replace(camera, fiducials=dict(camera.fiducials) | {"3": wrong}),))
 
 
-def with_station(network: Network, error: float) -> Network:
-    def moved(exterior: Exterior | None) -> Exterior | None:
+def spoil_station(network: Network, error: float) -> Network:
+    def spoil(exterior: Exterior | None) -> Exterior | None:
         return exterior and Exterior(exterior.values + error * np.eye(6)[0], exterior.sigmas)
 
-    images = tuple(replace(i, exterior=moved(i.exterior)) if i.name == "f2" else i for i in network.images)
+    images = tuple(replace(i, exterior=spoil(i.exterior)) if i.name == "f2" else i for i in network.images)
     return replace(network, images=images)
 
 
@@ -76,22 +76,22 @@ CASES: dict[str, tuple[str, int, Callable[[Network, float], Network]]] = {
         0,
         lambda n, e: with_errors(n, {row_of(n, "fiducial", "f3", "2"): e * X}),
     ),
-    "control": ("control point 5 Z", 0, with_control),
-    "datum": ("given fiducial 3 (camera K)", 1, with_fiducial),
-    "exterior": ("given X0 of image f2", 0, with_station),
+    "control": ("control point 5 Z", 0, spoil_control),
+    "datum": ("given fiducial 3 (camera K)", 1, spoil_fiducial),
+    "exterior": ("given X0 of image f2", 0, spoil_station),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_smallest_detectable_error_shifts_the_test_by_delta0_and_the_camera_as_told(case: str) -> None:
+def test_the_smallest_detectable_error_shifts_the_test_by_delta0_and_the_camera_as_stated(case: str) -> None:
     name, axis, spoilt = CASES[case]
     network, start = exact_network()
     clean = adjust(network, start)
-    tests = reliability_of(clean)
+    tests = assess_reliability(clean)
     unit = [tested.name for tested in tests.tested].index(name)
     error = tests.smallest[unit, axis]
     dirty = adjust(spoilt(network, error), start)
-    assert abs(reliability_of(dirty).w[unit, axis]) == pytest.approx(DELTA0, rel=2e-3)
+    assert abs(assess_reliability(dirty).w[unit, axis]) == pytest.approx(DELTA0, rel=2e-3)
 
     shift = dirty.values - clean.values
     sigma = np.sqrt(clean.cofactor.variances)
@@ -105,10 +105,10 @@ def test_the_smallest_detectable_error_shifts_the_test_by_delta0_and_the_camera_
         assert outer.in_sigmas == pytest.approx(abs(outer.effect) / sigma[position], rel=1e-9)
 
 
-def test_the_cause_that_is_named_moves_the_parameter_by_what_is_told() -> None:
+def test_the_cause_that_is_named_moves_the_parameter_by_what_is_reported() -> None:
     network, start = exact_network()
     clean = adjust(network, start)
-    tests = reliability_of(clean)
+    tests = assess_reliability(clean)
     named = {
         t.coordinate_name(axis): (i, axis) for i, t in enumerate(tests.tested) for axis in range(len(t.coordinates))
     }
@@ -127,20 +127,20 @@ def test_the_cause_that_is_named_moves_the_parameter_by_what_is_told() -> None:
 
 def test_an_error_in_the_least_favourable_direction_shifts_the_test_of_the_point() -> None:
     network, start = exact_network()
-    tests = reliability_of(adjust(network, start))
+    tests = assess_reliability(adjust(network, start))
     unit = row_of(network, "target", "f1", "4")
     size = tests.smallest_together[unit]
     turns = np.linspace(0.0, np.pi, 7)[:-1]
     errors = size * np.column_stack([np.cos(turns), np.sin(turns)])
     spoilt = [adjust(with_errors(network, {unit: error}), start) for error in errors]
-    statistics = [reliability_of(result).statistic[unit] for result in spoilt]
+    statistics = [assess_reliability(result).statistic[unit] for result in spoilt]
     # As a function of the direction it is a constant and a sine of twice the angle: its minimum follows from these.
     mean = np.mean(statistics)
     wave = np.hypot(np.mean(statistics * np.cos(2 * turns)), np.mean(statistics * np.sin(2 * turns)))
     assert mean - 2.0 * wave == pytest.approx(Probabilities().noncentrality(2) ** 2, rel=5e-3)
 
 
-def test_an_undetected_error_of_an_earlier_calibration_moves_the_camera_as_told() -> None:
+def test_an_undetected_error_of_an_earlier_calibration_moves_the_camera_as_stated() -> None:
     """Its values are correlated; the one that does most harm is wrong."""
     truth = Truth()
     network, start = simulated(np.random.default_rng(3), truth, noise=False, free={"k3": np.inf})
@@ -150,21 +150,21 @@ def test_an_undetected_error_of_an_earlier_calibration_moves_the_camera_as_told(
     sigmas = np.array([0.002, 1e-9])
     covariance = np.array([[1.0, -0.6], [-0.6, 1.0]]) * np.outer(sigmas, sigmas)
 
-    def with_calibration(error: Array) -> Network:
+    def set_calibration(error: Array) -> Network:
         return replace(network, cameras=(camera,), calibrations=(Calibration(own, values + error, covariance),))
 
-    clean = adjust(with_calibration(np.zeros(2)), start)
-    told = {outer.parameter: outer for outer in reliability_of(clean).outer}
+    clean = adjust(set_calibration(np.zeros(2)), start)
+    result = {outer.parameter: outer for outer in assess_reliability(clean).outer}
     for name in own:
-        i = [f"calibration {each.label}" for each in own].index(told[name].cause)
-        wrong = adjust(with_calibration(clean.further[i].detectable * np.eye(2)[i]), start)
-        assert wrong.value(name) - clean.value(name) == pytest.approx(told[name].effect, rel=0.01)
+        i = [f"calibration {each.label}" for each in own].index(result[name].cause)
+        wrong = adjust(set_calibration(clean.further[i].detectable * np.eye(2)[i]), start)
+        assert wrong.value(name) - clean.value(name) == pytest.approx(result[name].effect, rel=0.01)
 
 
 def test_the_redundancies_of_everything_add_up() -> None:
     network, start = exact_network()
     result = adjust(network, start)
-    tests = reliability_of(result)
+    tests = assess_reliability(result)
     assert tests.redundancy.sum() == pytest.approx(result.redundancy)
     assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
     np.testing.assert_allclose(tests.redundancy[: len(network.observations)], result.residuals.redundancy)
@@ -179,10 +179,10 @@ def test_w_of_an_observation_does_not_depend_on_the_weight_that_it_was_left() ->
     assert robust.weights[unit] < 1e-6
     others = np.delete(robust.weights, unit)
     assert (others == 1.0).mean() > 0.8
-    assert reliability_of(robust).w[unit] == pytest.approx(reliability_of(plain).w[unit], rel=0.15)
+    assert assess_reliability(robust).w[unit] == pytest.approx(assess_reliability(plain).w[unit], rel=0.15)
 
 
-def test_what_nothing_checks_is_told() -> None:
+def test_what_nothing_checks_is_reported() -> None:
     """Three fiducials for an affine transformation: no reading of theirs is checked, and none has an MDB."""
     network, start = simulated(np.random.default_rng(10))
     rows = network.observations
@@ -194,7 +194,7 @@ def test_what_nothing_checks_is_told() -> None:
     exterior = Exterior(np.array([*Truth().stations[0], *Truth().attitudes[0]]), np.zeros(6))
     images = tuple(replace(i, exterior=exterior) if i.name == "f0" else i for i in network.images)
     result = adjust(replace(network, observations=few, images=images), start)
-    tests = reliability_of(result)
+    tests = assess_reliability(result)
     unit = row_of(replace(network, observations=few), "fiducial", "f0", "1")
     assert np.isinf(tests.smallest[unit]).all()
     assert (tests.w[unit] == 0.0).all()
@@ -219,20 +219,20 @@ def test_critical_tau_is_the_quantile_of_a_residual_over_the_sigma0_that_it_is_p
 
 
 @pytest.mark.study
-def test_the_smallest_detectable_error_is_detected_as_often_as_told() -> None:
+def test_the_smallest_detectable_error_is_detected_as_often_as_stated() -> None:
     """Four errors in five at a level of 0.1 %, by the test of the coordinate and by that of the point."""
     points = field_points(np.random.default_rng(0), 12)
     exact, start = simulated(np.random.default_rng(0), points=points, noise=False)
-    reliability = reliability_of(adjust(exact, start))
+    reliability = assess_reliability(adjust(exact, start))
     unit, runs = row_of(exact, "target", "f1", "4"), 400
     limit = -special.ndtri(0.0005)
     _, directions = np.linalg.eigh(weight_of_point(exact, start, unit))
     found = np.zeros(2)
     for seed in range(runs):
         noisy, _ = simulated(np.random.default_rng(1000 + seed), points=points)
-        coordinate = reliability_of(adjust(with_errors(noisy, {unit: reliability.smallest[unit, 0] * X}), start))
+        coordinate = assess_reliability(adjust(with_errors(noisy, {unit: reliability.smallest[unit, 0] * X}), start))
         worst = reliability.smallest_together[unit] * directions[:, 0]
-        point = reliability_of(adjust(with_errors(noisy, {unit: worst}), start))
+        point = assess_reliability(adjust(with_errors(noisy, {unit: worst}), start))
         found += abs(coordinate.w[unit, 0]) > limit, point.statistic[unit] > special.chdtri(2, 0.001)
     assert found / runs == pytest.approx([0.8, 0.8], abs=0.06)
 
@@ -241,6 +241,6 @@ def weight_of_point(exact: Network, start: Approximations, unit: int) -> Array:
     """P Q_v P (2, 2) of a point, from what its statistic becomes with small errors."""
     size = 1e-4
     e = [X, Y, X + Y]
-    s = [reliability_of(adjust(with_errors(exact, {unit: size * each}), start)).statistic[unit] for each in e]
+    s = [assess_reliability(adjust(with_errors(exact, {unit: size * each}), start)).statistic[unit] for each in e]
     mixed = 0.5 * (s[2] - s[0] - s[1])
     return np.array([[s[0], mixed], [mixed, s[1]]]) / size**2

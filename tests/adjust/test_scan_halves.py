@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from halves import JOIN_SIGMA, Halves, halves, without
+from halves import JOIN_SIGMA, Halves, drop_images, halves
 
 from adjust import Adjustment, AdjustmentError, Options, adjust
 from adjust.problem.network import Network
@@ -68,7 +68,7 @@ def test_half_the_marks_in_each_scan_suffice_where_joins_say_how_they_lie() -> N
 
 def test_frames_without_any_target_are_joined_too() -> None:
     simulated = halves(np.random.default_rng(4))
-    adjustment = adjust(replace(without(simulated.network, "target"), points=()))
+    adjustment = adjust(replace(drop_images(simulated.network, "target"), points=()))
     assert adjustment.converged
     assert adjustment.groups["join"].redundancy > 50.0
     assert 0.8 < np.sqrt(np.mean(errors(simulated, adjustment)["joins"] ** 2)) < 1.2
@@ -141,7 +141,7 @@ def part(network: Network, keep: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -
 
 
 def test_scans_without_anything_in_common_are_refused() -> None:
-    network = without(halves(np.random.default_rng(9)).network, "join")
+    network = drop_images(halves(np.random.default_rng(9)).network, "join")
     shared = np.array([point == "5" for point in network.observations.point])  # the mark that both halves show
     targets = np.array([kind == "target" for kind in network.observations.kind])
     with pytest.raises(AdjustmentError, match=r"frame f0: its scan f0.right has 0 points in common with f0.left"):
@@ -165,7 +165,7 @@ def test_halves_of_different_cameras_are_refused() -> None:
 def test_a_film_that_nothing_determines_is_named_with_its_frame() -> None:
     """All joins on one line, no mark in the right half: it can stretch across the line."""
     simulated = halves(np.random.default_rng(13), join_count=8, overlap_mm=1e-12, join_sigma=1e-12)
-    network = without(simulated.network, "target")
+    network = drop_images(simulated.network, "target")
     observations = network.observations
     rows = zip(observations.image, observations.kind, strict=True)
     few = part(network, np.array([not (kind == "fiducial" and image == "f0.right") for image, kind in rows]))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bent_scans import HALF_MM, MIDDLE_MM, RESEAU_MM, bent, displacement, films, in_a_bent_scanner
+from bent_scans import HALF_MM, MIDDLE_MM, RESEAU_MM, bend_in_scanner, bent, displacement, films
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
@@ -107,20 +107,22 @@ def test_perfect_data_give_the_bend_back(method: str) -> None:
     truth = Truth(mirrored=(False, True, False, False), middle_mm=MIDDLE_MM)
     points = field_points(np.random.default_rng(5), 40)
     straight, _ = simulated(np.random.default_rng(4), truth, points=points, noise=False)
-    network = in_a_bent_scanner(straight, BEND_MM, free(*BEND_MM))
+    network = bend_in_scanner(straight, BEND_MM, free(*BEND_MM))
     result = solved(network, Options(method="combined" if method == "combined" else "elements"))
     assert result.converged
     assert np.abs(result.residuals.v_mm).max() < 1e-9
     for name, value in BEND_MM.items():
         assert result.value(f"SC.S.{name}") == pytest.approx(value, abs=1e-8)
     image = adjusted_image(result, "f1")
-    seen = [i for i, name in enumerate(network.observations.image) if name == "f1" and i % 2]
-    camera_mm = image.camera_from_comparator(network.observations.xy_mm[seen])
+    observed = [i for i, name in enumerate(network.observations.image) if name == "f1" and i % 2]
+    camera_mm = image.camera_from_comparator(network.observations.xy_mm[observed])
     back, found = image.comparator_from_camera(camera_mm)
     assert found.all()
-    np.testing.assert_allclose(back, network.observations.xy_mm[seen], atol=1e-9)
+    np.testing.assert_allclose(back, network.observations.xy_mm[observed], atol=1e-9)
     plain = adjusted_image(solved(straight), "f1")
-    np.testing.assert_allclose(camera_mm, plain.camera_from_comparator(straight.observations.xy_mm[seen]), atol=1e-7)
+    np.testing.assert_allclose(
+        camera_mm, plain.camera_from_comparator(straight.observations.xy_mm[observed]), atol=1e-7
+    )
 
 
 def test_the_derivatives_of_an_image_through_scanner_and_film() -> None:
@@ -155,7 +157,7 @@ def test_frames_in_two_poses_tell_a_bend_from_the_fiducials(
     ]
 
 
-def test_frames_that_lie_alike_are_told() -> None:
+def test_frames_that_lie_alike_are_reported() -> None:
     result = solved(films([0.0] * 4, BEND_MM, free("a20")))
     (warning,) = [text for text in result.warnings if "bend of scanner S" in text]
     assert "in its term a20: " in warning
@@ -175,7 +177,7 @@ def test_given_fiducials_separate_the_scanner_in_one_pose_too() -> None:
     assert 0.2e-3 < result.sigma("SC.S.a20") / result.sigma0 < 2e-3  # as good as the marks are known
 
 
-def test_a_prior_makes_a_bend_regular_and_is_said_to_be_all() -> None:
+def test_a_prior_makes_a_bend_regular_and_is_stated_to_be_all() -> None:
     result = solved(films([0.0] * 4, {}, {"a20": Prior(0.0, 0.01)}, sigma_given_mm=np.inf))
     assert "SC.S.a20" not in [moved.text for each in result.singular for moved in each.parameters]
 
@@ -219,7 +221,7 @@ def test_approximations_know_a_bend_that_is_given() -> None:
     assert np.abs(result.residuals.v_mm).max() < 1e-9
 
 
-def test_what_is_wrong_with_a_scanner_is_said() -> None:
+def test_what_is_wrong_with_a_scanner_is_stated() -> None:
     with pytest.raises(ValueError, match="has no term a10"):
         Scanner("S", free("a10"))
     with pytest.raises(ValueError, match="two positive lengths"):
@@ -236,12 +238,12 @@ def test_a_bend_that_a_lens_makes_too_is_laid_to_the_lens() -> None:
     truth = Truth(attitudes=attitudes, distortion={"k3": 0.0}, middle_mm=MIDDLE_MM, x0=0.0, y0=0.0)
     network, start = simulated(np.random.default_rng(4), truth, points=points, free={"k3": np.inf})
     radial = ("a30", "a12", "b21", "b03")
-    result = adjust(in_a_bent_scanner(network, {}, free(*radial)), start)
+    result = adjust(bend_in_scanner(network, {}, free(*radial)), start)
     (warning,) = [text for text in result.warnings if "bend of scanner S" in text]
     assert ": the distortion of a lens does the same however the frames lie" in warning
     assert "a30" in warning
     known = adjust(
-        in_a_bent_scanner(simulated(np.random.default_rng(4), truth, points=points)[0], {}, free(*radial)), start
+        bend_in_scanner(simulated(np.random.default_rng(4), truth, points=points)[0], {}, free(*radial)), start
     )
     assert not any("bend of scanner S" in text for text in known.warnings)
 

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from bent_scans import MIDDLE_MM, RESEAU_MM, films, in_a_bent_scanner
+from bent_scans import MIDDLE_MM, RESEAU_MM, bend_in_scanner, films
 from simulated import STATIONS, Truth, field_points, simulated
 
 from adjust.initial_values.approximations import approximate
@@ -17,7 +17,7 @@ from adjust.solution.result import Adjustment
 QUARTERS = [0.0, 90.0, 180.0, 270.0]
 
 
-def adjusted(network: Network) -> Adjustment:
+def adjust_network(network: Network) -> Adjustment:
     return adjust(network, approximate(network))
 
 
@@ -31,17 +31,17 @@ def _start() -> Approximations:
     return approximate(films(QUARTERS, {}, {}))
 
 
-def chosen(network: Network, by: Callable[[Network], Adjustment] = adjusted) -> set[str]:
+def chosen(network: Network, by: Callable[[Network], Adjustment] = adjust_network) -> set[str]:
     return set(choose_bends(network, by).network.scanners[0].terms)
 
 
 def test_the_terms_that_are_there_are_chosen() -> None:
     truth = {"a20": 0.02, "b11": -0.015, "b02": 0.01}
     network = films(QUARTERS * 2, truth, {}, np.random.default_rng(1))
-    choice = choose_bends(network, adjusted)
+    choice = choose_bends(network, adjust_network)
     # over the extent of the marks, which is not that of the truth, products of degree 2 take parts of degree 1 and 0
     assert set(choice.network.scanners[0].terms) == set(truth)
-    result = adjusted(choice.network)
+    result = adjust_network(choice.network)
     assert result.sigma0 == pytest.approx(1.0, abs=0.2)
     assert result.value("SC.S.a20") == pytest.approx(0.02, rel=0.15)
 
@@ -61,7 +61,7 @@ def test_where_nothing_bends_nothing_is_chosen() -> None:
 
 
 def test_frames_that_lie_alike_get_no_bend_and_a_sentence() -> None:
-    choice = choose_bends(films([0.0] * 4, {"a20": 0.05}, {}, np.random.default_rng(3)), adjusted)
+    choice = choose_bends(films([0.0] * 4, {"a20": 0.05}, {}, np.random.default_rng(3)), adjust_network)
     assert not choice.network.scanners[0].terms
     even, odd = choice.remarks
     assert "a20, a11, a02, b20, b11, b02: all frames lie alike in the scanner" in even
@@ -74,7 +74,7 @@ def test_targets_tell_the_bend_of_frames_that_lie_alike() -> None:
     truth = Truth(distortion={})
     points = field_points(np.random.default_rng(5), 60)
     network, _ = simulated(np.random.default_rng(4), truth, points=points)
-    bent = in_a_bent_scanner(network, {"a20": 0.05}, {})
+    bent = bend_in_scanner(network, {"a20": 0.05}, {})
     assert len(chosen(bent)) > 0
 
 
@@ -83,7 +83,7 @@ def test_two_photographs_are_enough_for_terms_that_they_tell() -> None:
     truth = Truth(stations=STATIONS[:2], attitudes=((0.0, 0.0, 0.0), (-0.05, 0.36, 1.6)), middle_mm=MIDDLE_MM)
     points = field_points(np.random.default_rng(5), 30)
     network, _ = simulated(np.random.default_rng(4), truth, points=points, free={"k3": np.inf, "k5": np.inf})
-    choice = choose_bends(in_a_bent_scanner(network, {"a20": 0.04, "b11": -0.03}, {}), adjusted)
+    choice = choose_bends(bend_in_scanner(network, {"a20": 0.04, "b11": -0.03}, {}), adjust_network)
     assert {"a20", "b11"} <= set(choice.network.scanners[0].terms)
     assert not any("No bend of the scanner was estimated" in text for text in choice.remarks)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_cases import CAUSES, DROPPED, Case, approximations_of, load, network_of
+from reference_cases import CAUSES, DROPPED, Case, case_approximations, case_network, load
 from simulated import field_points, simulated
 
 from adjust.problem.network import Network
@@ -24,8 +24,8 @@ def dropped(case: Case, functions: set[int]) -> Case:
     return case
 
 
-def adjusted(case: Case, options: Options | None = None) -> Adjustment:
-    return adjust(network_of(case), approximations_of(case, case["state"]), options)
+def adjust_network(case: Case, options: Options | None = None) -> Adjustment:
+    return adjust(case_network(case), case_approximations(case, case["state"]), options)
 
 
 @pytest.mark.parametrize("priors", list(DROPPED))
@@ -33,7 +33,7 @@ def adjusted(case: Case, options: Options | None = None) -> Adjustment:
 def test_null_directions_are_counted_and_named(name: str, priors: str) -> None:
     case = load(f"v_singular_{name}_affine")
     expected = case["expected_defects_by_dropped_pseudo_observations"][priors]
-    result = adjusted(dropped(case, DROPPED[priors]))
+    result = adjust_network(dropped(case, DROPPED[priors]))
 
     assert len(result.singular) == expected["total_defect"]
     assert result.termination == ("singular" if expected["total_defect"] else "converged")
@@ -54,7 +54,7 @@ def kind(name: str) -> str:
 
 def test_a_singular_result_keeps_the_approximations() -> None:
     case = load("v_singular_K3D_conv_affine")
-    result = adjusted(dropped(case, {5, 6, 7, 8, 9}))
+    result = adjust_network(dropped(case, {5, 6, 7, 8, 9}))
     assert result.value("EO.2.X0") == case["state"]["EO2.X0"]
     assert not result.converged
     assert result.history == ()
@@ -63,7 +63,7 @@ def test_a_singular_result_keeps_the_approximations() -> None:
 @pytest.mark.parametrize("datum", ["minimal", "free"])
 def test_a_datum_for_the_object_leaves_the_camera_directions(datum: Datum) -> None:
     case = load("v_singular_U3D_vert0_affine")
-    result = adjusted(dropped(case, {9}), Options(datum=datum))
+    result = adjust_network(dropped(case, {9}), Options(datum=datum))
     assert [CAUSES["IO.c"] in direction.cause for direction in result.singular] == [True]
 
 
@@ -74,7 +74,7 @@ def test_a_flat_field_of_heights_needs_four_datum_values() -> None:
     for row, sigma in zip(case["input"]["pts_obs"], case["input"]["pts_sigma"], strict=True):
         row[2] += rng.normal(0.0, 0.02)
         sigma[2] = 0.02
-    result = adjusted(case, Options(datum="minimal"))
+    result = adjust_network(case, Options(datum="minimal"))
     assert result.converged
     fixed = [name for name in result.names if name.startswith("PT.") and result.sigma(name) == 0.0]
     assert sorted(name[-1] for name in fixed) == ["X", "X", "Y", "Y"]
@@ -94,24 +94,24 @@ def test_a_point_in_one_image_only_is_named(count: int) -> None:
     lonely = [(image, "3", "target") for image in ("f0", "f1", "f2")]
     keys = list(zip(rows.image, rows.point, rows.kind, strict=True))
     result = adjust(
-        kept(network, [i for i, key in enumerate(keys) if key not in lonely]), start, Options(datum="minimal")
+        keep_points(network, [i for i, key in enumerate(keys) if key not in lonely]), start, Options(datum="minimal")
     )
     assert result.termination == "singular"
     (direction,) = result.singular
     assert {(each.kind, each.id) for each in direction.parameters} == {("point", "3")}
 
 
-def kept(network: Network, keep: list[int]) -> Network:
+def keep_points(network: Network, keep: list[int]) -> Network:
     """The network with some of its observations."""
     return replace(network, observations=network.observations.only(np.array(keep)))
 
 
-def test_what_no_image_shows_is_told() -> None:
+def test_what_no_image_shows_is_reported() -> None:
     network, start = simulated(np.random.default_rng(4))
     rows = network.observations
     keep = [
         i for i, (point, kind) in enumerate(zip(rows.point, rows.kind, strict=True)) if (point, kind) != ("3", "target")
     ]
-    result = adjust(kept(network, keep), start)
+    result = adjust(keep_points(network, keep), start)
     assert result.converged
     assert result.warnings == ("No image shows the object points 3: they take no part.",)

@@ -84,7 +84,7 @@ def test_clean_observations_are_rarely_suspect() -> None:
     assert called <= 3
 
 
-def test_observations_all_worse_than_said_raise_the_limits_by_the_square_of_their_scale() -> None:
+def test_observations_all_worse_than_stated_raise_the_limits_by_the_square_of_their_scale() -> None:
     """Errors three times as large as they are given: a statistic is a square, so that chance lets it be nine times."""
     network, start = checkable(3)
     rows = network.observations
@@ -97,7 +97,7 @@ def test_observations_all_worse_than_said_raise_the_limits_by_the_square_of_thei
 
 
 @pytest.mark.study
-def test_two_rays_of_a_point_cannot_be_told_apart() -> None:
+def test_two_rays_of_a_point_cannot_be_distinguished() -> None:
     network, start = simulated(np.random.default_rng(4), point_sigma=0.0)
     rows = network.observations
     free = replace(next(point for point in network.points if point.id == "4"), X=None, Y=None, Z=None)

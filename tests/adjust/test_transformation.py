@@ -25,14 +25,14 @@ mirrors = pytest.mark.parametrize("mirrored", [False, True])
 all_kinds = pytest.mark.parametrize("kind", KINDS)
 
 
-def parameters_of(kind: Transformation, mirrored: bool) -> Array:
+def make_parameters(kind: Transformation, mirrored: bool) -> Array:
     return film_parameters(Truth(middle_mm=(120.0, -110.0), mirrored=4 * (mirrored,)), 1, kind)
 
 
 @mirrors
 @all_kinds
 def test_the_formulas(kind: Transformation, mirrored: bool) -> None:
-    parameters = parameters_of(kind, mirrored)
+    parameters = make_parameters(kind, mirrored)
     expected = np.stack(camera_of_film(kind, parameters, mirrored, *PLACES_MM.T), axis=1)
     np.testing.assert_allclose(film_kind(kind, mirrored).apply(parameters, PLACES_MM), expected, rtol=1e-13)
 
@@ -40,7 +40,7 @@ def test_the_formulas(kind: Transformation, mirrored: bool) -> None:
 @mirrors
 @all_kinds
 def test_derivatives_by_complex_steps(kind: Transformation, mirrored: bool) -> None:
-    formula, parameters = film_kind(kind, mirrored), parameters_of(kind, mirrored)
+    formula, parameters = film_kind(kind, mirrored), make_parameters(kind, mirrored)
     gradient = formula.gradient(parameters, PLACES_MM)
     design = formula.design(parameters, PLACES_MM, np.zeros(2), ONE)
     for axis in (0, 1):
@@ -72,7 +72,7 @@ def test_centred_parameters_are_those_of_the_formula_about_the_middle(kind: Tran
 @mirrors
 @all_kinds
 def test_the_inverse_leads_back(kind: Transformation, mirrored: bool) -> None:
-    film = Film(kind, parameters_of(kind, mirrored), MIDDLE_MM, mirrored)
+    film = Film(kind, make_parameters(kind, mirrored), MIDDLE_MM, mirrored)
     back, found = film.comparator_from_camera(film.camera_from_comparator(PLACES_MM))
     assert found.all()
     np.testing.assert_allclose(back, PLACES_MM, rtol=0, atol=1e-11)
@@ -126,7 +126,7 @@ def test_numbers_of_parameters_and_marks() -> None:
         ("bilinear(2)", ['no transformation "bilinear(2)"']),
     ],
 )
-def test_a_wrong_spelling_is_told_what_is_possible(spelling: str, words: list[str]) -> None:
+def test_a_wrong_spelling_is_reported_what_is_possible(spelling: str, words: list[str]) -> None:
     with pytest.raises(ValueError, match=r"possible are none, congruent, .* projective, bilinear, conformal") as caught:
         Image("f1", "K", spelling)
     assert all(word in str(caught.value) for word in words)

@@ -36,11 +36,11 @@ def test_what_is_wrong_with_a_picture_is_no_unmodelled_error_that_passes() -> No
     xy_mm[rows, 0] = FRAME_MM[0] - xy_mm[rows, 0]
     mirrored = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
     try:
-        said = " ".join(adjust_unmodelled(mirrored, adjust).warnings)
+        text = " ".join(adjust_unmodelled(mirrored, adjust).warnings)
     except AdjustmentError as error:
-        said = str(error)
-    assert "p3" in said
-    assert "mirrored" in said
+        text = str(error)
+    assert "p3" in text
+    assert "mirrored" in text
 
 
 def test_an_implausible_one_is_a_warning() -> None:

@@ -22,14 +22,14 @@ from adjust.solution.result import Adjustment
 Array = NDArray[np.float64]
 
 
-def adjusted(truth: Frames) -> Adjustment:
+def adjust_network(truth: Frames) -> Adjustment:
     return adjust(truth.network, truth.start)
 
 
 def test_a_single_frame_whose_marks_only_place_the_datum_has_a_priori_sigmas() -> None:
     """Of the shift by hand: the design matrix, and the two standard deviations of a mark."""
     truth = frames("affine", 1, 8, 1.0, 0.01, np.random.default_rng(1))
-    result = adjusted(truth)
+    result = adjust_network(truth)
     assert result.redundancy == 10
     assert result.variance.is_a_priori
     assert result.sigma0 == 1.0
@@ -44,7 +44,7 @@ def test_a_single_frame_whose_marks_only_place_the_datum_has_a_priori_sigmas() -
 def test_sigma0_of_affine_frames_is_what_their_figures_leave(count: int) -> None:
     """The figure of all frames together has rank 2 about its means (Tomasi and Kanade 1992): the rest is noise."""
     truth = frames("affine", count, 8, 1.0, 0.01, np.random.default_rng(2))
-    result = adjusted(truth)
+    result = adjust_network(truth)
     figures = truth.network.observations.xy_mm.reshape(count, 8, 2).transpose(0, 2, 1).reshape(2 * count, 8)
     left = np.linalg.svd(figures - figures.mean(axis=1, keepdims=True), compute_uv=False)[2:]
     redundancy = 10 * (count - 1)
@@ -54,7 +54,9 @@ def test_sigma0_of_affine_frames_is_what_their_figures_leave(count: int) -> None
 
 
 def test_sigma0_multiplies_the_noise_of_marks_and_not_the_datum() -> None:
-    calm, loud = (adjusted(frames("affine", 5, 8, 1.0, 0.01, np.random.default_rng(3), noise)) for noise in (1.0, 4.0))
+    calm, loud = (
+        adjust_network(frames("affine", 5, 8, 1.0, 0.01, np.random.default_rng(3), noise)) for noise in (1.0, 4.0)
+    )
     assert loud.sigma0 == pytest.approx(4.0 * calm.sigma0, rel=1e-2)
     assert loud.sigma("T.f0.a1") == pytest.approx(calm.sigma("T.f0.a1"), rel=1e-3)
     assert loud.sigma("T.f0.a1") == pytest.approx(1.0 / np.sqrt(8), rel=0.01)
@@ -77,7 +79,7 @@ def corrections_covariance(result: Adjustment) -> Array:
 def test_a_certificate_tells_sigma0_of_a_single_frame() -> None:
     """Marks and certificate of the same sigma: v'Pv of the affine fit over its redundancy of 10."""
     truth = frames("affine", 1, 8, NOISE_MM, NOISE_MM, np.random.default_rng(4))
-    result = adjusted(truth)
+    result = adjust_network(truth)
     assert not result.variance.left_out
     assert result.variance.redundancy == result.redundancy == 10
     assert result.sigma0 == pytest.approx(np.sqrt(result.vpv / 10))
@@ -148,7 +150,7 @@ def test_every_sigma_holds_against_realisations(kind: Transformation, marks: int
     for seed in range(30):
         truth = frames(kind, count, marks, 1.0, 1.0, np.random.default_rng(seed))
         trial: dict[str, list[float]] = defaultdict(list)
-        for name, error, sigma in errors(adjusted(truth), truth):
+        for name, error, sigma in errors(adjust_network(truth), truth):
             trial[name].append((error / sigma) ** 2)
         for name, normalised in trial.items():
             squares[name].append(float(np.mean(normalised)) - 1.0)

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from dense_adjustment import solve_densely
-from simulated import Truth, field_points, joined, simulated
+from simulated import Truth, field_points, join_observations, simulated
 from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Distortion, Prior
@@ -102,7 +102,7 @@ def two_cameras() -> Case:
     rows, turned = other.observations, np.array([[1.0, 0.6], [0.6, 1.5]]) * 0.004**2
     renamed = tuple(names[name] for name in rows.image)
     rows = replace(rows, image=renamed, covariance_mm2=np.tile(turned, (len(rows), 1, 1)))
-    observations = joined(film.observations, rows)
+    observations = join_observations(film.observations, rows)
     images = (*film.images, *(Image(name, "D", "none") for name in names.values()))
     both = Network((*film.cameras, camera), images, film.points, observations)
     return both, Approximations(

@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import chain
 
 import numpy as np
-from simulated import Truth, field_points, joined, simulated
+from simulated import Truth, field_points, join_observations, simulated
 
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Network
@@ -30,7 +30,7 @@ def two_cameras(
         tuple(each.cameras[0] for each in networks),
         tuple(chain.from_iterable(each.images for each in networks)),
         networks[0].points,
-        joined(*(each.observations for each in networks)),
+        join_observations(*(each.observations for each in networks)),
     )
     start = replace(
         starts[0],
@@ -46,14 +46,14 @@ def _named(
 ) -> tuple[Network, Approximations]:
     new = {each.name: image(f"{number}{each.name}") for each in network.images}
     rows = network.observations
-    seen = (mark(name) if kind == "fiducial" else point(name) for name, kind in zip(rows.point, rows.kind, strict=True))
+    view = (mark(name) if kind == "fiducial" else point(name) for name, kind in zip(rows.point, rows.kind, strict=True))
     return (
         replace(
             network,
             cameras=(_camera(network.cameras[0], camera, mark),),
             images=tuple(replace(each, name=new[each.name], camera=camera) for each in network.images),
             points=tuple(replace(each, id=point(each.id)) for each in network.points),
-            observations=replace(rows, image=tuple(new[name] for name in rows.image), point=tuple(seen)),
+            observations=replace(rows, image=tuple(new[name] for name in rows.image), point=tuple(view)),
         ),
         replace(
             start,

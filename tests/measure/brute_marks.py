@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
-from drawn import in_strips, pixel_means
+from drawn import encode_strips, pixel_means
 from numpy.typing import NDArray
 
 from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring
@@ -50,7 +50,7 @@ def _brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: 
             for a, b, center in zip(first, last, pixel_from_mark[:, 2], strict=True)
         )
         box = inside[first[1] : last[1], first[0] : last[0]]
-        for strip, down in zip(in_strips(box, len(col)), in_strips(row, len(col)), strict=True):
+        for strip, down in zip(encode_strips(box, len(col)), encode_strips(row, len(col)), strict=True):
             x, y = (line[0] * col[None, :] + line[1] * down[:, None] for line in mark_from_pixel.astype(np.float32))
             strip |= is_inside(part, x, y)
     step = POINTS // KEPT

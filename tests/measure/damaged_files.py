@@ -26,7 +26,7 @@ _HEADERS = 800  # bytes at either end of a file: where tags and tables stand
 
 
 @cache
-def shown() -> NDArray[np.uint16]:
+def read_pixels() -> NDArray[np.uint16]:
     """(400, 400), of 16 bits."""
     return np.clip(frame_picture(NUMBERED, pixel_from_camera("0")), 0, 65535).astype(np.uint16)
 
@@ -52,7 +52,7 @@ def _png(grey: NDArray[Any]) -> bytes:
 @cache
 def stored() -> Mapping[str, bytes]:
     """The frame as files, by how they store it."""
-    fine = shown()
+    fine = read_pixels()
     grey = (fine >> 7).clip(0, 255).astype(np.uint8)
     colour = np.dstack([grey, grey, grey])
     in_jpeg: dict[str, Any] = {"compression": "jpeg", "compressionargs": {"level": 90}}
@@ -113,7 +113,7 @@ DAMAGES: Mapping[str, Damage] = {
 }
 
 
-def measured(path: Path) -> FrameMeasurement:
+def measure_file(path: Path) -> FrameMeasurement:
     with open_scan(path) as scan:
         return measure_fiducials(scan, NUMBERED, (PITCH_UM, PITCH_UM))
 
@@ -122,7 +122,7 @@ def outcome(path: Path, right: FrameMeasurement) -> str:
     """What measuring a damaged file came to, beside the whole one: `message` where it was refused, `right` where every
     measured mark lies where it did, and `wrong` with the marks that do not."""
     try:
-        found = measured(path)
+        found = measure_file(path)
     except MeasurementError:
         return "message"
     moved = [

@@ -30,11 +30,11 @@ def drawn(
     pad = int(np.ceil(5 * blur_px)) + 1
     fine = [(np.arange((size + 2 * pad) * fineness) + 0.5) / fineness - 0.5 - pad for size in (width, height)]
     columns, rows = np.meshgrid(*fine, sparse=True)
-    sharp = np.concatenate([inside(columns, strip) for strip in in_strips(rows, columns.size)]).astype(float)
+    sharp = np.concatenate([inside(columns, strip) for strip in encode_strips(rows, columns.size)]).astype(float)
     return pixel_means(sharp, blur_px, fineness, pad)
 
 
-def in_strips(rows: NDArray[Any], columns: int) -> list[NDArray[Any]]:
+def encode_strips(rows: NDArray[Any], columns: int) -> list[NDArray[Any]]:
     """Rows in strips of so few samples that all that is made of them stays in a processor's cache."""
     return np.array_split(rows, max(len(rows) * columns // STRIP, 1))
 

@@ -37,7 +37,7 @@ def mapped(homography: Array, points: Array) -> Array:
     return np.asarray(np.stack([x / w, y / w], axis=-1))
 
 
-def picture_of(spec: BoardSpec, homography: Array, is_dark: Any, seed: int = 1) -> Array:
+def take_picture(spec: BoardSpec, homography: Array, is_dark: Any, seed: int = 1) -> Array:
     """A board whose middle lies on the homography's origin; is_dark says so of board coordinates in mm."""
     middle = np.mean([point[:2] for point in spec.object_points().values()], axis=0)
 
@@ -50,7 +50,7 @@ def picture_of(spec: BoardSpec, homography: Array, is_dark: Any, seed: int = 1) 
     return 8000 + 30000 * clean + rng.normal(0, 300, clean.shape)
 
 
-def truth_of(spec: BoardSpec, homography: Array) -> dict[str, Array]:
+def read_truth(spec: BoardSpec, homography: Array) -> dict[str, Array]:
     points = spec.object_points()
     flat = np.array([point[:2] for point in points.values()])
     places = mapped(np.asarray(np.linalg.inv(homography)), np.asarray(flat - flat.mean(axis=0)))
@@ -59,8 +59,8 @@ def truth_of(spec: BoardSpec, homography: Array) -> dict[str, Array]:
 
 def errors_px(board: BoardMeasurement, truth: dict[str, Array]) -> Array:
     """(n, 2) of the points that were measured."""
-    seen = [mark for mark in board.marks if mark.status.is_observation]
-    return np.asarray([np.asarray(mark.center_px) - truth[mark.point] for mark in seen], float)
+    measured_marks = [mark for mark in board.marks if mark.status.is_observation]
+    return np.asarray([np.asarray(mark.center_px) - truth[mark.point] for mark in measured_marks], float)
 
 
 def chessboard_dark(spec: ChessboardSpec) -> Any:
@@ -89,10 +89,10 @@ def circles_dark(spec: CircleGridSpec) -> Any:
 def printed(board: Any, spec: BoardSpec, size_mm: tuple[float, float], corner_mm: Array) -> Any:
     """Darkness from OpenCV's own drawing of a board, 4 px a mm, whose upper left corner lies at corner_mm."""
     drawing = board.generateImage((round(size_mm[0] * 4), round(size_mm[1] * 4)), marginSize=0, borderBits=1)
-    return dark_of(drawing, corner_mm)
+    return darkness(drawing, corner_mm)
 
 
-def dark_of(drawing: Any, corner_mm: Array) -> Any:
+def darkness(drawing: Any, corner_mm: Array) -> Any:
     """Darkness from a drawing, 4 px a mm, whose upper left corner lies at corner_mm."""
 
     def dark(x: Array, y: Array) -> Array:
@@ -113,7 +113,7 @@ def charuco_picture(spec: CharucoSpec, homography: Array) -> Array:
     drawing.setLegacyPattern(bool(spec.legacy))
     width, height = spec.columns * spec.square_mm, spec.rows * spec.square_mm
     corner = np.array([-spec.square_mm, height - spec.square_mm])
-    return picture_of(spec, homography, printed(drawing, spec, (width, height), corner))
+    return take_picture(spec, homography, printed(drawing, spec, (width, height), corner))
 
 
 def april_grid_dark(spec: AprilGridSpec, quarter_turns: int = 0) -> Any:
@@ -129,7 +129,7 @@ def april_grid_dark(spec: AprilGridSpec, quarter_turns: int = 0) -> Any:
             where = np.s_[top + gap : top + gap + side, left + gap : left + gap + side]
             drawing[where] = np.rot90(marker, quarter_turns)
     corner = np.array([-spec.gap_mm, spec.rows * (spec.marker_mm + spec.gap_mm)])
-    return dark_of(drawing, corner)
+    return darkness(drawing, corner)
 
 
 def squares_dark(spec: SquareGridSpec) -> Any:
@@ -143,7 +143,7 @@ def squares_dark(spec: SquareGridSpec) -> Any:
     return dark
 
 
-def beside_each_other(spec: BoardSpec, is_dark: Any, shown: tuple[float, ...], fineness: int = 4) -> Array:
+def tile_boards(spec: BoardSpec, is_dark: Any, shown: tuple[float, ...], fineness: int = 4) -> Array:
     """Boards of one kind side by side, upright, at 1 mm a pixel times the scale in which each is shown."""
     extent = np.ptp([point[:2] for point in spec.object_points().values()], axis=0) + 60.0
     width, height = int(extent[0]), int(extent[1])

@@ -42,61 +42,61 @@ class Stand:
         return False
 
 
-def found_by(
+def search_attempts(
     monkeypatch: pytest.MonkeyPatch, *expected: float | None, given: int = 1, at_given: int | None = None
 ) -> tuple[Found, list[int]]:
     """What a list of attempts comes to, each of two hypotheses and with so many frames that chance is expected to make
     a hypothesis, and how many hypotheses each was judged by. given: how many of them believe what they find; at_given:
     which of the others is under the given pitch."""
-    judged: list[int] = []
+    checked: list[int] = []
 
     def attempt(number: int, each: float | None) -> Attempt:
         def look(_: FrameSearch, __: Sequence[PitchHypothesis], tried: int) -> Any:
-            judged.append(tried)
+            checked.append(tried)
             return [], [] if each is None else [(tried * each, cast(Frame, Stand(str(number))))]
 
         search = cast(FrameSearch, None)
         return Attempt(search, [GIVEN, GIVEN], look, lambda found: found.is_taken, number < given, number == at_given)
 
     monkeypatch.setattr(stages, "_attempts", lambda *_: [attempt(*each) for each in enumerate(expected)])
-    return find_frame(SCAN, ALIKE, [[GIVEN]], True, FiducialOptions()), judged
+    return find_frame(SCAN, ALIKE, [[GIVEN]], True, FiducialOptions()), checked
 
 
 def name(found: Found) -> str:
     return cast(Stand, found.frame).name if found.frame else ""
 
 
-def test_each_attempt_is_judged_by_all_hypotheses_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_attempt_is_tested_by_all_hypotheses_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
     """What would be taken by itself may be chance after so many others; its pitch is worth to be given then."""
-    found, judged = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5)
-    assert judged == [2, 4, 6]
+    found, checked = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5)
+    assert checked == [2, 4, 6]
     assert name(found) == ""
     assert [cast(Stand, frame).name for frame in found.unsure] == ["2"]
     assert found.misfit.startswith("not 0; under another pitch 3 of them fit")
-    found, _ = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 7)
+    found, _ = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 7)
     assert (name(found), found.is_taken) == ("2", True)
 
 
-def test_attempts_under_the_given_pitch_are_judged_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, judged = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5, at_given=2)
-    assert judged == [2, 4, 4]
+def test_attempts_under_the_given_pitch_are_tested_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, checked = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5, at_given=2)
+    assert checked == [2, 4, 4]
     assert name(found) == "2"
-    found, _ = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 3, at_given=2)
+    found, _ = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 3, at_given=2)
     assert (name(found), found.unsure) == ("", ())
     assert "3 faint marks fit, where 0.01 such false alarms are expected" in found.misfit
     assert "another pitch does not separate them; click the visible marks in `reseau review`" in found.misfit
-    found, _ = found_by(monkeypatch, np.inf, 1.0, 0.3, at_given=2)
+    found, _ = search_attempts(monkeypatch, np.inf, 1.0, 0.3, at_given=2)
     assert found.misfit == "not 0"  # chance makes more than one
 
 
-def test_what_is_settled_is_not_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, judged = found_by(monkeypatch, np.inf, 1e-5, 1e-9)
-    assert judged == [2, 4]
+def test_what_is_settled_is_not_inspected_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, checked = search_attempts(monkeypatch, np.inf, 1e-5, 1e-9)
+    assert checked == [2, 4]
     assert name(found) == "1"
 
 
-def test_where_nothing_was_seen_the_reason_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, _ = found_by(monkeypatch, None, None)
+def test_where_nothing_was_detected_the_reason_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, _ = search_attempts(monkeypatch, None, None)
     assert name(found) == ""
     assert found.misfit == "no two of the camera's marks were found in the scan"
 
@@ -115,9 +115,9 @@ def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
     assert [each.is_given for each in listed] == [True, *[False] * (looks - 1)]
     assert [each.hypotheses for each in listed[: len(hypotheses)]] == hypotheses
     close = listed[len(hypotheses) :]
-    looks_each = [True, False] if is_given else [False]
-    assert [each.search.surroundings for each in close] == [CLOSE for _ in looks_each] + [GRAINY for _ in looks_each]
-    assert [each.at_given for each in close] == 2 * looks_each
+    closer_each = [True, False] if is_given else [False]
+    assert [each.search.surroundings for each in close] == [CLOSE for _ in closer_each] + [GRAINY for _ in closer_each]
+    assert [each.at_given for each in close] == 2 * closer_each
 
 
 def test_marks_are_fitted_through_other_tone_curves_only_where_the_first_leaves_them_unsettled(

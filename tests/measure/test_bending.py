@@ -21,13 +21,13 @@ def patches(rng: np.random.Generator, along: Array, count: int = 300) -> tuple[l
         response = root @ root.T + 6.0 * np.eye(6)
         noise = response / 4.0
         bending = rng.multivariate_normal(np.zeros(6), variance)
-        seen = response @ bending + rng.multivariate_normal(np.zeros(6), noise)
-        bendings.append(Bending(seen, response, noise, ON_PLACE))
+        view = response @ bending + rng.multivariate_normal(np.zeros(6), noise)
+        bendings.append(Bending(view, response, noise, ON_PLACE))
         moved.append(ON_PLACE @ bending)
     return bendings, np.array(moved)
 
 
-def test_places_are_freed_of_the_bending_and_what_stays_is_as_large_as_said() -> None:
+def test_places_are_freed_of_the_bending_and_what_stays_is_as_large_as_stated() -> None:
     bendings, moved = patches(np.random.default_rng(1), np.array([0.5, 0.2]))
     variance = bending_variance(bendings)
     assert variance[1, 1] == pytest.approx(0.25, rel=0.3)

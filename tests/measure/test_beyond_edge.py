@@ -25,21 +25,21 @@ def test_a_wing_is_measured_whose_base_is_the_frames_edge() -> None:
     grey = GROUND + 5500.0 * brute_picture(WING, place, 121, 121, 1.0)
     grey[:, 84:] = EDGE
     grey += np.random.default_rng(1).normal(0.0, NOISE, grey.shape)
-    seen = detect_mark(scan_of(grey), MarkPrediction(WING, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
-    assert seen.fit is not None
-    assert np.hypot(*(seen.fit.center_px - place[:, 2])) < 0.2
+    detection = detect_mark(scan_of(grey), MarkPrediction(WING, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
+    assert detection.fit is not None
+    assert np.hypot(*(detection.fit.center_px - place[:, 2])) < 0.2
 
 
-def test_a_faint_light_cross_is_measured_whose_dark_pad_ends_beside_it_in_a_light_landscape() -> None:
+def test_a_faint_light_cross_is_measured_whose_dark_pad_ends_next_to_it_in_a_light_landscape() -> None:
     mark, place = MarkShape(cross(0.5, 0.05, 0.07, 45.0), "light"), placed(PX_PER_MM, (60.3, 59.7))
     rng = np.random.default_rng(4)
     row, col = np.mgrid[:121, :121]
     landscape = 30000.0 + 6000.0 * gaussian_filter(rng.normal(size=(121, 121)), 3.0) * 10.0
     grey = np.where(np.hypot(col - 60.3, row - 59.7) < 20.0, 4000.0, landscape)
     grey += 3500.0 * brute_picture(mark, place, 121, 121, 0.7) + rng.normal(0.0, 900.0, grey.shape)
-    seen = detect_mark(scan_of(grey), MarkPrediction(mark, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
-    assert seen.fit is not None, seen.reason
-    assert np.hypot(*(seen.fit.center_px - place[:, 2])) < 0.3
+    detection = detect_mark(scan_of(grey), MarkPrediction(mark, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
+    assert detection.fit is not None, detection.reason
+    assert np.hypot(*(detection.fit.center_px - place[:, 2])) < 0.3
 
 
 def test_the_marks_own_ground_is_never_beyond_an_edge() -> None:
@@ -50,7 +50,7 @@ def test_the_marks_own_ground_is_never_beyond_an_edge() -> None:
         assert not pixels_beyond_edge(grey, WING, place).any()
 
 
-def test_a_cross_that_dust_touches_is_seen_where_the_others_put_it() -> None:
+def test_a_cross_that_dust_touches_is_visible_where_the_others_put_it() -> None:
     mark, size, rng = MarkShape(cross(0.5, 0.1)), 440, np.random.default_rng(5)
     corners = [(x, y) for x in (-4.4, 4.4) for y in (-4.4, 4.4)]
     layout, matrix = layout_of([mark] * 4, corners, (11.0, 11.0)), placed(PX_PER_MM, (220.3, 220.3))

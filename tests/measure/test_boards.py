@@ -11,15 +11,15 @@ from drawn import drawn, scan_of
 from drawn_boards import (
     HEIGHT,
     WIDTH,
-    beside_each_other,
     board_from_pixel,
     chessboard_dark,
     circles_dark,
     errors_px,
     mapped,
-    picture_of,
+    read_truth,
     squares_dark,
-    truth_of,
+    take_picture,
+    tile_boards,
 )
 from numpy.typing import NDArray
 from real_data import DATA, needs
@@ -53,18 +53,18 @@ Array = NDArray[np.float64]
 def test_a_chessboard_in_any_direction_keeps_its_names(turn_deg: float) -> None:
     spec = ChessboardSpec(6, 5, 24.0)
     homography = board_from_pixel(turn_deg)
-    board = measure_board(scan_of(picture_of(spec, homography, chessboard_dark(spec))), spec)
+    board = measure_board(scan_of(take_picture(spec, homography, chessboard_dark(spec))), spec)
     assert board.reason == ""
     assert all(mark.status is Status.MEASURED for mark in board.marks)
-    errors = errors_px(board, truth_of(spec, homography))
+    errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) == 30
     assert np.sqrt(np.mean(errors**2)) < 0.012
 
 
-def test_crossings_side_by_side_are_told_from_a_texture() -> None:
+def test_crossings_side_by_side_are_distinguished_from_a_texture() -> None:
     """All of a board but its four corners hang together, fainter and beside a texture too; of texture hardly any."""
     spec = ChessboardSpec(6, 5, 24.0)
-    grey = picture_of(spec, board_from_pixel(), chessboard_dark(spec)) / 256.0
+    grey = take_picture(spec, board_from_pixel(), chessboard_dark(spec)) / 256.0
     grains = np.random.default_rng(3).normal(0.0, 60.0, (HEIGHT, WIDTH))
     texture = 128.0 + 60.0 / 0.14 * (cv2.GaussianBlur(grains, (0, 0), 2.0) / 60.0)
     both = np.hstack([100.0 + 0.3 * grey, texture])
@@ -79,22 +79,22 @@ def test_trap_half_a_pixel_lost() -> None:
     """The mean error of a whole board is a few thousandths of a pixel, at full size and searched at a reduced one."""
     spec = ChessboardSpec(6, 5, 24.0)
     homography = board_from_pixel(3.0)
-    picture = picture_of(spec, homography, chessboard_dark(spec))
+    picture = take_picture(spec, homography, chessboard_dark(spec))
     board = measure_board(scan_of(picture), spec)
-    assert np.abs(errors_px(board, truth_of(spec, homography)).mean(axis=0)).max() < 0.006
+    assert np.abs(errors_px(board, read_truth(spec, homography)).mean(axis=0)).max() < 0.006
     large = np.pad(np.kron(picture, np.ones((4, 4))), ((0, 0), (0, 1100)), constant_values=38000.0)
     board = measure_board(scan_of(large), spec)
     centers = {mark.point: mark.center_px for mark in board.marks if mark.center_px is not None}
-    errors = np.array([(centers[name] - 1.5) / 4 - place for name, place in truth_of(spec, homography).items()])
+    errors = np.array([(centers[name] - 1.5) / 4 - place for name, place in read_truth(spec, homography).items()])
     assert np.abs(errors.mean(axis=0)).max() < 0.01
 
 
 def test_a_board_that_a_half_turn_does_not_change_is_taken_as_upright_and_says_so() -> None:
     spec = ChessboardSpec(6, 4, 24.0)
     homography = board_from_pixel(10.0)
-    board = measure_board(scan_of(picture_of(spec, homography, chessboard_dark(spec))), spec)
+    board = measure_board(scan_of(take_picture(spec, homography, chessboard_dark(spec))), spec)
     assert "looks the same after a half turn" in board.notes[0]
-    assert np.abs(errors_px(board, truth_of(spec, homography))).max() < 0.05
+    assert np.abs(errors_px(board, read_truth(spec, homography))).max() < 0.05
 
 
 @parametrize_with_studies(
@@ -107,9 +107,9 @@ def test_a_board_that_a_half_turn_does_not_change_is_taken_as_upright_and_says_s
 )
 def test_circle_grids(spec: CircleGridSpec) -> None:
     homography = board_from_pixel(tilt=5e-5)
-    board = measure_board(scan_of(picture_of(spec, homography, circles_dark(spec))), spec)
+    board = measure_board(scan_of(take_picture(spec, homography, circles_dark(spec))), spec)
     assert board.reason == ""
-    errors = errors_px(board, truth_of(spec, homography))
+    errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) == len(spec.places())
     assert np.abs(errors).max() < 0.06
 
@@ -127,7 +127,7 @@ def test_circle_grids(spec: CircleGridSpec) -> None:
 )
 def test_a_chessboard_of_another_count_is_refused_with_its_own(columns: int, rows: int, words: str) -> None:
     spec = ChessboardSpec(6, 5, 24.0)
-    picture = picture_of(spec, board_from_pixel(8.0, 6e-4), chessboard_dark(spec))
+    picture = take_picture(spec, board_from_pixel(8.0, 6e-4), chessboard_dark(spec))
     board = measure_board(scan_of(picture), ChessboardSpec(columns, rows, 24.0))
     assert words in board.reason
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
@@ -139,7 +139,7 @@ LARGE = ChessboardSpec(9, 6, 24.0)
 @pytest.fixture(scope="module")
 def large_board() -> tuple[Array, dict[str, Array]]:
     homography = board_from_pixel(8.0, 3e-4)
-    return picture_of(LARGE, homography, chessboard_dark(LARGE)), truth_of(LARGE, homography)
+    return take_picture(LARGE, homography, chessboard_dark(LARGE)), read_truth(LARGE, homography)
 
 
 @parametrize_with_studies(
@@ -207,8 +207,8 @@ def test_a_pattern_grows_to_where_it_ends() -> None:
     """From a part of its lines; a line along its border is none of it, and one that the picture cuts is no end."""
     spec = ChessboardSpec(6, 5, 24.0)
     homography = board_from_pixel(5.0, 4e-4)
-    picture = (picture_of(spec, homography, chessboard_dark(spec)) / 256).astype(np.uint8)
-    grid = np.array(list(truth_of(spec, homography).values())).reshape(5, 6, 2)
+    picture = (take_picture(spec, homography, chessboard_dark(spec)) / 256).astype(np.uint8)
+    grid = np.array(list(read_truth(spec, homography).values())).reshape(5, 6, 2)
     part = whole_pattern(picture, grid[1:4, :4])
     assert part is not None
     assert part.grid.shape == grid.shape
@@ -226,9 +226,9 @@ def test_corners_of_separate_squares(turn_deg: float, gap_mm: float) -> None:
     """Named by row, column and corner, to some hundredths of a pixel, their standard deviations honest."""
     spec = SquareGridSpec(5, 4, 45.0 - gap_mm, gap_mm)
     homography = board_from_pixel(turn_deg, 2e-4)
-    board = measure_board(scan_of(picture_of(spec, homography, squares_dark(spec))), spec)
+    board = measure_board(scan_of(take_picture(spec, homography, squares_dark(spec))), spec)
     assert board.notes == ("the grid looks the same when turned: it was taken as upright in the scan",)
-    errors = errors_px(board, truth_of(spec, homography))
+    errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) >= 78
     assert np.sqrt(np.mean(errors**2)) < 0.03
     assert np.abs(errors.mean(axis=0)).max() < 0.006
@@ -242,7 +242,7 @@ def test_a_grid_of_squares_with_some_hidden_keeps_its_names() -> None:
     """A square that is covered is absent, with the reason; the others are what they are."""
     spec = SquareGridSpec(5, 4, 27.0, 18.0)
     homography = board_from_pixel(3.0, 1e-4)
-    picture, truth = picture_of(spec, homography, squares_dark(spec)), truth_of(spec, homography)
+    picture, truth = take_picture(spec, homography, squares_dark(spec)), read_truth(spec, homography)
     col, row = np.mean([truth[f"r1c2.{i}"] for i in range(4)], axis=0).astype(int)
     picture[row - 22 : row + 22, col - 22 : col + 22] = 38000.0
     board = measure_board(scan_of(picture), spec)
@@ -253,7 +253,7 @@ def test_a_grid_of_squares_with_some_hidden_keeps_its_names() -> None:
 
 
 @parametrize_with_studies("kind", ["chessboard", "circle-grid", "squares"])
-def test_of_boards_that_look_the_same_none_is_observed(kind: str) -> None:
+def test_of_boards_that_are_alike_none_is_observed(kind: str) -> None:
     """Neither by their size, for nobody knows how far away they are; the reason says how many, and where."""
     spec: ChessboardSpec | CircleGridSpec | SquareGridSpec
     if kind == "chessboard":
@@ -265,10 +265,10 @@ def test_of_boards_that_look_the_same_none_is_observed(kind: str) -> None:
     else:
         spec = CircleGridSpec(6, 5, 28.0, 13.0)
         dark, words = circles_dark(spec), "3 grids of 6 x 5 dots"
-    one = measure_board(scan_of(beside_each_other(spec, dark, (1.0,))), spec)
+    one = measure_board(scan_of(tile_boards(spec, dark, (1.0,))), spec)
     assert not one.ambiguous
     assert all(mark.status is Status.MEASURED for mark in one.marks)
-    three = measure_board(scan_of(beside_each_other(spec, dark, (1.0, 0.9, 1.0))), spec)
+    three = measure_board(scan_of(tile_boards(spec, dark, (1.0, 0.9, 1.0))), spec)
     assert words in three.ambiguous
     places = [float(place) for place in re.findall(r"\((\d+), \d+\)", three.ambiguous)]
     width = np.ptp([point[:2] for point in spec.object_points().values()], axis=0)[0] + 60.0
@@ -279,7 +279,7 @@ def test_of_boards_that_look_the_same_none_is_observed(kind: str) -> None:
 
 def test_a_circle_grid_is_no_part_of_a_larger_one() -> None:
     spec, larger = CircleGridSpec(6, 5, 28.0, 13.0), CircleGridSpec(7, 5, 28.0, 13.0)
-    board = measure_board(scan_of(beside_each_other(larger, circles_dark(larger), (1.0,))), spec)
+    board = measure_board(scan_of(tile_boards(larger, circles_dark(larger), (1.0,))), spec)
     assert "the grid is larger than 6 x 5 dots" in board.reason
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
@@ -334,7 +334,7 @@ def test_bad_specifications_are_refused(make: Any, words: str) -> None:
 
 
 @pytest.mark.parametrize(("coma_px", "moves"), [(0.0, False), (0.02, False), (0.1, True)])
-def test_coma_is_told_from_noise_by_what_neighbours_share(coma_px: float, moves: bool) -> None:
+def test_coma_is_distinguished_from_noise_by_what_neighbours_share(coma_px: float, moves: bool) -> None:
     rng = np.random.default_rng(8)
     marks = []
     for row, column in np.ndindex(8, 10):
@@ -362,11 +362,11 @@ def chessboards(numbers: Iterable[int]) -> tuple[list[Array], list[Array]]:
     for number in numbers:
         with open_scan(DATA / "chessboards" / "bouguet" / f"Image{number}.tif") as scan:
             boards.append(measure_board(scan, spec).marks)
-    seen = [[mark for mark in marks if mark.status.is_observation] for marks in one_definition(boards)]
+    measured_marks = [[mark for mark in marks if mark.status.is_observation] for marks in one_definition(boards)]
     points = spec.object_points()
     return (
-        [np.array([points[mark.point] for mark in marks], np.float32) for marks in seen],
-        [np.array([mark.center_px for mark in marks], np.float32) for marks in seen],
+        [np.array([points[mark.point] for mark in marks], np.float32) for marks in measured_marks],
+        [np.array([mark.center_px for mark in marks], np.float32) for marks in measured_marks],
     )
 
 

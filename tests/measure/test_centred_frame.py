@@ -31,7 +31,7 @@ def _small_scans_count_as_large(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("measure.fiducials.search._LARGE_PX", 1)
 
 
-def measured(
+def measure_picture(
     grey: Array, layout: FiducialLayout, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[FrameMeasurement, bool]:
     """And whether the whole scan was searched."""
@@ -53,7 +53,7 @@ def test_a_frame_in_the_middle_is_found_and_named_without_the_whole_scan(
 ) -> None:
     matrix = pixel_from_camera(pose)
     monkeypatch.setattr(Scan, "reduced", None)
-    result, whole = measured(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path, monkeypatch)
+    result, whole = measure_picture(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path, monkeypatch)
     assert not whole
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == (pose, True)
@@ -70,10 +70,10 @@ def test_a_frame_off_the_middle_or_with_a_mark_hidden_is_searched_everywhere(
     if hidden:
         col, row = np.rint(matrix @ (*CORNERS[2], 1.0)).astype(int)
         grey[row - 40 : row + 40, col - 40 : col + 40] = 3000
-    result, whole = measured(grey, NUMBERED, tmp_path, monkeypatch)
+    result, whole = measure_picture(grey, NUMBERED, tmp_path, monkeypatch)
     assert whole
-    seen = [mark.status.is_observation for mark in result.marks]
-    assert seen == [True, True, not hidden, True]
+    measured_marks = [mark.status.is_observation for mark in result.marks]
+    assert measured_marks == [True, True, not hidden, True]
     off = [
         np.abs(mark.center_px - matrix @ (*given.xy_mm, 1.0)).max()
         for mark, given in zip(result.marks, NUMBERED.marks, strict=True)
@@ -109,7 +109,7 @@ def test_of_a_large_scan_with_all_marks_clear_only_windows_are_read(
     assert len(read) * 64**2 < 0.4 * grey.size
 
 
-def test_a_lattice_is_told_from_a_frame() -> None:
+def test_a_lattice_is_distinguished_from_a_frame() -> None:
     cross = MarkShape(ring_cross(0.5, 0.1, 0.8, 0.1))
     places = [(10.0 * i, 10.0 * j) for i in range(5) for j in range(5)]
     sides = ((7.7, 0.0), (0.0, 7.7), (-7.7, 0.0), (0.0, -7.7))
@@ -132,8 +132,8 @@ def test_a_frame_that_the_scan_holds_is_found_by_windows_as_by_the_whole(
         search = FrameSearch(scan, NUMBERED, FiducialOptions())
         found = search.search_room(hypothesis)[0]
         assert search.false_placements(found) < 0.01
-        beside = np.add(found.pixel_from_camera, [[0.0, 0.0, 9999.0], [0.0, 0.0, 0.0]])
-        assert np.isinf(search.false_placements(replace(found, pixel_from_camera=beside)))
+        neighbour = np.add(found.pixel_from_camera, [[0.0, 0.0, 9999.0], [0.0, 0.0, 0.0]])
+        assert np.isinf(search.false_placements(replace(found, pixel_from_camera=neighbour)))
     assert found.pose == whole.pose
     assert found.same_place(whole)
     assert np.hypot(*(found.pixel_from_camera - matrix)[:, 2]) < 3.0

@@ -69,13 +69,13 @@ def centers_px(layout: FiducialLayout, pose: str) -> Array:
     return np.array([placement(pose).pixel_from_camera @ (*mark.xy_mm, 1.0) for mark in layout.marks])
 
 
-def frame_of(scan: Scan, layout: FiducialLayout) -> Frame:
+def make_frame(scan: Scan, layout: FiducialLayout) -> Frame:
     return measure_frame(scan, layout, placement("0"), OPTIONS)
 
 
 def test_three_plain_dots_of_four_are_no_chance() -> None:
     scan = scan_of(picture(DOTS, "0", hidden=1))
-    frame = frame_of(scan, DOTS)
+    frame = make_frame(scan, DOTS)
     assert frame.inliers.tolist() == [True, False, True, True]
     assert doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame) == ""
 
@@ -84,7 +84,7 @@ def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -
     """It has the left and the middle ones under the names of the middle and the right ones; the rest is outside."""
     layout = layout_of([DOT] * 8, (*CORNERS, (0.0, -7.0), (-7.0, 0.0), (0.0, 7.0), (7.0, 0.0)), (16.0, 16.0))
     scan = scan_of(picture(layout, "0", hidden=7))
-    frame = frame_of(scan, layout)
+    frame = make_frame(scan, layout)
     moved_on = placement("0").pixel_from_camera - np.array([[0.0, 0.0, 7.0 * PX_PER_MM], [0.0, 0.0, 0.0]])
     other = measure_frame(scan, layout, replace(placement("0"), pixel_from_camera=moved_on), OPTIONS)
     assert (int(frame.inliers.sum()), int(other.inliers.sum())) == (7, 4)
@@ -93,7 +93,7 @@ def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -
     assert not frame.contains(frame)
 
 
-def test_three_marks_of_the_neighbouring_frame_are_no_frame_beside_five_of_its_own(
+def test_three_marks_of_the_neighbouring_frame_are_no_frame_next_to_five_of_its_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Three of eight may be chance, although each is plainly a mark, and answer more strongly than the five."""
@@ -123,7 +123,7 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
     free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
     scan = scan_of(strewn(np.concatenate([elsewhere[free], as_marks[1:]])))
-    frame = frame_of(scan, DOTS)
+    frame = make_frame(scan, DOTS)
     assert frame.inliers.tolist() == [False, True, True, True]
     sentence = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
     assert "only 3 of 4 marks were found, and 1 of 64 random places match as well (p = 0.06)" in sentence
@@ -135,7 +135,7 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     at = np.rint(centers_px(DOTS, "0")[2]).astype(int)
     grey[at[1] - 24 : at[1] + 25, at[0] - 24 : at[0] + 25] = 20000.0
     scan = scan_of(grey)
-    frame = frame_of(scan, DOTS)
+    frame = make_frame(scan, DOTS)
     chance = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
     assert "(p = 1.00): the frame may lie elsewhere" in chance
     result = present_frame(scan, DOTS, frame, Pose("0", False), (50.0, 50.0), (), chance)
@@ -163,7 +163,7 @@ def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
     ids = [tuple(Disk((0.9, 0.4 * k - 0.4), 0.12) for k in range(count)) for count in range(4)]
     layout = layout_of([MarkShape((*dot(0.2), *dots), "light") for dots in ids], CORNERS, (16.0, 16.0))
     scan = scan_of(picture(layout, "90"))
-    frame = replace(frame_of(scan, layout), inliers=np.array([True, False, False, False]))
+    frame = replace(make_frame(scan, layout), inliers=np.array([True, False, False, False]))
     pose = decide_pose(scan, layout, [placement(pose) for pose in POSES], frame, OPTIONS)
     assert (pose.name, pose.decided) == ("90", True)
 
@@ -175,7 +175,7 @@ def test_pictures_of_one_scan_alone_decide_a_pose_only_beyond_chance(
     """Among eight poses four marks agree on one by chance in one of 512 frames; three of them, whichever they are, in
     one of 18. What is drawn, or was averaged over scans, has no landscape that could agree."""
     scan = scan_of(picture(DOTS, "0"))
-    frame = frame_of(scan, DOTS)
+    frame = make_frame(scan, DOTS)
     with_chips = [
         replace(mark, mark=learn_template([cut(scan, centred(mark.xy_mm), 2.0)], 2.0)) if chips else mark
         for mark in DOTS.marks

@@ -26,7 +26,7 @@ from measure.results import FrameMeasurement, MarkMeasurement
 FAR_TURN_RAD = 0.35  # twenty degrees: no search looks for a frame that is laid so
 
 
-def clicks_at(matrix: Array, points: str, off_px: tuple[float, float] = (1.2, -0.9)) -> tuple[Click, ...]:
+def make_clicks(matrix: Array, points: str, off_px: tuple[float, float] = (1.2, -0.9)) -> tuple[Click, ...]:
     """As a person clicks, a pixel or so off."""
     return tuple(Click(point, *(matrix @ (*CORNERS[int(point) - 1], 1.0) + off_px)) for point in points)
 
@@ -35,7 +35,7 @@ def clicks_at(matrix: Array, points: str, off_px: tuple[float, float] = (1.2, -0
 def test_three_clicks_find_a_frame_in_any_pose_that_no_search_finds(pose: str, tmp_path: Path) -> None:
     matrix = pixel_from_camera(pose, FAR_TURN_RAD)
     grey = frame_picture(ALIKE, matrix)
-    result = measured(grey, ALIKE, tmp_path, FiducialOptions(clicks=clicks_at(matrix, "124")))
+    result = measured(grey, ALIKE, tmp_path, FiducialOptions(clicks=make_clicks(matrix, "124")))
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == (pose, True)
     assert_right(result, ALIKE, matrix)
@@ -51,17 +51,17 @@ def test_clicks_that_contradict_the_set_pose_give_no_observation(tmp_path: Path)
     """As in a viewer that turns the picture: the names would be those of other marks."""
     matrix = pixel_from_camera("180")
     grey = frame_picture(ALIKE, matrix)
-    result = measured(grey, ALIKE, tmp_path, FiducialOptions("0", clicks=clicks_at(matrix, "124")))
+    result = measured(grey, ALIKE, tmp_path, FiducialOptions("0", clicks=make_clicks(matrix, "124")))
     assert {mark.status for mark in result.marks} == {Status.REJECTED}
     assert "show the scan orientation 180, and 0 is set" in result.problems[0]
     assert_right(
-        measured(grey, ALIKE, tmp_path, FiducialOptions("180", clicks=clicks_at(matrix, "124"))), ALIKE, matrix
+        measured(grey, ALIKE, tmp_path, FiducialOptions("180", clicks=make_clicks(matrix, "124"))), ALIKE, matrix
     )
 
 
 def test_clicks_tell_the_pitch_where_nothing_else_does(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0", FAR_TURN_RAD)
-    options = FiducialOptions(clicks=clicks_at(matrix, "123"))
+    options = FiducialOptions(clicks=make_clicks(matrix, "123"))
     result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, options, pitch=False)
     assert result.px_per_mm == pytest.approx(20.0, rel=1e-3)
     assert_right(result, ALIKE, matrix)
@@ -83,7 +83,7 @@ def test_a_click_where_nothing_is_matched_counts_as_well_as_one_points(tmp_path:
     matrix = pixel_from_camera("0")
     result = bare_corner(matrix, tmp_path, ())
     assert row(result, "3").status is Status.PREDICTED
-    (click,) = clicks_at(matrix, "3", (0.0, 0.0))
+    (click,) = make_clicks(matrix, "3", (0.0, 0.0))
     mark = row(bare_corner(matrix, tmp_path, (click,)), "3")
     assert mark.status is Status.WEAK
     assert mark.center_px is not None
@@ -98,9 +98,9 @@ def test_a_click_says_which_of_two_marks_is_meant(tmp_path: Path) -> None:
     grey = frame_picture(ALIKE, matrix)
     meant = matrix.copy()
     meant[:, 2] += (30.0, 0.0)
-    grey_beside = frame_picture(ALIKE, meant)
+    grey_neighbour = frame_picture(ALIKE, meant)
     col, line = np.rint(meant @ (*CORNERS[3], 1.0)).astype(int)
-    grey[line - 25 : line + 26, col - 10 : col + 26] = grey_beside[line - 25 : line + 26, col - 10 : col + 26]
+    grey[line - 25 : line + 26, col - 10 : col + 26] = grey_neighbour[line - 25 : line + 26, col - 10 : col + 26]
     click = Click("4", *(meant @ (*CORNERS[3], 1.0)))
     mark = row(measured(grey, ALIKE, tmp_path, FiducialOptions(clicks=(click,))), "4")
     assert mark.center_px is not None

@@ -68,7 +68,7 @@ def test_a_censored_residual_is_twice_the_log_probability_and_derivatives_agree(
 
 
 @pytest.mark.parametrize("within", [-1.0, 0.0, 1.0])
-def test_noise_is_told_from_what_is_seen_of_it_and_little_dust_does_not_change_that(within: float) -> None:
+def test_noise_is_distinguished_from_what_is_visible_of_it_and_little_dust_does_not_change_that(within: float) -> None:
     noise = 3 * np.random.default_rng(4).standard_normal(20000)
     sides = (noise >= 3 * within).astype(np.int8)
     residuals = np.minimum(noise, 3 * within)

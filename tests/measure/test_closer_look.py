@@ -35,7 +35,7 @@ def wing(x: float, y: float) -> MarkShape:
 
 @pytest.mark.study
 @pytest.mark.parametrize("contrast", [4500.0, 0.0])
-def test_wings_are_found_beside_an_edge_that_is_nine_times_as_strong(contrast: float) -> None:
+def test_wings_are_found_next_to_an_edge_that_is_nine_times_as_strong(contrast: float) -> None:
     rng = np.random.default_rng(3)
     grey = np.full((300, 300), 55000.0)
     edge = slice(round(MIDDLE_PX - HALF_MM * PX_PER_MM), round(MIDDLE_PX + HALF_MM * PX_PER_MM))
@@ -60,7 +60,7 @@ def test_wings_are_found_beside_an_edge_that_is_nine_times_as_strong(contrast: f
 @pytest.mark.parametrize(
     ("surroundings", "chance", "is_taken"), [(CLOSE, 5e-4, True), (CLOSE, 5e-3, False), (WIDE, 5e-4, False)]
 )
-def test_at_a_closer_look_marks_are_taken_that_noise_seldom_makes_for_all_together_decide(
+def test_at_closer_matching_marks_are_taken_that_noise_seldom_makes_for_all_together_decide(
     surroundings: Surroundings, chance: float, is_taken: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     faint = cast(MarkFit, SimpleNamespace(likeness=0.1, significance=3.0))

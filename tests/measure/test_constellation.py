@@ -31,7 +31,7 @@ def placements(pose: str, answers: Responses) -> list[Placement]:
     return PlacementSearch(MARKS, answers, (PITCH_MM, PITCH_MM), BOUNDS).find_placements(pose, [0] * 6)
 
 
-def seen(pose: str, scale: float = 1.015, angle: float = 0.03) -> NDArray[np.float64]:
+def view_marks(pose: str, scale: float = 1.015, angle: float = 0.03) -> NDArray[np.float64]:
     c, s = np.cos(angle), np.sin(angle)
     up = np.array(PLACES) @ (scale * np.array([[c, -s], [s, c]]) @ up_from_camera(pose)).T
     return np.asarray(up * (1, -1) / PITCH_MM + (265.0, 255.0))
@@ -45,7 +45,7 @@ def test_the_place_is_found_among_brighter_false_answers() -> None:
     """Text, dials and trees answer more strongly than the marks; only the marks answer together."""
     rng = np.random.default_rng(3)
     for pose in POSES:
-        true = seen(pose)
+        true = view_marks(pose)
         false = rng.uniform(20, 500, (40, 2))
         places = np.concatenate([true, false])
         heights = np.concatenate([np.full(6, 0.6), rng.uniform(0.5, 0.9, 40)])
@@ -55,7 +55,7 @@ def test_the_place_is_found_among_brighter_false_answers() -> None:
 
 
 def test_missing_marks_do_not_hinder() -> None:
-    true = seen("0")
+    true = view_marks("0")
     found = placements("0", responses(true[:4], np.full(4, 0.5)))
     assert np.abs(predicted(found[0]) - true).max() < 2.0
 
@@ -88,7 +88,7 @@ def test_peaks_come_in_order_and_apart() -> None:
     np.testing.assert_allclose(heights, [0.9, 0.5], rtol=1e-6)
 
 
-def test_a_square_looks_alike_in_all_poses_and_six_marks_do_not() -> None:
+def test_a_square_is_alike_in_all_poses_and_six_marks_do_not() -> None:
     first = ("0", [0] * 4)
     assert all(same_picture(MARKS[:4], first, (pose, [0] * 4), NEAR_MM) for pose in POSES)
     others = [pose for pose in POSES if not same_picture(MARKS, ("0", [0] * 6), (pose, [0] * 6), NEAR_MM)]

@@ -58,7 +58,7 @@ def square_picture(center: Array, steps: Array, blur_px: float, alone: bool) -> 
     return 50 + CONTRAST * drawn(light, SIZE, SIZE, blur_px)
 
 
-def fitted(window: Array, start: Array, steps: Array, alone: bool) -> Corner:
+def fit_mark(window: Array, start: Array, steps: Array, alone: bool) -> Corner:
     outside = 4  # pixels that are none of the picture
     grey, valid = np.pad(window, outside), np.pad(np.ones(window.shape, bool), outside)
 
@@ -79,7 +79,7 @@ def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) ->
         clean = square_picture(center, steps, blur_px, alone)
         for _ in range(6):
             noisy = clean + rng.normal(0, NOISE, clean.shape)
-            corner = fitted(noisy, center + rng.normal(0, 0.3, 2), steps, alone)
+            corner = fit_mark(noisy, center + rng.normal(0, 0.3, 2), steps, alone)
             assert not corner.reason
             errors.append(whitened(corner.center_px - center, corner.covariance_px2))
             assert corner.noise_dn == pytest.approx(NOISE, rel=0.35)
@@ -92,7 +92,7 @@ def test_the_junction_lies_where_the_squares_meet(blur_px: float) -> None:
     rng = np.random.default_rng(7)
     for _ in range(8):
         center, steps = SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
-        corner = fitted(square_picture(center, steps, blur_px, False), center, steps, False)
+        corner = fit_mark(square_picture(center, steps, blur_px, False), center, steps, False)
         assert corner.junction_px is not None
         assert np.abs(corner.junction_px - center).max() < 0.03
 
@@ -103,7 +103,7 @@ def test_trap_pixel_locking() -> None:
     steps = board_steps(rng)
     for phase in np.linspace(-0.5, 0.5, 9):
         center = SIZE // 2 + np.array([phase, -phase / 2])
-        corner = fitted(square_picture(center, steps, 0.7, False), center + 0.2, steps, False)
+        corner = fit_mark(square_picture(center, steps, 0.7, False), center + 0.2, steps, False)
         assert np.abs(corner.center_px - center).max() < 0.004
 
 
@@ -113,7 +113,7 @@ def test_a_bent_tone_curve_and_sharpening_do_not_move_a_crossing() -> None:
         center, steps = SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
         linear = square_picture(center, steps, 0.8, False)
         bent = 255 * (np.clip(linear - 45, 0, None) / 255) ** 0.45
-        corner = fitted(bent, center + rng.normal(0, 0.3, 2), steps, False)
+        corner = fit_mark(bent, center + rng.normal(0, 0.3, 2), steps, False)
         assert np.abs(corner.center_px - center).max() < 0.01
 
 
@@ -121,8 +121,8 @@ def test_contrast_says_which_square_is_light() -> None:
     steps = np.diag([14.0, 14.0])
     center = np.array([12.2, 12.3])
     light = square_picture(center, steps, 0.8, False)
-    assert fitted(light, center, steps, False).contrast_dn == pytest.approx(CONTRAST, rel=0.05)
-    assert fitted(200 - light, center, steps, False).contrast_dn == pytest.approx(-CONTRAST, rel=0.05)
+    assert fit_mark(light, center, steps, False).contrast_dn == pytest.approx(CONTRAST, rel=0.05)
+    assert fit_mark(200 - light, center, steps, False).contrast_dn == pytest.approx(-CONTRAST, rel=0.05)
 
 
 def test_a_stain_is_left_out() -> None:
@@ -130,14 +130,14 @@ def test_a_stain_is_left_out() -> None:
     center, steps = np.array([12.1, 11.8]), np.diag([14.0, 14.0])
     window = square_picture(center, steps, 0.8, False) + rng.normal(0, 1.0, (SIZE, SIZE))
     window[7:9, 14:17] = 255
-    corner = fitted(window, center, steps, False)
+    corner = fit_mark(window, center, steps, False)
     assert not corner.reason
     assert 0.02 < corner.damaged_fraction < 0.1
     assert np.abs(corner.center_px - center).max() < 0.03
 
 
-def test_where_no_corner_is_the_reason_is_said() -> None:
+def test_where_no_corner_is_the_reason_is_stated() -> None:
     rng = np.random.default_rng(6)
     start, steps = np.array([12.0, 12.0]), np.diag([14.0, 14.0])
-    assert fitted(rng.normal(100, 4, (SIZE, SIZE)), start, steps, False).reason
-    assert fitted(np.full((SIZE, SIZE), 7.0), start, steps, False).reason
+    assert fit_mark(rng.normal(100, 4, (SIZE, SIZE)), start, steps, False).reason
+    assert fit_mark(np.full((SIZE, SIZE), 7.0), start, steps, False).reason

@@ -17,7 +17,7 @@ def test_the_covariance_of_a_mark_is_the_sum_of_its_causes() -> None:
     np.testing.assert_allclose(np.asarray(film.covariance_px2), noise + 2 * tone + 0.01 * np.eye(2))
 
 
-def test_causes_are_told_in_their_order_and_those_that_add_nothing_are_not() -> None:
+def test_causes_are_reported_in_their_order_and_those_that_add_nothing_are_not() -> None:
     known = Covariance({Cause.TONE: 4e-4 * np.eye(2), Cause.NOISE: 1e-4 * np.eye(2)})
     known = known.plus(Cause.COMPRESSION, np.zeros((2, 2)))
     assert known.sigmas_px == pytest.approx({Cause.NOISE: 0.01, Cause.TONE: 0.02})

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from damaged_files import DAMAGES, measured, outcome, stored
+from damaged_files import DAMAGES, measure_file, outcome, stored
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
@@ -41,12 +41,12 @@ def test_a_share_of_the_damaged_files(tmp_path: Path) -> None:
     cases = {"jpeg": "flipped", "tiff zstd": "zeroed", "tiff uncompressed": "flipped"}
     for name, kind in cases.items():
         path.write_bytes(stored()[name])
-        whole = measured(path)
+        whole = measure_file(path)
         path.write_bytes(damaged(name, kind, 1))
         assert outcome(path, whole) in ("message", "right"), name
 
 
-def test_every_damage_is_told_or_leaves_each_pixel_at_its_place(tmp_path: Path) -> None:
+def test_every_damage_is_reported_or_leaves_each_pixel_at_its_place(tmp_path: Path) -> None:
     """A checksum tells all; else a changed byte may leave another grey value where nobody can know it. A picture that
     is not where it was differs nearly everywhere, but for a changed brightness of what follows in a JPEG stream."""
     path = tmp_path / "s"
@@ -85,7 +85,7 @@ def test_thirty_bytes_lost_from_a_jpeg_stream(tmp_path: Path, kind: str) -> None
     data = stored()[kind]
     (tmp_path / "s.jpg").write_bytes(data[: len(data) // 2] + data[len(data) // 2 + 30 :])
     with open_scan(tmp_path / "s.jpg") as scan:
-        frame = with_damage(scan, measured(tmp_path / "s.jpg"))
+        frame = with_damage(scan, measure_file(tmp_path / "s.jpg"))
     assert {mark.status for mark in frame.marks} == {Status.ABSENT}
     assert all("nothing of it can be trusted" in mark.reason for mark in frame.marks)
     assert "file is damaged" in frame.problems[0]
@@ -105,9 +105,9 @@ def test_a_mark_in_a_damaged_tile_is_absent_and_the_others_are_measured(tmp_path
         offset, count = file.pages.first.dataoffsets[0], file.pages.first.databytecounts[0]
     data[offset + count // 2 : offset + count - 2] = bytes(count - 2 - count // 2)
     (tmp_path / "s.tif").write_bytes(bytes(data))
-    frame = measured(tmp_path / "s.tif")
-    told = {mark.point: mark.status for mark in frame.marks}
-    assert told == {"1": "measured", "2": "measured", "3": "absent", "4": "measured"}
+    frame = measure_file(tmp_path / "s.tif")
+    result = {mark.point: mark.status for mark in frame.marks}
+    assert result == {"1": "measured", "2": "measured", "3": "absent", "4": "measured"}
     assert "file is damaged at its place: tile 0" in frame.marks[2].reason
 
 
@@ -116,10 +116,10 @@ def test_damaged_files_by_the_thousand(tmp_path: Path) -> None:
     """In a process of its own, which has so much memory and no more. (python -m pytest -m study -s says the counts.)"""
     counts: dict[str, Counter[str]] = {name: Counter() for name in stored()}
     bad = []
-    for name, kind, case, told in _outcomes(tmp_path):
-        counts[name][told.split(":")[0]] += 1
-        if told not in ("message", "right"):
-            bad.append((name, kind, case, told))
+    for name, kind, case, own_outcome in _outcomes(tmp_path):
+        counts[name][own_outcome.split(":")[0]] += 1
+        if own_outcome not in ("message", "right"):
+            bad.append((name, kind, case, own_outcome))
             print(*bad[-1], flush=True)
     for name, counted in counts.items():
         print(f"{name:25} {dict(counted)}")
@@ -139,11 +139,11 @@ def _outcomes(folder: Path) -> Iterator[tuple[str, str, int, str]]:
         for each in cases[first:]:
             first += 1
             try:
-                told = here.recv() if here.poll(WAITED_S) else "hang"
+                result = here.recv() if here.poll(WAITED_S) else "hang"
             except EOFError:
-                told = "died"
-            yield *each, told
-            if told in ("hang", "died"):
+                result = "died"
+            yield *each, result
+            if result in ("hang", "died"):
                 break
         worker.kill()
         worker.join()
@@ -154,7 +154,7 @@ def _work(out: Connection, folder: Path, cases: list[tuple[str, str, int]]) -> N
     path = folder / "s"
     for name in dict.fromkeys(name for name, _, _ in cases):
         path.write_bytes(stored()[name])
-        whole[name] = measured(path)
+        whole[name] = measure_file(path)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + MOST_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
@@ -162,8 +162,8 @@ def _work(out: Connection, folder: Path, cases: list[tuple[str, str, int]]) -> N
         path.write_bytes(damaged(name, kind, case))
         start = time.process_time()
         try:
-            told = outcome(path, whole[name])
+            own_outcome = outcome(path, whole[name])
         except Exception as error:
-            told = f"traceback: {error!r}"
+            own_outcome = f"traceback: {error!r}"
         took_s = time.process_time() - start
-        out.send(told if took_s < LONGEST_S else f"hang: {took_s:.0f} s")
+        out.send(own_outcome if took_s < LONGEST_S else f"hang: {took_s:.0f} s")

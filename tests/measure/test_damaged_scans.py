@@ -38,7 +38,7 @@ def zeros_png(side: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-def test_a_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:
+def test_a_missing_file_is_named_with_the_place_inspected_for(tmp_path: Path) -> None:
     with pytest.raises(MeasurementError, match=r"no scan .*nowhere\.tif.*searched at.*check its name"):
         open_scan(tmp_path / "nowhere.tif")
 
@@ -89,7 +89,7 @@ def test_a_damaged_tile_is_unknown_and_costs_none_of_the_others(tmp_path: Path, 
     (tmp_path / "s.tif").write_bytes(bytes(data))
     with open_scan(tmp_path / "s.tif") as scan:
         for _ in range(2):
-            seen = map_in_threads(lambda row: scan.window(0, row, WIDTH, 1)[0], range(HEIGHT))
+            view = map_in_threads(lambda row: scan.window(0, row, WIDTH, 1)[0], range(HEIGHT))
             known = scan.inside(0, 0, WIDTH, HEIGHT)
         assert "tile 7" in scan.damage
         assert "tile 7" in scan.loss_reason(120, 120, 10, 10)
@@ -97,7 +97,7 @@ def test_a_damaged_tile_is_unknown_and_costs_none_of_the_others(tmp_path: Path, 
     lost = np.zeros((HEIGHT, WIDTH), bool)
     lost[64:128, 128:192] = True
     np.testing.assert_array_equal(known, ~lost)
-    np.testing.assert_array_equal(np.stack(seen)[known], picture()[known])
+    np.testing.assert_array_equal(np.stack(view)[known], picture()[known])
 
 
 @pytest.mark.parametrize("compression", [None, "lzw", "zlib", "zstd", "packbits"])

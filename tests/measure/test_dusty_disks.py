@@ -12,7 +12,7 @@ from measure.targets.identification import TargetPrediction, measure_disks
 CONTRAST, GROUND = 15000.0, 25000.0
 
 
-def test_a_speck_that_passes_for_the_disk_is_told_by_the_other_disks() -> None:
+def test_a_speck_that_passes_for_the_disk_is_known_by_the_other_disks() -> None:
     """A dark speck on a dark disk looks like another dark disk: only its contrast and its form are not the others'."""
     rng = np.random.default_rng(1)
     picture = GROUND + rng.normal(0, 500, (60, 40 * 12))
@@ -70,11 +70,13 @@ def test_targets_are_odd_by_more_than_noise_and_what_all_differ_by(share: float,
         for change in 20.0 * is_odd * rng.choice((-1, 1), 25):
             mixing = (np.eye(5) + rng.normal(0, 0.3, (5, 5))) * spread
             noise = rng.uniform(0.5, 5) * mixing @ mixing.T
-            look = rng.normal(0, spread) + rng.multivariate_normal(np.zeros(5), noise)
-            look[3] += change * np.hypot(spread[3], np.sqrt(noise[3, 3]))
-            values, vectors = np.linalg.eigh([[look[0] + look[1], look[2]], [look[2], look[0] - look[1]]])
-            shape, blur = 3 * (vectors * np.exp(values)) @ vectors.T, float(np.sqrt(max(1.5 + look[4], 0.1)))
-            contrast = float(np.exp(look[3])) * CONTRAST
+            observation = rng.normal(0, spread) + rng.multivariate_normal(np.zeros(5), noise)
+            observation[3] += change * np.hypot(spread[3], np.sqrt(noise[3, 3]))
+            values, vectors = np.linalg.eigh(
+                [[observation[0] + observation[1], observation[2]], [observation[2], observation[0] - observation[1]]]
+            )
+            shape, blur = 3 * (vectors * np.exp(values)) @ vectors.T, float(np.sqrt(max(1.5 + observation[4], 0.1)))
+            contrast = float(np.exp(observation[3])) * CONTRAST
             sloping = SecondPlace(of_slope.normal(0, 0.1, 2), 0.01 * np.eye(2))
             known = Covariance.from_noise(0.001 * np.eye(2))
             disks.append(FittedDisk(np.zeros(2), known, shape, contrast, 100.0, blur, 0.0, noise, sloping))

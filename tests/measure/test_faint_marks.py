@@ -31,7 +31,7 @@ def places(seed: int) -> Array:
     return np.asarray(grid + rng.uniform(-0.5, 0.5, grid.shape))
 
 
-def seen_at(grey: Array, predicted: Array, folder: Path) -> list[FaintMark | None]:
+def detect_marks(grey: Array, predicted: Array, folder: Path) -> list[FaintMark | None]:
     with written_scan(grey, folder) as scan:
         return [
             detect_faint(scan, MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1), 0.0, 0.7)
@@ -46,7 +46,7 @@ def test_a_cross_of_the_grounds_own_contrast_is_measured_with_an_honest_sigma(tm
         col0, row0 = np.rint(place).astype(int) - 25
         shown = brute_picture(CROSS, np.column_stack([LINEAR, place - (col0, row0)]), 51, 51, 0.7)
         grey[row0 : row0 + 51, col0 : col0 + 51] -= 5000 * shown
-    for found, place in zip(seen_at(grey, np.rint(true), tmp_path), true, strict=True):
+    for found, place in zip(detect_marks(grey, np.rint(true), tmp_path), true, strict=True):
         assert found is not None
         assert found.false_alarms < 1e-4
         error = found.fit.center_px - place
@@ -110,15 +110,15 @@ def test_what_answers_at_the_edge_of_a_wide_search_is_placed_within_the_window(t
 
 @pytest.mark.study
 def test_bare_texture_answers_as_often_as_chance_says(tmp_path: Path) -> None:
-    answers = [found for seed in range(2) for found in seen_at(textured(seed + 50), places(seed), tmp_path)]
+    answers = [found for seed in range(2) for found in detect_marks(textured(seed + 50), places(seed), tmp_path)]
     chances = np.array([found.false_alarms for found in answers if found is not None])
     assert (chances < 1e-3).sum() <= 1  # of fifty places
     assert 3 <= (chances < 0.1).sum() <= 22  # the strongest of those within three pixels, not one drawn blindly
 
 
-def test_where_the_ground_is_black_nothing_is_seen(tmp_path: Path) -> None:
+def test_where_the_ground_is_black_nothing_is_visible(tmp_path: Path) -> None:
     black = np.zeros((SIDE_PX * STEP_PX,) * 2)
-    assert all(found is None for found in seen_at(black, places(1)[:3], tmp_path))
+    assert all(found is None for found in detect_marks(black, places(1)[:3], tmp_path))
 
 
 def test_what_the_tone_curve_moves_a_faint_mark_by_is_in_its_covariance(tmp_path: Path) -> None:
@@ -129,13 +129,15 @@ def test_what_the_tone_curve_moves_a_faint_mark_by_is_in_its_covariance(tmp_path
     expected = MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1)
     with written_scan(grey, tmp_path) as scan:
         prior = Tone.unknown()
-        seen = detect_faint(scan.replace_tone(prior), expected, 0.0, 0.7)
+        detection = detect_faint(scan.replace_tone(prior), expected, 0.0, 0.7)
         ends = [detect_faint(scan.replace_tone(Tone(power(value))), expected, 0.0, 0.7) for value in (1.0, 2.2)]
-    assert seen is not None
+    assert detection is not None
     assert ends[0] is not None
     assert ends[1] is not None
     half = (ends[1].fit.center_px - ends[0].fit.center_px) / 2
     assert np.hypot(*half) > 1e-4
-    np.testing.assert_allclose(seen.fit.place_covariance.parts[Cause.TONE], np.outer(half, half), rtol=0.25, atol=2e-7)
-    np.testing.assert_allclose(seen.fit.center_px, ends[0].fit.center_px + half, atol=0.002)
+    np.testing.assert_allclose(
+        detection.fit.place_covariance.parts[Cause.TONE], np.outer(half, half), rtol=0.25, atol=2e-7
+    )
+    np.testing.assert_allclose(detection.fit.center_px, ends[0].fit.center_px + half, atol=0.002)
     assert Cause.TONE not in ends[0].fit.place_covariance.parts

@@ -88,7 +88,7 @@ def test_learned_marks_tell_the_pose_only_where_they_differ(
         assert {mark.status for mark in result.marks} == {Status.WEAK}
 
 
-def test_writing_beside_one_mark_names_no_pose(tmp_path: Path) -> None:
+def test_writing_next_to_one_mark_names_no_pose(tmp_path: Path) -> None:
     """Three dots beside a mark of a camera whose first mark has none, and whose others have one to three."""
     matrix = pixel_from_camera("0")
     grey = frame_picture(ALIKE, matrix)
@@ -98,7 +98,7 @@ def test_writing_beside_one_mark_names_no_pose(tmp_path: Path) -> None:
     assert not result.pose.decided, result.pose.evidence
 
 
-def test_what_covers_a_dot_and_looks_like_a_smaller_one_is_doubted(tmp_path: Path) -> None:
+def test_what_covers_a_dot_and_resembles_a_smaller_one_is_doubted(tmp_path: Path) -> None:
     dot, speck = MarkShape((Disk((0.0, 0.0), 0.4),)), MarkShape((Disk((0.01, -0.015), 0.34),))
     matrix = pixel_from_camera("0")
     given = layout_of([dot] * 4)
@@ -126,7 +126,7 @@ def test_the_finest_detail_of_an_outline_is_an_edge_and_no_piece_of_an_arc() -> 
 
 
 @pytest.mark.study
-def test_a_frame_without_a_mark_free_of_blemish_has_no_decided_pose(tmp_path: Path) -> None:
+def test_a_frame_without_a_mark_free_of_blemish_has_no_settled_pose(tmp_path: Path) -> None:
     """A part of every ring and cross is gone; the identification dots are all there."""
     matrix = pixel_from_camera("90")
     grey = frame_picture(NUMBERED, matrix)
@@ -149,7 +149,7 @@ def test_the_users_pose_is_taken(tmp_path: Path) -> None:
     assert result.problems == ()
 
 
-def test_a_pose_of_the_user_that_the_picture_contradicts_is_told(tmp_path: Path) -> None:
+def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported(tmp_path: Path) -> None:
     matrix = pixel_from_camera("90m")
     result = measured(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path, FiducialOptions(pose="0"))
     assert result.pose is not None
@@ -231,10 +231,10 @@ def test_a_mark_beyond_the_edge_is_absent(tmp_path: Path) -> None:
 def test_the_neighbouring_frames_marks_are_not_taken_for_this_frames(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0", turn_rad=0.0)
     grey = frame_picture(ALIKE, matrix, size=540)
-    beside = matrix.copy()
-    beside[0, 2] += 18.5 * PX_PER_MM
+    neighbour = matrix.copy()
+    neighbour[0, 2] += 18.5 * PX_PER_MM
     for place in CORNERS[1:3]:  # its left marks reach into this scan, brighter than our own
-        paint(grey, MarkShape(RING_CROSS), place, beside, 14000.0)
+        paint(grey, MarkShape(RING_CROSS), place, neighbour, 14000.0)
     result = measured(grey, ALIKE, tmp_path)
     assert_right(result, ALIKE, matrix)
 
@@ -289,7 +289,7 @@ def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> No
 @parametrize_with_studies(
     ("blot_dn", "said"), [(20000.0, "no candidate within"), (500.0, "the ground at its place is so dark")]
 )
-def test_a_missing_mark_is_said_to_be_hidden_only_where_its_ground_hides_it(
+def test_a_missing_mark_is_stated_to_be_hidden_only_where_its_ground_hides_it(
     blot_dn: float, said: str, tmp_path: Path
 ) -> None:
     """Nothing but the marks is dark in the scan, so that its darkest half per cent is lighter than they are."""

@@ -63,9 +63,9 @@ def test_all_four_corners_of_the_wild_frames(name: str) -> None:
     layout = square(WILD)
     with open_scan(SCANS / "aerial" / f"{name}.jpeg") as scan:
         result = measure_fiducials(scan, layout, scan.pitch_um)
-    given, seen = observations(result, layout)
-    assert len(seen) == 4
-    assert affine_rms_px(given, seen) < 0.8
+    given, observed = observations(result, layout)
+    assert len(observed) == 4
+    assert affine_rms_px(given, observed) < 0.8
     assert result.pose is not None
     assert result.pose.decided or "is assumed" in result.pose.evidence[0]
 
@@ -101,14 +101,14 @@ def test_the_crosses_of_a_reseau_on_a_landscape(number: int, steps: int) -> None
     within = np.all((places > first) & (places < first + np.array([shown.width_px, shown.height_px])), axis=1)
     indices, places, used = indices[within], places[within] - first, used[within]
     assert steps == 2 or len(places) == 9
-    given, seen = observations(result, layout)
-    distance = np.hypot(*np.moveaxis(places[:, None] - seen[None], -1, 0))
+    given, observed = observations(result, layout)
+    distance = np.hypot(*np.moveaxis(places[:, None] - observed[None], -1, 0))
     nearest = distance.argmin(axis=1)
-    assert len(seen) >= len(places)
+    assert len(observed) >= len(places)
     assert len(set(nearest.tolist())) == len(places)
     assert np.median(distance.min(axis=1)) < 0.5
-    assert affine_rms_px(given, seen) <= affine_rms_px(indices, places)
-    assert affine_rms_px(given[nearest[used]], seen[nearest[used]]) <= affine_rms_px(indices[used], places[used])
+    assert affine_rms_px(given, observed) <= affine_rms_px(indices, places)
+    assert affine_rms_px(given[nearest[used]], observed[nearest[used]]) <= affine_rms_px(indices[used], places[used])
 
 
 @pytest.mark.study
@@ -118,9 +118,9 @@ def test_a_nearly_black_frame_says_what_became_of_every_mark() -> None:
         result = measure_fiducials(scan, layout, (RESEAU_PITCH_UM, RESEAU_PITCH_UM))
     assert [mark.point for mark in result.marks] == [mark.id for mark in layout.marks]
     assert all(mark.reason or mark.status is Status.MEASURED for mark in result.marks)
-    given, seen = observations(result, layout)
-    assert len(seen) < 15  # the others lie in the dark
-    assert len(seen) < 4 or affine_rms_px(given, seen) < 1.0
+    given, observed = observations(result, layout)
+    assert len(observed) < 15  # the others lie in the dark
+    assert len(observed) < 4 or affine_rms_px(given, observed) < 1.0
 
 
 @pytest.mark.study
@@ -129,15 +129,15 @@ def test_handwriting_in_two_corners_is_not_taken_for_faint_crosses() -> None:
     layout = square(MarkShape(cross(1.75, 0.12, 0.25, 45.0), "light"))
     with open_scan(SCANS / "aerial" / "0cec8b13.jpeg") as scan:
         result = measure_fiducials(scan, layout, scan.pitch_um)
-    seen = observations(result, layout)[1]
+    observed = observations(result, layout)[1]
     crosses = np.array([(78.2, 83.9), (68.0, 1779.7), (1734.5, 103.0)])  # seen by a person
-    distance = np.hypot(*np.moveaxis(seen[:, None] - crosses[None], -1, 0))
-    assert len(seen) == 3
+    distance = np.hypot(*np.moveaxis(observed[:, None] - crosses[None], -1, 0))
+    assert len(observed) == 3
     assert distance.min(axis=0).max() < 1.0
 
 
 @pytest.mark.study
-def test_a_reseau_is_not_seen_in_a_frame_of_another_camera() -> None:
+def test_a_reseau_is_not_detected_in_a_frame_of_another_camera() -> None:
     with open_scan(SCANS / "aerial" / "0cec8b13.jpeg") as scan:
         result = measure_fiducials(scan, lattice(), (RESEAU_PITCH_UM, RESEAU_PITCH_UM))
     assert not any(mark.status.is_observation for mark in result.marks)

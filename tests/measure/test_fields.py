@@ -9,7 +9,7 @@ def line(text: str) -> Line:
     return Line({"0": Reading(text, 0.98, float(len(text)))}, "0", ((0.0, 0.0),) * 4, "top")
 
 
-def said(*texts: str) -> dict[str, str]:
+def read_fields(*texts: str) -> dict[str, str]:
     return {field.name: field.value for field in find_fields([line(text) for text in texts])}
 
 
@@ -50,18 +50,18 @@ def said(*texts: str) -> dict[str, str]:
     ],
 )
 def test_a_line_says(text: str, fields: dict[str, str]) -> None:
-    assert said(text) == fields
+    assert read_fields(text) == fields
 
 
 def test_the_frames_number_is_the_only_one_among_the_runs() -> None:
-    assert said("8601-8639", "8617", "RUN7", "14,000'")["frame"] == "8617"
-    assert said("5004-5024", "CAC145-5004")["frame"] == "5004"
-    assert "frame" not in said("157-191", "157", "AUS167")  # two of them
-    assert "frame" not in said("018-068", "44")  # not as they are written
-    assert "frame" not in said("157-191", "158-160", "157")  # two runs
+    assert read_fields("8601-8639", "8617", "RUN7", "14,000'")["frame"] == "8617"
+    assert read_fields("5004-5024", "CAC145-5004")["frame"] == "5004"
+    assert "frame" not in read_fields("157-191", "157", "AUS167")  # two of them
+    assert "frame" not in read_fields("018-068", "44")  # not as they are written
+    assert "frame" not in read_fields("157-191", "158-160", "157")  # two runs
 
 
-def test_plates_titles_and_the_films_own_name_are_told_apart() -> None:
+def test_plates_titles_and_the_films_own_name_are_distinguished() -> None:
     assert is_plate(line("Nr13043 152.75"))
     assert not is_plate(line("RUN 20"))
     assert signs(line("16.5.68")) == 1

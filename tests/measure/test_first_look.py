@@ -41,14 +41,14 @@ def test_a_soft_mark_that_hardly_stands_out_of_the_noise_is_measured() -> None:
         assert np.trace(fit.covariance_px2) < 1.5**2 * np.trace(mark.bound(0.2))
 
 
-def test_a_line_far_thinner_than_a_pixel_is_not_seen_in_noise_and_warns_of_nothing() -> None:
+def test_a_line_far_thinner_than_a_pixel_is_not_detected_in_noise_and_warns_of_nothing() -> None:
     mark = MarkShape(cross(1.5, 0.06), "dark")
     noise = np.random.default_rng(3).standard_normal((60, 60))
     place = np.array([[1.5, 0.0, 30.0], [0.0, -1.5, 30.0]])  # 0.67 mm a pixel
     assert localise(scan_of(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1)) is None
 
 
-def test_a_solid_mark_at_the_frames_border_is_seen_however_far_about_it_is_sought() -> None:
+def test_a_solid_mark_at_the_frames_border_is_visible_however_far_about_it_is_sought() -> None:
     """Its ground is that of the frame, not that of the border, of which the more is seen the smaller the window is."""
     rng, size, center = np.random.default_rng(4), 400, np.array([200.3, 199.6])
     block = MarkShape(polygon(((0.0, 0.0), (2.8, 0.0), (2.8, -1.4), (0.56, -1.4))), known_mm=((-9.0, -9.0), (1.9, 9.0)))
@@ -61,7 +61,7 @@ def test_a_solid_mark_at_the_frames_border_is_seen_however_far_about_it_is_sough
     scan = scan_of(light * ground + (1 - light) * border)
     for search_px in (5.0, 24.0):
         start = np.column_stack([place[:, :2], center + np.array([3.0, -2.0])])
-        look = localise(scan, MarkPrediction(block, start, search_px, -1))
-        assert look is not None
-        assert look[1] < 1e-3
-        assert np.hypot(*(look[0] - center)) < 6.0
+        observation = localise(scan, MarkPrediction(block, start, search_px, -1))
+        assert observation is not None
+        assert observation[1] < 1e-3
+        assert np.hypot(*(observation[0] - center)) < 6.0

@@ -46,14 +46,14 @@ def scanned(at_mm: float, is_notch: bool, blur_px: float = 0.9, landscape: float
     """A light frame with a wedge of its dark border, or a notch in it, on each side. landscape: by what share of itself
     its light varies, over some 6 px."""
     generator = np.random.default_rng(3)
-    light = light_of(at_mm, is_notch, blur_px)
+    light = light_profile(at_mm, is_notch, blur_px)
     noise = generator.normal(0, 400, light.shape)
     terrain = gaussian_filter(generator.normal(0, 1, light.shape), 6)
     return np.asarray(3000 + 20000 * light * (1 + landscape * terrain / terrain.std()) + noise)
 
 
 @cache
-def light_of(at_mm: float, is_notch: bool, blur_px: float) -> Array:
+def light_profile(at_mm: float, is_notch: bool, blur_px: float) -> Array:
     camera_from_pixel = np.linalg.inv(PIXEL_FROM_CAMERA[:, :2])
 
     def exposed(col: Array, row: Array) -> Array:
@@ -70,7 +70,7 @@ def light_of(at_mm: float, is_notch: bool, blur_px: float) -> Array:
     return drawn(exposed, 400, 400, blur_px, fineness=4)
 
 
-def measured(camera: FiducialLayout, picture: Array) -> list[Measured]:
+def measure_picture(camera: FiducialLayout, picture: Array) -> list[Measured]:
     """What is measured of the marks in it, none of them damaged or in doubt."""
     result = measure_fiducials(scan_of(picture), camera, (50.0, 50.0), FiducialOptions(pose="90"))
     found = []
@@ -98,14 +98,14 @@ def measured(camera: FiducialLayout, picture: Array) -> list[Measured]:
 def test_marks_at_the_border_are_measured_as_if_it_were_not_there(
     vertices: tuple[Point, ...], at_mm: float, is_notch: bool
 ) -> None:
-    for mark in measured(layout(vertices, at_mm), scanned(at_mm, is_notch)):
+    for mark in measure_picture(layout(vertices, at_mm), scanned(at_mm, is_notch)):
         assert mark.off_px < 0.1
         assert mark.chi2 < ONE_IN_8000
 
 
 @pytest.mark.study
 def test_the_border_of_a_soft_scan_reaches_farther_into_the_frame() -> None:
-    for mark in measured(layout(WEDGE_TO_EDGE, WEDGE_MM), scanned(WEDGE_MM, False, blur_px=1.8)):
+    for mark in measure_picture(layout(WEDGE_TO_EDGE, WEDGE_MM), scanned(WEDGE_MM, False, blur_px=1.8)):
         assert mark.off_px < 0.2
         assert mark.chi2 < ONE_IN_8000
 
@@ -113,7 +113,7 @@ def test_the_border_of_a_soft_scan_reaches_farther_into_the_frame() -> None:
 @pytest.mark.study
 def test_a_notch_claims_no_more_than_the_landscape_in_it_allows() -> None:
     camera = layout(NOTCH, HALF_MM)
-    even, uneven = (measured(camera, scanned(HALF_MM, True, 2.0, landscape)) for landscape in (0.0, 0.05))
+    even, uneven = (measure_picture(camera, scanned(HALF_MM, True, 2.0, landscape)) for landscape in (0.0, 0.05))
     assert max(mark.off_px for mark in uneven) > 3 * max(mark.sigma_px for mark in even)
     for mark in (*even, *uneven):
         assert mark.chi2 < ONE_IN_8000

@@ -81,7 +81,7 @@ def test_corners_of_the_frame_are_where_its_edges_meet(
     assert np.sqrt(np.mean(np.square(scores))) < 2.0
 
 
-def test_no_corner_is_seen_in_a_landscape(tmp_path: Path) -> None:
+def test_no_corner_is_visible_in_a_landscape(tmp_path: Path) -> None:
     land = 15000 + 3000 * gaussian_filter(np.random.default_rng(3).normal(0, 1, (400, 400)), 3.0) / 0.09
     start = np.column_stack([MATRIX[:, :2], (200.0, 200.0)])
     with written_scan(np.asarray(land), tmp_path) as scan:
@@ -98,23 +98,23 @@ def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> No
     scan = scan_of(65535 * (picture(4) / 65535) ** (1 / gamma))
     tone = Tone(power(gamma), covariance=np.eye(5))
 
-    def fitted(tone: Tone) -> MarkFit:
+    def fit_mark(tone: Tone) -> MarkFit:
         fit = fit_frame_corner(scan.replace_tone(tone), corner, start, 6.0, 1)
         assert fit.converged
         return fit
 
-    told = fitted(tone).tone
-    assert told is not None
+    estimate = fit_mark(tone).tone
+    assert estimate is not None
     for k in range(2):
-        more, less = (fitted(tone.replace_departures(way * 0.1 * np.eye(5)[k])).center_px for way in (1, -1))
-        np.testing.assert_allclose((more - less) / 0.2, told.on_place[:, k], atol=0.1)
-    assert np.hypot(*told.on_place[:, 0]) > 0.15
-    assert told.information.sum_of_squares < 25  # of 5 figures, by the true curve
-    assert fitted(Tone(power(gamma))).tone is None
+        more, less = (fit_mark(tone.replace_departures(way * 0.1 * np.eye(5)[k])).center_px for way in (1, -1))
+        np.testing.assert_allclose((more - less) / 0.2, estimate.on_place[:, k], atol=0.1)
+    assert np.hypot(*estimate.on_place[:, 0]) > 0.15
+    assert estimate.information.sum_of_squares < 25  # of 5 figures, by the true curve
+    assert fit_mark(Tone(power(gamma))).tone is None
 
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
-def test_the_frames_edges_beside_its_marks_tell_the_curve(gamma: float) -> None:
+def test_the_frames_edges_next_to_its_marks_tell_the_curve(gamma: float) -> None:
     wedge = MarkShape(polygon(((0.0, 0.0), (1.4, 0.7), (1.4, -0.7))))
     places = ((9.2, 0.0), (-9.2, 0.0), (0.0, 9.2), (0.0, -9.2))
     marks = FiducialLayout(
@@ -123,12 +123,12 @@ def test_the_frames_edges_beside_its_marks_tell_the_curve(gamma: float) -> None:
     scan = scan_of(65535 * (picture(5) / 65535) ** (1 / gamma))
     by_truth = Tone(power(gamma), covariance=np.eye(5))
     placement = Placement("0", MATRIX, 1.0, 4, 1, 1, (0.05, 0.05))
-    (said,) = edge_tone_information(scan.replace_tone(by_truth), marks, placement, None)
-    assert said.sum_of_squares < 25  # of 5 figures
+    (information,) = edge_tone_information(scan.replace_tone(by_truth), marks, placement, None)
+    assert information.sum_of_squares < 25  # of 5 figures
     other = by_truth.shift_to_power(gamma + 0.5)
-    (said,) = edge_tone_information(scan.replace_tone(other), marks, placement, None)
+    (information,) = edge_tone_information(scan.replace_tone(other), marks, placement, None)
     prior = Tone(power(gamma + 0.5), covariance=4 * np.eye(5))
-    found = prior.estimate([said]).tone
+    found = prior.estimate([information]).tone
     value, sigma = found.equivalent_power(0.2, 0.5)
     assert abs(value - gamma) < 3 * sigma
     assert sigma < 0.7 * prior.equivalent_power(0.2, 0.5)[1]

@@ -28,7 +28,9 @@ GROUND, CONTRAST, NOISE = 30000.0, 16000.0, 800.0  # 20 times the noise
 FAINT = (0, 3, 6)
 
 
-def frame_of(rng: np.random.Generator, blur_px: float, share: float) -> tuple[Frame, list[tuple[TrueMark, np.ndarray]]]:
+def make_frame(
+    rng: np.random.Generator, blur_px: float, share: float
+) -> tuple[Frame, list[tuple[TrueMark, np.ndarray]]]:
     """A frame of eight crosses with gaps, three of them with a share of the others' contrast: as it was measured, and
     each mark with its first pixel."""
     kind, middle = KIND["gap cross"], SIDE_PX / 2 + rng.uniform(-0.5, 0.5, 2)
@@ -50,7 +52,7 @@ def frame_of(rng: np.random.Generator, blur_px: float, share: float) -> tuple[Fr
 
 @pytest.mark.study
 def test_faint_marks_are_matched_with_the_others_blur() -> None:
-    frame, marks = frame_of(np.random.default_rng(3), 2.5, 0.25)
+    frame, marks = make_frame(np.random.default_rng(3), 2.5, 0.25)
     squares, to_bound = [], []
     for index in FAINT:
         fit, (mark, corner) = frame.detections[index].fit, marks[index]
@@ -65,7 +67,7 @@ def test_faint_marks_are_matched_with_the_others_blur() -> None:
 
 def test_a_faint_mark_in_plain_noise_is_measured_with_the_standard_deviation_that_it_has() -> None:
     """In white noise a claim of 0.2 px is one; on a landscape it knows of the noise in part."""
-    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
     detection = frame.detections[0]
     assert detection.fit is not None
     known = Covariance.from_noise(0.2**2 * np.eye(2))
@@ -76,7 +78,7 @@ def test_a_faint_mark_in_plain_noise_is_measured_with_the_standard_deviation_tha
 
 
 def test_what_all_marks_lack_alike_is_the_drawings_and_no_damage() -> None:
-    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
 
     def status(own: float, others: float) -> Status:
         detections = [
@@ -92,7 +94,7 @@ def test_what_all_marks_lack_alike_is_the_drawings_and_no_damage() -> None:
 
 
 def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause() -> None:
-    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
     before, added = frame.detections[2].fit, np.array([[4e-3, 1e-3], [1e-3, 2e-3]])
     assert before is not None
     widened = frame.add_covariance(2, Cause.TOUCHED, added).add_covariance(2, Cause.TOUCHED, added)
@@ -103,7 +105,7 @@ def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause() -> None
 
 
 def test_a_mark_whose_place_hangs_on_a_remnant_is_weak_however_little_of_it_is_damaged() -> None:
-    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
     detection = frame.detections[0]
     assert detection.fit is not None
     for lost, status in ((0.5, Status.MEASURED), (0.95, Status.WEAK)):
@@ -111,8 +113,8 @@ def test_a_mark_whose_place_hangs_on_a_remnant_is_weak_however_little_of_it_is_d
         assert replace(frame, detections=(one, *frame.detections[1:])).verdict(0)[0] is status
 
 
-def test_a_frame_in_which_marks_lie_as_they_should_but_look_unlike_their_drawings_says_so() -> None:
-    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+def test_a_frame_in_which_marks_lie_as_they_should_but_differ_from_their_drawings_says_so() -> None:
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
     assert frame.accepted
     unlike = [
         replace(detection, fit=replace(detection.fit, likeness=0.4)) if detection.fit and number > 1 else detection
@@ -126,7 +128,7 @@ def test_a_frame_in_which_marks_lie_as_they_should_but_look_unlike_their_drawing
 
 
 def test_a_frame_whose_marks_do_not_converge_says_so_and_not_that_camera_and_pitch_are_wrong() -> None:
-    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
     failed = [replace(each, fit=None, reason=UNSETTLED) for each in frame.detections[2:]]
     refused = orient_frame(replace(frame, detections=(*frame.detections[:2], *failed)))
     assert refused.may_settle
@@ -145,7 +147,7 @@ def test_a_frame_whose_marks_do_not_converge_says_so_and_not_that_camera_and_pit
 def test_a_contrast_within_that_of_the_texture_is_plain_where_all_of_the_mark_tells_it(
     significance: float, status: Status
 ) -> None:
-    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
     fit = frame.detections[0].fit
     assert fit is not None
     on_texture = replace(fit, noise_dn=abs(fit.contrast_dn) / 2.0, significance=significance)

@@ -49,7 +49,7 @@ def test_the_autocorrelations_are_those_of_noise_smeared_by_gaussians() -> None:
 
 
 @pytest.mark.parametrize(("grain_px", "is_grain"), [(1.5, True), (2.8, False)])
-def test_coarse_grain_is_told_from_a_landscape(grain_px: float, is_grain: bool) -> None:
+def test_coarse_grain_is_distinguished_from_a_landscape(grain_px: float, is_grain: bool) -> None:
     """By how alike neighbours are: in noise smeared by a Gaussian of s px by exp(-1 / (4 s²)); 1.8 px is film's end.
     Nine directions of a fit take little of what is so coarse in a window so wide."""
     rng = np.random.default_rng(4)

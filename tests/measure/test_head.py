@@ -76,7 +76,7 @@ def test_no_picture_is_decoded_for_its_head(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("name", ["a.tif", "a.jpg", "a.png"])
-def test_a_file_that_is_cut_short_is_told_by_its_head_and_its_end(name: str, tmp_path: Path) -> None:
+def test_a_file_that_is_cut_short_is_known_by_its_head_and_its_end(name: str, tmp_path: Path) -> None:
     path = written(tmp_path / name, GREY)
     data = path.read_bytes()
     for length in (len(data) - 200, 30, 3):

@@ -22,13 +22,13 @@ EIGHT = [(106.0 * x, 106.0 * y) for x in (-1, 0, 1) for y in (-1, 0, 1) if (x, y
 FOUR = [(x, y) for x, y in EIGHT if x and y]
 
 
-def layout_of(places: list[tuple[float, float]], sigma_mm: float = 0.005) -> FiducialLayout:
+def make_layout(places: list[tuple[float, float]], sigma_mm: float = 0.005) -> FiducialLayout:
     shape = MarkShape(cross(1.0, 0.1))
     marks = [LayoutMark(str(k), place, (sigma_mm, sigma_mm), shape) for k, place in enumerate(places)]
     return FiducialLayout(tuple(marks), (228.0, 228.0))
 
 
-def frames_of(
+def make_frames(
     layout: FiducialLayout,
     count: int,
     rng: np.random.Generator,
@@ -66,7 +66,7 @@ def checked_together(frames: list[FrameMeasurement], layout: FiducialLayout) -> 
     return check_frames(frames, layout, [(1000 / PX_PER_MM, 1000 / PX_PER_MM)] * len(frames)).frames
 
 
-def moved(frame: FrameMeasurement, mark: int, by_px: tuple[float, float]) -> FrameMeasurement:
+def shift_mark(frame: FrameMeasurement, mark: int, by_px: tuple[float, float]) -> FrameMeasurement:
     marks = list(frame.marks)
     old = marks[mark]
     marks[mark] = MarkMeasurement(
@@ -83,8 +83,8 @@ def weak(frames: tuple[FrameMeasurement, ...]) -> set[tuple[str, str]]:
 def test_good_marks_are_doubted_no_more_often_than_stated() -> None:
     """Two tests of one per cent each: of 40 cameras one may lose a mark, whatever their marks' true places."""
     rng = np.random.default_rng(1)
-    layout = layout_of(EIGHT, sigma_mm=1.0)
-    lost = sum(bool(weak(checked_together(frames_of(layout, 4, rng, camera_mm=0.01), layout))) for _ in range(40))
+    layout = make_layout(EIGHT, sigma_mm=1.0)
+    lost = sum(bool(weak(checked_together(make_frames(layout, 4, rng, camera_mm=0.01), layout))) for _ in range(40))
     assert lost <= 4  # 0.8 are expected at most, more than 4 in one run of 700
 
 
@@ -92,16 +92,16 @@ def test_good_marks_are_doubted_no_more_often_than_stated() -> None:
 def test_good_marks_of_a_frame_of_less_noise_than_the_others_are_not_doubted() -> None:
     """What the others' noise does to their median is no fault of that frame, on film that does not scatter."""
     rng = np.random.default_rng(6)
-    layout, sigmas_px = layout_of(EIGHT, sigma_mm=1.0), (0.01, 0.05, 0.05, 0.05)
-    cameras = [frames_of(layout, 4, rng, sigmas_px=sigmas_px, film_mm=0.0) for _ in range(40)]
+    layout, sigmas_px = make_layout(EIGHT, sigma_mm=1.0), (0.01, 0.05, 0.05, 0.05)
+    cameras = [make_frames(layout, 4, rng, sigmas_px=sigmas_px, film_mm=0.0) for _ in range(40)]
     assert sum(bool(weak(checked_together(frames, layout))) for frames in cameras) <= 2
 
 
 def test_a_mark_that_only_one_frame_has_elsewhere_is_weak() -> None:
     rng = np.random.default_rng(2)
-    layout = layout_of(EIGHT, sigma_mm=1.0)
-    frames = frames_of(layout, 5, rng, camera_mm=0.05)
-    frames[3] = moved(frames[3], 2, (1.5, -1.5))
+    layout = make_layout(EIGHT, sigma_mm=1.0)
+    frames = make_frames(layout, 5, rng, camera_mm=0.05)
+    frames[3] = shift_mark(frames[3], 2, (1.5, -1.5))
     checked = checked_together(frames, layout)
     assert weak(checked) == {("3", "2")}
     mark = checked[3].marks[2]
@@ -114,11 +114,11 @@ def test_a_mark_that_only_one_frame_has_elsewhere_is_weak() -> None:
 def test_a_mark_ten_standard_deviations_off_is_mostly_found_in_six_frames() -> None:
     """A distance of ten standard deviations of a coordinate, film included."""
     rng = np.random.default_rng(3)
-    layout, found = layout_of(EIGHT, sigma_mm=1.0), 0
+    layout, found = make_layout(EIGHT, sigma_mm=1.0), 0
     for camera in range(12):
-        frames, mark, angle = frames_of(layout, 6, rng, camera_mm=0.01), camera % 8, rng.uniform(0.0, 2 * np.pi)
+        frames, mark, angle = make_frames(layout, 6, rng, camera_mm=0.01), camera % 8, rng.uniform(0.0, 2 * np.pi)
         off = 10 * np.hypot(SIGMA_PX, FILM_MM * PX_PER_MM)
-        frames[4] = moved(frames[4], mark, (off * np.cos(angle), off * np.sin(angle)))
+        frames[4] = shift_mark(frames[4], mark, (off * np.cos(angle), off * np.sin(angle)))
         found += weak(checked_together(frames, layout)) == {("4", str(mark))}
     assert found >= 6
 
@@ -126,9 +126,9 @@ def test_a_mark_ten_standard_deviations_off_is_mostly_found_in_six_frames() -> N
 def test_of_four_marks_it_is_the_frame_that_does_not_fit() -> None:
     """A mark of four may be off, or film bent: the frame says so, and each of its marks is weak, for it may be that."""
     rng = np.random.default_rng(3)
-    layout = layout_of(FOUR, sigma_mm=1.0)
-    frames = frames_of(layout, 5, rng)
-    frames[1] = moved(frames[1], 0, (4.0, 4.0))
+    layout = make_layout(FOUR, sigma_mm=1.0)
+    frames = make_frames(layout, 5, rng)
+    frames[1] = shift_mark(frames[1], 0, (4.0, 4.0))
     result = check_frames(frames, layout, [(20.0, 20.0)] * 5)
     assert weak(result.frames) == {("1", mark.point) for mark in result.frames[1].marks}
     assert [len(frame.problems) for frame in result.frames] == [0, 1, 0, 0, 0]
@@ -146,10 +146,10 @@ def test_of_four_marks_it_is_the_frame_that_does_not_fit() -> None:
 
 def test_one_frame_names_the_mark_that_alone_is_off() -> None:
     rng = np.random.default_rng(4)
-    layout = layout_of(EIGHT)
-    (frame,) = frames_of(layout, 1, rng)
+    layout = make_layout(EIGHT)
+    (frame,) = make_frames(layout, 1, rng)
     assert weak(checked_together([frame], layout)) == set()
-    checked = checked_together([moved(frame, 1, (3.0, 0.0))], layout)
+    checked = checked_together([shift_mark(frame, 1, (3.0, 0.0))], layout)
     assert weak(checked) == {("0", "1")}
     assert "from where the other marks have it" in checked[0].marks[1].reason
     known = checked[0].marks[1].covariance
@@ -159,18 +159,18 @@ def test_one_frame_names_the_mark_that_alone_is_off() -> None:
 
 def test_the_projects_film_decides_how_far_off_a_mark_may_be() -> None:
     rng = np.random.default_rng(4)
-    layout = layout_of(EIGHT)
-    (frame,) = frames_of(layout, 1, rng)
-    bent = moved(frame, 1, (3.0, 0.0))
+    layout = make_layout(EIGHT)
+    (frame,) = make_frames(layout, 1, rng)
+    bent = shift_mark(frame, 1, (3.0, 0.0))
     pitches = [(1000 / PX_PER_MM, 1000 / PX_PER_MM)]
     assert weak(check_frames([bent], layout, pitches, BelievedFilm(0.04)).frames) == set()
 
 
 @pytest.mark.parametrize("count", [1, 4])
 def test_a_bent_frame_is_a_problem_of_the_frame(count: int) -> None:
-    rng, layout = np.random.default_rng(7), layout_of(EIGHT)
-    frames = frames_of(layout, count, rng)
-    frames[0] = frames_of(layout, 1, rng, film_mm=0.08)[0]
+    rng, layout = np.random.default_rng(7), make_layout(EIGHT)
+    frames = make_frames(layout, count, rng)
+    frames[0] = make_frames(layout, 1, rng, film_mm=0.08)[0]
     result = check_frames(frames, layout, [(20.0, 20.0)] * count)
     assert weak(result.frames) == set()
     assert [len(frame.problems) for frame in result.frames] == [1] + [0] * (count - 1)
@@ -180,8 +180,8 @@ def test_a_bent_frame_is_a_problem_of_the_frame(count: int) -> None:
 
 @pytest.mark.parametrize(("places", "count"), [(FOUR, 1), (FOUR, 3), (EIGHT, 2), (EIGHT, 6)])
 def test_given_coordinates_that_all_frames_contradict(places: list[tuple[float, float]], count: int) -> None:
-    rng, layout = np.random.default_rng(8), layout_of(places)
-    result = check_frames(frames_of(layout, count, rng, camera_mm=0.4), layout, [(20.0, 20.0)] * count)
+    rng, layout = np.random.default_rng(8), make_layout(places)
+    result = check_frames(make_frames(layout, count, rng, camera_mm=0.4), layout, [(20.0, 20.0)] * count)
     assert bool(weak(result.frames)) == (len(places) == 4 and count == 1)  # one of four may be wrong instead
     for frame in result.frames:
         (problem,) = frame.problems
@@ -192,27 +192,27 @@ def test_given_coordinates_that_all_frames_contradict(places: list[tuple[float, 
 
 
 def test_what_is_alike_in_scan_axes_is_the_scanners() -> None:
-    rng, layout = np.random.default_rng(9), layout_of(EIGHT)
-    frames = frames_of(layout, 8, rng, poses=("0", "90", "180", "270m"), scanner_mm=0.06)
+    rng, layout = np.random.default_rng(9), make_layout(EIGHT)
+    frames = make_frames(layout, 8, rng, poses=("0", "90", "180", "270m"), scanner_mm=0.06)
     result = check_frames(frames, layout, [(20.0, 20.0)] * 8)
     assert weak(result.frames) == set()
     assert all("scanner's axes" in frame.problems[0] and len(frame.problems) == 1 for frame in result.frames)
-    alike = check_frames(frames_of(layout, 8, rng, scanner_mm=0.06), layout, [(20.0, 20.0)] * 8).frames
+    alike = check_frames(make_frames(layout, 8, rng, scanner_mm=0.06), layout, [(20.0, 20.0)] * 8).frames
     assert all("The scanner may do the same" in frame.problems[0] for frame in alike)
-    turned = frames_of(layout, 8, rng, camera_mm=0.05, poses=("0", "90", "180", "270m"))
+    turned = make_frames(layout, 8, rng, camera_mm=0.05, poses=("0", "90", "180", "270m"))
     of_places = check_frames(turned, layout, [(20.0, 20.0)] * 8).frames
     assert all("given coordinates" in frame.problems[0] and "scanner" not in frame.problems[0] for frame in of_places)
 
 
 def test_ordinary_frames_have_no_problem() -> None:
     """One camera in a hundred has one, by each of the tests."""
-    rng, told = np.random.default_rng(10), 0
+    rng, own_result = np.random.default_rng(10), 0
     for number in range(60):
-        layout = layout_of(FOUR if number % 2 else EIGHT)
-        frames = frames_of(layout, 1 + number % 4, rng, camera_mm=0.005, film_mm=0.005, poses=("0", "90m"))
+        layout = make_layout(FOUR if number % 2 else EIGHT)
+        frames = make_frames(layout, 1 + number % 4, rng, camera_mm=0.005, film_mm=0.005, poses=("0", "90m"))
         result = check_frames(frames, layout, [(20.0, 20.0)] * len(frames))
-        told += any(frame.problems for frame in result.frames) or bool(weak(result.frames))
-    assert told <= 3
+        own_result += any(frame.problems for frame in result.frames) or bool(weak(result.frames))
+    assert own_result <= 3
 
 
 @pytest.mark.parametrize("places", [FOUR, EIGHT])
@@ -222,9 +222,11 @@ def test_no_problem_names_a_mark_as_wrong_that_is_measured(places: list[tuple[fl
     their status, and a measured mark is blamed by none."""
     rng, blamed, problems = np.random.default_rng(12), 0, 0
     for off_px, film_mm, camera_mm in [(4.0, 0.005, 0.0), (0.0, 0.08, 0.0), (0.0, 0.005, 0.3), (30.0, 0.02, 0.0)]:
-        layout = layout_of(places)
-        frames = frames_of(layout, count, rng, camera_mm=camera_mm)
-        frames[0] = moved(frames_of(layout, 1, rng, film_mm=film_mm, camera_mm=camera_mm)[0], 1, (off_px, -off_px))
+        layout = make_layout(places)
+        frames = make_frames(layout, count, rng, camera_mm=camera_mm)
+        frames[0] = shift_mark(
+            make_frames(layout, 1, rng, film_mm=film_mm, camera_mm=camera_mm)[0], 1, (off_px, -off_px)
+        )
         for frame in checked_together(frames, layout):
             measured = {mark.point for mark in frame.marks if mark.status is Status.MEASURED}
             for problem in frame.problems:
@@ -239,15 +241,15 @@ def test_no_problem_names_a_mark_as_wrong_that_is_measured(places: list[tuple[fl
 
 
 def test_judging_does_not_depend_on_the_order_of_frames() -> None:
-    rng, layout = np.random.default_rng(11), layout_of(EIGHT)
-    frames = frames_of(layout, 5, rng, camera_mm=0.02)
-    frames[2] = moved(frames[2], 3, (2.0, 1.0))
+    rng, layout = np.random.default_rng(11), make_layout(EIGHT)
+    frames = make_frames(layout, 5, rng, camera_mm=0.02)
+    frames[2] = shift_mark(frames[2], 3, (2.0, 1.0))
     one, other = (check_frames(order, layout, [(20.0, 20.0)] * 5).frames for order in (frames, frames[::-1]))
     assert weak(one) == weak(other) == {("2", "3")}
     assert [frame.problems for frame in one] == [frame.problems for frame in other[::-1]]
 
 
-def with_edges(frame: FrameMeasurement, sigmas: Sequence[float], off_px: float = 0.1) -> FrameMeasurement:
+def add_edges(frame: FrameMeasurement, sigmas: Sequence[float], off_px: float = 0.1) -> FrameMeasurement:
     """The frame with second places of its marks, so many standard deviations and off_px from the matched ones."""
     marks = [
         replace(
@@ -264,29 +266,29 @@ def second_method_px(frame: FrameMeasurement) -> list[float]:
 
 
 def test_a_mark_whose_edges_alone_put_it_elsewhere_is_weak() -> None:
-    layout = layout_of(EIGHT)
-    (frame,) = frames_of(layout, 1, np.random.default_rng(5))
-    checked = checked_together([with_edges(frame, (0.3, 1.0, 2.0, 0.7, 1.5, 9.0, 1.0, 2.0))], layout)
+    layout = make_layout(EIGHT)
+    (frame,) = make_frames(layout, 1, np.random.default_rng(5))
+    checked = checked_together([add_edges(frame, (0.3, 1.0, 2.0, 0.7, 1.5, 9.0, 1.0, 2.0))], layout)
     assert weak(checked) == {("0", "5")}
     assert "its edges put it 0.10 px elsewhere" in checked[0].marks[5].reason
 
 
 def test_where_edges_put_all_marks_elsewhere_their_drawing_is_not_true_and_none_is_weak() -> None:
     """What noise does not explain makes a mark less well known; weak only where it may be half a pixel off."""
-    layout = layout_of(EIGHT)
-    (frame,) = frames_of(layout, 1, np.random.default_rng(5))
+    layout = make_layout(EIGHT)
+    (frame,) = make_frames(layout, 1, np.random.default_rng(5))
     sigmas = (3.0, 4.0, 5.0, 4.5, 3.9, 6.0, 4.2, 1.0)
-    (checked,) = checked_together([with_edges(frame, sigmas)], layout)
+    (checked,) = checked_together([add_edges(frame, sigmas)], layout)
     assert weak((checked,)) == set()
     np.testing.assert_allclose(second_method_px(checked), [0.0] + [0.1 / np.sqrt(2)] * 6 + [0.0])
-    assert len(weak(checked_together([with_edges(frame, sigmas, 0.3)], layout))) == 6
+    assert len(weak(checked_together([add_edges(frame, sigmas, 0.3)], layout))) == 6
 
 
 def test_good_marks_differ_by_their_edges_no_more_often_than_stated() -> None:
-    rng, layout = np.random.default_rng(8), layout_of(FOUR)
-    (frame,) = frames_of(layout, 1, rng)
+    rng, layout = np.random.default_rng(8), make_layout(FOUR)
+    (frame,) = make_frames(layout, 1, rng)
     lost = sum(
-        bool(weak(checked_together([with_edges(frame, np.sqrt(rng.chisquare(2, 4)).tolist())], layout)))
+        bool(weak(checked_together([add_edges(frame, np.sqrt(rng.chisquare(2, 4)).tolist())], layout)))
         for _ in range(200)
     )
     assert lost <= 6  # two are expected at most

@@ -42,7 +42,7 @@ def pictures(
     return chips, true
 
 
-def measured(chips: list[Chip], options: MatchOptions = SHIFT) -> tuple[Array, Array]:
+def measure_picture(chips: list[Chip], options: MatchOptions = SHIFT) -> tuple[Array, Array]:
     """Places (n, 2) and standard deviations (n, 2) with the template that the chips give."""
     template = learn_template(chips, SIZE_MM)
     fits = [match(ScanWindow(chip.grey), template, chip.pixel_from_mark, options) for chip in chips]
@@ -55,7 +55,7 @@ def test_a_learned_template_measures_as_its_standard_deviations_say() -> None:
     scores = []
     for seed in (1, 2):
         chips, true = pictures(6, seed)
-        places, sigma = measured(chips)
+        places, sigma = measure_picture(chips)
         off = places - true
         scores.append((off - off.mean(axis=0)) / sigma / np.sqrt(1 - 1 / 6))
         assert sigma.max() < 0.04
@@ -69,7 +69,7 @@ def test_pictures_of_unlike_blur_show_an_unsymmetric_mark_at_one_place() -> None
     scores = []
     for seed, blurs in ((1, (0.7, 2.0, 1.8, 1.9, 1.7)), (2, (1.9, 3.0, 1.1, 0.7, 0.8))):
         chips, true = pictures(5, seed, blurs=blurs, scale=2)
-        places, sigma = measured(chips, MatchOptions(freedom="shift"))
+        places, sigma = measure_picture(chips, MatchOptions(freedom="shift"))
         off = places - true
         off -= off.mean(axis=0)
         assert np.abs(off).max() < 0.05
@@ -83,7 +83,7 @@ def test_noise_in_the_template_is_not_taken_for_slopes_of_the_mark() -> None:
     scores = []
     for seed in range(2):
         chips, true = pictures(5, seed, scale=2, noise_dn=10 * NOISE_DN)
-        places, sigma = measured(chips)
+        places, sigma = measure_picture(chips)
         off = places - true
         scores.append((off - off.mean(axis=0)) / sigma / np.sqrt(1 - 1 / 5))
     assert 0.7 < float(np.sqrt(np.mean(np.square(scores)))) < 1.65
@@ -127,16 +127,16 @@ def test_what_recurs_is_found_among_what_changes() -> None:
     assert recurrence(windows[0], [rng.normal(0, 1, (73, 73)).astype(np.float32)] * 3, 2.4).excess < 0.15
 
 
-def test_a_corner_of_the_border_beside_a_lighter_landscape_is_known_less_surely() -> None:
+def test_a_corner_of_the_border_next_to_a_lighter_landscape_is_known_less_surely() -> None:
     """Learned beside a landscape of 150, seen beside one of 230, each rough in its own way, whose glow on the border
     does not grow with it: both edges seem to lie elsewhere, as the standard deviations have to say."""
     rng = np.random.default_rng(6)
     template = learn_template([corner(rng, 150.0, 30 + rng.uniform(-0.5, 0.5, 2)) for _ in range(3)], SIZE_MM)
     errors = []
     for place in 30 + rng.uniform(-0.5, 0.5, (4, 2)):
-        seen = corner(rng, 230.0, place)
-        start = np.column_stack([seen.pixel_from_mark[:, :2], np.rint(place)])
-        fit = match(ScanWindow(seen.grey), template, start, MatchOptions(freedom="shift"))
+        view = corner(rng, 230.0, place)
+        start = np.column_stack([view.pixel_from_mark[:, :2], np.rint(place)])
+        fit = match(ScanWindow(view.grey), template, start, MatchOptions(freedom="shift"))
         error = fit.center_px - place
         assert fit.converged
         errors.append(error)

@@ -25,11 +25,11 @@ def fits(seen_px: Any, sigmas: Any) -> list[Any]:
 
 
 def test_a_faint_mark_gets_the_blur_of_the_others_and_those_need_none() -> None:
-    told = shared_blurs(fits([1.2, 1.2, 1.21, 1.19, 0.95], [0.01, 0.01, 0.02, 0.02, 0.2]))
-    assert told[:4] == [None] * 4
-    assert told[4] is not None
-    assert np.hypot(told[4].blur_px, np.sqrt(PIXEL)) == pytest.approx(1.2, rel=0.01)
-    assert not told[4].differs
+    shared = shared_blurs(fits([1.2, 1.2, 1.21, 1.19, 0.95], [0.01, 0.01, 0.02, 0.02, 0.2]))
+    assert shared[:4] == [None] * 4
+    assert shared[4] is not None
+    assert np.hypot(shared[4].blur_px, np.sqrt(PIXEL)) == pytest.approx(1.2, rel=0.01)
+    assert not shared[4].differs
 
 
 def test_marks_of_one_blur_are_rarely_doubted_and_another_blur_is() -> None:
@@ -40,8 +40,8 @@ def test_marks_of_one_blur_are_rarely_doubted_and_another_blur_is() -> None:
         own = 1.1 * np.exp(rng.normal(0, np.hypot(sigmas, 0.05)))
         doubted += any(each is not None and each.differs for each in shared_blurs(fits(own, sigmas)))
         own[0], sigmas[0] = 0.6, 0.08
-        told = shared_blurs(fits(own, sigmas))[0]
-        found += told is not None and told.differs
+        shared = shared_blurs(fits(own, sigmas))[0]
+        found += shared is not None and shared.differs
     assert doubted <= 12  # 1 in 100, and more for how much they differ is an estimate itself
     assert found > 270
 
@@ -52,9 +52,9 @@ def test_how_much_blurs_differ_from_mark_to_mark_comes_out_as_it_was_drawn() -> 
     sigmas = np.array([0.03, 0.05, 0.08, 0.12, 0.2, 0.2, 0.1])
     for _ in range(400):
         own = 1.1 * np.exp(rng.normal(0, np.hypot(sigmas, between)))
-        told = shared_blurs(fits(np.append(own, 1.1), [*sigmas, 0.3]))[-1]
-        assert told is not None
-        squares.append(told.sigma**2)
+        shared = shared_blurs(fits(np.append(own, 1.1), [*sigmas, 0.3]))[-1]
+        assert shared is not None
+        squares.append(shared.sigma**2)
     of_mean = 1 / np.sum(1 / (sigmas**2 + between**2 + 0.05**2))
     expected = between**2 + 0.05**2 + of_mean
     assert np.mean(squares) == pytest.approx(expected, rel=0.08)
@@ -62,16 +62,16 @@ def test_how_much_blurs_differ_from_mark_to_mark_comes_out_as_it_was_drawn() -> 
 
 def test_a_match_with_the_others_blur_rarely_contradicts_it_unless_its_own_is_another() -> None:
     rng, others_sigma, own_sigma = np.random.default_rng(3), 0.06, 0.1
-    told, weight = SharedBlur(np.sqrt(1.1**2 - PIXEL), others_sigma, False), others_sigma**2 / (0.06**2 + 0.1**2)
+    result, weight = SharedBlur(np.sqrt(1.1**2 - PIXEL), others_sigma, False), others_sigma**2 / (0.06**2 + 0.1**2)
     sigma = others_sigma * np.sqrt(1 - weight)  # of the weighted mean of both
     good = 1.1 * np.exp(weight * rng.normal(0, np.hypot(others_sigma, own_sigma), 2000))
     other = 1.1 * np.exp(weight * rng.normal(np.log(0.6), own_sigma, 2000))
     contradicted, found = (
-        sum(not told.is_confirmed(fit) for fit in fits(seen, [sigma] * len(seen))) for seen in (good, other)
+        sum(not result.is_confirmed(fit) for fit in fits(view, [sigma] * len(view))) for view in (good, other)
     )
     assert 8 <= contradicted <= 34  # 1 in 100
     assert found > 1800
-    assert not told.is_confirmed(fits([1.1], [np.inf])[0])
+    assert not result.is_confirmed(fits([1.1], [np.inf])[0])
 
 
 def test_too_few_marks_tell_nothing() -> None:
@@ -84,8 +84,8 @@ def test_marks_of_one_size_are_rarely_doubted_and_another_size_is() -> None:
     for _ in range(300):
         sigmas = rng.uniform(0.005, 0.05, 5)
         sizes = 1.08 * np.exp(rng.normal(0, np.hypot(sigmas, 0.014)))  # of all alike: the drawing's fault
-        told = shared_shapes(*sized(sizes, sigmas))
-        doubted += any(size is not None and size.differs for size in told)
+        shared = shared_shapes(*sized(sizes, sigmas))
+        doubted += any(size is not None and size.differs for size in shared)
         sizes[0], sigmas[0] = 0.85, 0.02
         odd = shared_shapes(*sized(sizes, sigmas))[0]
         found += odd is not None and odd.differs and abs(np.exp(odd.off[0]) - 0.79) < 0.08
@@ -117,7 +117,7 @@ def touch(ratio: float, sigma: float, radius_px: float, px_per_mm: float = 36.0)
 
 
 @pytest.mark.parametrize(("radius_px", "pitch_um"), [(5.0, 60.0), (50.0, 20.0), (150.0, 7.0)])
-def test_a_speck_is_no_larger_beside_a_large_mark(radius_px: float, pitch_um: float) -> None:
+def test_a_speck_is_no_larger_next_to_a_large_mark(radius_px: float, pitch_um: float) -> None:
     """A mark of a fine scan, as large as all others, is known no worse for what might touch it."""
     for off in (-1.0, 0.0, 1.0):
         one = touch(1 + 0.007 * off, 0.007, radius_px, 1000 / pitch_um)
@@ -149,7 +149,7 @@ def sized(sizes: Any, sigmas: Any) -> tuple[Any, Any]:
     return np.log(sizes)[:, None], np.asarray(sigmas)[:, None]
 
 
-def test_a_mark_with_another_shape_than_the_others_is_told_apart() -> None:
+def test_a_mark_with_another_shape_than_the_others_is_distinguished() -> None:
     rng, found, doubted = np.random.default_rng(7), 0, 0
     for _ in range(100):
         sigmas = rng.uniform(0.002, 0.01, (8, 2))

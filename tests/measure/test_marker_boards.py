@@ -13,9 +13,9 @@ from drawn_boards import (
     charuco_picture,
     errors_px,
     mapped,
-    picture_of,
     printed,
-    truth_of,
+    read_truth,
+    take_picture,
 )
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
@@ -42,9 +42,9 @@ def test_trap_charuco_corners_shifted_by_half_a_pixel(turn_deg: float) -> None:
     drawing = cv2.aruco.CharucoBoard((6, 5), 32.0, 24.0, aruco_dictionary("4X4_50"))
     homography = board_from_pixel(turn_deg, 2e-4)
     corner = np.array([-32.0, 4 * 32.0])
-    picture = picture_of(spec, homography, printed(drawing, spec, (192, 160), corner))
+    picture = take_picture(spec, homography, printed(drawing, spec, (192, 160), corner))
     board = measure_board(scan_of(picture), spec)
-    errors = errors_px(board, truth_of(spec, homography))
+    errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) >= 16
     assert np.abs(errors).max() < 0.06
     assert np.abs(errors.mean(axis=0)).max() < 0.01
@@ -56,7 +56,7 @@ def test_trap_charuco_corners_of_the_older_layout_have_their_neighbours_names() 
     homography = board_from_pixel(5.0, 2e-4) * np.array([[1.2], [1.2], [1.0]])
     picture = charuco_picture(OLDER, homography)
     board = measure_board(scan_of(picture), replace(OLDER, legacy=None))
-    errors = errors_px(board, truth_of(OLDER, homography))
+    errors = errors_px(board, read_truth(OLDER, homography))
     assert len(errors) >= 20
     assert np.abs(errors).max() < 0.06
     refused = measure_board(scan_of(picture), replace(OLDER, legacy=False))
@@ -72,18 +72,18 @@ def test_charuco_numbers_that_begin_later() -> None:
     homography = board_from_pixel(4.0, 2e-4)
     picture = charuco_picture(spec, homography)
     board = measure_board(scan_of(picture), spec)
-    errors = errors_px(board, truth_of(spec, homography))
+    errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) >= 16
     assert np.abs(errors).max() < 0.06
     assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=0)).reason
     assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=30)).reason
 
 
-def test_a_charuco_corner_is_held_against_the_markers_beside_it() -> None:
+def test_a_charuco_corner_is_held_against_the_markers_next_to_it() -> None:
     """One a square off, as another crossing would be, is named; where no marker beside it was read, nothing tells."""
     spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
     homography = board_from_pixel(3.0, 1e-4)
-    points, truth = spec.object_points(), truth_of(spec, homography)
+    points, truth = spec.object_points(), read_truth(spec, homography)
     outline = np.array([(-12.0, 12.0), (12.0, 12.0), (12.0, -12.0), (-12.0, -12.0)])
     middle = np.mean([point[:2] for point in points.values()], axis=0)
     marker = outline + np.array(points["c2"][:2]) - middle + 16.0  # in the square between c2 and c3
@@ -99,9 +99,9 @@ def test_aruco_and_apriltag_corners(dictionary: str) -> None:
     spec = ArucoSpec(dictionary, 3, 2, 63.0, 21.0, first_marker=7)
     drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary(dictionary), np.arange(7, 13))
     homography = board_from_pixel(4.0, 1e-4)
-    picture = picture_of(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
+    picture = take_picture(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
     board = measure_board(scan_of(picture), spec)
-    errors = errors_px(board, truth_of(spec, homography))
+    errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) == 24
     assert np.sqrt(np.mean(errors**2)) < 0.03
 
@@ -110,9 +110,9 @@ def test_aruco_and_apriltag_corners(dictionary: str) -> None:
 def test_a_grid_of_april_tags_has_its_corners_at_the_junctions(turn_deg: float, quarter_turns: int) -> None:
     """Counted from the lower left, however each tag is turned; two modules of border, squares at all corners."""
     homography = board_from_pixel(turn_deg, 1e-4)
-    picture = picture_of(APRIL_GRID, homography, april_grid_dark(APRIL_GRID, quarter_turns))
+    picture = take_picture(APRIL_GRID, homography, april_grid_dark(APRIL_GRID, quarter_turns))
     board = measure_board(scan_of(picture), APRIL_GRID)
-    errors = errors_px(board, truth_of(APRIL_GRID, homography))
+    errors = errors_px(board, read_truth(APRIL_GRID, homography))
     assert len(errors) == 24
     assert np.sqrt(np.mean(errors**2)) < 0.03
     assert np.abs(errors.mean(axis=0)).max() < 0.008
@@ -132,10 +132,10 @@ def test_a_board_in_a_mirror_keeps_its_names(kind: str) -> None:
     elif kind == "aruco":
         spec = ArucoSpec("5X5_100", 3, 2, 63.0, 21.0)
         drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary("5X5_100"))
-        picture = picture_of(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
+        picture = take_picture(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
     else:
-        picture = picture_of(spec, homography, april_grid_dark(APRIL_GRID))
-    truth = truth_of(spec, homography)
+        picture = take_picture(spec, homography, april_grid_dark(APRIL_GRID))
+    truth = read_truth(spec, homography)
     board = measure_board(scan_of(picture[:, ::-1]), spec)
     assert board.is_mirrored
     errors = errors_px(board, {name: np.array([WIDTH - 1 - col, row]) for name, (col, row) in truth.items()})
@@ -161,14 +161,14 @@ def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> Non
     picture[60:120, width + 100 : width + 160] = cv2.aruco.generateImageMarker(dictionary, 3, 60)
     two[20 : 20 + height, width + 40 : 2 * width + 40] = drawing
 
-    def measured(grey: Array) -> BoardMeasurement:
+    def measure_picture(grey: Array) -> BoardMeasurement:
         noise = np.random.default_rng(2).normal(0, 300, grey.shape)
         return measure_board(scan_of(8000 + 120 * cv2.GaussianBlur(grey, (0, 0), 0.8) + noise), spec)
 
-    seen = [mark.center_px for mark in measured(picture).marks if mark.status is Status.MEASURED]
-    assert len(seen) == len(spec.object_points())
-    assert max(center[0] for center in seen if center is not None) < width + 20
-    neither = measured(two)
+    measured_marks = [mark.center_px for mark in measure_picture(picture).marks if mark.status is Status.MEASURED]
+    assert len(measured_marks) == len(spec.object_points())
+    assert max(center[0] for center in measured_marks if center is not None) < width + 20
+    neither = measure_picture(two)
     assert "was read at 2 places" in neither.reason
     assert all(mark.status is Status.ABSENT for mark in neither.marks)
 

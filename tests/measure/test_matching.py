@@ -25,7 +25,7 @@ PHASES = 6
 
 
 @cache
-def drawn(name: str, blur_px: float) -> tuple[tuple[Array, Array], ...]:
+def draw_mark(name: str, blur_px: float) -> tuple[tuple[Array, Array], ...]:
     """Noise-free windows of a mark at several phases, slightly turned and scaled, with the places of the mark.
 
     Turned, for an upright edge falls between the rows of points that brute force asks.
@@ -39,7 +39,7 @@ def drawn(name: str, blur_px: float) -> tuple[tuple[Array, Array], ...]:
     return tuple(result)
 
 
-def measured(
+def measure_picture(
     grey: Array, mark: Mark, place: Array, rng: np.random.Generator, options: MatchOptions | None = None
 ) -> MarkFit:
     """The match from a start that is off by up to 0.7 px, with the drawn size and no turn."""
@@ -52,9 +52,9 @@ def errors_and_sigmas(name: str, blur_px: float, snr: float, count: int) -> tupl
     rng = np.random.default_rng(5)
     errors, sigmas = [], []
     for index in range(count):
-        shown, place = drawn(name, blur_px)[index % PHASES]
+        shown, place = draw_mark(name, blur_px)[index % PHASES]
         grey = GROUND + CONTRAST * shown + rng.normal(0, CONTRAST / snr, shown.shape)
-        fit = measured(grey, MARKS[name], place, rng)
+        fit = measure_picture(grey, MARKS[name], place, rng)
         assert fit.converged, fit.reason
         errors.append(fit.center_px - place[:, 2])
         sigmas.append(np.sqrt(np.diag(fit.covariance_px2)))
@@ -81,7 +81,7 @@ def test_sigmas_are_those_of_the_errors(name: str, blur_px: float, count: int) -
 def test_errors_are_at_the_cramer_rao_bound() -> None:
     name, blur_px, snr = "ring-cross", 1.0, 25.0
     errors, sigmas = errors_and_sigmas(name, blur_px, snr, 60)
-    bound = bound_px(MARKS[name], drawn(name, blur_px)[0][1], blur_px, snr)
+    bound = bound_px(MARKS[name], draw_mark(name, blur_px)[0][1], blur_px, snr)
     assert np.sqrt(np.mean(errors**2)) < 1.15 * bound  # 120 numbers: 6.5 % standard deviation
     assert sigmas.mean() == pytest.approx(bound, rel=0.04)
 
@@ -89,7 +89,9 @@ def test_errors_are_at_the_cramer_rao_bound() -> None:
 def bound_px(mark: MarkShape, place: Array, blur_px: float, snr: float) -> float:
     """The Cramér-Rao bound of a coordinate, every nuisance unknown, by differences of brute-force pictures."""
 
-    def shown(shift: tuple[float, float] = (0, 0), turn: float = 0.0, scale: float = 1.0, blur: float = 0.0) -> Array:
+    def draw_shifted(
+        shift: tuple[float, float] = (0, 0), turn: float = 0.0, scale: float = 1.0, blur: float = 0.0
+    ) -> Array:
         c, s = np.cos(turn), np.sin(turn)
         linear = scale * np.array([[c, -s], [s, c]]) @ place[:, :2]
         return brute_picture(mark, np.column_stack([linear, place[:, 2] + shift]), SIZE, SIZE, blur_px + blur)
@@ -97,12 +99,12 @@ def bound_px(mark: MarkShape, place: Array, blur_px: float, snr: float) -> float
     step = 0.1
     row, col = np.mgrid[:SIZE, :SIZE] / SIZE
     columns = [
-        (shown((step, 0)) - shown((-step, 0))) / (2 * step),
-        (shown((0, step)) - shown((0, -step))) / (2 * step),
-        (shown(turn=0.01) - shown(turn=-0.01)) / 0.02,
-        (shown(scale=1.01) - shown(scale=0.99)) / 0.02,
-        (shown(blur=0.05) - shown(blur=-0.05)) / 0.1,
-        shown(),
+        (draw_shifted((step, 0)) - draw_shifted((-step, 0))) / (2 * step),
+        (draw_shifted((0, step)) - draw_shifted((0, -step))) / (2 * step),
+        (draw_shifted(turn=0.01) - draw_shifted(turn=-0.01)) / 0.02,
+        (draw_shifted(scale=1.01) - draw_shifted(scale=0.99)) / 0.02,
+        (draw_shifted(blur=0.05) - draw_shifted(blur=-0.05)) / 0.1,
+        draw_shifted(),
         np.ones_like(col),
         col,
         row,
@@ -116,15 +118,15 @@ def bound_px(mark: MarkShape, place: Array, blur_px: float, snr: float) -> float
 def test_clean_marks_are_unbiased_at_every_phase(name: str, blur_px: float) -> None:
     """Trap: a 0.1 px grid left by sub-pixel refinement, and a half pixel lost in refining."""
     rng = np.random.default_rng(7)
-    for shown, place in drawn(name, blur_px):
-        fit = measured(GROUND + CONTRAST * shown + rng.normal(0, 0.5, shown.shape), MARKS[name], place, rng)
+    for shown, place in draw_mark(name, blur_px):
+        fit = measure_picture(GROUND + CONTRAST * shown + rng.normal(0, 0.5, shown.shape), MARKS[name], place, rng)
         assert np.abs(fit.center_px - place[:, 2]).max() < 0.003
         assert fit.blur_px == pytest.approx(blur_px, abs=0.03)
         assert fit.contrast_dn == pytest.approx(CONTRAST, rel=0.03)
 
 
 def test_the_windows_origin_counts() -> None:
-    shown, place = drawn("cross", 1.0)[0]
+    shown, place = draw_mark("cross", 1.0)[0]
     here = match(ScanWindow(shown * CONTRAST), MARKS["cross"], placed(SCALE, tuple(place[:, 2])))
     moved = placed(SCALE, tuple(place[:, 2] + (1000, 2000)))
     there = match(ScanWindow(shown * CONTRAST, (1000, 2000)), MARKS["cross"], moved)
@@ -136,7 +138,7 @@ def test_disturbances_that_cost_nothing(disturbance: str) -> None:
     rng = np.random.default_rng(11)
     ratios = []
     for index in range(30):
-        shown, place = drawn("ring-cross", 1.0)[index % PHASES]
+        shown, place = draw_mark("ring-cross", 1.0)[index % PHASES]
         grey = GROUND + CONTRAST * shown + rng.normal(0, 20, shown.shape)
         if disturbance == "dark mark":
             grey = 3000 - grey
@@ -144,7 +146,7 @@ def test_disturbances_that_cost_nothing(disturbance: str) -> None:
             grey = grey + np.linspace(0, 0.7 * CONTRAST, SIZE)[None, :]
         else:
             grey = np.rint(grey / 10)
-        fit = measured(grey, MARKS["ring-cross"], place, rng)
+        fit = measure_picture(grey, MARKS["ring-cross"], place, rng)
         assert fit.converged, fit.reason
         assert (fit.contrast_dn < 0) == (disturbance == "dark mark")
         ratios.append((fit.center_px - place[:, 2]) / np.sqrt(np.diag(fit.covariance_px2)))
@@ -155,13 +157,13 @@ def test_dust_is_cut_out() -> None:
     rng = np.random.default_rng(13)
     clean, dusty, ratios, fractions = [], [], [], []
     for index in range(18):
-        shown, place = drawn("ring-cross", 1.0)[index % PHASES]
+        shown, place = draw_mark("ring-cross", 1.0)[index % PHASES]
         grey = GROUND + CONTRAST * shown + rng.normal(0, 25, shown.shape)
-        clean.append(measured(grey, MARKS["ring-cross"], place, rng).center_px - place[:, 2])
+        clean.append(measure_picture(grey, MARKS["ring-cross"], place, rng).center_px - place[:, 2])
         for _ in range(3):
             speck = brute_picture(MarkShape(dot(0.2)), placed(SCALE, tuple(rng.uniform(6, 35, 2))), SIZE, SIZE, 0.7)
             grey = grey + 1.5 * CONTRAST * speck
-        fit = measured(grey, MARKS["ring-cross"], place, rng)
+        fit = measure_picture(grey, MARKS["ring-cross"], place, rng)
         dusty.append(fit.center_px - place[:, 2])
         ratios.append(dusty[-1] / np.sqrt(np.diag(fit.covariance_px2)))
         fractions.append(fit.damaged_fraction)
@@ -174,14 +176,14 @@ def test_a_large_speck_costs_what_it_covers() -> None:
     """Even where it carries plain least squares away from the mark."""
     rng = np.random.default_rng(31)
     for index in range(12):
-        shown, place = drawn("cross", 1.0)[index % PHASES]
+        shown, place = draw_mark("cross", 1.0)[index % PHASES]
         speck = brute_picture(MarkShape(dot(0.4)), placed(SCALE, tuple(rng.uniform(6, 35, 2))), SIZE, SIZE, 1.0)
         clean = GROUND + CONTRAST * shown + rng.normal(0, CONTRAST / 20, shown.shape)
         grey = clean + 2 * CONTRAST * speck
         found = match(ScanWindow(grey), MARKS["cross"], place + np.array([0, 0, 0.5]))
-        told = match(ScanWindow(grey, valid=speck < 0.01), MARKS["cross"], place)
-        assert found.sigma_px < 1.1 * told.sigma_px
-        assert np.hypot(*(found.center_px - told.center_px)) < told.sigma_px
+        result = match(ScanWindow(grey, valid=speck < 0.01), MARKS["cross"], place)
+        assert found.sigma_px < 1.1 * result.sigma_px
+        assert np.hypot(*(found.center_px - result.center_px)) < result.sigma_px
 
 
 @parametrize_with_studies("grain_px", [0.8, 1.3])
@@ -189,9 +191,9 @@ def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
     rng = np.random.default_rng(17)
     ratios = []
     for index in range(36):
-        shown, place = drawn("ring-cross", 1.0)[index % PHASES]
+        shown, place = draw_mark("ring-cross", 1.0)[index % PHASES]
         grain = gaussian_filter(rng.normal(0, 1, (SIZE, SIZE)), grain_px, mode="wrap")
-        fit = measured(GROUND + CONTRAST * shown + 25 * grain / grain.std(), MARKS["ring-cross"], place, rng)
+        fit = measure_picture(GROUND + CONTRAST * shown + 25 * grain / grain.std(), MARKS["ring-cross"], place, rng)
         assert fit.converged, fit.reason
         assert not fit.covariance_is_white
         error = fit.center_px - place[:, 2]
@@ -264,8 +266,8 @@ def test_nothing_is_not_a_mark() -> None:
     assert "outside" in outside.reason
 
 
-def test_half_of_a_mark_outside_of_the_scan_is_said() -> None:
-    shown, place = drawn("ring-cross", 1.0)[0]
+def test_half_of_a_mark_outside_of_the_scan_is_stated() -> None:
+    shown, place = draw_mark("ring-cross", 1.0)[0]
     valid = np.zeros(shown.shape, dtype=bool)
     valid[:, 24:] = True
     fit = match(ScanWindow(shown, valid=valid), MARKS["ring-cross"], place)

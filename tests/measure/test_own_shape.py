@@ -37,7 +37,7 @@ def test_noise_alone_moves_them_by_their_standard_deviations() -> None:
     assert 0.8 < np.sqrt(np.mean(ratios**2)) < 1.2  # 80 numbers: 1 within 2.5 of its standard deviations
 
 
-def test_another_size_and_turn_are_told_and_how_they_move_the_place() -> None:
+def test_another_size_and_turn_are_reported_and_how_they_move_the_place() -> None:
     (fit,) = fits(0.012, 0.008, 2.0, 1)
     assert fit.own_shape is not None
     assert np.abs(fit.own_shape.change - (0.012, 0.008)).max() < 1e-3

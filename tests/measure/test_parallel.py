@@ -30,11 +30,11 @@ def test_every_item_is_worked_on_in_its_order_while_opencvs_threads_rest(threads
     cv2.setNumThreads(threads)
     all_there = threading.Barrier(threads)
 
-    def seen(item: int) -> tuple[int, int, int]:
+    def view(item: int) -> tuple[int, int, int]:
         all_there.wait(60.0)
         return item, threading.get_ident(), cv2.getNumThreads()
 
-    found = map_in_threads(seen, range(6))
+    found = map_in_threads(view, range(6))
     assert [item for item, _, _ in found] == list(range(6))
     assert len({thread for _, thread, _ in found}) == threads
     assert {own for _, _, own in found} == {1}

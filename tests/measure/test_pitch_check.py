@@ -42,7 +42,7 @@ def test_separations_known_to_a_few_millimetres_say_little() -> None:
     assert pitch_problem(frame(20.6, 20.6), layout(0.1), (20.0, 20.0), "the project") is not None
 
 
-def test_right_pitches_are_called_wrong_as_rarely_as_is_said() -> None:
+def test_right_pitches_are_called_wrong_as_rarely_as_is_stated() -> None:
     """Eight marks of a small camera whose given places are known to a millimetre: 1 of 100, and less what film does."""
     generator = np.random.default_rng(5)
     true = np.array([(x, y) for x in (-16.0, 0.0, 16.0) for y in (-11.5, 0.0, 11.5) if (x, y) != (0.0, 0.0)])
@@ -54,10 +54,10 @@ def test_right_pitches_are_called_wrong_as_rarely_as_is_said() -> None:
         ]
         design = np.column_stack([given, np.ones(len(given))])
         matrix = np.asarray(np.linalg.lstsq(design, true * (50.0, -50.0), rcond=None)[0].T, float)
-        seen = [
+        view = [
             MarkMeasurement(mark.id, "fiducial", np.zeros(2), Covariance.from_noise(np.eye(2)), Status.MEASURED)
             for mark in marks
         ]
         small = FiducialLayout(tuple(marks), (33.0, 24.0))
-        wrong += pitch_problem(FrameMeasurement("a", tuple(seen), None, matrix), small, (20.0, 20.0), "x") is not None
+        wrong += pitch_problem(FrameMeasurement("a", tuple(view), None, matrix), small, (20.0, 20.0), "x") is not None
     assert 1 <= wrong <= 14, wrong  # 7 are expected at most, more than 14 in one run of 170

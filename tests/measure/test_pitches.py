@@ -75,13 +75,13 @@ def test_marks_outside_of_the_scan_are_named_where_the_others_are_too_few(tmp_pa
     assert "only 2 of 4 marks were found where the others put them, and these put 3, 4 outside of the scan" in problem
 
 
-def test_two_marks_are_said_to_give_a_similarity(tmp_path: Path) -> None:
+def test_two_marks_are_stated_to_give_a_similarity(tmp_path: Path) -> None:
     layout = layout_of([MarkShape(RING_CROSS)] * 2, ((-7.0, 0.0), (7.0, 0.2)))
     result = measured(frame_picture(layout, pixel_from_camera("0")), layout, tmp_path)
     assert any("a similarity on 2 fiducials has no redundancy" in problem for problem in result.problems)
 
 
-def test_pixels_given_as_longer_one_way_need_no_look(tmp_path: Path) -> None:
+def test_pixels_given_as_longer_one_way_need_no_attention(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0", turn_rad=0.0)
     matrix[:, :2] = np.diag([1.012, 0.988]) @ matrix[:, :2]
     with written_scan(frame_picture(ALIKE, matrix), tmp_path) as scan:
@@ -118,14 +118,14 @@ def test_the_pitch_to_try_is_what_the_marks_say(tmp_path: Path) -> None:
     pair_mm = (PITCH_UM / 1012, PITCH_UM / 988)
     with written_scan(frame_picture(ALIKE, matrix), tmp_path) as scan:
         frame = measure_frame(scan, ALIKE, Placement("0", matrix, 1.0, 4, 1, 1, pair_mm), STIFF)
-    told = _pitch_to_try([frame])
-    assert told.startswith("; under another pitch 4 of them fit, which may be a false alarm: try pitch_um = [")
-    pair = [float(number) for number in told.split("[")[1].rstrip("]").split(", ")]
+    result = _pitch_to_try([frame])
+    assert result.startswith("; under another pitch 4 of them fit, which may be a false alarm: try pitch_um = [")
+    pair = [float(number) for number in result.split("[")[1].rstrip("]").split(", ")]
     assert pair == pytest.approx([1000 * mm for mm in pair_mm], rel=1e-3)
     assert _pitch_to_try([]) == ""
 
 
-def test_a_closer_look_tries_pixels_slightly_longer_one_way_so_that_no_mark_lies_beyond_its_reach() -> None:
+def test_closer_matching_tries_pixels_slightly_longer_one_way_so_that_no_mark_lies_beyond_its_reach() -> None:
     """Of an aerial camera, pixels longer by up to 1 % either way."""
     layout, options = layout_of([MarkShape(RING_CROSS)] * 4, AERIAL, (228.0, 228.0)), FiducialOptions()
     near, longer = slightly_longer(PitchHypothesis((0.127, 0.127), 0.04, (0.127, 0.127)), 0.015)

@@ -39,7 +39,7 @@ BLOCKS = FiducialLayout(
 )
 
 
-def test_a_frame_seen_as_its_mirror_image_is_renamed_as_it_lies(tmp_path: Path) -> None:
+def test_a_frame_viewed_as_its_mirror_image_is_renamed_as_it_lies(tmp_path: Path) -> None:
     with written_scan(frame_picture(LEANING, pixel_from_camera("0")), tmp_path) as scan:
         found = FrameSearch(scan, LEANING, OPTIONS).search_scan(pitch_hypotheses(scan, LEANING, PITCH, OPTIONS)[0])
         right = next(each for each in found if each.pose == "0")
@@ -78,8 +78,8 @@ def block_picture(pose: str) -> tuple[Array, Array]:
 def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(pose: str) -> None:
     grey, matrix = block_picture(pose)
     truth = right_mm(BLOCKS) @ matrix[:, :2].T + matrix[:, 2]
-    for asked in ("auto", pose):
-        options = replace(OPTIONS, pose=asked)
+    for requests in ("auto", pose):
+        options = replace(OPTIONS, pose=requests)
         frame = measure_fiducials(scan_of(grey), BLOCKS, (1000 / PX_PER_MM,) * 2, options)
         assert frame.pose is not None
         assert frame.pose.name == pose
@@ -114,9 +114,9 @@ def test_half_wedges_of_any_pose(tmp_path: Path) -> None:
         grey = frame_picture(LEANING, matrix, seed)
         auto = measured(grey, LEANING, tmp_path)
         placed = measured(grey, LEANING, tmp_path, FiducialOptions(pose=pose))
-        seen, right = (
+        view, right = (
             sorted(mark.center_px.tolist() for mark in each.marks if mark.center_px is not None)
             for each in (auto, placed)
         )
-        np.testing.assert_allclose(seen, right, atol=0.05)
+        np.testing.assert_allclose(view, right, atol=0.05)
         assert all(mark.status.is_observation for mark in auto.marks)

@@ -33,11 +33,11 @@ def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
     turned = [np.diag([x, y]).astype(float) for x in (1, -1) for y in (-1, 1)]
     for seed in range(1):
         for index, linear in enumerate(turned):
-            for slid_px in (0.0, 4.0):
-                site = among_landscape(template, linear, seed, slid_px)
-                told = site.likelihoods([PosedMark(template, FLIP @ each) for each in turned])
-                assert told.argmax() == index
-                assert np.sort(told)[-2] < -4.0
+            for shift_px in (0.0, 4.0):
+                site = among_landscape(template, linear, seed, shift_px)
+                result = site.likelihoods([PosedMark(template, FLIP @ each) for each in turned])
+                assert result.argmax() == index
+                assert np.sort(result)[-2] < -4.0
 
 
 def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: int, slid_px: float) -> MarkSite:

@@ -68,8 +68,8 @@ def test_marks_say_how_well_the_frame_s_stretch_and_shear_are_known_that_move_th
         for _ in range(6):
             unit = rng.standard_normal((true.size, true.size)) / 200
             off = rng.normal(0, roughly, len(ALL_MOVES))
-            told = (np.eye(2) + np.tensordot(off, np.reshape(ALL_MOVES, (-1, 2, 2)), 1)) @ true.place[:, :2]
-            predicted = TrueMark(true.kind, np.column_stack([told, true.place[:, 2]]), true.size, 1.0)
+            result = (np.eye(2) + np.tensordot(off, np.reshape(ALL_MOVES, (-1, 2, 2)), 1)) @ true.place[:, :2]
+            predicted = TrueMark(true.kind, np.column_stack([result, true.place[:, 2]]), true.size, 1.0)
             fit = sighted(predicted, GROUND + CONTRAST * (true.picture + unit), rng)
             errors.append(fit.center_px - true.place[:, 2])
             covariances.append(fit.covariance_px2)
@@ -86,10 +86,10 @@ def test_a_disk_on_plain_ground_uses_more_of_it() -> None:
     plain = fit_disk(scan_of(grey), mark.place[:, 2] + 0.3, mark.place[:, :2])
     near = fit_disk(scan_of(grey), mark.place[:, 2] + 0.3, mark.place[:, :2], longest_margin_px=2.5)
     col = np.arange(mark.size) - mark.place[0, 2]
-    beside = fit_disk(scan_of(grey + 9000 * (col > 10)), mark.place[:, 2] + 0.3, mark.place[:, :2])
+    neighbour = fit_disk(scan_of(grey + 9000 * (col > 10)), mark.place[:, 2] + 0.3, mark.place[:, :2])
     assert np.trace(plain.covariance_px2) < 0.85 * np.trace(near.covariance_px2)
-    np.testing.assert_allclose(beside.center_px, mark.place[:, 2], atol=0.06)
-    assert not beside.reason
+    np.testing.assert_allclose(neighbour.center_px, mark.place[:, 2], atol=0.06)
+    assert not neighbour.reason
 
 
 def test_faint_soft_disks_are_at_the_bound() -> None:

@@ -10,8 +10,8 @@ ROOT = Path(__file__).parents[2]
 
 def test_the_page_has_every_limit_with_its_words() -> None:
     page = (ROOT / "docs" / "method" / "search.md").read_text(encoding="utf-8")
-    told = page.split("| limit | of | beyond it |\n|---|---|---|\n")[1].split("\n\n")[0].splitlines()
-    assert told == [f"| {float(limit):g} | {limit.of} | {limit.decides} |" for limit in LIMITS.values()]
+    result = page.split("| limit | of | beyond it |\n|---|---|---|\n")[1].split("\n\n")[0].splitlines()
+    assert result == [f"| {float(limit):g} | {limit.of} | {limit.decides} |" for limit in LIMITS.values()]
 
 
 def test_every_limit_is_used_and_none_stands_elsewhere() -> None:

@@ -90,7 +90,7 @@ def test_what_never_was_jpeg_is_not_taken_for_it(levels: int, tmp_path: Path) ->
             assert not scan.notes
 
 
-def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_said() -> None:
+def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_stated() -> None:
     """Of a contrast of three, four and six rounding steps: the rms error over the claim, both measured at once. What
     residuals do not show falls with the square of the contrast: one that fell with it would be twice too large."""
     rng, mark, ratios = np.random.default_rng(2), MarkShape(ring_cross(1.0, 0.2, 1.6, 0.15, angle_deg=45.0)), []

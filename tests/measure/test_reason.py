@@ -31,7 +31,7 @@ def test_every_reason_of_the_code_has_a_code() -> None:
     """Each call of Reason in measure and pipeline: a sentence, then at least one code."""
     calls = [
         (f"{file.relative_to(ROOT)}:{node.lineno}", len(node.args))
-        for file, node in nodes_of_files_with("Reason(")
+        for file, node in matching_nodes("Reason(")
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Reason"
     ]
     assert len(calls) > 80
@@ -41,14 +41,14 @@ def test_every_reason_of_the_code_has_a_code() -> None:
 def test_every_code_is_used() -> None:
     used = {
         node.attr
-        for file, node in nodes_of_files_with("Code.")
+        for file, node in matching_nodes("Code.")
         if file.name != "flags.py"
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "Code"
     }
     assert used == set(Code.__members__)
 
 
-def nodes_of_files_with(text: str) -> Iterator[tuple[Path, ast.AST]]:
+def matching_nodes(text: str) -> Iterator[tuple[Path, ast.AST]]:
     for package in ("measure", "pipeline"):
         for file in (ROOT / package).rglob("*.py"):
             content = file.read_text(encoding="utf-8")

@@ -101,7 +101,7 @@ def spotted() -> Any:
     return np.rint(grey + rng.normal(0, 3, grey.shape)).clip(0, 255).astype(np.uint8), places
 
 
-def with_overviews(path: Path, picture: Any, below: bool = False) -> None:
+def write_overviews(path: Path, picture: Any, below: bool = False) -> None:
     """Tiles, and the same picture at a half, a quarter and an eighth, as further pages or below its own."""
     small = [cv2.resize(picture, None, fx=1 / f, fy=1 / f, interpolation=cv2.INTER_AREA) for f in (2, 4, 8)]
     tiles: dict[str, Any] = {"tile": (TILE_PX, TILE_PX), "compression": "zlib", "metadata": None}
@@ -112,29 +112,29 @@ def with_overviews(path: Path, picture: Any, below: bool = False) -> None:
 
 
 @parametrize_with_studies(("factor", "below"), [(3, False), (4, True), (5, False), (8, True), (20, False)], quick=(4,))
-def test_a_scan_is_looked_at_small_by_its_overviews(
+def test_a_scan_is_inspected_at_small_by_its_overviews(
     tmp_path: Path, server: RangeServer, factor: int, below: bool
 ) -> None:
     picture, places = spotted()
-    with_overviews(tmp_path / "s.tif", picture, below)
+    write_overviews(tmp_path / "s.tif", picture, below)
     with open_scan(tmp_path / "s.tif") as local, open_scan(f"{server.url}/s.tif") as remote:
         opening = server.sent_bytes
-        seen, exact = remote.reduced(factor), local.reduced(factor)
+        view, exact = remote.reduced(factor), local.reduced(factor)
         fetched = server.sent_bytes - opening
         assert np.array_equal(remote.samples(9, 9, 50, 50), local.samples(9, 9, 50, 50))
-    assert seen.shape == exact.shape
-    assert np.abs(seen - exact)[2:-2, 2:-2].max() < 6 + 0.3 * factor  # what is interpolated
+    assert view.shape == exact.shape
+    assert np.abs(view - exact)[2:-2, 2:-2].max() < 6 + 0.3 * factor  # what is interpolated
     most = {3: 0.25, 4: 0.07, 5: 0.07, 8: 0.02, 20: 0.02}[factor]  # of the area, and so of what is stored
     assert fetched < 1.3 * most * SIDE_PX**2 + (1 << 17)
     with open_scan(f"{server.url}/s.tif") as remote:
         before = server.sent_bytes
         window = remote.reduced_window(factor, 5, 7, 12, 9)
         assert server.sent_bytes - before < 5 * TILE_PX**2  # of an overview
-    np.testing.assert_allclose(window, seen[7:16, 5:17], atol=2e-3)
-    col, row = np.meshgrid(np.arange(seen.shape[1]), np.arange(seen.shape[0]))
+    np.testing.assert_allclose(window, view[7:16, 5:17], atol=2e-3)
+    col, row = np.meshgrid(np.arange(view.shape[1]), np.arange(view.shape[0]))
     for place in (places - (factor - 1) / 2) / factor:
         near = np.hypot(col - place[0], row - place[1]) < 60 / factor
-        weights = np.clip(seen[near] - 70.0, 0, None)
+        weights = np.clip(view[near] - 70.0, 0, None)
         middle = np.array([np.average(axis[near], weights=weights) for axis in (col, row)])
         assert np.abs(middle - place).max() * factor < 0.1 * factor + 1.0
 
@@ -150,21 +150,21 @@ def test_a_thumbnail_of_another_form_is_no_overview(tmp_path: Path, server: Rang
         np.testing.assert_array_equal(remote.reduced(4), local.reduced(4))
 
 
-def test_tiles_of_a_window_are_asked_for_together(
+def test_tiles_of_a_window_are_requested_together(
     tmp_path: Path, server: RangeServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tifffile.imwrite(tmp_path / "s.tif", noise(), **LAYOUTS["tiles"])
-    asked: list[int] = []
+    requests: list[int] = []
     ranges = Address.ranges
 
     def counting(address: Address, extents: Any) -> Any:
-        asked.append(len(extents))
+        requests.append(len(extents))
         return ranges(address, extents)
 
     with open_scan(f"{server.url}/s.tif") as scan:
         monkeypatch.setattr(Address, "ranges", counting)
         scan.samples(100, 100, 200, 200)
-    assert asked == [9]
+    assert requests == [9]
 
 
 def test_a_picture_in_one_piece_is_fetched_whole_and_says_so(tmp_path: Path, server: RangeServer) -> None:
@@ -178,7 +178,7 @@ def test_a_picture_in_one_piece_is_fetched_whole_and_says_so(tmp_path: Path, ser
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("failures", [[403], [503, 500], [1.0]])
-def test_what_fails_in_the_middle_is_asked_for_again(
+def test_what_fails_in_the_middle_is_requested_again(
     tmp_path: Path, server: RangeServer, failures: list[int | float]
 ) -> None:
     picture = noise()
@@ -194,7 +194,7 @@ def test_what_fails_in_the_middle_is_asked_for_again(
 @pytest.mark.parametrize(
     ("failure", "told"), [(403, "forbids to read it .403.*credentials"), (500, "cannot be reached"), (1.0, "0.3 s")]
 )
-def test_what_goes_on_failing_is_told_and_is_no_damage(
+def test_what_goes_on_failing_is_reported_and_is_no_damage(
     tmp_path: Path, server: RangeServer, failure: float, told: str
 ) -> None:
     tifffile.imwrite(tmp_path / "s.tif", noise(), **LAYOUTS["tiles"])
@@ -216,7 +216,7 @@ def test_missing_forbidden_and_silent_addresses(tmp_path: Path, server: RangeSer
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_server_without_ranges_is_told(tmp_path: Path, server: RangeServer) -> None:
+def test_a_server_without_ranges_is_reported(tmp_path: Path, server: RangeServer) -> None:
     tifffile.imwrite(tmp_path / "s.tif", noise(), **LAYOUTS["tiles"])
     server.by_ranges = False
     with pytest.raises(UnreachableError, match="no parts of files"):

@@ -91,7 +91,7 @@ def test_what_is_not_cached_any_more_is_made_again() -> None:
     assert few[0, 1] is not first
 
 
-def test_a_faint_mark_beside_the_frames_edge_is_what_answers_most() -> None:
+def test_a_faint_mark_next_to_the_frames_edge_is_what_answers_most() -> None:
     """The edge is nine times as strong as the mark on overexposed film."""
     rng = np.random.default_rng(1)
     mark = MarkShape(ring_cross(0.5, 0.1, 0.8, 0.1), "light")
@@ -111,7 +111,7 @@ def test_a_faint_mark_beside_the_frames_edge_is_what_answers_most() -> None:
     assert response.max() < 0.6 * highest
 
 
-def test_lines_as_fine_as_the_grain_answer_at_a_closer_look_by_what_the_grain_hides_least() -> None:
+def test_lines_as_fine_as_the_grain_answer_at_closer_matching_by_what_the_grain_hides_least() -> None:
     """Pixels are alike about the crosses, which hides what is coarse of them."""
     rng = np.random.default_rng(2)
     mark, linear = MarkShape(cross(1.75, 0.12, 0.25, 45.0), "light"), np.diag([7.8, -7.8])

@@ -85,8 +85,8 @@ def test_what_measuring_gives_is_that_of_its_revision(tmp_path: Path) -> None:
     table = json.loads(TABLE.read_text(encoding="utf-8"))
     changed = differing(table["results"], results(tmp_path))
     then = "and run python tests/measure/test_revision.py"
-    told = f"{len(changed)} marks, such as {', '.join(changed[:3])}, are measured otherwise"
-    assert not changed or table["revision"] != MEASURE_REVISION, f"raise MEASURE_REVISION, {then}: {told}"
+    result = f"{len(changed)} marks, such as {', '.join(changed[:3])}, are measured otherwise"
+    assert not changed or table["revision"] != MEASURE_REVISION, f"raise MEASURE_REVISION, {then}: {result}"
     assert table["revision"] == MEASURE_REVISION, f"MEASURE_REVISION was raised: {then}"
 
 

@@ -87,7 +87,7 @@ def test_impossible_codes_are_refused() -> None:
         RingCode(12, (3.0, 2.0))
 
 
-def test_green_alone_is_the_grey_value_of_a_scan_asked_for_it() -> None:
+def test_green_alone_is_the_grey_value_of_a_scan_requested_it() -> None:
     colours = np.random.default_rng(8).integers(0, 65535, (20, 30, 3)).astype(np.uint16)
     scan = Scan(Path("colours.tif"), WholePicture(colours), NO_TAGS)
     before = scan.window(2, 3, 10, 8)
@@ -105,7 +105,7 @@ def test_the_published_choice_of_numbers() -> None:
     assert all(code.least_turn(number) == number for number in numbers)
 
 
-def test_a_ring_seen_from_behind() -> None:
+def test_a_ring_viewed_from_behind() -> None:
     code = RingCode()
     segments = np.array([0, 0, 0, 0, 0, 1, 0, 1, 1, 1, 0, 0], bool)
     assert code.mirrored(code.number(segments[::-1])) == code.number(segments)

@@ -217,7 +217,7 @@ def test_pitch_of_png_and_jpeg(tmp_path: Path) -> None:
             assert scan.pitch_um == pytest.approx((20.0, 25.0))
 
 
-def test_of_several_full_pictures_the_first_is_taken_and_the_others_need_a_look(tmp_path: Path) -> None:
+def test_of_several_full_pictures_the_first_is_taken_and_the_others_need_attention(tmp_path: Path) -> None:
     """Those of reduced size and masks do not count, whether their tags say so or not; a path may name a page."""
     with tifffile.TiffWriter(tmp_path / "s.tif") as file:
         file.write(picture()[::4, ::4], subfiletype=1)
@@ -226,8 +226,8 @@ def test_of_several_full_pictures_the_first_is_taken_and_the_others_need_a_look(
         file.write(np.zeros_like(picture()), metadata=None)
         file.write(np.zeros(picture().shape, bool), metadata=None, subfiletype=4, photometric="minisblack")
     with open_scan(tmp_path / "s.tif") as scan:
-        (told,) = scan.problems
-        assert "holds 2 pictures of full size (pages 2, 4), and page 2 was measured" in told
+        (finding,) = scan.problems
+        assert "holds 2 pictures of full size (pages 2, 4), and page 2 was measured" in finding
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
     with open_scan(f"{tmp_path / 's.tif'}#page=4") as scan:
         assert not scan.problems
@@ -248,9 +248,9 @@ def test_a_full_picture_below_a_thumbnail_is_read(flag: int, tmp_path: Path) -> 
         assert not scan.problems
 
 
-def test_which_band_is_used_is_said(tmp_path: Path) -> None:
+def test_which_band_is_used_is_stated(tmp_path: Path) -> None:
     bands = np.stack([picture()] * 5, axis=-1)
-    told = []
+    result = []
     for kind, samples, further in (
         ("minisblack", bands, [0] * 4),
         ("rgb", bands, [0] * 2),
@@ -258,14 +258,14 @@ def test_which_band_is_used_is_said(tmp_path: Path) -> None:
     ):
         tifffile.imwrite(tmp_path / "s.tif", samples, photometric=kind, planarconfig="contig", extrasamples=further)
         with open_scan(tmp_path / "s.tif") as scan:
-            told.append(scan.notes)
-    assert told[0] == ("the picture has 5 bands: the first is used",)
-    assert told[1] == ("the picture has 5 bands: the first three are used, as red, green and blue",)
-    assert told[2] == ()
+            result.append(scan.notes)
+    assert result[0] == ("the picture has 5 bands: the first is used",)
+    assert result[1] == ("the picture has 5 bands: the first three are used, as red, green and blue",)
+    assert result[2] == ()
 
 
 @pytest.mark.parametrize("pictures", [1, 3])
-def test_a_stack_is_read_and_what_was_put_into_its_pixels_is_seen(tmp_path: Path, pictures: int) -> None:
+def test_a_stack_is_read_and_what_was_put_into_its_pixels_is_visible(tmp_path: Path, pictures: int) -> None:
     """tifffile leaves room behind the tags of a further picture, and says the numbers of the first one's instead."""
     tifffile.imwrite(tmp_path / "s.tif", np.stack([picture()] * pictures), photometric="minisblack")
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
@@ -276,7 +276,7 @@ def test_a_stack_is_read_and_what_was_put_into_its_pixels_is_seen(tmp_path: Path
             open_scan(tmp_path / "s.tif")
 
 
-def test_the_orientation_tag_is_said_and_not_applied(tmp_path: Path) -> None:
+def test_the_orientation_tag_is_stated_and_not_applied(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "s.tif", picture(), extratags=[(274, 3, 1, 6, True)])
     with open_scan(tmp_path / "s.tif") as scan:
         assert "orientation tag (6) is not applied" in scan.notes[0]

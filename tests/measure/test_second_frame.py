@@ -24,10 +24,10 @@ def test_a_second_frame_is_named_with_the_windows_of_both(second: str | None, is
     with written_scan(np.vstack([other, first]), tmp_path) as scan:
         window = (0, FRAME_PX, FRAME_PX, FRAME_PX)
         frame = measure_fiducials(crop_scan(scan, window), ALIKE, (PITCH_UM, PITCH_UM), options)
-        told = second_frame(scan, ALIKE, moved_frame(frame, np.array([0.0, FRAME_PX])), options)
-    assert bool(told) == is_named
+        result = second_frame(scan, ALIKE, moved_frame(frame, np.array([0.0, FRAME_PX])), options)
+    assert bool(result) == is_named
     if is_named:
-        windows = re.findall(r'"(\d+) (\d+) (\d+) (\d+)"', told)
+        windows = re.findall(r'"(\d+) (\d+) (\d+) (\d+)"', result)
         (_, lower, _, _), (_, upper, _, height) = [tuple(map(int, window)) for window in windows]
         assert lower == pytest.approx(FRAME_PX + 27, abs=6)  # 17 mm about the middle, row 197.6
         assert upper == pytest.approx(27, abs=6)

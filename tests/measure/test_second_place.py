@@ -62,7 +62,7 @@ def test_noise_alone_makes_every_probability_of_edges_as_likely(mark: MarkShape,
     assert_as_likely(edge_chances(mark, brute_picture(mark, place, SIZE, SIZE, 1.0), place, options, 40))
 
 
-def test_damage_that_no_mask_takes_out_is_seen_by_the_edges() -> None:
+def test_damage_that_no_mask_takes_out_is_visible_by_the_edges() -> None:
     place = placed(10.0, (20.2, 19.7))
     grey = brute_picture(RING_CROSS, place, SIZE, SIZE, 1.0)
     grey[17:19, 21:34] = 1.0  # a scratch beside one arm

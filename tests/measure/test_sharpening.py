@@ -103,8 +103,8 @@ def test_scans_of_a_scanner_say_together_how_it_sharpens() -> None:
     assert pooled.radius_px == pytest.approx(1.2)
     assert 0.1 < np.sqrt(pooled.covariance[0, 0]) < 0.3
     assert not Sharpening.pooled([own[0], Sharpening(), Sharpening()])  # most are not
-    said = [replace(ToneInformation.empty(), sharpening=each) for each in own]
-    known = Tone.unknown().include_information(said).sharpening
+    information = [replace(ToneInformation.empty(), sharpening=each) for each in own]
+    known = Tone.unknown().include_information(information).sharpening
     assert known.amount == pytest.approx(1.5)
     assert known.prior is not None  # a scan's own marks add to it
 
@@ -112,10 +112,10 @@ def test_scans_of_a_scanner_say_together_how_it_sharpens() -> None:
 @pytest.mark.parametrize(("value", "is_taken"), [(0.8, True), (0.2, False), (-0.1, False), (4.5, False)])
 def test_a_curve_that_no_scanner_has_is_not_taken(value: float, is_taken: bool) -> None:
     prior = Tone.unknown()
-    said = prior.shift_to_power(value).mean
-    matrix = 400.0 * np.eye(len(said))
-    information = ToneInformation(matrix, matrix @ said, float(said @ matrix @ said), len(said))
-    mark = MarkTone(information, np.full((2, len(said)), 0.1), 0.1, 0.9)
+    text = prior.shift_to_power(value).mean
+    matrix = 400.0 * np.eye(len(text))
+    information = ToneInformation(matrix, matrix @ text, float(text @ matrix @ text), len(text))
+    mark = MarkTone(information, np.full((2, len(text)), 0.1), 0.1, 0.9)
     found = FrameTone.from_marks(prior, dict.fromkeys(range(8), mark), prior)
     assert (found.tone.equivalent_power(0.1, 0.9)[0] == pytest.approx(value, abs=0.1)) == is_taken
     assert ("was not taken" in found.note) == (not is_taken)

@@ -27,7 +27,7 @@ class View:
         return sum(self.origin[dot] != point for point, dot in naming.named.items())
 
 
-def seen(rng: np.random.Generator, columns: int, rows: int, codes: int, uneven: float = 0.0) -> View:
+def view_sheet(rng: np.random.Generator, columns: int, rows: int, codes: int, uneven: float = 0.0) -> View:
     """A sheet under a pinhole camera with a lens of up to 15 % distortion, rolled anyhow; a fifth of its dots missing,
     a fifth as many false ones."""
     grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
@@ -35,7 +35,7 @@ def seen(rng: np.random.Generator, columns: int, rows: int, codes: int, uneven: 
     height = uneven * np.sin(grid[:, 0] / 2.5) * np.cos(grid[:, 1] / 3.5)
     board = np.column_stack([grid - middle, height])
     tilt, around, roll = np.radians(rng.uniform(0, 50)), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
-    turn = about(2, roll) @ about(0, np.pi + tilt) @ about(2, around)
+    turn = rotation_matrix(2, roll) @ rotation_matrix(0, np.pi + tilt) @ rotation_matrix(2, around)
     distance = 1.25 * max(columns, rows)
     bend = rng.uniform(-0.15, 0.1)
 
@@ -63,7 +63,7 @@ def seen(rng: np.random.Generator, columns: int, rows: int, codes: int, uneven: 
     return View(grid, Dots(centers, shapes, coded), origin, int(inside.sum()))
 
 
-def about(axis: int, angle: float) -> Array:
+def rotation_matrix(axis: int, angle: float) -> Array:
     c, s = np.cos(angle), np.sin(angle)
     turn = np.roll(np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]]), axis, axis=(0, 1))
     return np.asarray(turn)
@@ -71,7 +71,7 @@ def about(axis: int, angle: float) -> Array:
 
 def spins(rng: np.random.Generator, count: int) -> Array:
     """An ellipse says nothing of the turn of its circle."""
-    return np.stack([about(2, angle)[:2, :2] for angle in rng.uniform(0, 2 * np.pi, count)])
+    return np.stack([rotation_matrix(2, angle)[:2, :2] for angle in rng.uniform(0, 2 * np.pi, count)])
 
 
 @parametrize_with_studies(
@@ -80,7 +80,7 @@ def spins(rng: np.random.Generator, count: int) -> Array:
 def test_a_fifth_missing_and_a_fifth_false(columns: int, rows: int, codes: int, views: int) -> None:
     rng = np.random.default_rng(columns + codes)
     for _ in range(views):
-        view = seen(rng, columns, rows, codes)
+        view = view_sheet(rng, columns, rows, codes)
         naming = name_dots(view.sheet, view.dots, SIZE)
         assert isinstance(naming, Naming), naming
         assert view.wrong(naming) == 0
@@ -92,7 +92,7 @@ def test_a_fifth_missing_and_a_fifth_false(columns: int, rows: int, codes: int, 
 def test_codes_misread_are_outvoted_or_nothing_is_named() -> None:
     rng = np.random.default_rng(3)
     for _ in range(2):
-        view = seen(rng, 8, 8, 5)
+        view = view_sheet(rng, 8, 8, 5)
         points = dict(view.dots.coded)
         one_wrong = {**points, next(iter(points)): int(rng.integers(0, 64))}
         naming = name_dots(view.sheet, replace(view.dots, coded=one_wrong), SIZE)
@@ -105,7 +105,7 @@ def test_codes_misread_are_outvoted_or_nothing_is_named() -> None:
 
 
 def test_one_code_is_not_enough() -> None:
-    view = seen(np.random.default_rng(4), 10, 10, 1)
+    view = view_sheet(np.random.default_rng(4), 10, 10, 1)
     naming = name_dots(view.sheet, view.dots, SIZE)
     assert naming == "1 coded targets of the sheet were recognised, and two are needed"
 
@@ -114,7 +114,7 @@ def test_a_sheet_that_is_not_quite_flat() -> None:
     """Bumps of 6 % of a step, three times what the sheet of a camera calibration was found to have."""
     rng = np.random.default_rng(5)
     for _ in range(5):
-        view = seen(rng, 10, 10, 4, uneven=0.06)
+        view = view_sheet(rng, 10, 10, 4, uneven=0.06)
         naming = name_dots(view.sheet, view.dots, SIZE)
         assert isinstance(naming, Naming), naming
         assert view.wrong(naming) == 0

@@ -17,7 +17,9 @@ FULL = 65535.0
 
 @pytest.mark.parametrize("grows", [0.0, 0.25, 0.5])
 @pytest.mark.parametrize("damaged", [0.0, 0.2])
-def test_how_noise_grows_with_light_is_told_by_residuals_and_damage_hardly_counts(grows: float, damaged: float) -> None:
+def test_how_noise_grows_with_light_is_known_by_residuals_and_damage_hardly_counts(
+    grows: float, damaged: float
+) -> None:
     rng = np.random.default_rng(2)
     ground = np.ones((60, 60), bool)
     ground[20:32, 10:50] = False

@@ -52,14 +52,14 @@ class Field:
     def scan(self) -> Scan:
         return scan_of(self.picture)
 
-    def measured(self, options: TargetOptions | None = None) -> dict[str, MarkMeasurement]:
+    def measure_picture(self, options: TargetOptions | None = None) -> dict[str, MarkMeasurement]:
         return {mark.point: mark for mark in measure_disks(self.scan(), self.predictions, options)}
 
 
 @parametrize_with_studies("sign", [1.0, -1.0])
 def test_all_targets_with_their_names_and_honest_sigmas(sign: float) -> None:
     field = Field(2, np.array([9.0, -7.0]), sign=sign)
-    marks = field.measured()
+    marks = field.measure_picture()
     errors = []
     for name, place in field.places.items():
         mark = marks[name]
@@ -76,7 +76,7 @@ def test_a_hidden_target_is_not_taken_for_its_neighbour() -> None:
     hidden = ("t0", "t10", "t24")
     for name in hidden:
         field.hide(name)
-    marks = field.measured()
+    marks = field.measure_picture()
     for name, place in field.places.items():
         mark = marks[name]
         if name in hidden:
@@ -95,7 +95,7 @@ def test_two_disks_at_one_place_are_refused() -> None:
     across = np.array([0.9 * shape[0, 0] + 5.0, 0.0])
     field.draw(place - across, shape)
     field.draw(place + across, shape)
-    mark = field.measured(TargetOptions(least_gate_px=14.0))["t17"]
+    mark = field.measure_picture(TargetOptions(least_gate_px=14.0))["t17"]
     assert mark.status is Status.REJECTED
     assert "2 disks lie within" in mark.reason
 
@@ -107,7 +107,7 @@ def test_every_prediction_has_a_row_with_its_reason() -> None:
         TargetPrediction("tiny", np.array([200.0, 100.0]), np.eye(2) * 0.8, 20.0),
         TargetPrediction("nothing", np.array([115.0, 105.0]), np.eye(2) * 4, 8.0),
     ]
-    marks = field.measured()
+    marks = field.measure_picture()
     assert len(marks) == 38
     assert marks["outside"].status is Status.ABSENT
     assert "outside of the scan" in marks["outside"].reason
@@ -124,18 +124,18 @@ def test_a_disk_of_another_size_or_polarity_is_no_target() -> None:
     field.sign = -1.0
     field.picture[:] += 25000
     field.draw(field.places["t8"], field.predictions[8].pixel_from_disk)
-    marks = field.measured()
+    marks = field.measure_picture()
     assert not marks["t3"].status.is_observation
     assert not marks["t8"].status.is_observation
     assert "not light" in marks["t8"].reason
 
 
-def test_small_disks_are_flagged_where_too_few_others_tell_what_they_look_like() -> None:
+def test_small_disks_are_flagged_where_too_few_others_tell_what_they_appear_like() -> None:
     field = Field(6, np.zeros(2))
     field.add("small", np.array([115.0, 105.0]), 2.3, np.zeros(2), 10.0)
-    assert field.measured()["small"].status is Status.MEASURED
+    assert field.measure_picture()["small"].status is Status.MEASURED
     field.predictions = field.predictions[-5:]
-    mark = field.measured()["small"]
+    mark = field.measure_picture()["small"]
     assert mark.status is Status.WEAK
     assert "dust" in mark.reason
 
@@ -143,9 +143,9 @@ def test_small_disks_are_flagged_where_too_few_others_tell_what_they_look_like()
 def test_the_order_of_predictions_does_not_matter() -> None:
     """Every disk lies near several places, so that another one is the first to have it fitted."""
     field = Field(7, np.array([5.0, 3.0]), search_px=110.0, count=14)
-    marks = field.measured()
+    marks = field.measure_picture()
     field.predictions.reverse()
-    for name, mark in field.measured().items():
+    for name, mark in field.measure_picture().items():
         assert (mark.status, mark.reason, mark.quality) == (marks[name].status, marks[name].reason, marks[name].quality)
         np.testing.assert_array_equal(np.array(mark.center_px), np.array(marks[name].center_px))
         np.testing.assert_array_equal(mark.covariance_px2, marks[name].covariance_px2)
@@ -154,7 +154,7 @@ def test_the_order_of_predictions_does_not_matter() -> None:
 def test_a_blank_scan_gives_rows_and_reasons() -> None:
     field = Field(8, np.zeros(2))
     field.picture[:] = 0
-    assert all(mark.status is Status.PREDICTED and mark.reason for mark in field.measured().values())
+    assert all(mark.status is Status.PREDICTED and mark.reason for mark in field.measure_picture().values())
 
 
 def test_crosses() -> None:
@@ -178,7 +178,7 @@ def test_crosses() -> None:
         assert np.abs(mark.center_px - places[mark.point]).max() < 0.04
 
 
-def test_a_cross_seen_obliquely() -> None:
+def test_a_cross_viewed_obliquely() -> None:
     """Its near arm is longer and wider than its far one: 0.04 px, were it fitted as two plain bars."""
     upright = np.array([[9.0, 4.0], [-6.0, 12.0]])  # px
     nearer = np.array([0.05, -0.03])  # per half length

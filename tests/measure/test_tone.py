@@ -33,12 +33,12 @@ TIP = Kind(
 )
 
 
-def code_of(mark: TrueMark, curve: float | str, snr: float, rng: np.random.Generator) -> np.ndarray:
+def encode_mark(mark: TrueMark, curve: float | str, snr: float, rng: np.random.Generator) -> np.ndarray:
     light = DARK + (LIGHT - DARK) * (mark.picture + rng.standard_normal(mark.picture.shape) / snr)
     return FULL * coded(np.clip(light, 0.0, 1.0).astype(np.float32), curve)
 
 
-def fitted(mark: TrueMark, code: np.ndarray, tone: Tone) -> MarkFit:
+def fit_mark(mark: TrueMark, code: np.ndarray, tone: Tone) -> MarkFit:
     scan = scan_of(code).replace_tone(tone)
     options = options_for(mark.kind.shape, MatchOptions(linear_sigma=0.05), mark.kind.known)
     return match(read_window(scan, (0, 0, mark.size, mark.size)), mark.kind.shape, mark.place, options)
@@ -58,9 +58,9 @@ def settled_from(
     tone: Tone, marks: list[TrueMark], codes: list[np.ndarray], prior: Tone
 ) -> tuple[list[MarkFit], FrameTone]:
     for _ in range(5):
-        fits = [fitted(mark, code, tone) for mark, code in zip(marks, codes, strict=True)]
-        told = {n: fit.tone for n, fit in enumerate(fits) if fit.tone is not None}
-        found = FrameTone.from_marks(prior, told, tone)
+        fits = [fit_mark(mark, code, tone) for mark, code in zip(marks, codes, strict=True)]
+        estimate = {n: fit.tone for n, fit in enumerate(fits) if fit.tone is not None}
+        found = FrameTone.from_marks(prior, estimate, tone)
         if found.apart < SETTLED:
             break
         tone = found.next_curve(tone)
@@ -77,10 +77,10 @@ def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the
     clear[5, 6:9] = True
     used, landscape = np.ones(shape, bool), Landscape(drawn, np.zeros(shape, bool), design[3])
     fit = LinearFit(rng.normal(size=shape), used, design, design / 576.0, noise, np.ones(shape))
-    said = mark_tone_information(
+    information = mark_tone_information(
         fit, drawn, drawn, clear, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape
     ).information
-    assert np.abs(said.matrix).max() < 1e-3
+    assert np.abs(information.matrix).max() < 1e-3
     blank = replace(fit, residuals=np.zeros(shape), noise=NoiseModel(4e-35, np.full((1, 1), 4e-35), 0.0))
     even = np.full(shape, 87.8)
     assert not mark_tone_information(
@@ -115,16 +115,18 @@ def test_departures_change_light_as_their_derivatives_say() -> None:
         step = np.eye(5)[k] * 1e-3
         more, less = (tone.replace_departures(way * step).light(codes, FULL).astype(float) for way in (1, -1))
         by_departure = (more - less) / 2e-3
-        told = tone.derivatives(tone.light(codes, FULL), FULL)[k]
-        gain = np.polyfit(tone.light(codes, FULL).astype(float), by_departure - told, 1)  # but for gain and offset
-        assert np.allclose(np.polyval(gain, tone.light(codes, FULL)), by_departure - told, atol=1e-3 * np.ptp(told) + 1)
+        result = tone.derivatives(tone.light(codes, FULL), FULL)[k]
+        gain = np.polyfit(tone.light(codes, FULL).astype(float), by_departure - result, 1)  # but for gain and offset
+        assert np.allclose(
+            np.polyval(gain, tone.light(codes, FULL)), by_departure - result, atol=1e-3 * np.ptp(result) + 1
+        )
 
 
 def test_a_declared_curve_holds_until_pictures_contradict_it() -> None:
     declared = Tone.declared(power(2.2), "the file says so")
     assert declared.equivalent_power(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.01)
     linear = -1.2 / 0.6 * np.eye(5)[0]  # departures that make a power of 1 of it
-    strong, faint = (said_of(linear, w) for w in (400.0, 0.1))
+    strong, faint = (tone_information(linear, w) for w in (400.0, 0.1))
     believed = declared.estimate([faint]).tone
     assert believed.equivalent_power(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.05)
     assert "contradict" not in believed.source
@@ -139,7 +141,7 @@ def test_the_tip_of_a_wedge_is_where_it_was_drawn_whatever_the_curve(curve: floa
     errors, covariances, off = [], [], []
     for _ in range(3):
         marks = [some_mark(TIP, 1.0, rng) for _ in range(4)]
-        codes = [code_of(mark, curve, 80.0, rng) for mark in marks]
+        codes = [encode_mark(mark, curve, 80.0, rng) for mark in marks]
         fits, found = settled(marks, codes, Tone.unknown())
         for mark, fit in zip(marks, fits, strict=True):
             assert fit.tone is not None
@@ -155,29 +157,29 @@ def test_the_tip_of_a_wedge_is_where_it_was_drawn_whatever_the_curve(curve: floa
 def test_a_mark_says_no_more_of_the_curve_where_its_frame_is_known_without_error() -> None:
     rng = np.random.default_rng(3)
     mark = some_mark(TIP, 1.0, rng)
-    code = code_of(mark, 2.2, 80.0, rng)
+    code = encode_mark(mark, 2.2, 80.0, rng)
     alike = [replace(mark, kind=replace(TIP, known=known)) for known in (1e-4, 1e-6)]
-    told = [fitted(each, code, Tone.unknown().shift_to_power(2.2)).tone for each in alike]
-    information = [one.information.matrix for one in told if one is not None]
+    estimate = [fit_mark(each, code, Tone.unknown().shift_to_power(2.2)).tone for each in alike]
+    information = [one.information.matrix for one in estimate if one is not None]
     np.testing.assert_allclose(information[1], information[0], rtol=0.1, atol=0.1)
 
 
 def test_the_linearised_effect_of_a_curve_is_that_of_a_fit_at_another_one() -> None:
     rng = np.random.default_rng(5)
     mark = some_mark(TIP, 1.0, rng)
-    code, tone = code_of(mark, 2.2, 200.0, rng), Tone(power(2.2), covariance=np.eye(5))
-    told = fitted(mark, code, tone).tone
-    assert told is not None
+    code, tone = encode_mark(mark, 2.2, 200.0, rng), Tone(power(2.2), covariance=np.eye(5))
+    estimate = fit_mark(mark, code, tone).tone
+    assert estimate is not None
     for k in range(3):
         step = 0.1 * np.eye(5)[k]
-        more, less = (fitted(mark, code, tone.replace_departures(way * step)).center_px for way in (1, -1))
-        np.testing.assert_allclose((more - less) / 0.2, told.on_place[:, k], atol=0.03)
+        more, less = (fit_mark(mark, code, tone.replace_departures(way * step)).center_px for way in (1, -1))
+        np.testing.assert_allclose((more - less) / 0.2, estimate.on_place[:, k], atol=0.03)
 
 
 def test_a_cross_does_not_move_by_the_curve() -> None:
     rng = np.random.default_rng(6)
     mark = some_mark(KIND["cross"], 1.0, rng)
-    fit = fitted(mark, code_of(mark, 2.2, 50.0, rng), Tone.unknown())
+    fit = fit_mark(mark, encode_mark(mark, 2.2, 50.0, rng), Tone.unknown())
     assert fit.tone is not None
     assert np.abs(fit.tone.on_place).max() < 0.02
 
@@ -202,20 +204,20 @@ def code_between_ends(mark: TrueMark, power: float, rng: np.random.Generator) ->
 
 
 def test_what_the_marks_contradict_one_another_by_is_in_the_covariance_of_each() -> None:
-    told = {n: told_of(way * np.eye(5)[0]) for n, way in enumerate((1.0, -1.0, 1.0, -1.0))}
-    agreed = {n: told_of(np.zeros(5)) for n in range(4)}
+    result = {n: mark_tone(way * np.eye(5)[0]) for n, way in enumerate((1.0, -1.0, 1.0, -1.0))}
+    agreed = {n: mark_tone(np.zeros(5)) for n in range(4)}
     prior = Tone.unknown()
     sigma, sigma_agreed = (
         float(np.sqrt(FrameTone.from_marks(prior, each, prior).covariance_px2(each[0])[0, 0]))
-        for each in (told, agreed)
+        for each in (result, agreed)
     )
     assert sigma_agreed < 0.06  # four marks, each 0.1 px
     assert sigma > 0.5  # they are 1 px from what they agree on
 
 
 def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
-    agreed = [told_of(np.eye(5)[0]).information] * 4
-    alone, prior = told_of(-3 * np.ones(5)).information, Tone.unknown()
+    agreed = [mark_tone(np.eye(5)[0]).information] * 4
+    alone, prior = mark_tone(-3 * np.ones(5)).information, Tone.unknown()
     together, without = prior.estimate([*agreed, alone]), prior.estimate(agreed)
     assert without.scatter == 0.0
     assert together.scatter > 0.3
@@ -223,10 +225,10 @@ def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
     assert np.sqrt(off @ np.linalg.solve(together.tone.covariance, off)) < 3
 
 
-def test_what_a_picture_says_of_a_curve_of_its_own_has_the_variance_of_that_beside_its_own() -> None:
-    said = told_of(np.arange(5.0)).information
-    loose = ToneInformation.pooled([said], 0.5)
-    np.testing.assert_allclose(np.linalg.inv(loose.matrix), np.linalg.inv(said.matrix) + 0.5 * np.eye(5))
+def test_what_a_picture_says_of_a_curve_of_its_own_has_the_variance_of_that_next_to_its_own() -> None:
+    information = mark_tone(np.arange(5.0)).information
+    loose = ToneInformation.pooled([information], 0.5)
+    np.testing.assert_allclose(np.linalg.inv(loose.matrix), np.linalg.inv(information.matrix) + 0.5 * np.eye(5))
     np.testing.assert_allclose(np.linalg.solve(loose.matrix, loose.right_side), np.arange(5.0), atol=1e-9)
     assert loose.sum_of_squares == pytest.approx(float(np.arange(5.0) @ loose.matrix @ np.arange(5.0)))
 
@@ -240,7 +242,7 @@ def test_what_is_wrong_alike_in_all_pictures_of_a_scanner_does_not_average() -> 
     for _ in range(60):
         truth, wrong = rng.standard_normal(5), np.sqrt(variance) * rng.standard_normal(5)
         each = [
-            replace(said_of(truth + wrong + 0.1 * rng.standard_normal(5), 100.0), common_variance=variance)
+            replace(tone_information(truth + wrong + 0.1 * rng.standard_normal(5), 100.0), common_variance=variance)
             for _ in range(20)
         ]
         at_once, in_turn = (
@@ -258,7 +260,7 @@ def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -
     values does not."""
     rng = np.random.default_rng(9)
     mark = some_mark(TIP, 1.0, rng)
-    code = code_of(mark, 2.2, 80.0, rng) / 257
+    code = encode_mark(mark, 2.2, 80.0, rng) / 257
     known = []
     for step_dn in (0.0, 12.0):
         scan = scan_of(code, 255, step_dn).replace_tone(Tone.unknown())
@@ -266,8 +268,8 @@ def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -
         fit = detect_mark(scan, expected, MatchOptions(linear_sigma=0.05), mark.kind.known).fit
         assert fit is not None
         assert fit.tone is not None
-        told = [ToneInformation.pooled([fit.tone.information] * count).scanner_information for count in (1, 16)]
-        known.append([np.linalg.norm(said.matrix, 2) for said in told])
+        estimate = [ToneInformation.pooled([fit.tone.information] * count).scanner_information for count in (1, 16)]
+        known.append([np.linalg.norm(information.matrix, 2) for information in estimate])
     (one, many), (one_rounded, many_rounded) = known
     assert many == pytest.approx(16 * one)
     assert many_rounded < 4 * one_rounded
@@ -281,19 +283,19 @@ def test_noise_that_is_cut_off_at_black_feigns_no_curve() -> None:
     for _ in range(12):
         mark = some_mark(TIP, 1.3, rng)
         light = 0.02 + 0.5 * (mark.picture + rng.standard_normal(mark.picture.shape) / 12)
-        told = fitted(mark, FULL * np.clip(light, 0.0, 1.0), linear).tone
-        assert told is not None
-        found = linear.estimate([told.information]).tone
-        moved.append(float(mark.place[:, 1] @ told.on_place @ found.mean / np.hypot(*mark.place[:, 1])))
+        estimate = fit_mark(mark, FULL * np.clip(light, 0.0, 1.0), linear).tone
+        assert estimate is not None
+        found = linear.estimate([estimate.information]).tone
+        moved.append(float(mark.place[:, 1] @ estimate.on_place @ found.mean / np.hypot(*mark.place[:, 1])))
     assert abs(np.mean(moved)) < 4 * np.std(moved) / np.sqrt(len(moved))
 
 
-def told_of(departures: np.ndarray) -> MarkTone:
+def mark_tone(departures: np.ndarray) -> MarkTone:
     """A mark that says them with a standard deviation of 0.1, and moves by 1 px for each."""
-    return MarkTone(said_of(departures, 100.0), np.eye(2, 5), 0.1, 0.7)
+    return MarkTone(tone_information(departures, 100.0), np.eye(2, 5), 0.1, 0.7)
 
 
-def said_of(departures: np.ndarray, weight: float) -> ToneInformation:
+def tone_information(departures: np.ndarray, weight: float) -> ToneInformation:
     """Each of them known to 1 / sqrt(weight)."""
     return ToneInformation(weight * np.eye(5), weight * departures, weight * float(departures @ departures), 5)
 
@@ -303,13 +305,13 @@ def test_a_mark_whose_detail_alone_was_fitted_moves_with_the_curve_and_says_noth
     mark, prior = some_mark(KIND["cross"], 1.0, rng), Tone.unknown()
     row, col = np.mgrid[: mark.size, : mark.size]
     landscape = 1 + 0.15 * (np.sin(col / 5) * np.sin(row / 5) - 1)
-    told = fitted(mark, landscape * code_of(mark, 2.2, 100.0, rng), prior).tone
-    assert told is not None
-    assert told.information.count == 0
-    found = FrameTone.from_marks(prior, {0: told}, prior)
+    estimate = fit_mark(mark, landscape * encode_mark(mark, 2.2, 100.0, rng), prior).tone
+    assert estimate is not None
+    assert estimate.information.count == 0
+    found = FrameTone.from_marks(prior, {0: estimate}, prior)
     assert found.scatter == 0.0
     assert np.array_equal(found.tone.covariance, prior.covariance)
-    assert 0.005 < np.sqrt(np.trace(found.covariance_px2(told))) < 0.1
+    assert 0.005 < np.sqrt(np.trace(found.covariance_px2(estimate))) < 0.1
 
 
 def test_what_a_mark_says_of_the_curve_is_the_same_however_closely_the_fit_held_the_frame() -> None:
@@ -324,8 +326,10 @@ def test_what_a_mark_says_of_the_curve_is_the_same_however_closely_the_fit_held_
     for change in (0.0, 0.003):
         fit = LinearFit(residuals - change * design[2], everywhere, design, by_grey, noise, np.ones(shape))
         priors, departures = np.array([0, 0, 50.0, 0, 0, 0, 0]), np.array([0, 0, 0.002 + change, 0, 0, 0, 0])
-        told = mark_tone_information(fit, drawn, drawn, everywhere, priors, departures, Tone.unknown(), FULL, landscape)
-        rights.append(told.information.right_side)
+        estimate = mark_tone_information(
+            fit, drawn, drawn, everywhere, priors, departures, Tone.unknown(), FULL, landscape
+        )
+        rights.append(estimate.information.right_side)
     np.testing.assert_allclose(rights[1], rights[0], rtol=1e-6)
 
 

@@ -38,7 +38,7 @@ def test_scans_of_one_exposed_frame_are_one_sight_of_a_point() -> None:
     of a, in b and in c. The scans of a are no pair, and a point of theirs that b alone shows has two sights only."""
     rng = np.random.default_rng(4)
     ground = rng.uniform([-300.0, -300.0, 0.0], [300.0, 300.0, 120.0], (400, 3))
-    looks = rng.normal(0.0, 1.0, (400, 128))
+    observations = rng.normal(0.0, 1.0, (400, 128))
     frames, features = [], []
     for image, part_of, station, first, end, lower in (
         ("a0", "a", (-60.0, 0.0, 900.0), 0, 700, 0),
@@ -51,8 +51,8 @@ def test_scans_of_one_exposed_frame_are_one_sight_of_a_point() -> None:
         shown = (places[:, 0] > first) & (places[:, 0] < end) & (places[:, 1] > lower) & (places[:, 1] < 1200)
         places = places[shown] - (first, 0)
         pixel_from_camera = np.array([[100.0, 0.0, 600.0 - first], [0.0, -100.0, 600.0]])
-        seen = (looks[shown] + rng.normal(0.0, 0.05, (shown.sum(), 128))).astype(np.float32)
-        features.append(Features(places, seen, np.ones(len(places)), np.ones(len(places)), (end - first, 1200)))
+        view = (observations[shown] + rng.normal(0.0, 0.05, (shown.sum(), 128))).astype(np.float32)
+        features.append(Features(places, view, np.ones(len(places)), np.ones(len(places)), (end - first, 1200)))
         none = np.zeros((0, 3))
         frames.append(TieFrame(image, Path(f"{image}.tif"), pixel_from_camera, None, none, part_of=part_of))
     shared = verify_pairs(frames, features, None)

@@ -15,13 +15,13 @@ MM, SIGMA_PX = 0.04, 0.05
 SCANNER = np.array([[1.002, 0.001], [0.0, 0.999]])
 
 
-def layout_of(places: dict[str, tuple[float, float]], sigma_mm: float = 0.02) -> FiducialLayout:
+def make_layout(places: dict[str, tuple[float, float]], sigma_mm: float = 0.02) -> FiducialLayout:
     shape = MarkShape(cross(1.0, 0.1))
     marks = [LayoutMark(name, place, (sigma_mm, sigma_mm), shape) for name, place in places.items()]
     return FiducialLayout(tuple(marks), (56.0, 56.0))
 
 
-def frame_of(
+def make_frame(
     rng: np.random.Generator,
     name: str = "a",
     off_mm: dict[str, tuple[float, float]] | None = None,
@@ -48,7 +48,7 @@ def frame_of(
 def weak(frames: list[FrameMeasurement], sigma_mm: float = 0.02, pitch_mm: float = MM) -> dict[str, set[str]]:
     """The weak marks by frame, checked as scans of pitch_mm."""
     checked = check_frames(
-        frames, layout_of(THREE, sigma_mm), [(1000 * pitch_mm, 1000 * pitch_mm)] * len(frames)
+        frames, make_layout(THREE, sigma_mm), [(1000 * pitch_mm, 1000 * pitch_mm)] * len(frames)
     ).frames
     found = {frame.image: {mark.point for mark in frame.marks if mark.status is Status.WEAK} for frame in checked}
     return {image: points for image, points in found.items() if points}
@@ -59,7 +59,7 @@ def weak(frames: list[FrameMeasurement], sigma_mm: float = 0.02, pitch_mm: float
 def test_good_triangles_are_doubted_no_more_often_than_stated(mirror: bool) -> None:
     """Two tests of one per cent each, and film of this kind stretches less than is allowed for."""
     rng = np.random.default_rng(1)
-    lost = sum(bool(weak([frame_of(rng, str(k), mirror=mirror) for k in range(4)])) for _ in range(60))
+    lost = sum(bool(weak([make_frame(rng, str(k), mirror=mirror) for k in range(4)])) for _ in range(60))
     assert lost <= 3
 
 
@@ -68,8 +68,8 @@ def test_a_triangle_that_a_mark_or_a_pitch_explains_is_a_problem_of_its_frame(mi
     """Half a millimetre of 52: in one of six frames alone along a side, as film may be stretched or a mark be off. Each
     mark may be that, is weak, and counts as known to what the triangle does not fit by."""
     rng = np.random.default_rng(2)
-    frames = [frame_of(rng, str(k), {"1": (0.5, 0.0)} if k == 4 else None, mirror=mirror) for k in range(6)]
-    checked = check_frames(frames, layout_of(THREE, 1.0), [(1000 * MM, 1000 * MM)] * 6).frames
+    frames = [make_frame(rng, str(k), {"1": (0.5, 0.0)} if k == 4 else None, mirror=mirror) for k in range(6)]
+    checked = check_frames(frames, make_layout(THREE, 1.0), [(1000 * MM, 1000 * MM)] * 6).frames
     weak_marks = {frame.image for frame in checked for mark in frame.marks if mark.status is Status.WEAK}
     assert weak_marks == {"4"}
     (problem,) = checked[4].problems
@@ -82,8 +82,8 @@ def test_a_triangle_that_a_mark_or_a_pitch_explains_is_a_problem_of_its_frame(mi
 
 def test_a_triangle_that_a_wrong_pitch_alone_explains_says_so() -> None:
     """Pixels longer by 8 % one way: a mark alone would have to lie 4 mm off. Its place is as certain as before."""
-    frame = frame_of(np.random.default_rng(3), pitch_mm=(1.04 * MM, 0.96 * MM))
-    (checked,) = check_frames([frame], layout_of(THREE), [(1000 * MM, 1000 * MM)]).frames
+    frame = make_frame(np.random.default_rng(3), pitch_mm=(1.04 * MM, 0.96 * MM))
+    (checked,) = check_frames([frame], make_layout(THREE), [(1000 * MM, 1000 * MM)]).frames
     (problem,) = checked.problems
     assert "A wrong pitch, or film that is stretched more, explains it best" in problem
     for mark in checked.marks:
@@ -95,15 +95,15 @@ def test_a_triangle_that_a_wrong_pitch_alone_explains_says_so() -> None:
 def test_a_wrong_pitch_makes_no_mark_weak() -> None:
     """Larger by 4 % in both directions: no single mark can do that."""
     rng = np.random.default_rng(3)
-    assert not weak([frame_of(rng, str(k)) for k in range(3)], pitch_mm=1.04 * MM)
+    assert not weak([make_frame(rng, str(k)) for k in range(3)], pitch_mm=1.04 * MM)
 
 
 def test_a_triangle_that_other_frames_have_otherwise_is_a_problem_of_its_frame() -> None:
     """0.3 mm of 52: no more than a scanner may do, but not in one of six frames alone. Film bent by as much is a
     hypothesis too: no mark is named, and the one that is off is known no better than it is."""
     rng = np.random.default_rng(4)
-    frames = [frame_of(rng, str(k), {"2": (0.2, 0.22)} if k == 4 else None) for k in range(6)]
-    layout, pitches = layout_of(THREE, 1.0), [(1000 * MM, 1000 * MM)] * 6
+    frames = [make_frame(rng, str(k), {"2": (0.2, 0.22)} if k == 4 else None) for k in range(6)]
+    layout, pitches = make_layout(THREE, 1.0), [(1000 * MM, 1000 * MM)] * 6
     assert not check_frames(frames[4:5], layout, pitches[:1]).frames[0].problems
     checked = check_frames(frames, layout, pitches).frames
     assert [len(frame.problems) for frame in checked] == [0, 0, 0, 0, 1, 0]
@@ -114,5 +114,5 @@ def test_a_triangle_that_other_frames_have_otherwise_is_a_problem_of_its_frame()
 
 def test_two_frames_do_not_tell_which_one_is_off() -> None:
     rng = np.random.default_rng(5)
-    frames = [frame_of(rng, "0"), frame_of(rng, "1", {"2": (0.2, 0.22)})]
+    frames = [make_frame(rng, "0"), make_frame(rng, "1", {"2": (0.2, 0.22)})]
     assert not weak(frames, sigma_mm=1.0)

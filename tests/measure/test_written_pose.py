@@ -37,7 +37,7 @@ def line(text: str, pose: str, side: Side, share: float = 0.2) -> Line:
 Written = tuple[str, str, Side]
 
 
-def seen(pose: str, *camera: Written) -> list[Line]:
+def view_lines(pose: str, *camera: Written) -> list[Line]:
     """Lines as a scan of that pose shows them, given as they lie in the camera's frame."""
     lines = []
     for text, own, camera_side in camera:
@@ -56,20 +56,20 @@ def lead(lines: Sequence[Line], pose: str, places: Sequence[WrittenPlace] = WILD
 
 @pytest.mark.parametrize("pose", POSES)
 def test_titles_that_stand_and_read_as_the_camera_has_them_decide_every_pose(pose: str) -> None:
-    assert lead(seen(pose, ("RUN 20 CANBERRA 7/7/89", "90", "left")), pose) > DECIDED
+    assert lead(view_lines(pose, ("RUN 20 CANBERRA 7/7/89", "90", "left")), pose) > DECIDED
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_titles_and_plate_that_read_alike_on_opposite_sides_are_told_by_what_they_say(pose: str) -> None:
+def test_titles_and_plate_that_read_alike_on_opposite_sides_are_known_by_what_they_say(pose: str) -> None:
     plate: Written = ("WILD 15/4 Nr 13043 152.75", "270", "right")
     title: Written = ("RUN 20 CANBERRA 7/7/89", "90", "left")
-    assert lead(seen(pose, plate), pose) > DECIDED
-    assert lead(seen(pose, plate, title), pose) > DECIDED
+    assert lead(view_lines(pose, plate), pose) > DECIDED
+    assert lead(view_lines(pose, plate, title), pose) > DECIDED
 
 
 def test_a_line_that_may_be_anybodys_does_not_decide_by_its_place() -> None:
     """Handwriting on the plate's side: upside down it would be a title on its own side."""
-    lines = seen("0", ("CHECKED BY MILLER", "270", "right"))
+    lines = view_lines("0", ("CHECKED BY MILLER", "270", "right"))
     of_all = dict(zip(POSES, writing_likelihoods(lines, WILD, POSES), strict=True))
     assert of_all["180"] - of_all["0"] < DECIDED
     assert of_all["180"] - of_all["180m"] > DECIDED  # but it is not mirrored
@@ -77,15 +77,15 @@ def test_a_line_that_may_be_anybodys_does_not_decide_by_its_place() -> None:
 
 def test_the_films_own_name_tells_the_mirror_alone() -> None:
     of_all = dict(
-        zip(POSES, writing_likelihoods(seen("90m", ("KODAK SAFETY FILM", "0", "top")), WILD, POSES), strict=True)
+        zip(POSES, writing_likelihoods(view_lines("90m", ("KODAK SAFETY FILM", "0", "top")), WILD, POSES), strict=True)
     )
     mirrored = [of_all[pose] for pose in POSES if pose.endswith("m")]
     assert mirrored == pytest.approx([0.0] * 4, abs=1e-3)
     assert max(of_all[pose] for pose in POSES if not pose.endswith("m")) < -DECIDED
 
 
-def test_without_a_known_place_only_the_mirror_is_told() -> None:
-    of_all = writing_likelihoods(seen("90", ("RUN 20 CANBERRA 7/7/89", "90", "left")), (), POSES)
+def test_without_a_known_place_only_the_mirror_is_reported() -> None:
+    of_all = writing_likelihoods(view_lines("90", ("RUN 20 CANBERRA 7/7/89", "90", "left")), (), POSES)
     assert of_all[:4] == pytest.approx([0.0] * 4, abs=1e-3)
     assert of_all[4:].max() < -DECIDED
 
@@ -129,7 +129,7 @@ def written_frame() -> Array:
     return np.asarray(grey + 40.0 * np.rot90(letters))
 
 
-def measured(
+def measure_picture(
     pose: str,
     folder: Path,
     places: tuple[WrittenPlace, ...],
@@ -144,8 +144,8 @@ def measured(
 
 
 @parametrize_with_studies("pose", ["270", "90m"])
-def test_the_pose_of_a_frame_with_marks_alike_is_decided_by_its_writing(pose: str, tmp_path: Path) -> None:
-    found = measured(pose, tmp_path, WILD).pose
+def test_the_pose_of_a_frame_with_marks_alike_is_settled_by_its_writing(pose: str, tmp_path: Path) -> None:
+    found = measure_picture(pose, tmp_path, WILD).pose
     assert found is not None
     assert (found.name, found.decided) == (pose, True)
     assert "RUN20CANBERRA" in found.evidence[-1].replace(" ", "")
@@ -154,7 +154,7 @@ def test_the_pose_of_a_frame_with_marks_alike_is_decided_by_its_writing(pose: st
 
 @pytest.mark.study
 def test_where_no_place_is_known_frames_are_named_so_that_their_writing_is_upright(tmp_path: Path) -> None:
-    found = measured("180m", tmp_path, ()).pose
+    found = measure_picture("180m", tmp_path, ()).pose
     assert found is not None
     assert not found.decided
     assert pose_in_camera(found.writing, found.name) == "0"
@@ -163,7 +163,7 @@ def test_where_no_place_is_known_frames_are_named_so_that_their_writing_is_uprig
 
 
 def test_nothing_is_read_where_nobody_asks_and_a_mirror_is_not_assumed(tmp_path: Path) -> None:
-    silent = measured("90m", tmp_path, WILD, "none")
+    silent = measure_picture("90m", tmp_path, WILD, "none")
     assert silent.writing is None
     assert silent.pose is not None
     assert (silent.pose.name, silent.pose.decided) == ("0", False)
@@ -175,7 +175,7 @@ TITLE = KnownLine("RUN 31  CANBERRA  17.6.69", "90", "left", ((-13.9, -9.0), (-1
 def test_a_frame_that_lies_as_others_of_its_roll_is_read_only_where_their_line_stands(
     tmp_path: Path,
 ) -> None:
-    alike = measured("0", tmp_path, WILD, known_lines=(TITLE,))
+    alike = measure_picture("0", tmp_path, WILD, known_lines=(TITLE,))
     assert [(each.side, each.pose) for each in alike.writing or ()] == [("left", "90")]
     assert alike.pose is not None
     assert (alike.pose.name, alike.pose.decided) == ("0", True)
@@ -185,7 +185,7 @@ def test_a_frame_that_lies_as_others_of_its_roll_is_read_only_where_their_line_s
 @pytest.mark.parametrize("pose", ["180", "0m"])
 def test_a_frame_that_lies_otherwise_is_read_as_a_whole(pose: str, tmp_path: Path) -> None:
     """The plate lies where the title is looked for, or the title itself in a mirror."""
-    other = measured(pose, tmp_path, WILD, known_lines=(TITLE,))
+    other = measure_picture(pose, tmp_path, WILD, known_lines=(TITLE,))
     assert {each.side for each in other.writing or ()} == {"left", "right"}
     assert other.pose is not None
     assert (other.pose.name, other.pose.decided) == (pose, True)

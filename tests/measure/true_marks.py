@@ -73,7 +73,7 @@ class TrueMark:
     @cached_property
     def picture(self) -> Array:
         """(size, size): 1 inside of the mark, 0 outside, seen through the blur."""
-        return self._seen(self.place, self.blur_px)
+        return self._cover(self.place, self.blur_px)
 
     @cached_property
     def design(self) -> Array:
@@ -81,11 +81,12 @@ class TrueMark:
         row, col = np.mgrid[: self.size, : self.size] / self.size - 0.5
         shifts = np.array([[0.0, 0, 0.05], [0, 0, 0]]), np.array([[0.0, 0, 0], [0, 0, 0.05]])
         columns = [
-            (self._seen(self.place + s, self.blur_px) - self._seen(self.place - s, self.blur_px)) / 0.1 for s in shifts
+            (self._cover(self.place + s, self.blur_px) - self._cover(self.place - s, self.blur_px)) / 0.1
+            for s in shifts
         ]
-        columns += [self._by_move(np.reshape(move, (2, 2))) for move in self.kind.unknown]
+        columns += [self._move_derivative(np.reshape(move, (2, 2))) for move in self.kind.unknown]
         columns.append(
-            (self._seen(self.place, self.blur_px + 0.02) - self._seen(self.place, self.blur_px - 0.02)) / 0.04
+            (self._cover(self.place, self.blur_px + 0.02) - self._cover(self.place, self.blur_px - 0.02)) / 0.04
         )
         return np.stack([*columns, self.picture, np.ones_like(col), col, row])
 
@@ -110,9 +111,9 @@ class TrueMark:
         Their mean square is the bound. Beside them, the errors of another method show in few marks what its own mean
         square would show in thousands only.
         """
-        (_, by_grey, by_told), near = self._best(sigma, seen, correlation)
+        (_, by_grey, by_statement), near = self._best(sigma, seen, correlation)
         errors = by_grey @ noise[near]
-        return np.asarray(errors if told is None else errors + by_told @ told)
+        return np.asarray(errors if told is None else errors + by_statement @ told)
 
     def _best(self, sigma: float, seen: Mask | None, correlation: Array | None) -> tuple[tuple[Array, ...], Mask]:
         """The bound, how the best estimate of the place follows from the pixels (2, pixels) and from what the frame
@@ -143,9 +144,9 @@ class TrueMark:
     def near(self) -> Mask:
         """Within MARGIN_PX of the mark's bounds and, so that no fit does better than the bound, at least what
         one takes in of a soft picture."""
-        col0, row0, width, height = areas.bounds(areas_of(self.kind.shape, self.place))
+        col0, row0, width, height = areas.bounds(mark_areas(self.kind.shape, self.place))
         row, col = np.mgrid[: self.size, : self.size]
-        outside = self._seen(self.place, _OUTLINE_BLUR_PX) < _SHOWN
+        outside = self._cover(self.place, _OUTLINE_BLUR_PX) < _SHOWN
         return np.asarray(
             (col >= col0 - MARGIN_PX)
             & (col < col0 + width + MARGIN_PX)
@@ -154,27 +155,27 @@ class TrueMark:
             | (np.asarray(distance_transform_edt(outside)) <= MARGIN_BLURS * self.blur_px)
         )
 
-    def _by_move(self, generator: Array) -> Array:
+    def _move_derivative(self, generator: Array) -> Array:
         step = 0.003
         plus, minus = (
             np.column_stack([(np.eye(2) + sign * step * generator) @ self.place[:, :2], self.place[:, 2]])
             for sign in (1, -1)
         )
-        return (self._seen(plus, self.blur_px) - self._seen(minus, self.blur_px)) / (2 * step)
+        return (self._cover(plus, self.blur_px) - self._cover(minus, self.blur_px)) / (2 * step)
 
-    def _seen(self, place: Array, blur_px: float) -> Array:
-        outlines = areas_of(self.kind.shape, place)
+    def _cover(self, place: Array, blur_px: float) -> Array:
+        outlines = mark_areas(self.kind.shape, place)
         col0, row0, width, height = areas.bounds(outlines)
         reach = reach_px(blur_px)
         col0, row0 = max(col0 - reach, 0), max(row0 - reach, 0)
         width, height = min(width + 2 * reach, self.size - col0), min(height + 2 * reach, self.size - row0)
-        seen = np.zeros((self.size, self.size))
+        view = np.zeros((self.size, self.size))
         shown = seen_coverage(outlines, col0, row0, width, height, blur_px, _FOLD)
-        seen[row0 : row0 + height, col0 : col0 + width] = shown
-        return seen
+        view[row0 : row0 + height, col0 : col0 + width] = shown
+        return view
 
 
-def areas_of(shape: MarkShape, pixel_from_mark: Array) -> tuple[areas.Area, ...]:
+def mark_areas(shape: MarkShape, pixel_from_mark: Array) -> tuple[areas.Area, ...]:
     """The mark's outlines in px."""
     return tuple(
         tuple(outline @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2] for outline in _area(part))
@@ -195,7 +196,7 @@ def _area(part: Part) -> areas.Area:
 def some_mark(kind: Kind, blur_px: float, rng: np.random.Generator, size: int = 0, px_per_mm: float = 10.0) -> TrueMark:
     """A mark of random phase, rotation and scale (5 %) about the middle of its window."""
     if not size:
-        extent = max(float(np.abs(outline).max()) for area in areas_of(kind.shape, np.eye(2, 3)) for outline in area)
+        extent = max(float(np.abs(outline).max()) for area in mark_areas(kind.shape, np.eye(2, 3)) for outline in area)
         size = 2 * int(extent * 1.05 * 1.42 * px_per_mm + MARGIN_PX + 2 * blur_px + 30) + 1
     turn, scale = rng.uniform(-np.pi, np.pi), px_per_mm * rng.uniform(0.95, 1.05)
     if kind.name == "ellipse":

@@ -37,7 +37,7 @@ def one_thread_of_opencv() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def in_one_process() -> Iterator[None]:
+def single_process() -> Iterator[None]:
     """Small scans are measured sooner than a new process has loaded its modules. The demonstration starts them."""
     with pools(lambda *_: nullcontext(Here())):
         yield

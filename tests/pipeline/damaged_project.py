@@ -26,15 +26,15 @@ HOSTILE = (
 )  # fmt: skip
 
 
-def made(folder: Path) -> Path:
+def make_project(folder: Path) -> Path:
     """A project that names every kind of table, adjusted once, with that as the camera's earlier calibration."""
     truth = Truth()
     network, _ = simulated(np.random.default_rng(5), truth, free={"k3": np.inf, "p1": np.inf})
     project = write_project(network, folder)
     assert run(["adjust", str(project)]) in (0, 1)
     (folder / "out").rename(folder / "earlier")
-    _with(folder / "camera.toml", "[sigma]\n", '[sigma]\ncalibration = "earlier/adjustment.json"\n')
-    _with(project, "[object]\n", '[object]\nimages = "images.csv"\ndistances = "distances.csv"\n')
+    _replace(folder / "camera.toml", "[sigma]\n", '[sigma]\ncalibration = "earlier/adjustment.json"\n')
+    _replace(project, "[object]\n", '[object]\nimages = "images.csv"\ndistances = "distances.csv"\n')
     rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg"]
     for i, (station, angles) in enumerate(zip(truth.stations, truth.attitudes, strict=True)):
         rows.append(",".join([f"f{i}", *(f"{value:.1f}" for value in (*station, *np.degrees(angles)))]))
@@ -44,7 +44,7 @@ def made(folder: Path) -> Path:
     return project
 
 
-def _with(path: Path, old: str, new: str) -> None:
+def _replace(path: Path, old: str, new: str) -> None:
     text = path.read_text(encoding="utf-8")
     assert old in text
     path.write_text(text.replace(old, new, 1), encoding="utf-8")

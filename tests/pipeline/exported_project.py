@@ -26,10 +26,10 @@ POINTS = np.random.default_rng(8).uniform((-700.0, -700.0, -150.0), (700.0, 700.
 def adjusted_project(folder: Path, truth: Truth = TRUTH, crs: str = "", kind: str = "affine") -> Path:
     """project.toml of an adjusted project, with scans that have a size and nothing in them."""
     network, _ = simulated(np.random.default_rng(1), truth, kind, points=POINTS, noise=False)
-    return project_of(network, folder, crs)
+    return make_project(network, folder, crs)
 
 
-def project_of(network: Network, folder: Path, crs: str = "") -> Path:
+def make_project(network: Network, folder: Path, crs: str = "") -> Path:
     """The same of a network of four images f0 to f3."""
     path = write_project(network, folder)
     text = path.read_text(encoding="utf-8")

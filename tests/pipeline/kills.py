@@ -38,7 +38,7 @@ def state(folder: Path) -> State:
     files = [folder / "comparator.csv", *sorted((folder / "out").rglob("*"))]
     names = {str(file.relative_to(folder)): file for file in files if file.is_file()}
     left = {name: file for name, file in names.items() if "/." not in name and not name.endswith(("-wal", "-shm"))}
-    return {name: told for name, file in left.items() if (told := content(file))}
+    return {name: result for name, file in left.items() if (result := content(file))}
 
 
 def started(folder: Path, command: str) -> subprocess.Popen[bytes]:
@@ -53,7 +53,7 @@ def started(folder: Path, command: str) -> subprocess.Popen[bytes]:
     )
 
 
-def seconds_of(source: Path, folder: Path, command: str) -> tuple[float, State]:
+def time_command(source: Path, folder: Path, command: str) -> tuple[float, State]:
     """How long the command takes when nobody ends it, and its results. folder: for now; the report has its name."""
     shutil.copytree(source, folder)
     start = time.monotonic()
@@ -72,14 +72,14 @@ def trial(source: Path, folder: Path, command: str, sign: signal.Signals, whom: 
         _wait(lambda: bool(_workers(parent.pid)) or parent.poll() is not None, LONGEST_S)
     _wait(lambda: parent.poll() is not None, after_s)
     before = parent.poll() is not None
-    asked = time.monotonic()
+    requests = time.monotonic()
     targets = [parent.pid] if whom == "parent" else _workers(parent.pid)
     if targets and not before:
         os.kill(random.Random(after_s).choice(targets), sign)
     else:
         before = True
     parent.wait(LONGEST_S)
-    in_time = whom == "worker" or before or time.monotonic() - asked < END_S
+    in_time = whom == "worker" or before or time.monotonic() - requests < END_S
     _wait(lambda: not _session(parent.pid), END_S)
     left = _session(parent.pid)
     for pid in left:

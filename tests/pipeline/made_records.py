@@ -18,7 +18,7 @@ from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan,
 FOLDER = Path("/project")
 
 
-def measured(seed: int = 1, marks: int = 8, status: Status = Status.MEASURED, **changes: Any) -> MeasuredScan:
+def measured_scan(seed: int = 1, marks: int = 8, status: Status = Status.MEASURED, **changes: Any) -> MeasuredScan:
     """A frame of so many fiducials. changes: of the frame."""
     rng = random.Random(seed)
     matrix = np.array([[rng.uniform(40, 60), rng.gauss(0, 1), 2500.0], [rng.gauss(0, 1), -50.0, 2000.0]])
@@ -49,16 +49,16 @@ def changed(scan: MeasuredScan, numbers: Iterable[int], status: Status, reason: 
 
 def failed(seed: int = 1) -> MeasuredScan:
     sentence = f"scans/{seed}.tif is damaged or truncated"
-    frame = measured(seed, 2, Status.ABSENT, pose=None, pixel_from_camera=None).frame
+    frame = measured_scan(seed, 2, Status.ABSENT, pose=None, pixel_from_camera=None).frame
     frame = replace(frame, problems=(Reason(sentence, Code.FAILED_SCAN),))
     return MeasuredScan.failed(str(FOLDER / f"scans/{seed}.tif"), frame, Failure(FailureCode.UNREADABLE, sentence))
 
 
-def kept(seed: int = 1, options: str = "{}", mtime_ns: int = 1, scan: MeasuredScan | None = None) -> Kept:
+def kept_result(seed: int = 1, options: str = "{}", mtime_ns: int = 1, scan: MeasuredScan | None = None) -> Kept:
     """A result of a scan of its own."""
     state = FileState(f"scans/{seed}.tif", 1000 + seed, mtime_ns)
     parts = hashlib.sha256(str(seed).encode()).hexdigest()
-    return Kept(Identity(state, parts), options, scan or measured(seed), camera="camera.toml")
+    return Kept(Identity(state, parts), options, scan or measured_scan(seed), camera="camera.toml")
 
 
 def content(scan: MeasuredScan) -> tuple[object, ...]:

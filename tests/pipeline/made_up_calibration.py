@@ -207,7 +207,7 @@ def singular_adjustment() -> Adjustment:
 
 
 @cache
-def measured() -> ReportData:
+def measured_report() -> ReportData:
     """Scans measured, nothing adjusted: every mark found, every pose decided."""
     observations = adjustment().network.observations
     pixels = observations.xy_mm * (1e3 / PITCH_UM, -1e3 / PITCH_UM) + 6000.0
@@ -252,17 +252,17 @@ class _Crosses:
 
 
 @cache
-def adjusted() -> ReportData:
+def adjusted_report() -> ReportData:
     """Measured, adjusted and in agreement with OpenCV."""
-    return _with(adjustment())
+    return _replace(adjustment())
 
 
 @cache
 def singular() -> ReportData:
-    return _with(singular_adjustment())
+    return _replace(singular_adjustment())
 
 
-def _with(result: Adjustment) -> ReportData:
+def _replace(result: Adjustment) -> ReportData:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "adjustment.json"
         write_adjustment(result, path)
@@ -272,13 +272,15 @@ def _with(result: Adjustment) -> ReportData:
         for name, unit, value, sigma in CHECKED
     )
     camera = CameraCheck("agrees", "All parameters agree within 0.1 sigma.", 5, 120, 4.61, 4.60, 0.012, rows)
-    return replace(measured(), adjustment=stored, covariance=covariance, check=Check.from_cameras({CAMERA: camera}))
+    return replace(
+        measured_report(), adjustment=stored, covariance=covariance, check=Check.from_cameras({CAMERA: camera})
+    )
 
 
 @cache
 def digital() -> ReportData:
     """The same by a digital camera: no film, no fiducials, pixels of PITCH_UM."""
-    data = adjusted()
+    data = adjusted_report()
     assert data.adjustment is not None
     assert data.measurement is not None
     stored = data.adjustment
@@ -305,7 +307,7 @@ def digital() -> ReportData:
 @cache
 def film_alone() -> ReportData:
     """The fiducials alone: no frame is oriented, and no camera calibrated."""
-    data = adjusted()
+    data = adjusted_report()
     assert data.adjustment is not None
     assert data.measurement is not None
     stored, unknown = data.adjustment, math.nan

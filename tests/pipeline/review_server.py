@@ -22,7 +22,7 @@ def write_faults(folder: Path) -> Path:
     folder.mkdir(parents=True)
     (folder / "camera.toml").write_text(CAMERA, encoding="utf-8")
     for seed, name in enumerate((GOOD, BARE, SCRATCHED, TURNED), 1):
-        grey = frame_picture(ALIKE, matrix_of(name), seed)
+        grey = frame_picture(ALIKE, mark_matrix(name), seed)
         col, row = np.rint(mark_px(name, "3")).astype(int)
         if name == BARE:
             noise = np.random.default_rng(seed).normal(0, NOISE_DN, (81, 81))
@@ -34,14 +34,14 @@ def write_faults(folder: Path) -> Path:
     return folder / "project.toml"
 
 
-def matrix_of(name: str) -> Array:
+def mark_matrix(name: str) -> Array:
     """Camera mm to pixels, as the frame was drawn."""
     return pixel_from_camera("0", FAR_TURN_RAD if name == TURNED else 0.004)
 
 
 def mark_px(name: str, point: str) -> Array:
     """Where a mark was drawn."""
-    return np.asarray(matrix_of(name) @ (*CORNERS[int(point) - 1], 1.0))
+    return np.asarray(mark_matrix(name) @ (*CORNERS[int(point) - 1], 1.0))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from adjust.problem.network import Network
 
 def write_project(network: Network, folder: Path) -> Path:
     """camera.toml, points.csv, comparator.csv and project.toml; the path of the last."""
-    camera, points, seen = network.cameras[0], network.points, network.observations
+    camera, points, observed = network.cameras[0], network.points, network.observations
     c, x0, y0 = camera.principal_distance_mm, camera.x0_mm, camera.y0_mm
     assert c is not None
     assert x0 is not None
@@ -45,9 +45,9 @@ def write_project(network: Network, folder: Path) -> Path:
         rows.append(",".join([point.id, *(repr(a.value) for a in axes), *(bare(a.sigma) for a in axes)]))
     (folder / "points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
-    for i, (x_mm, y_mm) in enumerate(seen.xy_mm.tolist()):
-        sx, sy = np.sqrt(np.diag(seen.covariance_mm2[i])).tolist()
-        rows.append(f"{seen.image[i]},{seen.point[i]},{seen.kind[i]},{x_mm!r},{y_mm!r},{sx!r},{sy!r}")
+    for i, (x_mm, y_mm) in enumerate(observed.xy_mm.tolist()):
+        sx, sy = np.sqrt(np.diag(observed.covariance_mm2[i])).tolist()
+        rows.append(f"{observed.image[i]},{observed.point[i]},{observed.kind[i]},{x_mm!r},{y_mm!r},{sx!r},{sy!r}")
     (folder / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     (folder / "project.toml").write_text(
         'camera = "camera.toml"\n[object]\npoints = "points.csv"\n'

@@ -277,12 +277,12 @@ def test_a_covariance_whose_names_say_nothing_is_refused(path: Path) -> None:
         read_covariance(path)
 
 
-def places_in(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def iterate_places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Every place of a JSON value, of lists those of the first entry."""
     yield place
     inner = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
     for key, each in inner:
-        yield from places_in(each, (*place, key))
+        yield from iterate_places(each, (*place, key))
 
 
 def test_a_check_with_a_value_of_a_wrong_type_is_refused_with_its_place(tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_a_check_with_a_value_of_a_wrong_type_is_refused_with_its_place(tmp_path
     path = tmp_path / "check.json"
     path.write_text(json.dumps(content), encoding="utf-8")
     assert plain_json(read_check(path)) == content
-    for place in places_in(content):
+    for place in iterate_places(content):
         spoilt: dict[Any, Any] = {"file": json.loads(json.dumps(content))}
         *way, last = ("file", *place)
         holder = spoilt

@@ -136,8 +136,8 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> None:
     act, again = CHANGES[change]
     act(folder)
-    seen = verdicts(folder)  # what is to be measured is known before
-    assert "".join(sorted(name for name in seen if seen[name] in ("old", "waiting"))) == again
+    statuses = verdicts(folder)  # what is to be measured is known before
+    assert "".join(sorted(name for name in statuses if statuses[name] in ("old", "waiting"))) == again
     assert measure(folder) in (0, 1)
     assert "".join(sorted(measured)) == again
     assert not {"old", "waiting"} & set(verdicts(folder).values())
@@ -174,7 +174,7 @@ def test_a_project_that_is_moved_as_a_whole_keeps_its_results(folder: Path, tmp_
     assert marks(tmp_path / "elsewhere") == before
 
 
-def test_moved_and_touched_files_are_known_by_their_content_where_that_is_asked(
+def test_moved_and_touched_files_are_known_by_their_content_where_that_is_requested(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def asks_first(tasks: Sequence[ScanTask], measure: Measure, _: Any) -> Any:
@@ -281,7 +281,7 @@ def test_an_interrupt_keeps_what_is_done(
     assert "2 of 3 scans measured already (1 to measure)" in capsys.readouterr().err
 
 
-def test_a_full_disk_is_told_and_costs_nothing_that_was_measured(
+def test_a_full_disk_is_reported_and_costs_nothing_that_was_measured(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: SAID
 ) -> None:
     before = marks(folder)
@@ -295,9 +295,9 @@ def test_a_full_disk_is_told_and_costs_nothing_that_was_measured(
     with monkeypatch.context() as patched:
         patched.setattr("pipeline.archive.results_database.opened", full)
         assert measure(folder) == 2
-    said = capsys.readouterr().err
-    assert "is full). Make room there" in said
-    assert "Traceback" not in said
+    message = capsys.readouterr().err
+    assert "is full). Make room there" in message
+    assert "Traceback" not in message
     assert marks(folder) == before
     measured.clear()
     assert measure(folder) in (0, 1)
@@ -346,21 +346,21 @@ def test_status_tells_what_changed_outside(folder: Path, capsys: SAID) -> None:
     assert verdicts(folder) == {"a": "old", "b": "good", "d": "waiting"}
     capsys.readouterr()
     assert run(["status", project, "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert {name: one["verdict"] for name, one in told["images"].items()} == {"a": "old", "d": "waiting"}
-    assert told["verdicts"]["good"]["scans"] == 1
+    output = json.loads(capsys.readouterr().out)
+    assert {name: one["verdict"] for name, one in output["images"].items()} == {"a": "old", "d": "waiting"}
+    assert output["verdicts"]["good"]["scans"] == 1
     assert run(["status", project, "--csv", "--verdict", "waiting"]) == 1
     assert capsys.readouterr().out.splitlines()[1].startswith("d,waiting,")
     assert run(["status", project, "--verdict", "dreadful"]) == 2
 
 
-def test_status_says_why_a_scan_needs_a_look(folder: Path) -> None:
+def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
     db = opened(folder / "out" / "measurement.db")
     with closing(db):
         db.execute("update result set pose_decided = 0")
         db.execute("update judged_frame set verdict = 'look'")
-        for image, is_decided in (("b", False), ("c", True)):
-            detail = json.dumps({"pose": pose_record(Pose("90", is_decided))})
+        for image, is_certain in (("b", False), ("c", True)):
+            detail = json.dumps({"pose": pose_record(Pose("90", is_certain))})
             db.execute("update judged_frame set detail = ? where name = ?", (detail, image))
         add_digests(db)
     status = archive_status(read_project(folder / "project.toml"))
@@ -376,23 +376,23 @@ def test_the_page_of_results_has_the_table_of_verdicts() -> None:
 BOARD = '[targets]\nkind = "chessboard"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\n'
 
 
-def without_targets(task: ScanTask) -> MeasuredFile:
+def drop_targets(task: ScanTask) -> MeasuredFile:
     """The board is sought in no scan: that takes longer than all the rest."""
     return measure_file(replace(task, options=replace(task.options, targets=None)))
 
 
 @pytest.mark.study
-def test_of_many_scans_only_the_lot_of_a_new_one_is_judged_again(
+def test_of_many_scans_only_the_lot_of_a_new_one_is_tested_again(
     folder: Path, three: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.archive.work.measure_file", without_targets)
+    monkeypatch.setattr("pipeline.archive.work.measure_file", drop_targets)
     rewritten(folder, "project.toml", "[measure]", f"{BOARD}[measure]")
     measure(folder)
     monkeypatch.setattr("pipeline.archive.cross_scan_checks._TOGETHER", 1)
-    beside = list[list[str]]()
+    neighbour = list[list[str]]()
 
     def counted(camera: CameraFile, scans: Sequence[MeasuredScan], *more: Any) -> tuple[CheckedScan, ...]:
-        beside.append([scan.frame.image for scan in scans])
+        neighbour.append([scan.frame.image for scan in scans])
         return check_scans(camera, scans, *more)
 
     monkeypatch.setattr("pipeline.archive.cross_scan_checks.check_scans", counted)
@@ -404,13 +404,13 @@ def test_of_many_scans_only_the_lot_of_a_new_one_is_judged_again(
         if name == "h":
             (folder / "d.tif").unlink()
         measure(folder)
-        assert [sorted(lot) for lot in beside] == lots  # by the SHA-256 of their names a, b, c and e are of one lot
-        beside.clear()
+        assert [sorted(lot) for lot in neighbour] == lots  # by the SHA-256 of their names a, b, c and e are of one lot
+        neighbour.clear()
     anew = tmp_path / "anew"
     shutil.copytree(folder, anew)
     (anew / "out" / "measurement.db").unlink()
     measure(anew)
-    assert sorted(chain.from_iterable(beside)) == ["a", "b", "c", "e", "h"]
+    assert sorted(chain.from_iterable(neighbour)) == ["a", "b", "c", "e", "h"]
     assert marks(anew) == marks(folder)
 
 
@@ -465,7 +465,7 @@ def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, caps
     assert measured == ["d"]
 
 
-def test_scans_that_fail_alike_are_told_once_and_all_scans_are_counted(tmp_path: Path, capsys: SAID) -> None:
+def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(tmp_path: Path, capsys: SAID) -> None:
     """No pitch in project and files: one sentence with the number and the names, not one a scan."""
     (tmp_path / "camera.toml").write_text('name = "c"\nprincipal_distance_mm = 10.0\n', encoding="utf-8")
     (tmp_path / "points.csv").write_text("point,X,Y,Z\n1,0,0,0\n2,9,0,0\n3,0,9,0\n4,9,9,1\n", encoding="utf-8")
@@ -478,9 +478,9 @@ def test_scans_that_fail_alike_are_told_once_and_all_scans_are_counted(tmp_path:
         encoding="utf-8",
     )
     assert run(["measure", str(tmp_path / "project.toml")]) == 2
-    said = capsys.readouterr().err
-    (last,) = [line for line in said.splitlines() if line.startswith("reseau: ")]
+    message = capsys.readouterr().err
+    (last,) = [line for line in message.splitlines() if line.startswith("reseau: ")]
     assert last.startswith("reseau: 6 scans (s0, s1, s2, s3, s4, s5): pitch_um is missing in the project, and the file")
-    assert said.count("pitch_um is missing") == 2  # at the first that fails, and at the end
-    assert re.findall(r"measured (\d) of 6", said)[-1] == "6"
-    assert "measured 1 of 1 " not in said
+    assert message.count("pitch_um is missing") == 2  # at the first that fails, and at the end
+    assert re.findall(r"measured (\d) of 6", message)[-1] == "6"
+    assert "measured 1 of 1 " not in message

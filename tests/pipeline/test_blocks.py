@@ -66,15 +66,15 @@ def mapped(noise_px: float = 0.0) -> Mapped:
         turn = np.diag([1.0, -1.0, -1.0]) @ rotation(*TRUTH.attitudes[i]) @ TURN.T
         station = SCALE * TURN @ np.array(TRUTH.stations[i]) + SHIFT
         poses[f"f{i}"] = (turn, -turn @ station)
-    seen = [lattice_px(camera_mm(i)) + rng.normal(0.0, noise_px, (100, 2)) for i in IMAGES]
+    view = [lattice_px(camera_mm(i)) + rng.normal(0.0, noise_px, (100, 2)) for i in IMAGES]
     off = float(noise_px * np.sqrt(2.0 * (8 - 3) / 8))  # of eight coordinates three went into the point
     tracks = {
-        j: [Sight(f"f{i}", float(seen[i][j, 0]), float(seen[i][j, 1]), 4.0, off) for i in IMAGES] for j in range(100)
+        j: [Sight(f"f{i}", float(view[i][j, 0]), float(view[i][j, 1]), 4.0, off) for i in IMAGES] for j in range(100)
     }
     return Mapped(poses, dict(enumerate(theirs)), tracks)
 
 
-def at_odds(block: Mapped, off_px: float) -> Mapped:
+def disagree(block: Mapped, off_px: float) -> Mapped:
     """The same places, but points that do not quite agree with them."""
     tracks = {j: [replace(sight, off_px=off_px) for sight in track] for j, track in block.tracks.items()}
     return replace(block, tracks=tracks)
@@ -90,7 +90,7 @@ def test_a_similarity_is_found() -> None:
 
 
 def test_tracks_come_back_into_turned_and_mirrored_scans() -> None:
-    marks = tie_marks(at_odds(mapped(), 0.4), PICTURES)
+    marks = tie_marks(disagree(mapped(), 0.4), PICTURES)
     assert {mark.image for mark in marks} == {"f0", "f1", "f2", "f3"}
     for mark in marks:
         col, row = scan_px(int(mark.image[1:]), camera_mm(int(mark.image[1:])))[int(mark.point.removeprefix("tie-"))]
@@ -101,7 +101,7 @@ def test_tracks_come_back_into_turned_and_mirrored_scans() -> None:
 LEFT_PX, RIGHT_PX = 1500, 1000  # the left scan of a frame ends at the one column, the right one begins at the other
 
 
-def in_halves(i: int) -> BlockPicture:
+def half_picture(i: int) -> BlockPicture:
     """A frame whose scan was cut into two that overlap."""
     a1, a2, a3, b1, b2, b3 = affine(TRUTH, i, "affine")
     begin_mm = RIGHT_PX * PITCH_MM
@@ -112,8 +112,8 @@ def in_halves(i: int) -> BlockPicture:
 
 
 def test_tracks_of_a_frame_that_was_scanned_in_parts_come_back_into_the_scan_that_shows_them() -> None:
-    block = at_odds(mapped(), 0.4)
-    marks = tie_marks(block, [in_halves(i) for i in IMAGES])
+    block = disagree(mapped(), 0.4)
+    marks = tie_marks(block, [half_picture(i) for i in IMAGES])
     whole = {(mark.image, mark.point): mark for mark in tie_marks(block, PICTURES)}
     assert len(marks) == len(whole)
     assert {mark.image for mark in marks} == {f"f{i}{half}" for i in IMAGES for half in "lr"}
@@ -188,7 +188,7 @@ def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> N
         is_right = mark.xy_mm[0] > 0.5 * (LEFT_PX + RIGHT_PX) * PITCH_MM
         shift = np.array([RIGHT_PX * PITCH_MM, 0.0]) if is_right else np.zeros(2)
         cut.append(replace(mark, image=f"{mark.image}{'r' if is_right else 'l'}", xy_mm=mark.xy_mm - shift))
-    placed = oriented_by_control(mapped(), [in_halves(i) for i in IMAGES], cut, points, rays)
+    placed = oriented_by_control(mapped(), [half_picture(i) for i in IMAGES], cut, points, rays)
     for i in IMAGES:
         np.testing.assert_allclose(placed[f"f{i}"][1], TRUTH.stations[i], atol=1e-6)
     (tmp_path / "images.csv").write_text(

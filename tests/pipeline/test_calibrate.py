@@ -57,12 +57,12 @@ def result(folder: Path, calibrations: list[Calibration]) -> dict[str, Any]:
     """What the command prints; its files stand in the folder `calibration`."""
     out, printed, calibrate = folder / "calibration", io.StringIO(), board_calibration.calibrate
 
-    def kept(*arguments: Any, **options: Any) -> Calibration:
+    def keep(*arguments: Any, **options: Any) -> Calibration:
         calibrations.append(calibrate(*arguments, **options))
         return calibrations[-1]
 
     with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(board_calibration, "calibrate", kept)
+        patch.setattr(board_calibration, "calibrate", keep)
         code = run(["calibrate", str(folder), *BOARD, "--lens", "opencv4", "--out", str(out), "--ros", "--json"])
     assert code == 1  # two pictures are left out
     return dict(json.loads(printed.getvalue()))

@@ -45,7 +45,7 @@ def true_px(pose: str = "0") -> Array:
     return np.array([matrix @ (*place, 1.0) for place in CORNERS])
 
 
-def marks_at(places: Array, given: bool = False) -> tuple[ClickedMark, ...]:
+def place_clicks(places: Array, given: bool = False) -> tuple[ClickedMark, ...]:
     xy = CORNERS if given else [(None, None)] * len(CORNERS)
     return tuple(ClickedMark(str(k), (float(c), float(r)), xy[k - 1]) for k, (c, r) in enumerate(places, 1))
 
@@ -102,13 +102,13 @@ def test_corners_of_a_polygon_come_where_they_are_clicked_and_go() -> None:
 
 @pytest.mark.parametrize("pose", ["0", "90", "180", "270m"])
 def test_the_axes_go_through_the_middles_of_opposite_marks(pose: str) -> None:
-    drawing = CameraDrawing("a", {"kind": "dot"}, marks_at(true_px(pose)), pose=pose)
+    drawing = CameraDrawing("a", {"kind": "dot"}, place_clicks(true_px(pose)), pose=pose)
     placement = place_frame(drawing, (400, 400), (PITCH_UM, PITCH_UM), "")
     np.testing.assert_allclose([placement.camera_mm(one.px) for one in drawing.marks], CORNERS, atol=2e-3)
 
 
 def test_given_coordinates_tell_pitch_and_mirror() -> None:
-    drawing = CameraDrawing("a", {"kind": "dot"}, marks_at(true_px("90m"), given=True))
+    drawing = CameraDrawing("a", {"kind": "dot"}, place_clicks(true_px("90m"), given=True))
     placement = place_frame(drawing, (400, 400), None, "")
     assert placement.pitch_um == pytest.approx((PITCH_UM, PITCH_UM), rel=1e-3)
     np.testing.assert_allclose(placement.pixel_from_camera, pixel_from_camera("90m", TURN_RAD), atol=0.05)
@@ -132,7 +132,7 @@ def placed(drawing: CameraDrawing) -> FramePlacement:
 def test_a_fit_finds_places_and_the_size(scan: Path) -> None:
     """Drawn 10 % too small, and clicked 3 px off."""
     sizes = {key: 0.9 * value for key, value in SIZES.items()}
-    drawing = CameraDrawing("a", {"kind": "ring-cross", **sizes}, marks_at(true_px() + np.array([3.0, -2.0])), "1")
+    drawing = CameraDrawing("a", {"kind": "ring-cross", **sizes}, place_clicks(true_px() + np.array([3.0, -2.0])), "1")
     with open_scan(scan) as opened:
         fitted = take_step(drawing, placed(drawing), {"fit": True}, opened)
     np.testing.assert_allclose([one.px for one in fitted.marks], true_px(), atol=0.05)
@@ -142,7 +142,7 @@ def test_a_fit_finds_places_and_the_size(scan: Path) -> None:
 
 @pytest.mark.parametrize("kind", [kind for kind in MARK_TABLES if kind != "polygon"])
 def test_every_kind_has_a_form_and_handles_to_start_from(kind: str, scan: Path) -> None:
-    start = CameraDrawing("a", {"kind": "dot", "radius_mm": 1.0}, marks_at(true_px()), "1", frame_mm=(17.0, 17.0))
+    start = CameraDrawing("a", {"kind": "dot", "radius_mm": 1.0}, place_clicks(true_px()), "1", frame_mm=(17.0, 17.0))
     with open_scan(scan) as opened:
         drawing = take_step(start, placed(start), {"kind": kind}, opened)
     shown = drawing_json(drawing, placed(drawing))
@@ -153,8 +153,8 @@ def test_every_kind_has_a_form_and_handles_to_start_from(kind: str, scan: Path) 
     assert shown["shown"]["has_picture"] == (kind not in ("template", "learned"))
 
 
-def test_what_is_not_complete_is_said_and_not_refused() -> None:
-    drawing = CameraDrawing("a", {"kind": "polygon", "vertices_mm": [[0.0, 0.0]]}, marks_at(true_px()), "1")
+def test_what_is_not_complete_is_stated_and_not_refused() -> None:
+    drawing = CameraDrawing("a", {"kind": "polygon", "vertices_mm": [[0.0, 0.0]]}, place_clicks(true_px()), "1")
     shown = drawing_json(drawing, placed(drawing))
     assert "at least three vertices" in shown["problem"]
     assert not shown["shown"]["has_picture"]
@@ -170,7 +170,7 @@ def test_what_is_not_complete_is_said_and_not_refused() -> None:
 def test_a_saved_camera_measures_the_scan(
     mark: dict[str, float | str], statuses: set[str], scan: Path, tmp_path: Path
 ) -> None:
-    drawing = CameraDrawing("a", mark, marks_at(true_px()), "1", name="K", frame_mm=(17.0, 17.0))
+    drawing = CameraDrawing("a", mark, place_clicks(true_px()), "1", name="K", frame_mm=(17.0, 17.0))
     with open_scan(scan) as opened:
         camera = save_drawing(drawing, placed(drawing), opened, tmp_path / "camera.toml")
     text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
@@ -199,7 +199,7 @@ def test_a_saved_camera_measures_the_scan(
 def test_what_would_be_no_camera_is_refused_and_not_written(
     change: dict[str, object], words: str, scan: Path, tmp_path: Path
 ) -> None:
-    marks = [{"id": one.id, "px": list(one.px)} for one in marks_at(true_px())]
+    marks = [{"id": one.id, "px": list(one.px)} for one in place_clicks(true_px())]
     given = {"image": "a", "mark": {"kind": "dot", "radius_mm": 0.5}, "marks": marks, "frame_mm": [17.0, 17.0]}
 
     def save() -> None:
@@ -219,7 +219,7 @@ def test_a_camera_file_is_not_written_over_unless_it_was_drawn(scan: Path, tmp_p
     for name in ("../a", "", ".hidden", "a/b.toml"):
         with pytest.raises(InputError, match="can be no file's name"):
             camera_path(tmp_path, name)
-    drawing = CameraDrawing("a", {"kind": "dot", "radius_mm": 0.5}, marks_at(true_px()), frame_mm=(17.0, 17.0))
+    drawing = CameraDrawing("a", {"kind": "dot", "radius_mm": 0.5}, place_clicks(true_px()), frame_mm=(17.0, 17.0))
     with open_scan(scan) as opened:
         for _ in range(2):
             save_drawing(drawing, placed(drawing), opened, camera_path(tmp_path, "new"))

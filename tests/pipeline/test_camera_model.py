@@ -23,10 +23,10 @@ FIDUCIALS = '[[fiducial]]\nid = "1"\nxy_mm = [18.0, -16.0]\nmark = "dot"\n[mark.
         ("principal_point_mm = [0.0, 0.0]", FIDUCIALS, False),
     ],
 )
-def test_a_principal_point_that_counts_from_elsewhere_is_told(
+def test_a_principal_point_that_counts_from_elsewhere_is_reported(
     given: str, rest: str, is_told: bool, tmp_path: Path
 ) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(f'name = "c"\nframe_mm = [40.0, 36.0]\nprincipal_distance_mm = 60.0\n{given}\n{rest}')
-    told = misplaced_principal_point(read_camera(path), MEASURED)
-    assert ("the middle of this scan is [20, -18]" in told) == is_told
+    result = misplaced_principal_point(read_camera(path), MEASURED)
+    assert ("the middle of this scan is [20, -18]" in result) == is_told

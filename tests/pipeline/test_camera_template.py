@@ -50,7 +50,7 @@ def sizes(kind: str, place: str) -> CameraSizes:
     return CameraSizes((kind,), size if place == "square" else None, size if place == "side" else None, None, 30.0)
 
 
-def camera_of(folder: Path, made: CameraSizes) -> CameraFile:
+def image_camera(folder: Path, made: CameraSizes) -> CameraFile:
     (folder / "camera.toml").write_text(camera_template(made), encoding="utf-8")
     return read_camera(folder / "camera.toml")
 
@@ -59,7 +59,7 @@ def camera_of(folder: Path, made: CameraSizes) -> CameraFile:
 def test_a_rendered_frame_of_each_kind_is_measured_with_its_template(kind: str, tmp_path: Path) -> None:
     """The scene shows the marks light or dark, as they are on film; the file that measures them leaves that open."""
     place = MARK_KINDS[kind].at[-1]
-    given = camera_of(tmp_path, sizes(kind, place))
+    given = image_camera(tmp_path, sizes(kind, place))
     text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
     (tmp_path / "camera.toml").write_text(
         text.replace('polarity = "auto"', f'polarity = "{POLARITY.get(kind, "light")}"'), encoding="utf-8"
@@ -92,7 +92,7 @@ def test_eight_marks_of_an_aerial_camera_have_the_places_and_names_of_calibratio
 
 
 def test_marks_to_be_learned_ask_for_clicks(tmp_path: Path) -> None:
-    camera = camera_of(tmp_path, sizes("learned", "square"))
+    camera = image_camera(tmp_path, sizes("learned", "square"))
     assert len(camera.learned) == 4
     assert camera.needs_clicks
 
@@ -108,7 +108,7 @@ def test_marks_to_be_learned_ask_for_clicks(tmp_path: Path) -> None:
         (("cross", "212", None, "100"), "--frame 100: smaller than the distances of the marks"),
     ],
 )
-def test_what_makes_no_camera_is_said(words: tuple[str, str | None, str | None, str | None], message: str) -> None:
+def test_what_makes_no_camera_is_stated(words: tuple[str, str | None, str | None, str | None], message: str) -> None:
     marks, square, side, frame = words
     with pytest.raises(InputError) as refused:
         CameraSizes.from_words(marks, square, side, frame, None, "x")

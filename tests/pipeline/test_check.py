@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from lens_networks import LENSES, network_of
+from lens_networks import LENSES, make_network
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from studies import parametrize_with_studies
@@ -65,8 +65,8 @@ def simulated(
     for number, station in enumerate(stations, 1):
         downward = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("XYZ", station[3:]).as_matrix().T
         center = np.array(station[:3])
-        seen, _ = cv2.projectPoints(xyz, cv2.Rodrigues(downward)[0], -downward @ center, matrix, np.array(lens))
-        camera_mm = seen.reshape(-1, 2) * [1.0, -1.0]
+        projected, _ = cv2.projectPoints(xyz, cv2.Rodrigues(downward)[0], -downward @ center, matrix, np.array(lens))
+        camera_mm = projected.reshape(-1, 2) * [1.0, -1.0]
         inside = np.flatnonzero((np.abs(camera_mm) < 112.0).all(axis=1))
         scan = np.eye(2) + rng.normal(0.0, 0.05 if film else 0.0, (2, 2))
 
@@ -105,7 +105,7 @@ def free(family: str, *names: str) -> Distortion:
     return Distortion(family, {name: Prior(0.0, FREE) for name in names})
 
 
-def checked(network: Network) -> CameraCheck:
+def check_network(network: Network) -> CameraCheck:
     return check_against_opencv(adjust(network, approximate(network))).cameras["rc20"]
 
 
@@ -121,7 +121,7 @@ def checked(network: Network) -> CameraCheck:
 )
 @pytest.mark.parametrize("film", [True, False], ids=["film", "digital"])
 def test_a_moderate_lens_agrees_to_a_tenth_of_a_sigma(distortion: Distortion, aspect: float, film: bool) -> None:
-    check = checked(simulated(CONVERGENT, film=film, distortion=distortion, aspect=aspect))
+    check = check_network(simulated(CONVERGENT, film=film, distortion=distortion, aspect=aspect))
     assert check.verdict == "agrees", check.reason
     assert check.images == 5
     assert check.refit_residual_um < 0.02
@@ -142,7 +142,7 @@ def test_the_unit_of_the_object_costs_opencv_no_digits(unit: float) -> None:
         ObjectPoint(each.id, *(prior and Prior(unit * prior.value, prior.sigma) for prior in (each.X, each.Y, each.Z)))
         for each in network.points
     )
-    scaled, plain = checked(replace(network, points=points)), checked(network)
+    scaled, plain = check_network(replace(network, points=points)), check_network(network)
     assert (scaled.verdict, plain.verdict) == ("agrees", "agrees")
     for row, same in zip(scaled.rows, plain.rows, strict=True):
         assert row.opencv.sigma == pytest.approx(same.opencv.sigma, rel=1e-3)
@@ -150,7 +150,7 @@ def test_the_unit_of_the_object_costs_opencv_no_digits(unit: float) -> None:
 
 
 def test_parameters_found_are_those_simulated() -> None:
-    check = checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
+    check = check_network(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
     truth = {
         "fx": C_MM,
         "cx": X0_MM,
@@ -169,7 +169,7 @@ def test_parameters_found_are_those_simulated() -> None:
 
 def test_fixed_distortion_stays_fixed() -> None:
     fixed = Distortion("opencv", {name: Prior(v) for name, v in zip(("k1", "k2", "p1", "p2"), MODERATE, strict=False)})
-    check = checked(simulated(CONVERGENT, distortion=fixed))
+    check = check_network(simulated(CONVERGENT, distortion=fixed))
     assert check.verdict == "agrees", check.reason
     assert [row.name for row in check.rows] == ["fx", "cx", "cy"]
     assert max(row.difference_sigmas for row in check.rows) < 0.1
@@ -187,7 +187,7 @@ def test_a_tilted_sensor_agrees(known: bool) -> None:
     network = simulated(CONVERGENT, lens=lens, distortion=distortion)
     # A tilted sensor is all but another principal point.
     held = replace(network.cameras[0], x0_mm=Prior(X0_MM), y0_mm=Prior(Y0_MM))
-    check = checked(replace(network, cameras=(held,)))
+    check = check_network(replace(network, cameras=(held,)))
     assert check.verdict == "agrees", check.reason
     assert [row.name for row in check.rows] == ["fx", "k1", "k2", *(() if known else TILT)]
     assert max(row.difference_sigmas for row in check.rows) < 0.1
@@ -195,25 +195,25 @@ def test_a_tilted_sensor_agrees(known: bool) -> None:
 
 def test_exact_observations_agree_as_far_as_single_precision_goes() -> None:
     distortion = free("opencv", "k1", "k2", "p1", "p2")
-    check = checked(simulated(CONVERGENT, noise_mm=0.0, distortion=distortion))
+    check = check_network(simulated(CONVERGENT, noise_mm=0.0, distortion=distortion))
     assert check.verdict == "agrees", check.reason
     assert check.rms_opencv_um < 0.02
 
 
-def test_one_flat_vertical_frame_is_not_possible_and_the_reason_is_told() -> None:
-    check = checked(simulated(VERTICAL, relief_m=0.0, lens=[0.0] * 5))
+def test_one_flat_vertical_frame_is_not_possible_and_the_reason_is_reported() -> None:
+    check = check_network(simulated(VERTICAL, relief_m=0.0, lens=[0.0] * 5))
     assert check.verdict == "not possible"
     assert check.reason.startswith("Priors carried the solution")
     assert not check.rows
 
 
-def test_unknown_points_are_told() -> None:
+def test_unknown_points_are_reported() -> None:
     network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
     points = tuple(
-        ObjectPoint(p.id, None, None, None) if int(p.id[1:]) >= 30 and seen(network, p.id) > 1 else p
+        ObjectPoint(p.id, None, None, None) if int(p.id[1:]) >= 30 and count_rays(network, p.id) > 1 else p
         for p in network.points
     )
-    check = checked(replace(network, points=points))
+    check = check_network(replace(network, points=points))
     unknown = sum(point.X is None for point in points)
     assert unknown > 5
     assert check.verdict == "agrees", check.reason
@@ -221,22 +221,22 @@ def test_unknown_points_are_told() -> None:
     assert max(row.difference_sigmas for row in check.rows) < 0.1
 
 
-def seen(network: Network, point: str) -> int:
+def count_rays(network: Network, point: str) -> int:
     return network.observations.point.count(point)
 
 
-def test_different_standard_deviations_are_told() -> None:
+def test_different_standard_deviations_are_reported() -> None:
     network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
     covariance = network.observations.covariance_mm2.copy()
     covariance[::2] *= 9.0
-    check = checked(replace(network, observations=replace(network.observations, covariance_mm2=covariance)))
+    check = check_network(replace(network, observations=replace(network.observations, covariance_mm2=covariance)))
     assert "differ up to 3" in check.reason
 
 
 def test_a_prior_that_contradicts_the_observations_differs() -> None:
     network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
     camera = replace(network.cameras[0], principal_distance_mm=Prior(C_MM + 0.2, 0.002))
-    check = checked(replace(network, cameras=(camera,)))
+    check = check_network(replace(network, cameras=(camera,)))
     assert check.verdict == "differs"
     assert "Priors or weights move c" in check.reason
 
@@ -253,7 +253,7 @@ def test_wrong_values_in_an_adjustment_differ() -> None:
 def test_a_strong_lens_agrees_by_way_of_the_same_model(family: str) -> None:
     names = {"torlegard": ("k3", "k5", "k7", "p1", "p2"), "brown": ("k1", "k2", "k3", "p1", "p2")}[family]
     network = simulated(CONVERGENT * 4, film=False, lens=STRONG, noise_mm=0.002, distortion=free(family, *names))
-    check = checked(network)
+    check = check_network(network)
     assert check.verdict == "agrees", check.reason
     assert check.reason.startswith("Given the very same model both programs agree.")
     assert max(row.difference_sigmas for row in check.rows) > 1.0
@@ -262,7 +262,7 @@ def test_a_strong_lens_agrees_by_way_of_the_same_model(family: str) -> None:
 @parametrize_with_studies("skew", [True, False], ids=["skew", "no skew"])
 def test_a_fisheye_agrees_with_opencvs_fisheye(skew: bool) -> None:
     """Which estimates both focal lengths or none: one of them free here is two for the comparison."""
-    network = network_of("opencv_fisheye", np.random.default_rng(2))
+    network = make_network("opencv_fisheye", np.random.default_rng(2))
     if not skew:
         camera = network.cameras[0]
         lens = {"k1": Prior(0.0, FREE), "k2": Prior(0.0, FREE), "b2": Prior(LENSES["opencv_fisheye"][1]["b2"], 0.0)}
@@ -291,7 +291,7 @@ def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, wha
         return replace(found, parameters=found.parameters + 1.5 * found.sigmas)
 
     monkeypatch.setattr("pipeline.opencv_check.check.calibrate", shifted)
-    check = checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
+    check = check_network(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
     assert check.verdict == "differs"
     assert ("factor of 1.4" if what == "sigmas" else "by 1.5") in check.reason
 
@@ -301,7 +301,7 @@ def test_every_run_gets_the_same_digits_of_opencv(monkeypatch: pytest.MonkeyPatc
     given, threads = list[Callable[[], OpenCvCalibration]](), []
     plain = cv2.calibrateCameraExtended
 
-    def kept(*arguments: Any, **options: Any) -> OpenCvCalibration:
+    def keep(*arguments: Any, **options: Any) -> OpenCvCalibration:
         given.append(partial(calibrate, *arguments, **options))
         return calibrate(*arguments, **options)
 
@@ -309,12 +309,12 @@ def test_every_run_gets_the_same_digits_of_opencv(monkeypatch: pytest.MonkeyPatc
         threads.append(cv2.getNumThreads())
         return plain(*arguments, **options)
 
-    monkeypatch.setattr("pipeline.opencv_check.check.calibrate", kept)
+    monkeypatch.setattr("pipeline.opencv_check.check.calibrate", keep)
     monkeypatch.setattr(cv2, "calibrateCameraExtended", watched)
     before = cv2.getNumThreads()
     cv2.setNumThreads(4)
     try:
-        checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
+        check_network(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
         found = [given[0]() for _ in range(40)]
         assert cv2.getNumThreads() == 4
     finally:
@@ -341,11 +341,11 @@ def test_what_robust_estimation_set_aside_is_left_out() -> None:
 def test_images_with_too_few_points_are_left_out() -> None:
     network = simulated(CONVERGENT, distortion=free("opencv", "k1", "k2"))
     few = replace(network, observations=keeping(network.observations, {"f2": 5}))
-    check = checked(few)
+    check = check_network(few)
     assert check.images == 4
     assert "left out, for too few points: f2" in check.reason
     none = replace(network, observations=keeping(network.observations, {f"f{n}": 5 for n in range(1, 6)}))
-    check = checked(replace(none, cameras=(replace(none.cameras[0], distortion=NO_DISTORTION),)))
+    check = check_network(replace(none, cameras=(replace(none.cameras[0], distortion=NO_DISTORTION),)))
     assert check.verdict == "not possible"
     assert "No image shows enough points" in check.reason
 
@@ -371,13 +371,13 @@ def keeping(observations: Observations, targets: dict[str, int]) -> Observations
 
 def test_what_opencv_has_no_model_for() -> None:
     network = simulated(VERTICAL, distortion=Distortion("juhl", {"t1": Prior(0.0)}, r0_mm=135.0))
-    assert "no counterpart of the distortion family juhl" in checked(network).reason
+    assert "no counterpart of the distortion family juhl" in check_network(network).reason
     gruen = Distortion("gruen", {"a12": Prior(0.0)}, half_mm=(115.0, 115.0))
     polynomials = replace(network, cameras=(replace(network.cameras[0], distortion=gruen),))
-    assert checked(polynomials).verdict == "not possible"
-    assert "no counterpart of the distortion family gruen" in checked(polynomials).reason
+    assert check_network(polynomials).verdict == "not possible"
+    assert "no counterpart of the distortion family gruen" in check_network(polynomials).reason
     one_fixed = replace(network.cameras[0], distortion=Distortion(), x0_mm=Prior(0.0))
-    assert "both coordinates of the principal point" in checked(replace(network, cameras=(one_fixed,))).reason
+    assert "both coordinates of the principal point" in check_network(replace(network, cameras=(one_fixed,))).reason
 
 
 def test_verdict_on_the_whole() -> None:

@@ -106,12 +106,12 @@ def test_both_figures_are_of_the_points_that_both_have(folder: Path) -> None:
     assert found.reseau.rms < 1e-3
     np.testing.assert_allclose(own, truth, atol=3.0)
     # The rms per point as cv2.calibrateCamera itself says it, of the same corners.
-    seen = [find_points(picture(number), BOARD) for number in range(4)]
+    view = [find_points(picture(number), BOARD) for number in range(4)]
     objects = [POINTS.astype(np.float32)] * 4
-    nearest = [cdist(corners_px(number), each).argmin(axis=1) for number, each in enumerate(seen)]
+    nearest = [cdist(corners_px(number), each).argmin(axis=1) for number, each in enumerate(view)]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-    points = [each[order].astype(np.float32) for each, order in zip(seen, nearest, strict=True)]
+    points = [each[order].astype(np.float32) for each, order in zip(view, nearest, strict=True)]
     rms, matrix, *_ = cv2.calibrateCamera(objects, points, SIZE_PX, MATRIX.copy(), np.zeros(5), flags=flags)
     assert found.opencv.rms == pytest.approx(rms, rel=1e-3)
     np.testing.assert_allclose(own, matrix[[0, 1, 0, 1], [0, 1, 2, 2]], atol=0.01)
@@ -148,7 +148,7 @@ def test_without_scans_or_a_detector_it_is_left_out(folder: Path) -> None:
     assert len(find_points(picture(0), SquareGridSpec(3, 3, 20.0, 20.0))) == 0
 
 
-def project_in(folder: Path) -> Path:
+def write_project(folder: Path) -> Path:
     lens = '[distortion]\nfamily = "opencv"\n[distortion.sigma]\nk1 = "free"\n'
     (folder / "camera.toml").write_text(f'name = "D"\nprincipal_distance_mm = 5.0\n{lens}', encoding="utf-8")
     (folder / "project.toml").write_text(
@@ -163,7 +163,7 @@ def test_both_figures_stand_in_file_terminal_and_report(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    project, rng = str(project_in(tmp_path)), np.random.default_rng(1)
+    project, rng = str(write_project(tmp_path)), np.random.default_rng(1)
     rows = ["# comparator coordinates, reseau", "image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
     for image in images():
         noisy = image.xy_mm + rng.normal(0.0, 2e-4, image.xy_mm.shape)
@@ -172,7 +172,7 @@ def test_both_figures_stand_in_file_terminal_and_report(
     (tmp_path / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     assert run(["adjust", project]) in (0, 1)
     assert run(["check", project]) in (0, 1)
-    said = " ".join(capsys.readouterr().out.split())
+    output = " ".join(capsys.readouterr().out.split())
     corners = json.loads((tmp_path / "out" / "check.json").read_text(encoding="utf-8"))["cameras"]["D"]["corners_px"]
     assert (corners["images"], corners["points"], corners["not_found"]) == (5, 175, [])
     assert corners["reseau"]["fx"] == pytest.approx(FOCAL_PX, abs=1.0)
@@ -180,14 +180,14 @@ def test_both_figures_stand_in_file_terminal_and_report(
     assert run(["report", project]) in (0, 1)
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     for figures in (corners["reseau"], corners["opencv"]):
-        assert f"rms {figures['rms']:.3f} px a point" in said
+        assert f"rms {figures['rms']:.3f} px a point" in output
         assert f"<td>{figures['fx']:.2f}</td>" in page
-    assert "OpenCV's own (findChessboardCorners and cornerSubPix, half a window of 11 px)" in said
+    assert "OpenCV's own (findChessboardCorners and cornerSubPix, half a window of 11 px)" in output
 
 
 @pytest.mark.study
 def test_a_digital_camera_has_the_frame_of_its_pictures(folder: Path) -> None:
-    assert run(["run", str(project_in(folder))]) in (0, 1)
+    assert run(["run", str(write_project(folder))]) in (0, 1)
     adjusted = json.loads((folder / "out" / "adjustment.json").read_text(encoding="utf-8"))["cameras"]["D"]
     point = np.array([adjusted["principal_point_mm"][axis]["value"] for axis in "xy"])
     corners = [np.array([x, y]) for x in (0.0, 4.0) for y in (0.0, -3.2)]

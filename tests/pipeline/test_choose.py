@@ -17,7 +17,7 @@ from pipeline.results.record_json import plain_json
 
 
 @parametrize_with_studies("given", ["none", "torlegard"])
-def test_the_project_is_told_what_its_data_ask_for(
+def test_the_project_is_reported_what_its_data_ask_for(
     given: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A lens without distortion: right as given without any, and to be looked at where k3 is estimated."""

@@ -33,12 +33,12 @@ def test_a_killed_worker_loses_nothing_and_is_replaced(tmp_path: Path) -> None:
         os.kill(first, signal.SIGKILL)
         results = [future.result(60) for future in futures]
         assert [number for number, _ in results] == list(range(40))
-        end, seen = time.monotonic() + 60, set[int]()
-        while len(seen - {first}) < 2:
+        end, view = time.monotonic() + 60, set[int]()
+        while len(view - {first}) < 2:
             assert time.monotonic() < end
             pair = [executor.submit(process, number, 0.05) for number in range(2)]  # one for each worker
-            seen = {future.result(60)[1] for future in pair}
-        assert first not in seen
+            view = {future.result(60)[1] for future in pair}
+        assert first not in view
 
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -47,7 +47,7 @@ def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
         pass
 
 
-def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "_ANSWER_S", 0.5)
     with pytest.raises(InputError, match="no scheduler answers there"), cluster_executor("tcp://127.0.0.1:9", []):
         pass
@@ -66,7 +66,7 @@ class Answers:
         return self.answers
 
 
-def test_workers_are_asked_for_their_versions_and_their_way_to_the_scans() -> None:
+def test_workers_are_requested_their_versions_and_their_way_to_the_scans() -> None:
     same = cluster.versions()
     good = (same, list[tuple[str, str]]())
     cluster._check_workers(Answers({"a": good}), "x", [])
@@ -85,7 +85,7 @@ def test_workers_are_asked_for_their_versions_and_their_way_to_the_scans() -> No
             cluster._check_workers(Answers({"a": good, "b": answer}), "x", [])
 
 
-def test_one_scan_a_folder_is_looked_for(tmp_path: Path) -> None:
+def test_one_scan_a_folder_is_inspected_for(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         for name in "12":
@@ -94,7 +94,7 @@ def test_one_scan_a_folder_is_looked_for(tmp_path: Path) -> None:
     assert cluster._one_a_folder([*scans, ""]) == [str(tmp_path / "a/1"), str(tmp_path / "b/1")]
 
 
-def test_addresses_are_looked_for_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_addresses_are_inspected_for_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("measure.scans.remote._WAITS_S", (0.01,))
     for name in ("a/1.tif", "a/2.tif", "closed/1.tif", "closed/2.tif"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

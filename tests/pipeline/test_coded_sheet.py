@@ -66,13 +66,13 @@ def shot(seed: int, coded: bool = True) -> Shot:
     return photographed(sheet, grid, missing, rng)
 
 
-def on_drawing(place: Array) -> Array:
+def draw_place(place: Array) -> Array:
     """The sheet's y is up, the drawing's rows go down."""
     return np.array([place[..., 0] + 1.0, SIDE - place[..., 1]]).T * FINE
 
 
 def disk(sheet: NDArray[np.uint8], place: Array, radius: float) -> None:
-    center = np.round(16 * on_drawing(place)).astype(int)
+    center = np.round(16 * draw_place(place)).astype(int)
     cv2.circle(sheet, (int(center[0]), int(center[1])), round(16 * radius * FINE), 25, -1, cv2.LINE_AA, 4)
 
 
@@ -82,7 +82,7 @@ def ring(sheet: NDArray[np.uint8], place: Array, code: int, turn: float) -> None
         if code >> (11 - bit) & 1:
             angles = turn + 2 * np.pi / 12 * (bit + np.linspace(-0.001, 1.001, 12))
             arc = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-            outline = np.concatenate([2.0 * arc, 3.0 * arc[::-1]]) * RADIUS * FINE + on_drawing(place)
+            outline = np.concatenate([2.0 * arc, 3.0 * arc[::-1]]) * RADIUS * FINE + draw_place(place)
             cv2.fillPoly(sheet, [np.round(16 * outline).astype(np.int32)], 25, cv2.LINE_AA, 4)
 
 
@@ -108,7 +108,7 @@ def photographed(sheet: NDArray[np.uint8], grid: Array, missing: set[int], rng: 
     )
     picture = cv2.GaussianBlur(cv2.resize(fine, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), (0, 0), 0.7)
     noisy = np.clip(picture + rng.normal(0, 2.0, picture.shape), 0, 255).astype(np.uint8)
-    target = cv2.perspectiveTransform(on_drawing(grid).reshape(-1, 1, 2), homography).reshape(-1, 2)
+    target = cv2.perspectiveTransform(draw_place(grid).reshape(-1, 1, 2), homography).reshape(-1, 2)
     places, middle = target.astype(np.float64), np.array([WIDTH, HEIGHT]) / 2 - 0.5
     for _ in range(50):
         places = target / (1 + bend * (places**2).sum(axis=1, keepdims=True) / unit**2)
@@ -142,10 +142,10 @@ def test_a_drawn_sheet_with_a_fifth_missing_and_a_fifth_false(tmp_path: Path) ->
     rows = table(tmp_path)
     assert len(rows) == 2 * SIDE**2
     own = {int(row["point"][1:]): row for row in rows if row["image"] == "coded"}
-    seen = {i for i, row in own.items() if row["status"] in ("measured", "weak")}
+    own_found = {i for i, row in own.items() if row["status"] in ("measured", "weak")}
     missing = shots["coded"].missing
-    assert seen == set(range(SIDE**2)) - missing
-    for i in seen:
+    assert own_found == set(range(SIDE**2)) - missing
+    for i in own_found:
         found = np.array([float(own[i]["col_px"]), float(own[i]["row_px"])])
         assert np.hypot(*(found - shots["coded"].places[i])) < 0.4, i  # eccentricity and all
     assert all(own[i]["reason"] for i in missing)

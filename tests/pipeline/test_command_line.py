@@ -184,10 +184,10 @@ def test_wrong_input_gets_one_message_and_code_2_and_leaves_earlier_results(
     before = results(project)
     spoil(project)
     assert run(["run", str(project / "project.toml")]) == 2
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     for word in words:
-        assert word in said
-    assert "Traceback" not in said
+        assert word in message
+    assert "Traceback" not in message
     assert results(project) == before
 
 
@@ -215,7 +215,7 @@ def test_full_disk_gets_a_message_and_leaves_earlier_results(project: Path, caps
     assert results(project) == before
 
 
-def adjusted(project: Path, capsys: SAID, marks: str | None = None) -> tuple[int, dict[str, Any], str]:
+def adjust_network(project: Path, capsys: SAID, marks: str | None = None) -> tuple[int, dict[str, Any], str]:
     """`reseau adjust --json` on coordinates alone: exit code, summary, what was said on stderr."""
     replaced(project / "project.toml", "scans = [", "# scans = [")
     if marks is not None:
@@ -226,7 +226,7 @@ def adjusted(project: Path, capsys: SAID, marks: str | None = None) -> tuple[int
     return code, json.loads(out) if out else {}, err
 
 
-def test_an_interrupt_is_told_and_has_a_code_of_its_own(
+def test_an_interrupt_is_reported_and_has_a_code_of_its_own(
     project: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
@@ -238,7 +238,7 @@ def test_an_interrupt_is_told_and_has_a_code_of_its_own(
 
 
 def test_an_interrupt_does_not_wait_for_the_scans_in_hand() -> None:
-    def measured() -> None:
+    def measure_picture() -> None:
         with worker_pool(4) as workers:
             for _ in range(8):
                 workers.submit(time.sleep, 300.0)
@@ -246,7 +246,7 @@ def test_an_interrupt_does_not_wait_for_the_scans_in_hand() -> None:
 
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        measured()
+        measure_picture()
     assert time.monotonic() - start < 100.0
     assert not multiprocessing.active_children()
 
@@ -254,7 +254,7 @@ def test_an_interrupt_does_not_wait_for_the_scans_in_hand() -> None:
 def test_point_that_nobody_measured_is_named(project: Path, capsys: SAID) -> None:
     with (project / "points.csv").open("a", encoding="utf-8") as file:
         file.write("999,1,2,3,0,0,0,0,0,1\n")
-    code, _, _ = adjusted(project, capsys)
+    code, _, _ = adjust_network(project, capsys)
     assert code == 0  # of a large pattern a part is used
     assert any("999" in note for note in json.loads((project / "out" / "adjustment.json").read_text())["notes"])
 
@@ -263,10 +263,10 @@ def test_measured_point_that_nobody_gave_is_named_with_its_line(project: Path, c
     marks = (project / "comparator.csv").read_text(
         encoding="utf-8"
     ) + "frame1,1O1,target,1,2,0.001,0.001,0,,,measured,\n"
-    code, _, said = adjusted(project, capsys, marks)
+    code, _, text = adjust_network(project, capsys, marks)
     assert code == 2
     for word in ("'1O1'", "Did you mean", "line", "comparator.csv"):
-        assert word in said
+        assert word in text
 
 
 def test_coordinates_in_pixels_are_refused(project: Path, capsys: SAID) -> None:
@@ -274,15 +274,15 @@ def test_coordinates_in_pixels_are_refused(project: Path, capsys: SAID) -> None:
     rows = [line.split(",") for line in lines if line.startswith("frame")]
     pixels = [",".join([*row[:3], row[8], row[9], *row[5:]]) for row in rows if row[8]]
     head = next(line for line in lines if line.startswith("image,"))
-    code, _, said = adjusted(project, capsys, "\n".join([head, *pixels]) + "\n")
+    code, _, text = adjust_network(project, capsys, "\n".join([head, *pixels]) + "\n")
     assert code == 2
-    assert "comparator.csv, line 2: the fiducials of image 'frame1' stand 22.4 times as far apart" in said
+    assert "comparator.csv, line 2: the fiducials of image 'frame1' stand 22.4 times as far apart" in text
 
 
 def test_frames_that_the_coordinates_no_longer_hold_are_not_counted(project: Path, capsys: SAID) -> None:
     lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if not line.startswith("frame2")]
-    _, summary, _ = adjusted(project, capsys, "\n".join(kept) + "\n")
+    _, summary, _ = adjust_network(project, capsys, "\n".join(kept) + "\n")
     assert "in 2 frames" in summary["sentence"]
     assert set(summary["poses"]) == {"frame1", "frame3"}
 
@@ -291,7 +291,7 @@ def test_image_with_two_targets_is_left_out_and_named(project: Path, capsys: SAI
     lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
     targets = [line for line in lines if line.startswith("frame1,") and ",target," in line and ",measured," in line]
     kept = [line for line in lines if line not in targets[2:]]
-    code, summary, _ = adjusted(project, capsys, "\n".join(kept) + "\n")
+    code, summary, _ = adjust_network(project, capsys, "\n".join(kept) + "\n")
     assert code == 1
     what = " ".join(problem["what"] for problem in summary["problems"])
     assert "'frame1'" in what
@@ -305,7 +305,7 @@ def test_singular_network_is_named_in_words(project: Path, capsys: SAID) -> None
         (project / "camera.toml").read_text(encoding="utf-8").replace("sigma_mm = [0.005, 0.005]", 'sigma_mm = "free"')
     )
     (project / "camera.toml").write_text(text, encoding="utf-8")
-    code, summary, _ = adjusted(project, capsys)
+    code, summary, _ = adjust_network(project, capsys)
     assert code == 1
     what = " ".join(problem["what"] for problem in summary["problems"])
     for word in ("Shift x", "Shift y", "Rotation", "Scale"):
@@ -313,7 +313,7 @@ def test_singular_network_is_named_in_words(project: Path, capsys: SAID) -> None
 
 
 @pytest.mark.study
-def test_scan_of_another_camera_is_said_to_be_one(project: Path, capsys: SAID) -> None:
+def test_scan_of_another_camera_is_stated_to_be_one(project: Path, capsys: SAID) -> None:
     rng = np.random.default_rng(1)
     picture = (20000 + 3000 * rng.standard_normal((678, 678))).astype(np.uint16)
     tifffile.imwrite(

@@ -17,7 +17,7 @@ from pipeline.results.record_json import plain_json
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def moved(project: Path, name: str, change_mm: float) -> Path:
+def shift_parameter(project: Path, name: str, change_mm: float) -> Path:
     """A copy of the project's calibration whose principal distance is another."""
     copy = project.parent / name / "adjustment.json"
     copy.parent.mkdir()
@@ -35,16 +35,16 @@ def moved(project: Path, name: str, change_mm: float) -> Path:
 
 def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = project / "out" / "adjustment.json"
-    assert run(["compare", str(first), str(moved(project, "same", 0.0))]) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert told.startswith("no drift ")
-    assert "same less out" in told
-    assert "were adjusted from the same measured marks: they are not independent" in told
+    assert run(["compare", str(first), str(shift_parameter(project, "same", 0.0))]) == 0
+    output = " ".join(capsys.readouterr().out.split())
+    assert output.startswith("no drift ")
+    assert "same less out" in output
+    assert "were adjusted from the same measured marks: they are not independent" in output
     out = project / "compared"
-    assert run(["compare", str(first), str(moved(project, "later", 0.5)), "--out", str(out)]) == 1
-    told = capsys.readouterr().out
-    assert told.startswith("drift\n")
-    (largest,) = re.findall(r"Fiducial marks after a similarity: at most ([\d.]+) µm", told)
+    assert run(["compare", str(first), str(shift_parameter(project, "later", 0.5)), "--out", str(out)]) == 1
+    output = capsys.readouterr().out
+    assert output.startswith("drift\n")
+    (largest,) = re.findall(r"Fiducial marks after a similarity: at most ([\d.]+) µm", output)
     assert float(largest) < 0.2  # of their 0.3 um: c and the marks are hardly tied
     drawn = ElementTree.parse(out / "compare.svg").getroot()
     assert len(drawn.findall(f".//{SVG}ellipse")) == 49  # one a place of the field
@@ -58,7 +58,7 @@ def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.Cap
 
 
 def test_a_series_has_a_trend(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    paths = [str(moved(project, f"y{year}", 0.02 * (year - 1950))) for year in (1952, 1958, 1961, 1970)]
+    paths = [str(shift_parameter(project, f"y{year}", 0.02 * (year - 1950))) for year in (1952, 1958, 1961, 1970)]
     assert run(["compare", *paths, "--times", "1952,1958,1961,1970", "--json"]) == 1
     content = json.loads(capsys.readouterr().out)
     assert content["trend"]["probability"] < 1e-6
@@ -77,13 +77,13 @@ def test_a_series_has_a_trend(project: Path, capsys: pytest.CaptureFixture[str])
     ],
 )
 def test_what_it_refuses(arguments: list[str], words: str, project: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    paths = [str(project / "out" / "adjustment.json"), str(moved(project, "same", 0.0))]
+    paths = [str(project / "out" / "adjustment.json"), str(shift_parameter(project, "same", 0.0))]
     assert run(["compare", *paths, *arguments]) == 2
     assert words in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_the_covariance_of_another_adjustment_is_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    other = moved(project, "other", 0.1)
+    other = shift_parameter(project, "other", 0.1)
     other.with_suffix(".npz").write_bytes((project / "out" / "adjustment.npz").read_bytes())
     assert run(["compare", str(project / "out" / "adjustment.json"), str(other)]) == 2
     assert "is of another adjustment than" in capsys.readouterr().err.replace("\n", " ")

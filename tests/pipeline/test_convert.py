@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lens_networks import network_of
+from lens_networks import make_network
 from simulated_project import write_project
 
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
@@ -47,7 +47,7 @@ def test_a_camera_file_becomes_opencvs(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
     """The converted file compares with its source as no drift, and comes back to it when converted back."""
-    project = write_project(network_of("australis", np.random.default_rng(7)), tmp_path)
+    project = write_project(make_network("australis", np.random.default_rng(7)), tmp_path)
     run(["adjust", str(project)])
     first = tmp_path / "out" / "adjustment.json"
     there, back = tmp_path / "brown", tmp_path / "back"
@@ -74,7 +74,7 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
 
 @pytest.mark.study
 def test_a_converted_calibration_is_taken_in(tmp_path: Path) -> None:
-    project = write_project(network_of("australis", np.random.default_rng(7)), tmp_path)
+    project = write_project(make_network("australis", np.random.default_rng(7)), tmp_path)
     run(["adjust", str(project)])
     assert run(["convert", str(tmp_path / "out" / "adjustment.json"), "brown", str(tmp_path / "brown")]) == DONE
     text = (tmp_path / "camera.toml").read_text(encoding="utf-8").replace('"australis"', '"brown"')
@@ -84,13 +84,13 @@ def test_a_converted_calibration_is_taken_in(tmp_path: Path) -> None:
     assert len(read_adjustment(tmp_path / "out" / "adjustment.json").calibrations) == 9
 
 
-def test_what_does_not_fit_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_does_not_fit_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     camera = tmp_path / "camera.toml"
     camera.write_text(CAMERA, encoding="utf-8")
     assert run(["convert", str(camera), "brown", str(tmp_path / "out"), "--json"]) == LOOK
-    told = json.loads(capsys.readouterr().out)
-    assert not told["same"]
-    assert 0.5 < told["largest_um"] < 10.0
+    output = json.loads(capsys.readouterr().out)
+    assert not output["same"]
+    assert 0.5 < output["largest_um"] < 10.0
     for arguments, words in (
         (["opencf", "out"], "did you mean"),
         (["juhl", "out"], "needs a radius r0"),

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from damaged_project import FILES, copied, damaged, made
+from damaged_project import FILES, copied, damaged, make_project
 
 from pipeline.cli import run
 from pipeline.text.csv_table import csv_line, read_csv
@@ -28,7 +28,7 @@ LONGEST_S, LONGEST_MESSAGE, MOST_KB = 20.0, 4000, 1_000_000
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sound")
-    made(folder)
+    make_project(folder)
     return folder
 
 
@@ -43,14 +43,14 @@ def outcomes(sound: Path, folder: Path, trials: int, seed: int, capsys: SAID) ->
         file.write_bytes(damaged(file.read_bytes(), name, rng))
         start = time.process_time()
         code = run(["adjust", str(project), "--json"])
-        said = capsys.readouterr()
+        captured = capsys.readouterr()
         if time.process_time() - start > LONGEST_S:
             counted[f"longer than {LONGEST_S:g} s: trial {trial}, {name}"] += 1
-        elif code not in (0, 1, 2) or "Traceback" in said.err or (code == 2) != ("reseau: " in said.err):
-            counted[f"code {code}: trial {trial}, {name}: {said.err[-2000:]}"] += 1
-        elif len(said.err) > LONGEST_MESSAGE:
-            counted[f"a message of {len(said.err)} letters: trial {trial}, {name}: {said.err[:500]}"] += 1
-        elif "\x1b" in said.out + said.err:
+        elif code not in (0, 1, 2) or "Traceback" in captured.err or (code == 2) != ("reseau: " in captured.err):
+            counted[f"code {code}: trial {trial}, {name}: {captured.err[-2000:]}"] += 1
+        elif len(captured.err) > LONGEST_MESSAGE:
+            counted[f"a message of {len(captured.err)} letters: trial {trial}, {name}: {captured.err[:500]}"] += 1
+        elif "\x1b" in captured.out + captured.err:
             counted[f"an escape sequence: trial {trial}, {name}"] += 1
         else:
             counted[MESSAGE if code == 2 else RESULT] += 1
@@ -112,9 +112,9 @@ def test_what_no_table_holds_gets_its_message(
     start = time.process_time()
     assert run(["adjust", str(project)]) == 2
     assert time.process_time() - start < LONGEST_S / 2
-    said = capsys.readouterr().err
-    assert words in said
-    assert len(said) < LONGEST_MESSAGE
+    message = capsys.readouterr().err
+    assert words in message
+    assert len(message) < LONGEST_MESSAGE
 
 
 def damaged_covariance(how: str, data: bytes) -> bytes:
@@ -200,8 +200,8 @@ def test_a_terminal_of_few_letters(sound: Path, encoding: str, json_wanted: bool
     command = [sys.executable, "-c", main, "adjust", str(sound / "project.toml"), *["--json"] * json_wanted]
     done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONIOENCODING": encoding}, check=False)
     assert done.returncode in (0, 1), done.stderr
-    said = done.stdout.decode(encoding)
-    assert json.loads(said)["adjustment"]["sigma0"] if json_wanted else "c principal distance" in said
+    output = done.stdout.decode(encoding)
+    assert json.loads(output)["adjustment"]["sigma0"] if json_wanted else "c principal distance" in output
     assert b"Traceback" not in done.stderr
 
 
@@ -213,10 +213,10 @@ def test_escape_sequences_in_names_do_not_reach_the_terminal(sound: Path, tmp_pa
     )
     assert run(["adjust", str(project)]) in (0, 1)
     assert run(["adjust", str(project.parent / "none.toml")]) == 2
-    said = capsys.readouterr()
-    assert r"K\x1b[31m" in said.out
-    assert r"\x1b]0;owned\x07" in said.err
-    assert not set("\x1b\x07") & set(said.out + said.err)
+    captured = capsys.readouterr()
+    assert r"K\x1b[31m" in captured.out
+    assert r"\x1b]0;owned\x07" in captured.err
+    assert not set("\x1b\x07") & set(captured.out + captured.err)
 
 
 @pytest.mark.parametrize(
@@ -231,9 +231,9 @@ def test_what_the_machine_refuses_has_its_own_advice(
 
     monkeypatch.setattr("pipeline.stages.run_adjust", refuse)
     assert run(["adjust", str(sound / "project.toml")]) == 2
-    said = capsys.readouterr().err
-    assert words in said
-    assert ("Make room" in said) == (error == errno.ENOSPC)
+    message = capsys.readouterr().err
+    assert words in message
+    assert ("Make room" in message) == (error == errno.ENOSPC)
 
 
 @pytest.mark.parametrize(

@@ -35,13 +35,13 @@ from pipeline.results.measured_record import MeasuredScan
 TASK = ScanTask("a", "a.tif", ScanOptions(cast(CameraFile, SimpleNamespace()), None, FiducialOptions()))
 
 
-def key_of(task: ScanTask) -> str:
+def task_key(task: ScanTask) -> str:
     """A stand-in for the fingerprint: what of the options decisions change."""
     fiducials = task.options.fiducials
     return f"{fiducials.pose} {[(click.point, click.col_px) for click in fiducials.clicks]}"
 
 
-def pose_of(key: str) -> str | None:
+def result_pose(key: str) -> str | None:
     """In the stand-in for the store no result tells its pose."""
     return None
 
@@ -56,15 +56,15 @@ def place(point: str, col_px: float, **rest: Any) -> Decision:
 
 def test_what_is_appended_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "decisions.jsonl"
-    told = [
+    result = [
         Decision("box/a", Choice.ACCEPT, "1", "fiducial", note="é <b>", who="ann", when="2026-01-01T10:00:00+00:00"),
         place("2", 1.5, fingerprint="f", window=(1.0, 2.0, 81.0, 81.0)),
         Decision("a", Choice.POSE, pose="90m"),
         Decision("a", Choice.UNDO),
     ]
-    append_decisions(path, told[:1])
-    append_decisions(path, told[1:])
-    assert read_decisions(path) == tuple(told)
+    append_decisions(path, result[:1])
+    append_decisions(path, result[1:])
+    assert read_decisions(path) == tuple(result)
 
 
 def test_a_line_cut_short_does_not_count_and_the_next_one_stands_by_itself(tmp_path: Path) -> None:
@@ -169,9 +169,9 @@ def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, caps
     )
     for command in ("measure", "report", "status"):
         assert run([command, str(project)]) == 1, command
-        told = " ".join(capsys.readouterr().out.split())
-        assert [word for word in words if word not in told] == [], command
-        assert "Decisions stand behind" not in told
+        output = " ".join(capsys.readouterr().out.split())
+        assert [word for word in words if word not in output] == [], command
+        assert "Decisions stand behind" not in output
 
 
 def test_status_is_stale_until_a_decision_is_taken_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -270,50 +270,50 @@ def test_the_last_line_counts_and_undo_takes_back_the_one_before() -> None:
 
 def test_decisions_of_another_result_do_not_count() -> None:
     old = mark_decision(Choice.ACCEPT, fingerprint="another file")
-    own = mark_decision(Choice.REJECT, "2", fingerprint=key_of(TASK))
-    assert list(apply_decisions(TASK, [old, own], key_of, pose_of).counting.values()) == [own]
+    own = mark_decision(Choice.REJECT, "2", fingerprint=task_key(TASK))
+    assert list(apply_decisions(TASK, [old, own], task_key, result_pose).counting.values()) == [own]
 
 
 def test_decisions_count_for_what_follows_from_those_before_them() -> None:
     """Accepted, then another mark placed, then, on what was measured from that, one more rejected."""
-    accept = mark_decision(Choice.ACCEPT, "1", fingerprint=key_of(TASK))
-    placed = place("2", 7.0, fingerprint=key_of(TASK))
-    now = apply_decisions(TASK, [accept, placed], key_of, pose_of)
+    accept = mark_decision(Choice.ACCEPT, "1", fingerprint=task_key(TASK))
+    placed = place("2", 7.0, fingerprint=task_key(TASK))
+    now = apply_decisions(TASK, [accept, placed], task_key, result_pose)
     assert now.task.options.fiducials.clicks == (Click("2", 7.0, 2.0),)
-    reject = mark_decision(Choice.REJECT, "3", fingerprint=key_of(now.task))
-    assert set(apply_decisions(TASK, [accept, placed, reject], key_of, pose_of).counting.values()) == {
+    reject = mark_decision(Choice.REJECT, "3", fingerprint=task_key(now.task))
+    assert set(apply_decisions(TASK, [accept, placed, reject], task_key, result_pose).counting.values()) == {
         accept,
         placed,
         reject,
     }
 
 
-def test_what_was_decided_about_marks_does_not_count_in_another_pose() -> None:
-    placed = place("2", 7.0, fingerprint=key_of(TASK))
-    pose = Decision("a", Choice.POSE, pose="90", fingerprint=key_of(TASK))
-    late = mark_decision(Choice.ACCEPT, "3", fingerprint=key_of(TASK))  # on a page that was not measured anew yet
-    now = apply_decisions(TASK, [pose, late], key_of, pose_of)
+def test_what_was_settled_about_marks_does_not_count_in_another_pose() -> None:
+    placed = place("2", 7.0, fingerprint=task_key(TASK))
+    pose = Decision("a", Choice.POSE, pose="90", fingerprint=task_key(TASK))
+    late = mark_decision(Choice.ACCEPT, "3", fingerprint=task_key(TASK))  # on a page that was not measured anew yet
+    now = apply_decisions(TASK, [pose, late], task_key, result_pose)
     assert now.task.options.fiducials.pose == "90"
     assert list(now.counting.values()) == [pose]
     other = replace(pose, pose="180")  # somebody thinks again, on that page
-    assert apply_decisions(TASK, [pose, other], key_of, pose_of).task.options.fiducials.pose == "180"
+    assert apply_decisions(TASK, [pose, other], task_key, result_pose).task.options.fiducials.pose == "180"
     undone = Decision("a", Choice.UNDO, fingerprint="whatever is shown")
-    assert apply_decisions(TASK, [placed, pose, undone], key_of, pose_of).task.options.fiducials.pose == "auto"
+    assert apply_decisions(TASK, [placed, pose, undone], task_key, result_pose).task.options.fiducials.pose == "auto"
 
 
-def test_what_was_decided_about_marks_counts_on_in_the_pose_in_which_they_were_found() -> None:
+def test_what_was_settled_about_marks_counts_on_in_the_pose_in_which_they_were_found() -> None:
     """Decided on one page, the pose first or last, before it is measured anew."""
-    early, late = (mark_decision(Choice.ACCEPT, point, fingerprint=key_of(TASK)) for point in "13")
-    pose = Decision("a", Choice.POSE, pose="90", fingerprint=key_of(TASK))
-    found = {key_of(TASK): "90"}
-    now = apply_decisions(TASK, [early, pose, late], key_of, found.get)
+    early, late = (mark_decision(Choice.ACCEPT, point, fingerprint=task_key(TASK)) for point in "13")
+    pose = Decision("a", Choice.POSE, pose="90", fingerprint=task_key(TASK))
+    found = {task_key(TASK): "90"}
+    now = apply_decisions(TASK, [early, pose, late], task_key, found.get)
     assert now.task.options.fiducials.pose == "90"
     assert set(now.counting.values()) == {early, pose, late}
-    found = {key_of(TASK): "180"}
-    assert set(apply_decisions(TASK, [pose, late], key_of, found.get).counting.values()) == {pose}
+    found = {task_key(TASK): "180"}
+    assert set(apply_decisions(TASK, [pose, late], task_key, found.get).counting.values()) == {pose}
 
 
-def scan_of(*marks: MarkMeasurement) -> MeasuredScan:
+def make_scan(*marks: MarkMeasurement) -> MeasuredScan:
     return MeasuredScan("a.tif", 100, 100, (20.0, 20.0), FrameMeasurement("a", marks))
 
 
@@ -324,12 +324,12 @@ def weak(point: str, kind: Any = "fiducial") -> MarkMeasurement:
     )
 
 
-def test_a_mark_becomes_what_was_decided_and_says_by_whom() -> None:
+def test_a_mark_becomes_what_was_settled_and_says_by_whom() -> None:
     choices = {"1": Choice.ACCEPT, "2": Choice.REJECT, "3": Choice.ABSENT}
     counting = {
         one.subject: one for point, choice in choices.items() if (one := mark_decision(choice, point, who="ann"))
     }
-    scan = scan_of(*(weak(point) for point in "1234"))
+    scan = make_scan(*(weak(point) for point in "1234"))
     before, after = before_checks(scan, counting), after_checks(scan, counting)
     statuses = [Status.WEAK, Status.REJECTED, Status.ABSENT, Status.WEAK]
     assert [mark.status for mark in before.frame.marks] == statuses
@@ -346,19 +346,19 @@ def test_a_mark_that_was_not_measured_cannot_be_accepted() -> None:
         "1", "fiducial", np.array([5.0, 6.0]), None, Status.PREDICTED, Reason("not seen", Code.NOT_FOUND)
     )
     one = mark_decision(Choice.ACCEPT)
-    assert after_checks(scan_of(bare), {one.subject: one}).frame.marks[0].status is Status.PREDICTED
+    assert after_checks(make_scan(bare), {one.subject: one}).frame.marks[0].status is Status.PREDICTED
 
 
 def test_a_target_that_is_placed_counts_as_well_as_one_points() -> None:
     one = Decision("a", Choice.PLACE, "1", "target", col_px=50.0, row_px=60.0)
-    (mark,) = after_checks(scan_of(weak("1", "target")), {one.subject: one}).frame.marks
+    (mark,) = after_checks(make_scan(weak("1", "target")), {one.subject: one}).frame.marks
     assert mark.status is Status.WEAK
     assert mark.center_px is not None
     np.testing.assert_array_equal(mark.center_px, (50.0, 60.0))
 
 
 @pytest.mark.study
-def test_decisions_that_were_not_taken_in_are_told_until_measure_takes_them(
+def test_decisions_that_were_not_taken_in_are_reported_until_measure_takes_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     project = write_project(tmp_path / "p", ["a", "b"])
@@ -369,10 +369,10 @@ def test_decisions_that_were_not_taken_in_are_told_until_measure_takes_them(
     assert run(["report", str(project)]) == 1
     assert "Decisions were made" in capsys.readouterr().out
     run(["measure", str(project)])
-    said = capsys.readouterr()
-    assert "0 to measure" in said.err  # a mark that is no mark is judged, and not measured, anew
-    assert "Decisions were made" not in said.out
-    assert "Decisions stand behind these marks: 1 of ann" in " ".join(said.out.split())
+    captured = capsys.readouterr()
+    assert "0 to measure" in captured.err  # a mark that is no mark is judged, and not measured, anew
+    assert "Decisions were made" not in captured.out
+    assert "Decisions stand behind these marks: 1 of ann" in " ".join(captured.out.split())
     assert "rejected by ann" in project.with_name("comparator.csv").read_text(encoding="utf-8")
     append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.UNDO)])
     assert run(["measure", str(project)]) == 0
@@ -380,7 +380,7 @@ def test_decisions_that_were_not_taken_in_are_told_until_measure_takes_them(
     assert rows == [line for line in before.splitlines() if line[0] != "#"]
 
 
-def test_what_is_decided_is_not_open_and_every_command_says_who_decided(
+def test_what_is_settled_is_not_open_and_every_command_says_who_settled(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A mark that no scan shows needs a look, until a person says that it is not there."""
@@ -394,13 +394,13 @@ def test_what_is_decided_is_not_open_and_every_command_says_who_decided(
     assert run(["status", str(project), "--json"]) == 0
     verdicts = json.loads(capsys.readouterr().out)["verdicts"]
     assert (verdicts["decided"]["scans"], verdicts["good"]["scans"], verdicts["look"]["scans"]) == (1, 0, 0)
-    told = "Decisions stand behind these marks: 1 of ann lee."
+    result = "Decisions stand behind these marks: 1 of ann lee."
     for command in ("adjust", "report", "check"):
         run([command, str(project)])
-        assert told in " ".join(capsys.readouterr().out.split()), command
-    assert told in project.parent.joinpath("out", "report.html").read_text(encoding="utf-8")
+        assert result in " ".join(capsys.readouterr().out.split()), command
+    assert result in project.parent.joinpath("out", "report.html").read_text(encoding="utf-8")
     assert run(["export", str(project), "csv", str(tmp_path / "csv")]) == 0
-    assert told in (tmp_path / "csv" / "README.txt").read_text(encoding="utf-8")
+    assert result in (tmp_path / "csv" / "README.txt").read_text(encoding="utf-8")
 
 
 def test_whose_decisions_stand_behind_a_file_is_read_from_its_head(tmp_path: Path) -> None:
@@ -411,7 +411,7 @@ def test_whose_decisions_stand_behind_a_file_is_read_from_its_head(tmp_path: Pat
     )
     read = read_decision_counts(path)
     assert read == {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line end"): 3}
-    said = "a.toml: 2 of ann, the second; b.toml: 1 of bob, 3 of line end"
-    assert describe_decisions(read) == f"Decisions stand behind these marks: {said}."
+    text = "a.toml: 2 of ann, the second; b.toml: 1 of bob, 3 of line end"
+    assert describe_decisions(read) == f"Decisions stand behind these marks: {text}."
     assert describe_decisions({}) == ""
     assert len(read_comparator(path)) == 1

@@ -89,11 +89,11 @@ def test_the_order_of_points_csv_changes_no_digit(finished: tuple[Path, int], tm
     write_comparator(project.comparator, mark_rows([scan.frame]), {"frame1": scan.pitch_um})
     before = (finished[0] / "comparator.csv").read_text(encoding="utf-8").splitlines()
     shuffled = project.comparator.read_text(encoding="utf-8").splitlines()
-    assert marks_of("frame1", shuffled) == marks_of("frame1", before)
-    assert len(marks_of("frame1", before)) > 40
+    assert image_marks("frame1", shuffled) == image_marks("frame1", before)
+    assert len(image_marks("frame1", before)) > 40
 
 
-def marks_of(image: str, comparator: list[str]) -> list[str]:
+def image_marks(image: str, comparator: list[str]) -> list[str]:
     return [line for line in comparator if line.startswith(f"{image},")]
 
 

@@ -75,7 +75,7 @@ def small(folder: Path, *changes: tuple[str, str]) -> Path:
     return path
 
 
-def juhl_with(quantity: str, values: tuple[float, ...], layouts: int) -> Swept:
+def vary_juhl(quantity: str, values: tuple[float, ...], layouts: int) -> Swept:
     scene = Variations.read(JUHL)
     scene.values["design"]["layouts"] = layouts
     return sweep(scene, 1, Sweep(quantity, values))
@@ -84,7 +84,7 @@ def juhl_with(quantity: str, values: tuple[float, ...], layouts: int) -> Swept:
 @pytest.fixture(scope="module")
 def over_points() -> Swept:
     """Juhl's figure 1."""
-    return juhl_with("field.points", (75, 100, 150, 200), layouts=10)
+    return vary_juhl("field.points", (75, 100, 150, 200), layouts=10)
 
 
 @pytest.mark.study
@@ -104,7 +104,7 @@ def test_juhls_first_figure_falls_with_the_number_of_points(over_points: Swept) 
 
 def test_juhls_second_figure_is_r1_alone() -> None:
     """Heights of 0.003 to 0.1 per mille of the flying height: no matter at first, then in proportion; others hardly."""
-    swept = juhl_with("design.sigma_height", (0.005, 0.02, 0.15, 0.3), layouts=2)
+    swept = vary_juhl("design.sigma_height", (0.005, 0.02, 0.15, 0.3), layouts=2)
     r1 = np.array([step.sigmas.mean["r1"] for step in swept.steps])
     assert r1[1] / r1[0] < 1.07
     assert r1[2] / r1[0] > 2.0
@@ -275,7 +275,7 @@ def test_a_camera_in_a_file_of_its_own_can_be_varied() -> None:
         ("field.points", "counts things"),
     ],
 )
-def test_a_wrong_quantity_is_told_with_what_is_near(tmp_path: Path, quantity: str, words: str) -> None:
+def test_a_wrong_quantity_is_reported_with_what_is_near(tmp_path: Path, quantity: str, words: str) -> None:
     scene = Variations.read(small(tmp_path))
     with pytest.raises(InputError) as caught:
         sweep(scene, 1, Sweep(quantity, (1.5, 2.5)))
@@ -304,7 +304,7 @@ def test_a_wrong_quantity_is_wrong_input(tmp_path: Path, capsys: pytest.CaptureF
         ('[[design.sweep]]\nquantity = "design..x"\nvalues = [2, 3]', "write a dotted name"),
     ],
 )
-def test_a_wrong_table_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, words: str) -> None:
+def test_a_wrong_table_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, words: str) -> None:
     assert run(["design", str(small(tmp_path, ("[[image]]", f"{line}\n[[image]]")))]) == WRONG_INPUT
     assert words in capsys.readouterr().err
     assert not (tmp_path / "small-design").exists()
@@ -333,7 +333,7 @@ def test_a_field_of_natural_points_cannot_be_planned() -> None:
         scene_setup(read_scene(SCENES / "juhl_natural.toml"))
 
 
-def with_table(folder: Path, table: str) -> Path:
+def write_table(folder: Path, table: str) -> Path:
     path = small(folder)
     path.write_text(path.read_text(encoding="utf-8") + table, encoding="utf-8")
     return path
@@ -359,14 +359,14 @@ def test_a_distance_has_the_part_that_its_variance_gives_it(tmp_path: Path) -> N
     for name in ("IO.K.c", "EO.two.X0", "PT.6.Z"):
         i = names.index(name)
         assert after.plan.sigma(name) == pytest.approx(np.sqrt(expected[i, i]), rel=1e-6)
-    (told,) = after.plan.adjustment.further
-    assert told.redundancy == pytest.approx(sigma**2 / (sigma**2 + row @ gain), rel=1e-6)
+    (finding,) = after.plan.adjustment.further
+    assert finding.redundancy == pytest.approx(sigma**2 / (sigma**2 + row @ gain), rel=1e-6)
     assert {group.group for group in after.reliability.groups} >= {"distance"}
 
 
 def test_observed_orientations_hold_what_they_are_of(tmp_path: Path) -> None:
     """One frame's station is observed far better than targets give it; the other one's angles."""
-    path = with_table(
+    path = write_table(
         tmp_path,
         '[[design.orientation]]\nimage = "one"\nposition_sigma = 1e-6\n'
         "[[design.orientation]]\nangles_sigma_deg = [1e-5, 1e-5, 1e-5]\n",
@@ -390,8 +390,8 @@ def test_distances_hold_the_scale_of_a_free_network(tmp_path: Path) -> None:
     )
     path = tmp_path / "free.toml"
     path.write_text(text + distances, encoding="utf-8")
-    told = expect(Variations.read(path).setup())
-    assert without.plan.adjustment.redundancy + 1 == told.plan.adjustment.redundancy  # one of both is needed
+    result = expect(Variations.read(path).setup())
+    assert without.plan.adjustment.redundancy + 1 == result.plan.adjustment.redundancy  # one of both is needed
     assert run(["design", str(path)]) in (DONE, LOOK)
     content = json.loads((tmp_path / "free-design" / "design.json").read_text(encoding="utf-8"))
     assert [each["name"] for each in content["distances"]] == ["1 to 4", "13 to 16"]
@@ -411,7 +411,7 @@ def test_distances_hold_the_scale_of_a_free_network(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_observed_is_refused(table: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
-        Variations.read(with_table(tmp_path, table)).setup()
+        Variations.read(write_table(tmp_path, table)).setup()
 
 
 def test_frames_to_be_scanned_in_parts_are_planned_as_wholes(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from lens_networks import network_of
+from lens_networks import make_network
 from numpy.typing import NDArray
 from simulated_project import write_project
 
@@ -25,7 +25,7 @@ POINTS = np.random.default_rng(2).uniform(-1.0, 1.0, (60, 3)) * [2.0, 2.0, 0.3]
 
 def fisheye_project(folder: Path) -> Path:
     """Digital, 36 mm x 24 mm, exact images; its comparator begins at the first pixel."""
-    network = network_of("opencv_fisheye")
+    network = make_network("opencv_fisheye")
     shift = np.array([18.0, -12.0])
     observations = replace(network.observations, xy_mm=network.observations.xy_mm + shift)
     middle = {"x0_mm": Prior(18.0, np.inf), "y0_mm": Prior(-12.0, np.inf)}
@@ -44,7 +44,7 @@ def fisheye_project(folder: Path) -> Path:
     return path
 
 
-def test_a_skew_that_no_program_takes_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_skew_that_no_program_takes_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """b2 = -3e-4 on 12 mm is 0.036 px of 0.1 mm: allowed; not at 0.01 px."""
     project = fisheye_project(tmp_path)
     assert run(["export", str(project), "opencv", str(tmp_path / "o")]) == DONE
@@ -98,5 +98,5 @@ def test_skews_of_other_programs_come_in(tmp_path: Path) -> None:
     radial = rays * (1.0 - 0.1 * (rays**2).sum(axis=1))[:, None]
     u = 180.0 + 400.0 * radial[:, 0] + 10.0 * radial[:, 0] + 3.0 * radial[:, 1]
     v = 120.0 + 400.0 * radial[:, 1]
-    seen = seen_px(read_camera(tmp_path / "m" / "camera.toml"), rays)
-    np.testing.assert_allclose(seen, np.stack([u, v], axis=1) - 0.5, atol=1e-9)
+    view = seen_px(read_camera(tmp_path / "m" / "camera.toml"), rays)
+    np.testing.assert_allclose(view, np.stack([u, v], axis=1) - 0.5, atol=1e-9)

@@ -25,7 +25,7 @@ from exported_project import (
     camera_mm,
     frame_px,
     ideal_mm,
-    project_of,
+    make_project,
     scan_px,
 )
 from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_affine, micmac_px, opencv_px, values
@@ -79,18 +79,18 @@ def test_frames_without_their_lens_are_the_same_to_a_millionth_of_a_pixel(
 
 
 @pytest.mark.parametrize("format", PINHOLES)
-def test_frames_with_their_lens_are_off_by_no_more_than_is_told(format: str, project: Path, tmp_path: Path) -> None:
+def test_frames_with_their_lens_are_off_by_no_more_than_is_reported(format: str, project: Path, tmp_path: Path) -> None:
     reader, _ = PINHOLES[format]
     folder = exported(project, format, tmp_path)
-    told = told_misfit_px(folder)
-    assert 0.0 < told < 0.05
+    stated_px = told_misfit_px(folder)
+    assert 0.0 < stated_px < 0.05
     for i in IMAGES:
         off = np.linalg.norm(reader(folder, f"f{i}", POINTS) - frame_px(i, camera_mm(i)), axis=1)
-        assert off.max() < 1.05 * told + SAME_PX  # the told one is of a grid
+        assert off.max() < 1.05 * stated_px + SAME_PX  # the told one is of a grid
 
 
 @parametrize_with_studies("format", PINHOLES, quick=(2,))
-def test_half_a_pixel_and_the_y_axis_are_seen(
+def test_half_a_pixel_and_the_y_axis_are_visible(
     format: str, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reader, module = PINHOLES[format]
@@ -128,7 +128,7 @@ def test_colmap_has_the_tracks_of_the_marks(project: Path, tmp_path: Path) -> No
 def test_micmac_makes_the_frames_that_its_camera_is_for(project: Path, tmp_path: Path) -> None:
     """From the scan's pixels through MicMac's own fit and ReSampFid's box to the pixels of camera and pose."""
     folder = exported(project, "micmac", tmp_path)
-    told = told_misfit_px(folder)
+    stated_px = told_misfit_px(folder)
     text = (folder / "README.txt").read_text(encoding="utf-8")
     box = [float(value) for value in text[text.index("BoxCh=[") + 7 :].split("]")[0].split(",")]
     assert box == [-114.0, -114.0, 114.0, 114.0]
@@ -137,10 +137,10 @@ def test_micmac_makes_the_frames_that_its_camera_is_for(project: Path, tmp_path:
         made = (scan_px(i, camera_mm(i)) @ matrix.T + shift - box[:2]) / PITCH_MM
         np.testing.assert_allclose(made, (camera_mm(i) * (1, -1) - box[:2]) / PITCH_MM, atol=1e-5)
         off = np.linalg.norm(micmac_px(folder, f"f{i}", POINTS) - made, axis=1)
-        assert off.max() < 1.05 * told + 1e-5
+        assert off.max() < 1.05 * stated_px + 1e-5
 
 
-def test_micmac_with_half_a_pixel_or_y_up_is_seen(
+def test_micmac_with_half_a_pixel_or_y_up_is_visible(
     project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wrong = replace(micmac_format.CONVENTION, first_pixel_px=(0.5, 0.5))
@@ -181,11 +181,11 @@ def test_rho_changes_its_sign_where_rows_run_down(project: Path) -> None:
 def test_metashape_script_makes_film_cameras(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The script against a stub of Metashape's module; the calibration by its manual's formulas."""
     folder = exported(project, "metashape", tmp_path, code=LOOK)
-    told = told_misfit_px(folder)
+    stated_px = told_misfit_px(folder)
     for i in (0, 1, 3):
         in_camera = (np.diag([1, -1, -1]) @ rotation(*TRUTH.attitudes[i]) @ (POINTS - np.array(TRUTH.stations[i])).T).T
         off = np.linalg.norm(metashape_mm(folder / "K.xml", PITCH_MM, in_camera) - camera_mm(i), axis=1)
-        assert off.max() / PITCH_MM < 1.05 * told + SAME_PX
+        assert off.max() / PITCH_MM < 1.05 * stated_px + SAME_PX
 
     class Photo:
         def __init__(self, path: str) -> None:
@@ -249,8 +249,8 @@ def test_footprints_hold_what_the_frames_show(tmp_path: Path) -> None:
         from simulated import camera_point
 
         ground = np.column_stack([ring[:-1], np.full(len(x), feature["properties"]["ground"])])
-        seen = camera_point(upright, i, ground)
-        np.testing.assert_allclose(np.abs(seen).max(axis=1), 114.0, atol=1e-4)
+        projected = camera_point(upright, i, ground)
+        np.testing.assert_allclose(np.abs(projected).max(axis=1), 114.0, atol=1e-4)
 
 
 def test_utm_is_the_conformal_map_of_its_meridian() -> None:
@@ -292,8 +292,8 @@ def test_tables_tell_what_the_adjustment_says(project: Path, tmp_path: Path) -> 
     own = [row for row in covariances if row["first"] == row["second"] == "EO.f2.Z0"]
     assert own[0]["covariance"] == pytest.approx(exterior["Z0"]["sigma"] ** 2, rel=1e-9)
     marks = [row for row in pyarrow.parquet.read_table(binary / "marks.parquet").to_pylist() if row["image"] == "f1"]
-    seen = [[row["camera_x_mm"], row["camera_y_mm"]] for row in marks if row["kind"] == "target"]
-    np.testing.assert_allclose(seen, camera_mm(1), atol=1e-7)
+    view = [[row["camera_x_mm"], row["camera_y_mm"]] for row in marks if row["kind"] == "target"]
+    np.testing.assert_allclose(view, camera_mm(1), atol=1e-7)
 
 
 def test_only_observations_go_out(tmp_path: Path) -> None:
@@ -332,16 +332,16 @@ def test_what_cannot_go_out_is_refused_with_its_reason(
     assert [path.name for path in full.iterdir()] == ["mine.txt"]
 
 
-def test_a_strong_lens_is_refused_unless_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_strong_lens_is_refused_unless_requested(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     strong = replace(TRUTH, distortion={**LENS, "k3": 4e-6, "k5": -2e-10})
     project = adjusted_project(tmp_path, strong)
     assert run(["export", str(project), "asp", str(tmp_path / "a")]) == WRONG_INPUT
     assert "allow more with --misfit-px" in capsys.readouterr().err
     folder = exported(project, "asp", tmp_path, "--misfit-px", "100")
-    told = told_misfit_px(folder)
-    assert told > 0.05
+    stated_px = told_misfit_px(folder)
+    assert stated_px > 0.05
     off = np.linalg.norm(asp_px(folder, "f0", POINTS) - frame_px(0, camera_mm(0, strong), truth=strong), axis=1)
-    assert off.max() < 1.05 * told
+    assert off.max() < 1.05 * stated_px
 
 
 def test_an_export_takes_the_place_of_an_earlier_one_whole(
@@ -397,7 +397,7 @@ def test_a_digital_camera_goes_out_as_its_pictures_are(tmp_path: Path, monkeypat
 def test_how_far_out_an_estimated_lens_is_known_goes_out(tmp_path: Path) -> None:
     """In every README, and in OpenCV's files as a comment that its reader passes over."""
     network, _ = simulated(np.random.default_rng(1), TRUTH, points=POINTS, noise=False, free={"k3": np.inf})
-    project = project_of(network, tmp_path)
+    project = make_project(network, tmp_path)
     known = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))["cameras"]["K"]["lens_known"]
     words = f"The distortion of K is known up to {known['radius_mm']:.3g} mm from the principal point"
     for format in ("opencv", "asp", "micmac", "bingo"):
@@ -411,7 +411,7 @@ def test_how_far_out_an_estimated_lens_is_known_goes_out(tmp_path: Path) -> None
     assert storage.getNode("distortion_coefficients").mat().size == 5
 
 
-def test_a_bent_sight_is_told(project: Path) -> None:
+def test_a_bent_sight_is_reported(project: Path) -> None:
     """The earth's curvature lowers a point at 700 m by 4 cm: some 3 um in the picture."""
     block = read_block(read_project(project))
     frame = block.frames[0]
@@ -449,10 +449,10 @@ def test_resampled_frames_lie_where_the_export_says(finished: tuple[Path, int], 
     point = np.array([camera["principal_point_mm"][axis]["value"] for axis in "xy"])
     for frame in sorted((tmp_path / "frames").glob("*.tif")):
         with tifffile.TiffFile(frame) as file:
-            said, shape = json.loads(file.pages.first.description), file.pages.first.shape
+            description, shape = json.loads(file.pages.first.description), file.pages.first.shape
         storage = cv2.FileStorage(str(folder / f"{frame.stem}.yml"), cv2.FILE_STORAGE_READ)
         matrix = storage.getNode("camera_matrix").mat()
-        there = (point - (said["x_mm"], said["y_mm"])) * (1, -1) / said["pitch_mm"]
+        there = (point - (description["x_mm"], description["y_mm"])) * (1, -1) / description["pitch_mm"]
         np.testing.assert_allclose(matrix[:2, 2], there, atol=0.01)  # the fit may move it a little
         size = [int(storage.getNode(f"image_{side}").real()) for side in ("height", "width")]
         assert size == list(shape[:2])

@@ -21,7 +21,7 @@ def huge(column: int) -> Spoil:
     return spoil
 
 
-def at_one_place(kind: str) -> Spoil:
+def collapse(kind: str) -> Spoil:
     def spoil(cells: list[str]) -> None:
         if cells[2] == kind:
             cells[3:5] = ["30.0", "-30.0"]
@@ -42,8 +42,8 @@ def spoiled(path: Path, spoil: Spoil) -> None:
         ("points.csv", huge(1), r"points.csv, line 2, column X: '1e300' is larger than anything"),
         ("comparator.csv", huge(3), r"comparator.csv, line 2, column x_mm: '1e300'"),
         ("comparator.csv", huge(5), r"comparator.csv, line 2, column sx_mm: '1e300'"),
-        ("comparator.csv", at_one_place("target"), r"image f\d: all its \d+ targets are at one place, \(30, -30\) mm"),
-        ("comparator.csv", at_one_place("fiducial"), r"image f\d: all its \d+ fiducials are at one place"),
+        ("comparator.csv", collapse("target"), r"image f\d: all its \d+ targets are at one place, \(30, -30\) mm"),
+        ("comparator.csv", collapse("fiducial"), r"image f\d: all its \d+ fiducials are at one place"),
     ],
 )
 def test_each_ends_with_one_message(
@@ -53,9 +53,9 @@ def test_each_ends_with_one_message(
     project = write_project(network, tmp_path)
     spoiled(tmp_path / name, spoil)
     assert run(["adjust", str(project)]) == WRONG_INPUT
-    told = capsys.readouterr().err
-    assert re.search(words, told)
-    assert told.count("reseau: ") == 1
+    message = capsys.readouterr().err
+    assert re.search(words, message)
+    assert message.count("reseau: ") == 1
 
 
 @pytest.mark.parametrize(("sigma", "is_wrong"), [("1e-12", True), ("0", False)])
@@ -70,5 +70,5 @@ def test_a_fiducial_is_not_known_to_a_millionth_of_a_nanometre(
     after = re.sub(r"sigma_mm = .*", f"sigma_mm = {sigma}", after, count=1)
     camera.write_text(f"{before}[[fiducial]]{after}", encoding="utf-8")
     code = run(["status", str(project)])
-    told = capsys.readouterr().err
-    assert (code == WRONG_INPUT and "nothing is known to 1e-12 mm" in told) == is_wrong
+    message = capsys.readouterr().err
+    assert (code == WRONG_INPUT and "nothing is known to 1e-12 mm" in message) == is_wrong

@@ -37,7 +37,7 @@ def write_project(folder: Path, marks: dict[str, int], camera: str = "", extra: 
     return folder / "project.toml"
 
 
-def result_of(project: Path) -> dict[str, Any]:
+def read_result(project: Path) -> dict[str, Any]:
     content: dict[str, Any] = json.loads((project.parent / "out" / "adjustment.json").read_text(encoding="utf-8"))
     return content
 
@@ -56,7 +56,7 @@ def test_film_transformations_without_an_object(tmp_path: Path, capsys: pytest.C
         word in report for word in ("OpenCV</h2>", "Calibration report", "Distortion</h2>", "Parameters</h2>")
     )
     assert run(["report", str(project)]) == 0  # and it may be written over
-    result = result_of(project)
+    result = read_result(project)
     assert result["converged"]
     assert (result["unknowns"], result["redundancy"]) == (18, 8)
     for seed, image in enumerate(("a", "b")):
@@ -88,7 +88,7 @@ def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: 
     (tmp_path / "points.csv").write_text("point,X,Y,Z\nt1,0,0,0\n", encoding="utf-8")
     project.write_text('camera = "camera.toml"\n[object]\npoints = "points.csv"\n', encoding="utf-8")
     assert run(["adjust", str(project)]) == 1
-    result = result_of(project)
+    result = read_result(project)
     assert list(result["images"]) == ["a"]
     assert {row["kind"] for row in result["residuals"]} == {"fiducial"}
     warnings = " ".join(result["warnings"])
@@ -98,7 +98,7 @@ def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: 
     assert result["cameras"]["K"]["principal_distance_mm"]["sigma"] is None
 
 
-def test_too_few_fiducials_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_few_fiducials_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["adjust", str(write_project(tmp_path, {"a": 2}))]) == 2
     message = " ".join(capsys.readouterr().err.split())
     assert "'a' shows the most fiducials, 2, and its affine transformation needs 3" in message
@@ -110,7 +110,7 @@ def test_the_film_transformation_can_be_chosen(tmp_path: Path, capsys: pytest.Ca
     assert "The data ask for affine, no distortion" in " ".join(capsys.readouterr().out.split())
 
 
-def test_the_form_of_the_fiducials_is_told_where_they_are_estimated(
+def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Marks with a datum of 1 mm: no figure of mm is left in the form, and the dashes are gone."""
@@ -141,14 +141,14 @@ def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(
     run(["adjust", str(project)])
     printed = " ".join(capsys.readouterr().out.split())
     assert "standard deviations a priori" in printed
-    result = result_of(project)
+    result = read_result(project)
     assert result["sigma0_from"] == {"redundancy": 0.0, "a_priori": True, "left_out": []}
     design = np.column_stack([np.ones(5), comparator_mm(0)])
     sigma = np.sqrt(np.linalg.inv(design.T @ design)[0, 0] * (1.0 + SIGMA_MM**2))
     assert result["images"]["a"]["transformation"]["a1"]["sigma"] == pytest.approx(sigma, rel=1e-3)
 
 
-def test_one_frame_within_its_certificate_needs_no_look(tmp_path: Path) -> None:
+def test_one_frame_within_its_certificate_needs_no_attention(tmp_path: Path) -> None:
     """Four calibrated fiducials of one frame, given to 10 µm and measured to 4 µm: nothing speaks against any."""
     project = write_project(tmp_path, {"a": 4})
     camera = tmp_path / "camera.toml"

@@ -182,7 +182,7 @@ def test_camera_file_with_a_mistake_gets_a_message_that_helps(
         assert word in message
 
 
-def test_a_self_calibration_set_without_a_frame_is_told_what_it_needs(tmp_path: Path) -> None:
+def test_a_self_calibration_set_without_a_frame_is_reported_what_it_needs(tmp_path: Path) -> None:
     text = CAMERA.replace("frame_mm = [228.0, 228.0]\n", "").replace('"torlegard"', '"ebner"')
     message = refused(read_camera, written(tmp_path, "camera.toml", text))
     assert "line 8: [distortion] family: ebner counts in halves of the frame" in message
@@ -206,7 +206,7 @@ def test_a_camera_file_in_place_of_a_project_is_named(tmp_path: Path) -> None:
         read_project(tmp_path / "camera.toml")
 
 
-def test_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:
+def test_missing_file_is_named_with_the_place_inspected_for(tmp_path: Path) -> None:
     path = tmp_path / "no.toml"
     assert str(path.resolve()) in refused(read_toml, path)
     assert str(path.resolve()) in refused(read_points, path)
@@ -379,7 +379,7 @@ def test_an_image_is_called_as_its_file_without_what_no_table_keeps() -> None:
     assert image_name("frame.2") == "frame.2"
 
 
-def project_of(folder: Path, scans: str, *files: str) -> Project:
+def make_project(folder: Path, scans: str, *files: str) -> Project:
     for file in files:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).touch()
@@ -405,14 +405,14 @@ def test_images_are_called_by_their_path_below_the_folder_that_all_share(
     tmp_path: Path, said: str, names: list[str]
 ) -> None:
     files = ("box/1952/0001.tif", "box/1952/deep/0001.tif", "box/1958/0001.tif", "box/0000.tif", "box/notes.txt")
-    assert set(project_of(tmp_path, said, *files).scans) == set(names)
+    assert set(make_project(tmp_path, said, *files).scans) == set(names)
 
 
 def test_an_image_that_is_left_out_may_stand_in_images_csv(tmp_path: Path) -> None:
     """One that is neither found nor left out has no scan, and is told so."""
     written(tmp_path, "images.csv", "image\na\nb\nc\n")
-    said = 'scans = ["scans/*.tif"]\nexclude = ["scans/b.tif"]\n[object]\nimages = "images.csv"\n[ties]'
-    project = project_of(tmp_path, said, "scans/a.tif", "scans/b.tif")
+    text = 'scans = ["scans/*.tif"]\nexclude = ["scans/b.tif"]\n[object]\nimages = "images.csv"\n[ties]'
+    project = make_project(tmp_path, text, "scans/a.tif", "scans/b.tif")
     assert project.left_out == {"b"}
     assert set(project.scans) == {"a"}
     assert check_measurable(project) == ("a", "c")
@@ -432,14 +432,14 @@ def test_a_column_for_what_is_written_asks_for_it_on_all_scans(
 ) -> None:
     written(tmp_path, "images.csv", f"{columns}\na{',' * columns.count(',')}\n")
     project = f'scans = ["a.tif"]\n[object]\nimages = "images.csv"\n[measure]\n{said}'
-    assert project_of(tmp_path, project, "a.tif").reads == reads
+    assert make_project(tmp_path, project, "a.tif").reads == reads
 
 
 def test_two_files_of_one_name_in_a_folder_are_refused_and_so_is_leaving_all_out(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="have the same name 'a/1'"):
-        project_of(tmp_path, 'scans = ["**/*.*g"]', "a/1.jpg", "a/1.png", "b/1.png")
+        make_project(tmp_path, 'scans = ["**/*.*g"]', "a/1.jpg", "a/1.png", "b/1.png")
     with pytest.raises(InputError, match=r"exclude.*leaves no scan of those that scans names"):
-        project_of(tmp_path, 'scans = ["a/*"]\nexclude = ["a/*"]')
+        make_project(tmp_path, 'scans = ["a/*"]\nexclude = ["a/*"]')
 
 
 @pytest.mark.parametrize(
@@ -476,7 +476,9 @@ def test_rows_go_down_and_y_goes_up() -> None:
         ("frame_mm = [228.0, 228.0", "Mend that line."),
     ],
 )
-def test_a_value_without_quotes_or_with_a_unit_is_told_as_it_should_be(tmp_path: Path, line: str, remedy: str) -> None:
+def test_a_value_without_quotes_or_with_a_unit_is_reported_as_it_should_be(
+    tmp_path: Path, line: str, remedy: str
+) -> None:
     (tmp_path / "camera.toml").write_text(f'name = "K"\n{line}\n', encoding="utf-8")
     with pytest.raises(InputError) as refused:
         read_toml(tmp_path / "camera.toml")

@@ -47,7 +47,7 @@ def test_films_of_every_kind_are_adjusted_from_files(kind: Transformation, tmp_p
         ("conformal(9)", ["order must be from 1 to 5"]),
     ],
 )
-def test_a_wrong_transformation_is_told_with_its_line(spelling: str, words: list[str], tmp_path: Path) -> None:
+def test_a_wrong_transformation_is_reported_with_its_line(spelling: str, words: list[str], tmp_path: Path) -> None:
     network, _ = simulated(np.random.default_rng(4), noise=False)
     write_project(network, spelling, tmp_path)
     with pytest.raises(InputError) as caught:
@@ -81,9 +81,11 @@ def write_project(network: Network, kind: Transformation, folder: Path) -> None:
     ]
     (folder / "points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
-    seen = network.observations
-    sigmas = np.sqrt(np.diagonal(seen.covariance_mm2, axis1=1, axis2=2))
-    for *names, xy, sigma in zip(seen.image, seen.point, seen.kind, seen.xy_mm.tolist(), sigmas.tolist(), strict=True):
+    observed = network.observations
+    sigmas = np.sqrt(np.diagonal(observed.covariance_mm2, axis1=1, axis2=2))
+    for *names, xy, sigma in zip(
+        observed.image, observed.point, observed.kind, observed.xy_mm.tolist(), sigmas.tolist(), strict=True
+    ):
         rows.append(",".join([*names, *map(repr, xy), *map(repr, sigma)]))
     (folder / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     (folder / "project.toml").write_text(

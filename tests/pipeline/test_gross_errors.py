@@ -93,7 +93,7 @@ def test_a_control_point_with_exchanged_coordinates_is_named(adjust: str, tmp_pa
         ("robust = true\nsnooping = true", "Set one of the two to false"),
     ],
 )
-def test_wrong_keys_are_told(line: str, words: str, tmp_path: Path) -> None:
+def test_wrong_keys_are_reported(line: str, words: str, tmp_path: Path) -> None:
     project = spoilt_project(tmp_path, line)
     with pytest.raises(InputError, match=words):
         read_project(project)
@@ -103,16 +103,16 @@ def test_wrong_keys_are_told(line: str, words: str, tmp_path: Path) -> None:
 def test_an_image_without_orientation_is_left_out_and_named(tmp_path: Path) -> None:
     """The targets of one of four frames have one another's numbers: the other three are adjusted."""
     network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 15))
-    seen = network.observations
+    observed = network.observations
     rows = [
         i
-        for i, (image, kind) in enumerate(zip(seen.image, seen.kind, strict=True))
+        for i, (image, kind) in enumerate(zip(observed.image, observed.kind, strict=True))
         if (image, kind) == ("f2", "target")
     ]
-    points = list(seen.point)
+    points = list(observed.point)
     for row, other in zip(rows, np.random.default_rng(4).permutation(rows).tolist(), strict=True):
-        points[row] = seen.point[other]
-    project = write_network(replace(network, observations=replace(seen, point=tuple(points))), tmp_path)
+        points[row] = observed.point[other]
+    project = write_network(replace(network, observations=replace(observed, point=tuple(points))), tmp_path)
     assert run(["adjust", str(project)]) == 1
     result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
     assert result["converged"]
@@ -125,7 +125,7 @@ def test_an_image_without_orientation_is_left_out_and_named(tmp_path: Path) -> N
 
 
 @parametrize_with_studies(("frame_mm", "level"), [(228.0, 0), (600.0, 1)])
-def test_a_lens_known_in_the_middle_alone_needs_a_look(frame_mm: float, level: int, tmp_path: Path) -> None:
+def test_a_lens_known_in_the_middle_alone_needs_attention(frame_mm: float, level: int, tmp_path: Path) -> None:
     """Targets within some 110 mm of the principal point: most of a picture of 228 mm, a quarter of one of 600 mm."""
     free = {"k3": np.inf, "k5": np.inf}
     network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 40), free=free)

@@ -45,7 +45,7 @@ GOOD, WRONG, TRACEBACK, OUTSIDE = "right or refused", "wrong as right", "traceba
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def measured_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hostile") / "p"
     project = write_project(folder, ["a", "b", "c"])
     assert run(["measure", str(project)]) == 0
@@ -57,7 +57,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def adjusted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def adjusted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return adjusted_project(tmp_path_factory.mktemp("adjusted"))
 
 
@@ -79,7 +79,7 @@ def outcome(trial: Callable[[], str]) -> str:
 def readings(folder: Path) -> dict[str, Any]:
     """What every reader makes of a project's store; of what it refuses, nothing."""
     project = read_project(folder / "project.toml")
-    path, told = project.measurement_path, dict[str, Any]()
+    path, result = project.measurement_path, dict[str, Any]()
 
     def scans() -> Any:
         scans = measured_scans(path)
@@ -101,10 +101,10 @@ def readings(folder: Path) -> dict[str, Any]:
 
     for name, reading in (("scans", scans), ("questions", questions), ("status", statuses)):
         try:
-            told[name] = reading()
+            result[name] = reading()
         except REFUSED:
-            told[name] = None
-    return told
+            result[name] = None
+    return result
 
 
 def _is_own(code: FailureCode) -> bool:
@@ -121,12 +121,12 @@ def is_right(found: Any, right: Any) -> bool:
 
 
 def database_trial(
-    rng: random.Random, measured: Path, folder: Path, damage: Callable[[random.Random, Path], None]
+    rng: random.Random, measured_folder: Path, folder: Path, damage: Callable[[random.Random, Path], None]
 ) -> str:
-    right = readings(measured)
-    shutil.copytree(measured, folder)
+    right = readings(measured_folder)
+    shutil.copytree(measured_folder, folder)
     for name in ("a", "b", "c"):
-        shutil.copystat(measured / f"{name}.tif", folder / f"{name}.tif")
+        shutil.copystat(measured_folder / f"{name}.tif", folder / f"{name}.tif")
     damage(rng, folder / "out" / "measurement.db")
 
     def trial() -> str:
@@ -195,7 +195,7 @@ def change_values(rng: random.Random, path: Path) -> None:
 # --- decisions
 
 
-def decisions_trial(rng: random.Random, measured: Path, folder: Path) -> str:
+def decisions_trial(rng: random.Random, measured_folder: Path, folder: Path) -> str:
     """A file of good lines, one of them spoiled: all good ones are read, or the bad one is named; and appending writes
     all of a batch or nothing."""
     folder.mkdir(parents=True)
@@ -258,21 +258,21 @@ def imports_trial(rng: random.Random, folder: Path) -> str:
         run_import(format, [source], folder / "out", ImportOptions(pitch_um=10.0, sigma_px=0.1))
         return GOOD
 
-    told = outcome(trial)
+    own_outcome = outcome(trial)
     new = files(folder.parent) - before
-    return OUTSIDE if any(not path.is_relative_to(folder / "out") for path in new) else told
+    return OUTSIDE if any(not path.is_relative_to(folder / "out") for path in new) else own_outcome
 
 
-def names_trial(rng: random.Random, adjusted: Path, folder: Path) -> str:
+def names_trial(rng: random.Random, adjusted_folder: Path, folder: Path) -> str:
     folder.mkdir(parents=True)
     name = word(rng)
     for file in ("project.toml", "camera.toml", "points.csv"):
-        if (adjusted.parent / file).exists():
-            shutil.copy(adjusted.parent / file, folder / file)
+        if (adjusted_folder.parent / file).exists():
+            shutil.copy(adjusted_folder.parent / file, folder / file)
     project = folder / "project.toml"
     project.write_text(project.read_text().replace('scans = ["scans/*.tif"]\n', ""))
     cell = '"' + name.replace('"', '""') + '"'
-    lines = adjusted.with_name("comparator.csv").read_text().splitlines()
+    lines = adjusted_folder.with_name("comparator.csv").read_text().splitlines()
     (folder / "comparator.csv").write_text(
         "\n".join(cell + line[2:] if line.startswith("f1,") else line for line in lines)
     )
@@ -282,9 +282,9 @@ def names_trial(rng: random.Random, adjusted: Path, folder: Path) -> str:
         run_export(read_project(project), rng.choice(["csv", "mmvii", "micmac"]), folder / "o" / "out", ExportOptions())
         return GOOD
 
-    told = outcome(trial)
+    own_outcome = outcome(trial)
     new = files(folder.parent) - before
-    return OUTSIDE if any(not path.is_relative_to(folder / "o" / "out") for path in new) else told
+    return OUTSIDE if any(not path.is_relative_to(folder / "o" / "out") for path in new) else own_outcome
 
 
 def files(folder: Path) -> set[Path]:
@@ -314,8 +314,8 @@ def addresses_trial(rng: random.Random) -> str:
 
     def trial() -> str:
         one, two = Address(f"{base}?{query()}"), Address(f"{base}?{query()}")
-        told = [str(one), repr(one), one.name, *names_below([one, one.with_name("b.tif")]), f"{one}", str([one])]
-        if str(one) != str(two) or any(secret in text for secret in SECRETS for text in told):
+        result = [str(one), repr(one), one.name, *names_below([one, one.with_name("b.tif")]), f"{one}", str([one])]
+        if str(one) != str(two) or any(secret in text for secret in SECRETS for text in result):
             return WRONG
         return GOOD if "?" not in names_below([one])[0] and names_below([one]) == ["0001"] else WRONG
 
@@ -325,38 +325,38 @@ def addresses_trial(rng: random.Random) -> str:
 KINDS = ("bytes", "values", "decisions", "imports", "names", "addresses")
 
 
-def study(kind: str, count: int, seed: int, measured: Path, adjusted: Path, folder: Path) -> Counter[str]:
+def study(kind: str, count: int, seed: int, measured_folder: Path, adjusted_folder: Path, folder: Path) -> Counter[str]:
     counts = Counter[str]()
     for number in range(count):
         rng, place = random.Random(f"{kind} {seed} {number}"), folder / f"{kind}{number}"
         match kind:
             case "bytes":
-                told = database_trial(rng, measured, place, change_bytes)
+                own_outcome = database_trial(rng, measured_folder, place, change_bytes)
             case "values":
-                told = database_trial(rng, measured, place, change_values)
+                own_outcome = database_trial(rng, measured_folder, place, change_values)
             case "decisions":
-                told = decisions_trial(rng, measured, place)
+                own_outcome = decisions_trial(rng, measured_folder, place)
             case "imports":
-                told = imports_trial(rng, place / "p")
+                own_outcome = imports_trial(rng, place / "p")
             case "names":
-                told = names_trial(rng, adjusted, place / "p")
+                own_outcome = names_trial(rng, adjusted_folder, place / "p")
             case _:
-                told = addresses_trial(rng)
-        if told != GOOD:
-            print(kind, seed, number, told)
-        counts[told] += 1
+                own_outcome = addresses_trial(rng)
+        if own_outcome != GOOD:
+            print(kind, seed, number, own_outcome)
+        counts[own_outcome] += 1
         shutil.rmtree(place, ignore_errors=True)
     return counts
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_hostile_inputs_end_in_the_right_result_or_in_a_message(
-    kind: str, measured: Path, adjusted: Path, tmp_path: Path
+    kind: str, measured_folder: Path, adjusted_folder: Path, tmp_path: Path
 ) -> None:
-    assert study(kind, 4, 1, measured, adjusted, tmp_path) == {GOOD: 4}
+    assert study(kind, 4, 1, measured_folder, adjusted_folder, tmp_path) == {GOOD: 4}
 
 
 @pytest.mark.study
 @pytest.mark.parametrize("kind", KINDS)
-def test_thousands_of_hostile_inputs(kind: str, measured: Path, adjusted: Path, tmp_path: Path) -> None:
-    assert study(kind, 600, 36, measured, adjusted, tmp_path) == {GOOD: 600}
+def test_thousands_of_hostile_inputs(kind: str, measured_folder: Path, adjusted_folder: Path, tmp_path: Path) -> None:
+    assert study(kind, 600, 36, measured_folder, adjusted_folder, tmp_path) == {GOOD: 600}

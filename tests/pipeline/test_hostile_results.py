@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exported_project import POINTS, TRUTH, project_of
+from exported_project import POINTS, TRUTH, make_project
 from simulated import simulated
 
 from pipeline.cli import run
@@ -27,7 +27,7 @@ LONGEST_MESSAGE = 2000
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
     network, _ = simulated(np.random.default_rng(1), TRUTH, points=POINTS, free={"k3": np.inf})
-    project = project_of(network, folder, "EPSG:25832")
+    project = make_project(network, folder, "EPSG:25832")
     camera = folder / "camera.toml"
     camera.write_text(camera.read_text().replace("[[fiducial]]\n", '[[fiducial]]\nmark = "none"\n'))
     assert run(["check", str(project)]) in (0, 1)

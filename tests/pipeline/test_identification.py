@@ -27,13 +27,13 @@ def test_pattern_is_named_right_with_targets_missing_and_marks_that_are_none() -
 
 
 @parametrize_with_studies(("targets", "strays"), [(4, 0), (8, 16), (25, 0), (25, 50)], quick=(1,))
-def test_agreement_by_chance_is_told_from_a_pattern(targets: int, strays: int) -> None:
+def test_agreement_by_chance_is_distinguished_from_a_pattern(targets: int, strays: int) -> None:
     """A fifth of the pattern's marks missing; the other marks are placed as well as chance allows."""
     rng = np.random.default_rng([2, targets, strays])
     for _ in range(2):
         places = rng.uniform(0.0, 3000.0, (targets, 2))
-        seen = places[: max(round(0.8 * targets), 4)] + rng.normal(0.0, 1.0, (max(round(0.8 * targets), 4), 2))
-        marks = np.concatenate([seen, rng.uniform(0.0, 3000.0, (strays, 2))])
+        view = places[: max(round(0.8 * targets), 4)] + rng.normal(0.0, 1.0, (max(round(0.8 * targets), 4), 2))
+        marks = np.concatenate([view, rng.uniform(0.0, 3000.0, (strays, 2))])
         placement = recognise(places, marks)
         assert placement is not None
         assert log10_of_chance(places, marks, 6.0, placement.tried) < -1.0

@@ -45,11 +45,11 @@ def imported(format: str, paths: list[Path], folder: Path, *options: str) -> Pat
     return folder / format
 
 
-def lens_of(camera: CameraFile) -> dict[str, float]:
+def make_lens(camera: CameraFile) -> dict[str, float]:
     return {name: prior.value for name, prior in camera.distortion.parameters.items()}
 
 
-def adjusted(project: Path) -> dict[str, Any]:
+def adjust_network(project: Path) -> dict[str, Any]:
     return dict(json.loads((project.parent / "out" / "adjustment.json").read_text(encoding="utf-8")))
 
 
@@ -86,9 +86,10 @@ def test_fiducials_that_count_from_a_corner_give_no_principal_point_at_the_origi
     camera = read_camera(folder / "camera.toml")
     assert camera.principal_point_mm == pytest.approx((118.923, -117.5))
     assert camera.principal_point_sigma_mm == (np.inf, np.inf)
-    told = " ".join(capsys.readouterr().out.split())
+    output = " ".join(capsys.readouterr().out.split())
     assert (
-        "the files give no principal point. Adjusting starts at the middle of the fiducials, (118.9, -117.5) mm" in told
+        "the files give no principal point. Adjusting starts at the middle of the fiducials, (118.9, -117.5) mm"
+        in output
     )
     written = (folder / "camera.toml").read_text()
     bare = tmp_path / "bare.toml"
@@ -107,7 +108,7 @@ def test_points_of_a_set_of_marks_are_targets(project: Path, tmp_path: Path) -> 
     np.testing.assert_allclose(first, camera_mm(1) - (-114.0, 114.0), atol=1e-6)  # type: ignore[arg-type]
 
 
-def test_marks_without_a_sigma_need_one_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_marks_without_a_sigma_need_one_that_is_stated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "MeasuresIm-a.tif.xml"
     file.write_text(
         "<MesureAppuiFlottant1Im><NameIm>a.tif</NameIm><OneMesureAF1I><NamePt>1</NamePt><PtIm>10 20</PtIm>"
@@ -133,7 +134,7 @@ def test_poses_and_cameras_come_back_as_they_went(format: str, project: Path, tm
     exterior = read_images(folder / "images.csv").exterior["f1"]
     assert exterior is not None
     assert not np.isfinite(exterior.sigmas).any()
-    known = adjusted(project)["images"]["f1"]["exterior"]
+    known = adjust_network(project)["images"]["f1"]["exterior"]
     np.testing.assert_allclose(exterior.values[:3], [known[axis]["value"] for axis in ("X0", "Y0", "Z0")], atol=1e-8)
     angles = [known[f"{angle}_deg"]["value"] for angle in ("omega", "phi", "kappa")]
     np.testing.assert_allclose(np.degrees(exterior.values[3:]), angles, atol=1e-9)
@@ -150,15 +151,15 @@ def test_a_lens_comes_back_as_it_went(project: Path, tmp_path: Path) -> None:
     storage = cv2.FileStorage(str(yml), cv2.FILE_STORAGE_READ)
     values = storage.getNode("distortion_coefficients").mat().ravel()
     by_opencv = read_camera(imported("opencv", [yml], tmp_path, *PITCH) / "camera.toml")
-    assert lens_of(by_opencv) == pytest.approx(
+    assert make_lens(by_opencv) == pytest.approx(
         dict(zip(("k1", "k2", "p1", "p2", "k3"), values, strict=True)), rel=1e-12
     )
     sparse = exported(project, "colmap", tmp_path) / "sparse"
     by_colmap = read_camera(imported("colmap", [sparse], tmp_path, *PITCH) / "camera2.toml")
-    assert lens_of(by_colmap) == pytest.approx(lens_of(by_opencv), rel=1e-12)
+    assert make_lens(by_colmap) == pytest.approx(make_lens(by_opencv), rel=1e-12)
     xml = exported(project, "metashape", tmp_path) / "K.xml"
     by_metashape = read_camera(imported("metashape", [xml], tmp_path, *PITCH, "--from-middle") / "camera.toml")
-    assert lens_of(by_metashape) == pytest.approx(lens_of(by_opencv), rel=1e-9)
+    assert make_lens(by_metashape) == pytest.approx(make_lens(by_opencv), rel=1e-9)
     assert by_metashape.principal_distance_mm == pytest.approx(TRUTH.c, abs=1e-3)
     assert by_metashape.principal_point_mm == pytest.approx((TRUTH.x0, TRUTH.y0), abs=1e-3)
     assert by_metashape.frame_mm == pytest.approx((228.0, 228.0))

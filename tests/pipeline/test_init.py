@@ -79,7 +79,7 @@ def test_scans_of_one_size_and_head_are_no_copies_unless_all_their_bytes_are_the
     assert catalogue([tmp_path], no_count).copies == {}
 
 
-def of_camera(
+def identify_camera(
     path: Path, *names: str, plate: Mapping[str, str] | None = None, against: Sequence[str] = (), beside: str = ""
 ) -> Identification:
     trial = Trial(names, 4, 4, 0.9, 9.0, 0.9, None, None, None, "", 1.0, 1e-9, 20.0)
@@ -92,73 +92,73 @@ def kind(group: ScanGroup, *samples: Identification) -> ScanGroup:
     return replace(group, samples=samples)
 
 
-def test_a_camera_is_told_by_most_samples_and_by_what_its_plate_does_not_contradict(box: Path) -> None:
+def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contradict(box: Path) -> None:
     group = catalogue([box / "1958"], no_count).groups[0]
     path = group.paths[0]
-    alike = of_camera(path, "wild-rc10-153", "wild-rc10-305", against=["wild-rc10-305"])
-    assert kind(group, alike, of_camera(path), of_camera(path, "wild-rc10-153", "wild-rc10-305")).cameras == (
-        "wild-rc10-153",
-    )
+    alike = identify_camera(path, "wild-rc10-153", "wild-rc10-305", against=["wild-rc10-305"])
+    assert kind(
+        group, alike, identify_camera(path), identify_camera(path, "wild-rc10-153", "wild-rc10-305")
+    ).cameras == ("wild-rc10-153",)
     for samples, why in [
-        ((of_camera(path), of_camera(path)), "no camera stands out in 2 of them"),
-        ((alike, of_camera(path, "zeiss-rmk-a-153")), "not all show the same camera"),
-        ((alike, of_camera(path), of_camera(path)), "not all show the same camera"),
+        ((identify_camera(path), identify_camera(path)), "no camera stands out in 2 of them"),
+        ((alike, identify_camera(path, "zeiss-rmk-a-153")), "not all show the same camera"),
+        ((alike, identify_camera(path), identify_camera(path)), "not all show the same camera"),
         (
-            (of_camera(path, "wild-rc5-153", against=["wild-rc5-153"]),),
+            (identify_camera(path, "wild-rc5-153", against=["wild-rc5-153"]),),
             "the camera's plate in the picture names",
         ),
     ]:
-        told = kind(group, *samples)
-        assert told.cameras == ()
-        assert why in told.why_not()
-    form = of_camera(path, "zeiss-rmk-a-153", beside="arrow-153")
+        fake_identification = kind(group, *samples)
+        assert fake_identification.cameras == ()
+        assert why in fake_identification.why_not()
+    form = identify_camera(path, "zeiss-rmk-a-153", beside="arrow-153")
     assert kind(group, form).camera == ""
     assert "compare the drawings" in kind(group, form).sentence()
     plate = {"camera_type": "Zeiss"}
     assert kind(group, replace(form, plate=plate)).camera == "zeiss-rmk-a-153"
     solid, lines = (
-        new_project._rests_on_form(kind(group, of_camera(path, name))) for name in ("arrow-153", "park-153")
+        new_project._rests_on_form(kind(group, identify_camera(path, name))) for name in ("arrow-153", "park-153")
     )
     assert (solid, lines) == (True, False)
-    assert not new_project._rests_on_form(kind(group, replace(of_camera(path, "arrow-153"), plate=plate)))
-    both = kind(group, of_camera(path, "wild-rc30-153", "wild-rc10-153"))
+    assert not new_project._rests_on_form(kind(group, replace(identify_camera(path, "arrow-153"), plate=plate)))
+    both = kind(group, identify_camera(path, "wild-rc30-153", "wild-rc10-153"))
     assert both.camera == "wild-rc10-153"  # by far the more reports
 
 
 @pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> None:
+def fake_identification(monkeypatch: pytest.MonkeyPatch) -> None:
     """What samples say, by where they stand: those of 1952 are of one camera, all others of none that is known."""
 
     def samples(grouped: GroupedScans, *_: object) -> GroupedScans:
         groups = []
         for group in grouped.groups:
             names = ("wild-rc10-153",) if group.folder.name in ("1952", "sub") else ()
-            plate, beside = {"camera_number": str(group.head.height_px)}, "arrow-153" * (group.folder.name == "sub")
-            groups.append(kind(group, of_camera(group.paths[0], *names, plate=plate, beside=beside)))
+            plate, neighbour = {"camera_number": str(group.head.height_px)}, "arrow-153" * (group.folder.name == "sub")
+            groups.append(kind(group, identify_camera(group.paths[0], *names, plate=plate, beside=neighbour)))
         return replace(grouped, groups=tuple(groups))
 
     monkeypatch.setattr(new_project, "name_cameras", samples)
 
 
-@pytest.mark.usefixtures("told")
+@pytest.mark.usefixtures("fake_identification")
 def test_the_project_that_is_written_is_read_and_has_each_scans_camera(box: Path, tmp_path: Path, capsys: SAID) -> None:
     out = tmp_path / "work" / "first"
     assert run(["init", str(box), "--out", str(out), "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
+    fake_identification = json.loads(capsys.readouterr().out)
     project = read_project(out / "project.toml")
     assert sorted(project.scans) == ["0001", "0002", "0003", "0004"]
     assert all(project.image_camera(name).name == "Wild RC10, 153 mm" for name in project.scans)
     lines = (out / "images.csv").read_text(encoding="utf-8").splitlines()
     assert lines[:2] == ["image,camera", "0001,library:wild-rc10-153"]
-    assert told["scans"] == len(lines) - 1 == 4
-    looks = told["needs_a_look"]
-    assert len(looks) == 3
-    (forms,) = [case for cases in looks.values() for case in cases if str(box / "1952" / "sub") in case]
+    assert fake_identification["scans"] == len(lines) - 1 == 4
+    observations = fake_identification["needs_a_look"]
+    assert len(observations) == 3
+    (forms,) = [case for cases in observations.values() for case in cases if str(box / "1952" / "sub") in case]
     assert "perhaps wild-rc10-153, 4 of 4 marks found, but that rests on the form of its marks alone" in forms
     assert "and arrow-153 has marks much like them" in forms
-    assert any("broken.tif" in case for cases in looks.values() for case in cases)
-    assert any("1958" in case and "no camera stands out" in case for cases in looks.values() for case in cases)
-    assert any("Nr 120, 60" in case for cases in looks.values() for case in cases)
+    assert any("broken.tif" in case for cases in observations.values() for case in cases)
+    assert any("1958" in case and "no camera stands out" in case for cases in observations.values() for case in cases)
+    assert any("Nr 120, 60" in case for cases in observations.values() for case in cases)
     text = (out / "project.toml").read_text(encoding="utf-8")
     assert "# the same bytes as another scan\n" in text
     assert "0002 Kopie.tif" in text
@@ -167,8 +167,8 @@ def test_the_project_that_is_written_is_read_and_has_each_scans_camera(box: Path
     assert (out / "project.toml").read_text(encoding="utf-8") == text
 
 
-@pytest.mark.usefixtures("told")
-def test_where_no_camera_is_told_all_scans_are_of_the_one_that_the_user_draws(
+@pytest.mark.usefixtures("fake_identification")
+def test_where_no_camera_is_reported_all_scans_are_of_the_one_that_the_user_draws(
     box: Path, monkeypatch: pytest.MonkeyPatch, capsys: SAID
 ) -> None:
     """The project stands among the scans: what it will write is not taken for one."""
@@ -187,7 +187,7 @@ def test_where_no_camera_is_told_all_scans_are_of_the_one_that_the_user_draws(
 
 def test_of_each_group_in_each_folder_three_are_tried(box: Path) -> None:
     def identified(path: Path) -> Identification | str:
-        return "cannot be decoded" if path.name == "0004.tif" else of_camera(path, "wild-rc5-153")
+        return "cannot be decoded" if path.name == "0004.tif" else identify_camera(path, "wild-rc5-153")
 
     for number in range(5, 9):
         scan(box / "1952" / f"000{number}.tif")
@@ -209,8 +209,8 @@ def test_init_and_cameras_group_scans_alike(box: Path) -> None:
     assert {path.parent.name for path in first.paths} == {"1952", "sub"}
 
 
-@pytest.mark.usefixtures("told")
-def test_what_a_server_lists_is_looked_at_as_a_folder_is(box: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("fake_identification")
+def test_what_a_server_lists_is_inspected_at_as_a_folder_is(box: Path, tmp_path: Path) -> None:
     with range_server(box) as server:
         assert run(["init", f"{server.url}/1952/", "--out", str(tmp_path / "p")]) == 1  # a broken file
         project = read_project(tmp_path / "p" / "project.toml")
@@ -223,8 +223,8 @@ def test_what_a_server_lists_is_looked_at_as_a_folder_is(box: Path, tmp_path: Pa
     assert project.image_camera("0001").name == read_library()["wild-rc10-153"].name
 
 
-@pytest.mark.usefixtures("told")
-def test_a_list_of_addresses_and_paths_is_looked_at(box: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("fake_identification")
+def test_a_list_of_addresses_and_paths_is_inspected_at(box: Path, tmp_path: Path) -> None:
     with range_server(box) as server:
         lines = ["# of box 1", f"{server.url}/1952/0001.tif", "", f"{server.url}/1952/0004.tif"]
         (tmp_path / "list.txt").write_text("\n".join(lines), encoding="utf-8")
@@ -236,7 +236,9 @@ def test_a_list_of_addresses_and_paths_is_looked_at(box: Path, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("given", "said"), [("nowhere", "there is no"), ("empty", "no scan there, nor below"), ("only", "none can be read")]
 )
-def test_what_holds_no_scan_is_told_and_nothing_is_written(given: str, said: str, tmp_path: Path, capsys: SAID) -> None:
+def test_what_holds_no_scan_is_reported_and_nothing_is_written(
+    given: str, said: str, tmp_path: Path, capsys: SAID
+) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "only").mkdir()
     (tmp_path / "only" / "a.tif").write_bytes(b"no scan")

@@ -7,8 +7,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from damaged_project import made
-from kills import Whom, seconds_of, state, trial
+from damaged_project import make_project
+from kills import Whom, state, time_command, trial
 
 from pipeline.cli import run
 
@@ -19,7 +19,7 @@ def counted(old: Path, folder: Path, command: str, trials: int, whoms: tuple[Who
     """How so many trials ended. old: a project whose results are of other input than it has now."""
     rng = random.Random(seed)
     earlier = state(old)
-    seconds, complete = seconds_of(old, folder / "trial", command)
+    seconds, complete = time_command(old, folder / "trial", command)
     assert complete.keys() >= earlier.keys() - {"out/check.json", "out/report.html"}
     assert all(complete[name] != earlier[name] for name in ("out/adjustment.json", "out/adjustment.npz"))
     found: Counter[str] = Counter()
@@ -53,7 +53,7 @@ def changed(project: Path) -> None:
 def test_a_share_of_the_kills(tmp_path: Path) -> None:
     old = tmp_path / "old"
     old.mkdir()
-    project = made(old)
+    project = make_project(old)
     text = (old / "camera.toml").read_text(encoding="utf-8")
     (old / "camera.toml").write_text(text.replace('calibration = "earlier/adjustment.json"\n', ""), encoding="utf-8")
     assert run(["adjust", str(project)]) in (0, 1)

@@ -69,7 +69,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def project_of(folder: Path, camera: str, scans: str = '"scans/*.tif"', pose: str = "0") -> Project:
+def make_project(folder: Path, camera: str, scans: str = '"scans/*.tif"', pose: str = "0") -> Project:
     given = "".join(
         f'[[fiducial]]\nid = "{id}"\nxy_mm = [{x + 0.2}, {y - 0.3}]\nmark = "m"\n' for id, (x, y) in CORNERS.items()
     )
@@ -109,7 +109,7 @@ def learned(project: Project) -> Project:
     return learn_marks(project, reporter, measure_scans, None, project.output / "learned", Forgetful())
 
 
-def measured(project: Project, *scans: str) -> list[FrameMeasurement]:
+def measure_picture(project: Project, *scans: str) -> list[FrameMeasurement]:
     """Those scans, measured with what all scans of the project tell."""
     known = learned(project)
     return [measure_scan(known, name).frame for name in scans]
@@ -128,10 +128,10 @@ def assert_measured_alike(project: Project, first: FrameMeasurement) -> None:
 
 
 @pytest.fixture(scope="module")
-def shown(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Project, Project]:
+def clicked_projects(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Project, Project]:
     """The project whose marks were clicked in one of its scans, before and after these were learned."""
     folder = tmp_path_factory.mktemp("shown")
-    project = project_of(folder, LEARNED + clicks(rendered), f'"{rendered}/scans/*.tif"')
+    project = make_project(folder, LEARNED + clicks(rendered), f'"{rendered}/scans/*.tif"')
     return project, learned(project)
 
 
@@ -150,22 +150,22 @@ def assert_off_alike(frames: list[FrameMeasurement], true: dict[str, Array]) -> 
 
 @pytest.mark.study
 def test_marks_learned_from_clicks_lie_off_the_true_ones_alike_in_all_frames(
-    rendered: Path, shown: tuple[Project, Project]
+    rendered: Path, clicked_projects: tuple[Project, Project]
 ) -> None:
     """In the scan that was clicked in, and in another one."""
-    assert_off_alike([measure_scan(shown[1], name).frame for name in ("f0", "f1")], truth(rendered))
+    assert_off_alike([measure_scan(clicked_projects[1], name).frame for name in ("f0", "f1")], truth(rendered))
 
 
 @pytest.mark.study
 def test_marks_that_recur_lie_off_the_true_ones_alike_in_all_frames(rendered: Path) -> None:
-    project = project_of(rendered, LEARNED)
-    frames = measured(project, "f0", "f2")
+    project = make_project(rendered, LEARNED)
+    frames = measure_picture(project, "f0", "f2")
     assert_off_alike(frames, truth(rendered))
     assert_measured_alike(project, frames[0])
 
 
 @pytest.mark.study
-def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictures(
+def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_known_by_its_pictures(
     rendered: Path, tmp_path: Path
 ) -> None:
     """Turned by a quarter: the arrows point elsewhere."""
@@ -175,7 +175,7 @@ def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictu
     copy(rendered / "truth.json", tmp_path)
     upright = tifffile.imread(rendered / "scans" / "f2.tif")
     tifffile.imwrite(tmp_path / "scans" / "f2.tif", np.rot90(upright))  # counter-clockwise
-    project = project_of(tmp_path, LEARNED + clicks(rendered), pose="auto")
+    project = make_project(tmp_path, LEARNED + clicks(rendered), pose="auto")
     known = learned(project)
     assert scan_tasks(known, ["f1"])[0].options.fiducials.pose == "0"
     turned = measure_scan(known, "f2").frame
@@ -189,10 +189,10 @@ def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictu
 
 @pytest.mark.study
 def test_one_scan_must_be_clicked_and_says_what_it_can_tell(rendered: Path) -> None:
-    project = project_of(rendered, LEARNED, '"scans/f1.tif"')
+    project = make_project(rendered, LEARNED, '"scans/f1.tif"')
     with pytest.raises(InputError, match="with one scan nothing says what is a mark"):
         learned(project)
-    (frame,) = measured(project_of(rendered, LEARNED + clicks(rendered), '"scans/f1.tif"'), "f1")
+    (frame,) = measure_picture(make_project(rendered, LEARNED + clicks(rendered), '"scans/f1.tif"'), "f1")
     assert {str(mark.status) for mark in frame.marks} == {"weak"}
     assert "its template is its own picture" in frame.marks[0].reason
     assert all(0 < np.trace(np.asarray(mark.covariance_px2)) < 0.01 for mark in frame.marks)
@@ -205,7 +205,7 @@ def test_cameras_whose_files_are_named_alike_are_stored_apart(
     is its first pictures: it has no second scan to seek them in."""
     monkeypatch.setattr(learn_stage, "_chips", lambda *_: ({}, set()))
     files = {"f0": "a/camera.toml", "f1": "b/camera.toml", "f2": "b/camera-2.toml"}
-    project_of(tmp_path, LEARNED, f'"{rendered}/scans/*.tif"')
+    make_project(tmp_path, LEARNED, f'"{rendered}/scans/*.tif"')
     given = (tmp_path / "camera.toml").read_text()
     for name, places in truth(rendered).items():
         px = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, places, strict=True))
@@ -225,7 +225,7 @@ def test_cameras_whose_files_are_named_alike_are_stored_apart(
             assert camera.learned_from.scan == image
 
 
-def shares_of(project: Project) -> set[frozenset[str]]:
+def read_shares(project: Project) -> set[frozenset[str]]:
     """The scans that each mark of the project's camera says it was learned from."""
     marks = [fiducial.mark for camera in project.cameras.values() for fiducial in camera.fiducials]
     assert all(isinstance(mark, MarkTemplate) for mark in marks)
@@ -234,40 +234,40 @@ def shares_of(project: Project) -> set[frozenset[str]]:
 
 @pytest.mark.study
 def test_scans_of_several_folders_that_are_called_alike_have_a_share_each(
-    shown: tuple[Project, Project], rendered: Path, tmp_path: Path
+    clicked_projects: tuple[Project, Project], rendered: Path, tmp_path: Path
 ) -> None:
     for number in range(3):
         (tmp_path / f"box{number}").mkdir()
         copy(rendered / "scans" / f"f{number}.tif", tmp_path / f"box{number}" / "0001.tif")
     clicked = clicks(rendered).replace("f1.tif", "box1/0001.tif")
-    project = project_of(tmp_path, LEARNED + clicked, '"box*/0001.tif"')
+    project = make_project(tmp_path, LEARNED + clicked, '"box*/0001.tif"')
     known = learned(project)
-    assert shares_of(known) == {frozenset({"box0/0001", "box1/0001", "box2/0001"})}
+    assert read_shares(known) == {frozenset({"box0/0001", "box1/0001", "box2/0001"})}
     for of_folder, of_name in ((0, "box0/0001"), (2, "box2/0001")):
-        frame, same = measure_scan(known, of_name).frame, measure_scan(shown[1], f"f{of_folder}").frame
+        frame, same = measure_scan(known, of_name).frame, measure_scan(clicked_projects[1], f"f{of_folder}").frame
         for mark, other in zip(frame.marks, same.marks, strict=True):
             np.testing.assert_allclose(np.array(mark.covariance_px2), np.array(other.covariance_px2), rtol=0.05)
 
 
 def test_marks_learned_in_one_project_hold_nothing_of_the_scans_of_another(
-    shown: tuple[Project, Project], rendered: Path, tmp_path: Path
+    clicked_projects: tuple[Project, Project], rendered: Path, tmp_path: Path
 ) -> None:
     """There f1 is another scan than the one that they were clicked in."""
     for name, other in (("f1", "f0"), ("f2", "f2")):
         copy(rendered / "scans" / f"{other}.tif", tmp_path / f"{name}.tif")
-    stored = shown[0].output / "learned"
+    stored = clicked_projects[0].output / "learned"
     copytree(stored, tmp_path / "cameras")
-    project_of(tmp_path, LEARNED, '"*.tif"')
+    make_project(tmp_path, LEARNED, '"*.tif"')
     text = (tmp_path / "project.toml").read_text().replace('"camera.toml"', '"cameras/camera.toml"')
     (tmp_path / "project.toml").write_text(text)
     known = learned(read_project(tmp_path / "project.toml"))
-    assert all(shares.isdisjoint(known.scans) for shares in shares_of(known))
+    assert all(shares.isdisjoint(known.scans) for shares in read_shares(known))
 
 
-def test_what_was_learned_is_stored_whole_and_read_without_it_too(shown: tuple[Project, Project]) -> None:
+def test_what_was_learned_is_stored_whole_and_read_without_it_too(clicked_projects: tuple[Project, Project]) -> None:
     """A file of before has none of what a template's pixels tell, and is read as then. Another scan of the name of the
     one clicked in says nothing of the pose."""
-    project, camera = shown[0], shown[1].default_camera
+    project, camera = clicked_projects[0], clicked_projects[1].default_camera
     folder = project.output / "learned"
     stored = (folder / "camera.toml").read_text()
     again = read_camera(folder / "camera.toml")
@@ -296,8 +296,8 @@ def test_what_was_learned_is_stored_whole_and_read_without_it_too(shown: tuple[P
 
 def test_clicks_that_cannot_be_are_refused(rendered: Path) -> None:
     with pytest.raises(InputError, match="says nothing of 4"):
-        project_of(rendered, LEARNED + clicks(rendered).rsplit("4 =", 1)[0])
-    project = project_of(rendered, LEARNED + clicks(rendered).replace("f1.tif", "g1.tif"))
+        make_project(rendered, LEARNED + clicks(rendered).rsplit("4 =", 1)[0])
+    project = make_project(rendered, LEARNED + clicks(rendered).replace("f1.tif", "g1.tif"))
     with pytest.raises(InputError, match="'g1', which is none of this camera's scans"):
         learned(project)
     camera = project.default_camera
@@ -308,21 +308,23 @@ def test_clicks_that_cannot_be_are_refused(rendered: Path) -> None:
 
 
 @pytest.mark.parametrize("pose", ["0", "auto"])
-def test_clicks_that_contradict_the_set_orientation_are_asked(pose: str, rendered: Path, tmp_path: Path) -> None:
+def test_clicks_that_contradict_the_set_orientation_are_questioned(pose: str, rendered: Path, tmp_path: Path) -> None:
     """As a viewer shows it that obeys the file's orientation tag: turned by 180 degrees, other marks lie there."""
     picture = tifffile.imread(rendered / "scans" / "f1.tif")
     (tmp_path / "scans").mkdir()
     tifffile.imwrite(tmp_path / "scans" / "f1.tif", picture, extratags=[(274, 3, 1, 3, True)])
-    shown = np.array(picture.shape[1::-1]) - 1 - truth(rendered)["f1"]
-    lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, shown.tolist(), strict=True))
-    project = project_of(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose=pose)
+    turned_px = np.array(picture.shape[1::-1]) - 1 - truth(rendered)["f1"]
+    lines = "".join(
+        f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, turned_px.tolist(), strict=True)
+    )
+    project = make_project(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose=pose)
     with pytest.raises(InputError) as raised:
         learned(project)
     does = "sets 0" if pose == "0" else "sets none"
     assert f"show the frame in the scan orientation 180, and the project {does}" in str(raised.value)
     assert "orientation tag (3) asks viewers to turn the picture" in str(raised.value)
     if pose == "0":
-        learned(project_of(tmp_path, LEARNED + clicks(rendered)))
+        learned(make_project(tmp_path, LEARNED + clicks(rendered)))
 
 
 @pytest.mark.parametrize(
@@ -337,8 +339,11 @@ def test_clicks_that_contradict_the_set_orientation_are_asked(pose: str, rendere
         (8, lambda col, row, last_col, last_row: (row, last_col - col)),
     ],
 )
-def test_clicks_in_a_picture_turned_by_any_orientation_tag_are_asked(
-    tag: int, shown: Callable[[float, float, float, float], tuple[float, float]], rendered: Path, tmp_path: Path
+def test_clicks_in_a_picture_turned_by_any_orientation_tag_are_questioned(
+    tag: int,
+    shown: Callable[[float, float, float, float], tuple[float, float]],
+    rendered: Path,
+    tmp_path: Path,
 ) -> None:
     """The tag's own definition (TIFF 6.0, page 36) says where a viewer shows a pixel."""
     picture = tifffile.imread(rendered / "scans" / "f1.tif")
@@ -348,7 +353,7 @@ def test_clicks_in_a_picture_turned_by_any_orientation_tag_are_asked(
     places = [shown(col, row, last_col, last_row) for col, row in truth(rendered)["f1"].tolist()]
     lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, places, strict=True))
     with pytest.raises(InputError, match=f"in the scan orientation {SHOWN[tag]}, .*orientation tag .{tag}. asks"):
-        learned(project_of(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="0"))
+        learned(make_project(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="0"))
 
 
 @pytest.mark.study
@@ -373,7 +378,7 @@ def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_p
     rng = np.random.default_rng(6)
     px = true["f1"] + rng.uniform(-2.5, 2.5, (4, 2))
     lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, px.tolist(), strict=True))
-    project = project_of(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="auto")
+    project = make_project(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="auto")
     known = learned(project)
     frames = [measure_scan(known, f"f{k}").frame for k in range(len(poses))]
     outward, across = [], []

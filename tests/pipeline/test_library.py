@@ -110,19 +110,19 @@ def test_a_printed_camera_is_a_file_to_start_from(tmp_path: Path, capsys: pytest
         ("Wild RC9", "'wild-rc9-88'"),
     ],
 )
-def test_a_misspelt_camera_is_told_its_neighbours(
+def test_a_misspelt_camera_is_reported_its_neighbours(
     name: str, near: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "project.toml").write_text(f'output = "out"\ncamera = "library:{name}"\n', encoding="utf-8")
     assert run(["measure", str(tmp_path / "project.toml")]) == 2
-    said = capsys.readouterr().err
-    assert f"project.toml, line 2: camera: the camera library has no '{name}'. Did you mean {near}" in said
-    assert "`reseau cameras`" in said
+    message = capsys.readouterr().err
+    assert f"project.toml, line 2: camera: the camera library has no '{name}'. Did you mean {near}" in message
+    assert "`reseau cameras`" in message
     assert run(["cameras", name]) == 2
     assert near in capsys.readouterr().err
 
 
-def test_a_name_like_no_other_is_told_where_they_stand() -> None:
+def test_a_name_like_no_other_is_reported_where_they_stand() -> None:
     with pytest.raises(InputError, match=r"no 'xyz'\. `reseau cameras` lists them"):
         library_path("xyz")
 
@@ -167,7 +167,7 @@ def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(
 
 
 @pytest.mark.study
-def test_the_frame_is_told_from_another_camera(frame: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_frame_is_distinguished_from_another_camera(frame: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A ring with a cross holds the plain cross of older cameras too: the ring then counts as damage. No other pitch
     than the file's is tried."""
     monkeypatch.setattr(LayoutSearch, "longer_one_way", None)
@@ -214,14 +214,14 @@ def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras
         "pipeline.files.library.read_library", lambda: {name: LIBRARY[name] for name in ("wild-rc5-153", RENDERED)}
     )
     assert run(["cameras", "--scan", str(folder), "--project", str(tmp_path / "project.toml"), "--json"]) == 1
-    said = json.loads(capsys.readouterr().out)
-    assert [len(kind["scans"]) for kind in said["kinds"]] == [4, 1]
-    assert [len(kind["samples"]) for kind in said["kinds"]] == [3, 1]
-    assert [kind["best"] for kind in said["kinds"]] == [sorted(["ours.toml", RENDERED]), []]
-    assert [Path(each["scan"]).name for each in said["unread"]] == ["broken.tif"]
+    output = json.loads(capsys.readouterr().out)
+    assert [len(kind["scans"]) for kind in output["kinds"]] == [4, 1]
+    assert [len(kind["samples"]) for kind in output["kinds"]] == [3, 1]
+    assert [kind["best"] for kind in output["kinds"]] == [sorted(["ours.toml", RENDERED]), []]
+    assert [Path(each["scan"]).name for each in output["unread"]] == ["broken.tif"]
 
 
-def test_a_folder_without_scans_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_scans_is_reported_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["cameras", "--scan", str(tmp_path)]) == 2
     assert "no scan there, nor below" in capsys.readouterr().err
 
@@ -230,7 +230,7 @@ def test_a_folder_without_scans_is_told_so(tmp_path: Path, capsys: pytest.Captur
 @pytest.mark.parametrize(
     ("at_pitch", "looked_at"), [((1e-3, 5.0), [0]), ((0.5, 5.0), [1]), ((5.0, 0.5), [1, 0])], ids=str
 )
-def test_marks_are_looked_at_once_a_search_answers_that_chance_does_not_make(
+def test_marks_are_inspected_at_once_a_search_answers_that_chance_does_not_make(
     frame: Path, monkeypatch: pytest.MonkeyPatch, at_pitch: tuple[float, float], looked_at: list[int]
 ) -> None:
     """The first search, with pixels alike, or else after the second, with pixels longer one way: then each camera's
@@ -242,17 +242,17 @@ def test_marks_are_looked_at_once_a_search_answers_that_chance_does_not_make(
         left = iter(expected)
         return lambda search, layout, pitch_um: Tried(layout, layout, search._fine, [], before, Answer(next(left), ()))
 
-    seen = list[int]()
+    view = list[int]()
 
     def looked(_: LayoutSearch, names: tuple[str, ...], each: Tried, __: float) -> Trial:
-        seen.append(each.before)
+        view.append(each.before)
         return replace(trial(names, 0.5, None), expected=each.answer.expected)
 
     monkeypatch.setattr(LayoutSearch, "try_pitch", answers(0, *at_pitch))
     monkeypatch.setattr(LayoutSearch, "longer_one_way", answers(1, 0.02 if at_pitch[0] > 1 else 1e-3, 7.0))
     monkeypatch.setattr(camera_trials, "_trial", looked)
     identify(scan, two, 100.0, Reporter())
-    assert seen == looked_at
+    assert view == looked_at
 
 
 @pytest.mark.study
@@ -273,7 +273,7 @@ def test_a_part_of_a_lattice_is_no_other_camera(
 
 
 @pytest.mark.study
-def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
+def test_a_camera_too_large_for_the_scan_is_reported_so_in_words_and_json(
     frame: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nowhere do its marks answer together: that is no number, which neither a sentence nor JSON could hold."""
@@ -312,9 +312,9 @@ def test_what_chance_finds_as_well_does_not_stand_out() -> None:
     assert found.as_json()["best"] == []
 
 
-def test_a_pitch_that_the_marks_contradict_is_told() -> None:
-    seen = replace(trial(("a",), 0.8), expected=math.inf, pixel_um=127.3)
-    right = Identification(Path("a.tif"), (seen,), pitch_um=(126.0, 128.0))
+def test_a_pitch_that_the_marks_contradict_is_reported() -> None:
+    view = replace(trial(("a",), 0.8), expected=math.inf, pixel_um=127.3)
+    right = Identification(Path("a.tif"), (view,), pitch_um=(126.0, 128.0))
     assert "um" not in right.sentence()
     wrong = replace(right, pitch_um=(63.5, 63.5))
     assert "only if a pixel measures 127.3 µm, not 63.5" in wrong.sentence()
@@ -329,7 +329,7 @@ def test_cameras_that_come_close_are_all_named() -> None:
 
 
 @pytest.mark.parametrize(("score", "alike"), [(0.75, {"a": ("b",), "A": ("b",)}), (0.6, {})])
-def test_a_form_that_fits_the_scan_clearly_worse_is_not_told_beside_a_name(
+def test_a_form_that_fits_the_scan_clearly_worse_is_not_reported_next_to_a_name(
     score: float, alike: dict[str, tuple[str, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """a was found with 0.85. b, drawn much like it, is looked at where a lies; c, as much alike, has no mark there."""
@@ -341,20 +341,20 @@ def test_a_form_that_fits_the_scan_clearly_worse_is_not_told_beside_a_name(
 
     picture: Any = None
 
-    def of(id: str) -> Tried:
+    def make_trial(id: str) -> Tried:
         layout = FiducialLayout((replace(LIBRARY[RENDERED].layout().marks[0], id=id),), (10.0, 10.0))
         return Tried(layout, layout, picture, [], 0, Answer(0.1, ()))
 
-    of_a = of("a")
+    of_a = make_trial("a")
     monkeypatch.setattr(camera_trials, "likeness", lambda _: score)
-    tries: Any = {("a", "A"): of_a, ("b", "B"): of("b"), ("c",): of("c")}
+    tries: Any = {("a", "A"): of_a, ("b", "B"): make_trial("b"), ("c",): make_trial("c")}
     drawn = {"a": ("b", "c"), "b": ("a",)}
     search: Any = Search()
     found = camera_trials._alike_in_scan(search, [trial(("a", "A"), 0.85), trial(("b", "B"), 0.0)], tries, drawn)
     assert found == alike
 
 
-def test_wings_of_much_the_same_form_are_told_beside_a_name_that_rests_on_them() -> None:
+def test_wings_of_much_the_same_form_are_reported_next_to_a_name_that_rests_on_them() -> None:
     layouts = {names: LIBRARY[names[0]].layout() for names in _alike(LIBRARY)}
     alike = drawn_alike(layouts)
     assert "fairchild-k17-small-flat-153" in alike["fairchild-k17-curved-flat-305"]

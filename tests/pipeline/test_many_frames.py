@@ -89,14 +89,14 @@ def test_its_counts_are_those_of_the_frames(many: ReportData) -> None:
     assert judge(many).sentence.startswith(f"Measured: {observed} marks in {FRAMES} frames, but ")
 
 
-def test_the_worst_frames_are_shown_and_alike_problems_said_once(many: ReportData, page: str) -> None:
+def test_the_worst_frames_are_shown_and_alike_problems_stated_once(many: ReportData, page: str) -> None:
     shown = set(many.measurement or {})
     assert {image(number) for number in FAILED} <= shown
     assert shown <= {image(number) for number in (*BAD, *FAILED)}
-    told = [problem.what for problem in judge(many).problems]
-    assert len(told) == 2
-    assert f"and {len(BAD) - 8} more: 1 fiducial mark not measured, 7 measured" in told[0]
-    assert f"and {len(FAILED) - 8} more: scan 5 is damaged" in told[1]
+    finding = [problem.what for problem in judge(many).problems]
+    assert len(finding) == 2
+    assert f"and {len(BAD) - 8} more: 1 fiducial mark not measured, 7 measured" in finding[0]
+    assert f"and {len(FAILED) - 8} more: scan 5 is damaged" in finding[1]
 
 
 def test_what_users_named_is_escaped(page: str) -> None:
@@ -116,7 +116,7 @@ def test_pictures_of_all_that_is_shown_leave_it_small(many: ReportData) -> None:
     assert len(page.encode()) < 10_000_000
 
 
-def test_good_frames_alone_need_no_look() -> None:
+def test_good_frames_alone_need_no_attention() -> None:
     scans = [scan(number) for number in range(1, 400) if number not in BAD and number not in FAILED]
     data = reduced(ReportData("Good", list(rows(scans))), iter(scans), lambda _: "k")
     assert judge(data).level == "good"
@@ -134,7 +134,7 @@ def test_the_page_of_a_frame_has_all_its_marks() -> None:
     assert "<b>0/" not in html
 
 
-def given(folder: Path, images: int) -> Path:
+def write_images(folder: Path, images: int) -> Path:
     """A project of coordinates that somebody has measured."""
     marks = {"1": (-100, -100), "2": (100, -100), "3": (100, 100), "4": (-100, 100)}
     fiducials = [f'[[fiducial]]\nid = "{id}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0' for id, (x, y) in marks.items()]
@@ -151,8 +151,8 @@ def given(folder: Path, images: int) -> Path:
 
 
 @pytest.mark.study
-def test_pages_are_made_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    project = given(tmp_path, MOST_FRAMES + 5)
+def test_pages_are_made_when_requested(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = write_images(tmp_path, MOST_FRAMES + 5)
     assert run(["adjust", str(project)]) in (0, 1)
     for _ in range(2):  # what was written may be written over
         assert run(["report", str(project)]) in (0, 1)
@@ -170,7 +170,7 @@ def test_pages_are_made_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_few_frames_are_shown_one_by_one(tmp_path: Path) -> None:
-    project = given(tmp_path, 3)
+    project = write_images(tmp_path, 3)
     assert run(["adjust", str(project)]) in (0, 1)
     assert run(["report", str(project)]) in (0, 1)
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -180,17 +180,17 @@ def test_few_frames_are_shown_one_by_one(tmp_path: Path) -> None:
 
 def stored(folder: Path) -> tuple[Path, list[MeasuredScan]]:
     """A project whose many scans were measured; of every tenth no target was seen."""
-    project, scans = given(folder, 1), []
+    project, scans = write_images(folder, 1), []
     project.write_text('camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = 20.0\n', encoding="utf-8")
     (folder / "scans").mkdir()
     for number in range(MOST_FRAMES + 11):
         file = folder / "scans" / f"{number:04d}.tif"
         file.write_bytes(f"scan {number}".encode())
         one = scan(number)
-        seen = (
+        view = (
             (Status.PREDICTED, Reason("it is faint", Code.COVERED)) if number % 10 == 3 else (Status.MEASURED, Reason())
         )
-        targets = [MarkMeasurement(f"t{i}", "target", np.full(2, 7.0 * i), KNOWN, *seen) for i in (1, 2)]
+        targets = [MarkMeasurement(f"t{i}", "target", np.full(2, 7.0 * i), KNOWN, *view) for i in (1, 2)]
         marks = (*one.frame.marks, *(targets if number not in FAILED else ()))
         scans.append(replace(one, scan=str(file), frame=replace(one.frame, image=file.stem, marks=marks)))
     digest = keep_scans(folder / "out" / "measurement.db", scans)
@@ -228,7 +228,7 @@ def is_blind(number: int) -> bool:
     return number % 10 == 3 and number not in BAD and number not in FAILED
 
 
-def test_frames_that_need_no_look_are_counted_as_if_each_were_read(tmp_path: Path, monkeypatch: Any) -> None:
+def test_frames_that_need_no_attention_are_counted_as_if_each_were_read(tmp_path: Path, monkeypatch: Any) -> None:
     project = read_project(stored(tmp_path)[0])
     every = report_data(project, lambda path: path)
     as_written(tmp_path)

@@ -85,7 +85,7 @@ def likeness(picture: Picture, mark: Mark, dot: Array) -> float:
 
 @needs("mark_gallery")
 @parametrize_with_studies(("name", "camera", "marks", "least"), SEEN, quick=(6, 9, 11, 12))
-def test_a_drawing_looks_like_the_real_mark(name: str, camera: str, marks: str, least: float) -> None:
+def test_a_drawing_resembles_the_real_mark(name: str, camera: str, marks: str, least: float) -> None:
     picture = np.asarray(cv2.imread(str(GALLERY / f"{name}.png")))
     given = {mark.id: mark.mark for mark in LIBRARY[camera].layout().marks}
     like = {id: round(likeness(picture, given[id], place_of_dot(picture, DOTS[id])), 2) for id in marks}
@@ -95,7 +95,7 @@ def test_a_drawing_looks_like_the_real_mark(name: str, camera: str, marks: str, 
 DRAWN = [names[0] for names in _alike(LIBRARY) if names[0] != "hasselblad-reseau-60"]
 
 
-def scene_of(name: str) -> str:
+def scene_text(name: str) -> str:
     """One frame, in a scan that holds the marks beyond its edge. Light lines stand on pads; what is solid or dark has
     none, for it could not be seen there; what is dark beside the frame stands in exposed pockets."""
     layout = LIBRARY[name].layout()
@@ -105,8 +105,8 @@ def scene_of(name: str) -> str:
     start, end = SCENE.index("[camera]\n"), SCENE.index("[field]\n")
     scene = SCENE[:start] + f'camera = "library:{name}"\n' + SCENE[end:]
     changes = {"pitch_um = 45.0": "pitch_um = 125.0", "margin_mm = 3.0": "margin_mm = 9.0"}
-    beside = min(max(map(abs, each.xy_mm)) for each in layout.marks) > max(layout.frame_mm) / 2
-    pocket_mm = 6.0 if beside and all(mark.polarity == "dark" for mark in marks) else 0.0
+    neighbour = min(max(map(abs, each.xy_mm)) for each in layout.marks) > max(layout.frame_mm) / 2
+    pocket_mm = 6.0 if neighbour and all(mark.polarity == "dark" for mark in marks) else 0.0
     behind = {"pad_mm = 1.9": f"pad_mm = {pad_mm}", "pocket_mm = 0.0": f"pocket_mm = {pocket_mm}"}
     for old, new in (changes | behind).items():
         assert old in scene
@@ -118,7 +118,7 @@ def scene_of(name: str) -> str:
 def test_scans_of_wings_are_named_where_the_scan_tells_their_form(tmp_path: Path) -> None:
     """Of three forms that are drawn much alike."""
     name = "fairchild-k17-tall-flat-153"
-    (tmp_path / "scene.toml").write_text(scene_of(name), encoding="utf-8")
+    (tmp_path / "scene.toml").write_text(scene_text(name), encoding="utf-8")
     render_project(tmp_path / "scene.toml", tmp_path)
     forms = {each: camera for each, camera in LIBRARY.items() if "k17" in each or each == "zeiss-rmk-a-153"}
     grouped = group_scans(sorted((tmp_path / "scans").iterdir()), lambda *_: None)
@@ -130,7 +130,7 @@ def test_scans_of_wings_are_named_where_the_scan_tells_their_form(tmp_path: Path
 @pytest.mark.parametrize("name", DRAWN)
 def test_a_drawn_camera_is_found_among_all(name: str, tmp_path: Path) -> None:
     """Rendered with another code, turned by half a degree, at 125 um."""
-    (tmp_path / "scene.toml").write_text(scene_of(name), encoding="utf-8")
+    (tmp_path / "scene.toml").write_text(scene_text(name), encoding="utf-8")
     render_project(tmp_path / "scene.toml", tmp_path)
     (scan,) = (tmp_path / "scans").glob("*.tif")
     found = identify(scan, LIBRARY, None, Reporter())

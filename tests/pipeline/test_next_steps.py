@@ -42,7 +42,7 @@ def test_a_summary_calls_for_what_mends_it_then_for_the_next_stage(given: Any, s
         assert step.startswith(begins)
 
 
-def test_three_steps_at_most_are_printed_each_once_and_none_beside_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_three_steps_at_most_are_printed_each_once_and_none_next_to_json(capsys: pytest.CaptureFixture[str]) -> None:
     print_next(False, "a", "a", "b", command_step("run", PROJECT, why="c"), "d")
     assert capsys.readouterr().out == "Next: a\nNext: b\nNext: reseau run 'my project.toml'  # c\n"
     print_next(True, "a")

@@ -46,12 +46,12 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def of_scans(folder: Path, scans: str) -> Path:
+def write_scan_project(folder: Path, scans: str) -> Path:
     write_project(folder, [], PROJECT.replace('"*.tif"', scans))
     return folder
 
 
-def measured(folder: Path, *options: str) -> int:
+def measure_picture(folder: Path, *options: str) -> int:
     return run(["measure", str(folder / "project.toml"), *options])
 
 
@@ -64,18 +64,18 @@ def rows(folder: Path) -> list[str]:
 def test_a_bucket_and_a_server_give_the_rows_of_the_disk(
     store: Any, local: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert measured(local) == 0
+    assert measure_picture(local) == 0
     for name in ("a", "b"):
         store.upload_file(str(local / f"{name}.tif"), "prints", f"1952/{name}.tif")
-    bucket = of_scans(tmp_path / "bucket", '"s3://prints/1952/*.tif"')
-    assert measured(bucket) == 0
+    bucket = write_scan_project(tmp_path / "bucket", '"s3://prints/1952/*.tif"')
+    assert measure_picture(bucket) == 0
     assert rows(bucket) == rows(local)
     with range_server(local) as server:
-        named = of_scans(tmp_path / "named", f'"{server.url}/a.tif", "{server.url}/b.tif"')
-        assert measured(named) == 0
+        named = write_scan_project(tmp_path / "named", f'"{server.url}/a.tif", "{server.url}/b.tif"')
+        assert measure_picture(named) == 0
     assert rows(named) == rows(local)
     capsys.readouterr()
-    assert measured(bucket) == 0
+    assert measure_picture(bucket) == 0
     assert "2 of 2 scans measured already" in capsys.readouterr().err
 
 
@@ -84,7 +84,7 @@ def test_names_are_those_below_the_common_folder_and_contents_tell_copies(
 ) -> None:
     for key, name in (("box/1/a.tif", "a"), ("box/2/a.tif", "b"), ("box/2/copy.tif", "b"), ("box/2/a.txt", "a")):
         store.upload_file(str(local / f"{name}.tif"), "prints", key)
-    scans = read_project(of_scans(tmp_path, '"s3://prints/box/**/*.tif"') / "project.toml").scans
+    scans = read_project(write_scan_project(tmp_path, '"s3://prints/box/**/*.tif"') / "project.toml").scans
     assert {name: str(path) for name, path in scans.items()} == {
         "1/a": "s3://prints/box/1/a.tif",
         "2/a": "s3://prints/box/2/a.tif",
@@ -127,7 +127,7 @@ def test_init_makes_a_project_of_a_bucket(
 def test_a_bucket_without_scans_and_one_that_is_not_there(store: Any, tmp_path: Path) -> None:
     for pattern in ("s3://prints/nowhere/*.tif", "s3://no-such-bucket/*.tif"):
         with pytest.raises(InputError, match=r"scans.*finds no object.*Check the bucket|there is no s3://no-such"):
-            read_project(of_scans(tmp_path, f'"{pattern}"') / "project.toml")
+            read_project(write_scan_project(tmp_path, f'"{pattern}"') / "project.toml")
 
 
 def test_an_address_that_does_not_answer_costs_the_others_nothing(
@@ -135,8 +135,8 @@ def test_an_address_that_does_not_answer_costs_the_others_nothing(
 ) -> None:
     monkeypatch.setattr(remote, "_WAITS_S", (0.01,))
     with range_server(local) as server:
-        folder = of_scans(tmp_path, f'"{server.url}/a.tif", "{server.url}/closed/b.tif"')
-        assert measured(folder, "--workers", "1") == 1
+        folder = write_scan_project(tmp_path, f'"{server.url}/a.tif", "{server.url}/closed/b.tif"')
+        assert measure_picture(folder, "--workers", "1") == 1
     with sqlite3.connect(folder / "out" / "measurement.db") as db:
         query = "select scan.name, detail ->> '$.failure.code' from result join scan on scan.id = result.scan"
         codes = dict(db.execute(query))
@@ -145,7 +145,7 @@ def test_an_address_that_does_not_answer_costs_the_others_nothing(
 
 
 @pytest.mark.study
-def test_credentials_and_signatures_are_used_and_told_nowhere(
+def test_credentials_and_signatures_are_used_and_reported_nowhere(
     local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By two processes, which are given them. Another signature is the same scan; a wrong one is told without it."""
@@ -154,19 +154,19 @@ def test_credentials_and_signatures_are_used_and_told_nowhere(
         for signature, left in (("s3cr3t1", "0 of 2"), ("s3cr3t2", "2 of 2"), ("s3cr3t3", "")):
             server.signature = "s3cr3t2" if signature == "s3cr3t3" else signature
             url, query = server.url.replace("://", "://ann:hunter2@"), f"X-Amz-Date=1&X-Amz-Signature={signature}"
-            folder = of_scans(tmp_path / "p", f'"{url}/a.tif?{query}", "{url}/b.tif?{query}"')
-            code = measured(folder, "--workers", "2")
-            said = capsys.readouterr()
-            assert f"{left} scans measured already" in said.err or not left
+            folder = write_scan_project(tmp_path / "p", f'"{url}/a.tif?{query}", "{url}/b.tif?{query}"')
+            code = measure_picture(folder, "--workers", "2")
+            captured = capsys.readouterr()
+            assert f"{left} scans measured already" in captured.err or not left
             assert code == (0 if left else 2)  # where no scan can be read
             run(["report", str(folder / "project.toml")])
             run(["status", str(folder / "project.toml"), "--csv"])
             after = capsys.readouterr()
-            told = [said.out, said.err, after.out, after.err]
-            told += [path.read_bytes().decode("latin-1") for path in folder.rglob("*") if path.is_file()]
-            told = [text for text in told if "scans = [" not in text]  # the user's own file
+            result = [captured.out, captured.err, after.out, after.err]
+            result += [path.read_bytes().decode("latin-1") for path in folder.rglob("*") if path.is_file()]
+            result = [text for text in result if "scans = [" not in text]  # the user's own file
             for secret in ("s3cr3t", "hunter2", "ann:"):
-                assert not [text for text in told if secret in text], secret
+                assert not [text for text in result if secret in text], secret
     assert {row.partition(",")[0] for row in rows(folder)[1:]} == {"a", "b"}
 
 
@@ -192,5 +192,5 @@ def test_scans_that_a_query_tells_apart_are_two() -> None:
 
 
 def test_a_text_is_shown_without_what_opens_its_addresses() -> None:
-    told = "'htps://ann:pw@h.org/a.tif?token=1' finds no file: /x/htps:/ann:pw@h.org/a.tif, tcp://host:8786"
-    assert remote.public_text(told) == "'htps://h.org/a.tif' finds no file: /x/htps:/h.org/a.tif, tcp://host:8786"
+    result = "'htps://ann:pw@h.org/a.tif?token=1' finds no file: /x/htps:/ann:pw@h.org/a.tif, tcp://host:8786"
+    assert remote.public_text(result) == "'htps://h.org/a.tif' finds no file: /x/htps:/h.org/a.tif, tcp://host:8786"

@@ -40,7 +40,7 @@ def free_project(folder: Path, adjust: str = "", objects: str = "", scale: float
     return case
 
 
-def adjusted(folder: Path) -> Adjustment:
+def adjust_network(folder: Path) -> Adjustment:
     project = read_project(folder / "project.toml")
     return adjust_marks(project, read_comparator(project.comparator))
 
@@ -49,7 +49,7 @@ def test_chosen_datum_coordinates(tmp_path: Path) -> None:
     """Other seven coordinates than the reference holds: its camera, and the seven where points.csv has them."""
     held = ["2.X", "2.Y", "2.Z", "9.X", "9.Y", "9.Z", "4.Z"]
     case = free_project(tmp_path, f'datum = "minimal"\ndatum_coordinates = {json.dumps(held)}')
-    result = adjusted(tmp_path)
+    result = adjust_network(tmp_path)
     reference = case["result"]["parameters"]["IO.c"]
     assert result.value("IO.C.c") == pytest.approx(reference["value"], abs=1e-6 * reference["std_apriori"])
     assert result.sigma("IO.C.c") == pytest.approx(reference["std_aposteriori"], rel=1e-7)
@@ -67,7 +67,7 @@ def test_distances_through_files(tmp_path: Path) -> None:
     lengths = [scale * float(np.linalg.norm(xyz[int(b) - 1] - xyz[int(a) - 1])) for a, b, scale in bars]
     rows = [f"{a},{b},{length!r},0.2" for (a, b, _), length in zip(bars, lengths, strict=True)]
     (tmp_path / "bars.csv").write_text("\n".join(["from,to,distance,sigma", *rows]) + "\n", encoding="utf-8")
-    result = adjusted(tmp_path)
+    result = adjust_network(tmp_path)
     write_adjustment(result, tmp_path / "adjustment.json")
     written = read_adjustment(tmp_path / "adjustment.json")
     assert [(row.start, row.end) for row in written.distances] == [("1", "2"), ("3", "9"), ("5", "7")]
@@ -94,7 +94,7 @@ def test_a_mistake_in_the_distances_gets_a_message(row: str, words: list[str], t
     free_project(tmp_path, objects='distances = "bars.csv"')
     (tmp_path / "bars.csv").write_text(f"from,to,distance,sigma\n{row}\n", encoding="utf-8")
     with pytest.raises(InputError) as error:
-        adjusted(tmp_path)
+        adjust_network(tmp_path)
     for word in ["bars.csv", *words]:
         assert word in str(error.value)
 
@@ -104,7 +104,7 @@ def test_a_distance_to_a_point_that_no_image_shows_is_left_out(tmp_path: Path) -
     with (tmp_path / "points.csv").open("a", encoding="utf-8") as points:
         points.write("lost,0.0,0.0,0.0,,,\n")
     (tmp_path / "bars.csv").write_text("from,to,distance,sigma\n1,lost,3.0,0.1\n", encoding="utf-8")
-    result = adjusted(tmp_path)
+    result = adjust_network(tmp_path)
     assert result.further == ()
     assert any("1 to lost" in warning for warning in result.warnings)
 
@@ -118,7 +118,7 @@ def test_refraction_and_curvature_through_files(tmp_path: Path) -> None:
         case = free_project(
             folder, 'datum = "minimal"\nrefraction = true\nearth_curvature = true', f'unit = "{unit}"', scale
         )
-        results.append(adjusted(folder))
+        results.append(adjust_network(folder))
     straight = case["result"]["parameters"]["IO.c"]
     first, second = results
     assert second.value("IO.C.c") == pytest.approx(first.value("IO.C.c"), abs=1e-6 * straight["std_apriori"])
@@ -135,12 +135,12 @@ def earlier(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Adjustment]
     """The folder of a reference case, and its adjustment."""
     folder = tmp_path_factory.mktemp("earlier")
     write_project(json.loads((CASES / "iii_selfcal_mixed.json").read_text(encoding="utf-8")), folder)
-    first = adjusted(folder)
+    first = adjust_network(folder)
     write_adjustment(first, folder / "adjustment.json")
     return folder, first
 
 
-def with_antennas(earlier: tuple[Path, Adjustment], folder: Path, sigma: str) -> Adjustment:
+def adjust_antennas(earlier: tuple[Path, Adjustment], folder: Path, sigma: str) -> Adjustment:
     """The reference case with antennas observed where its adjustment puts them, 2.5 units away from the lenses."""
     source, first = earlier
     offset = (0.5, -1.0, 2.2)
@@ -157,13 +157,13 @@ def with_antennas(earlier: tuple[Path, Adjustment], folder: Path, sigma: str) ->
     text = (source / "project.toml").read_text(encoding="utf-8")
     keys = f'[object]\nimages = "images.csv"\nantenna_offset = {list(offset)}\n'
     (folder / "project.toml").write_text(text.replace("[object]\n", keys), encoding="utf-8")
-    return adjusted(folder)
+    return adjust_network(folder)
 
 
 def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
     """They are where the adjustment puts them, so that nothing moves but every station becomes more certain."""
     _, first = earlier
-    result = with_antennas(earlier, tmp_path, "0.05")
+    result = adjust_antennas(earlier, tmp_path, "0.05")
     for image in first.network.images:
         name = f"EO.{image.name}.Z0"
         assert result.value(name) == pytest.approx(first.value(name), abs=1e-3 * first.sigma(name))
@@ -177,7 +177,7 @@ def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], tmp_p
 
 def test_an_antenna_cannot_be_fixed(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="column sX0: is 0, but an antenna can be observed only"):
-        with_antennas(earlier, tmp_path, "0")
+        adjust_antennas(earlier, tmp_path, "0")
 
 
 def once_more(earlier: Path, folder: Path, change: Callable[[str], str] = str) -> Adjustment:
@@ -187,7 +187,7 @@ def once_more(earlier: Path, folder: Path, change: Callable[[str], str] = str) -
     text = (earlier / "camera.toml").read_text(encoding="utf-8")
     key = f'calibration = "{(earlier / "adjustment.json").as_posix()}"'
     (folder / "camera.toml").write_text(change(text.replace("[sigma]\n", f"[sigma]\n{key}\n", 1)), encoding="utf-8")
-    return adjusted(folder)
+    return adjust_network(folder)
 
 
 def test_an_earlier_calibration_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
@@ -258,7 +258,7 @@ def test_a_mistake_in_the_datum_gets_a_message(
     monkeypatch.setattr("adjust.solution.adjustment.blunder_sentence", lambda *_: pytest.fail("sought a slip"))
     free_project(tmp_path, lines)
     with pytest.raises((InputError, AdjustmentError)) as error:
-        adjusted(tmp_path)
+        adjust_network(tmp_path)
     for word in words:
         assert word in str(error.value)
 
@@ -305,7 +305,7 @@ def test_distances_between_fiducials_through_files(tmp_path: Path, capsys: pytes
 
 def test_a_wrong_distance_of_a_certificate_is_named(tmp_path: Path) -> None:
     project = fiducial_project(tmp_path, [*ALL_SIX[:4], ("1", "3", 0.4), ("2", "4", 0.0)])
-    result = adjusted(project.parent)
+    result = adjust_network(project.parent)
     write_adjustment(result, tmp_path / "adjustment.json")
     verdict = judge(ReportData("t", adjustment=read_adjustment(tmp_path / "adjustment.json")))
     assert any("contradicted" in each.what and "1 to 3 of K" in each.what for each in verdict.problems)

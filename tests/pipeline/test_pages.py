@@ -40,7 +40,7 @@ def commands(page: Path) -> Iterator[str]:
             yield f"reseau{(found[1] or '').partition(' #')[0].rstrip()}"
 
 
-def words_of(command: str) -> list[str]:
+def split_words(command: str) -> list[str]:
     return shlex.split(command, comments=True)[1:]
 
 
@@ -49,7 +49,7 @@ def test_every_command_of_a_page_exists_with_its_options(page: Path) -> None:
     known = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     general = {"--version", "--help", "--install-completion"}
     for command in commands(page):
-        name, *others = words_of(command.split(">")[0])
+        name, *others = split_words(command.split(">")[0])
         if name in general:
             continue
         options = {option for parameter in known[name].params for option in parameter.opts}
@@ -90,7 +90,7 @@ def small_library(monkeypatch: pytest.MonkeyPatch) -> None:
 def run_all(page: Path, skip: Callable[[str], bool] = lambda _: False) -> dict[str, int]:
     """The exit code of each command of a page, run in the current folder."""
     done = dict.fromkeys(command for command in commands(page) if not skip(command))
-    return {command: run(words_of(command)) for command in done}
+    return {command: run(split_words(command)) for command in done}
 
 
 @pytest.mark.study

@@ -98,12 +98,12 @@ def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def truth_of(folder: Path) -> dict[str, Any]:
+def read_truth(folder: Path) -> dict[str, Any]:
     content: dict[str, Any] = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     return dict(content["images"])
 
 
-def camera_of(image: dict[str, Any], pixels: np.ndarray) -> np.ndarray:
+def image_camera(image: dict[str, Any], pixels: np.ndarray) -> np.ndarray:
     """Camera mm of pixels (n, 2), by the truth."""
     x, y = (pixels * [0.06, -0.06]).T
     t = {name: value["value"] for name, value in image["transformation"].items() if name != "kind"}
@@ -112,7 +112,7 @@ def camera_of(image: dict[str, Any], pixels: np.ndarray) -> np.ndarray:
 
 @pytest.mark.study
 def test_half_of_the_marks_lie_outside_and_the_others_are_found(halves: Path) -> None:
-    truth = truth_of(halves)
+    truth = read_truth(halves)
     for scan in read_measurement(halves / "out" / "measurement.db"):
         for mark in scan.frame.marks:
             if mark.kind != "fiducial":
@@ -129,7 +129,7 @@ def test_half_of_the_marks_lie_outside_and_the_others_are_found(halves: Path) ->
 @pytest.mark.study
 def test_joins_are_the_same_places_of_the_film(halves: Path) -> None:
     """Their errors are as large as their standard deviations say."""
-    truth = truth_of(halves)
+    truth = read_truth(halves)
     first, second = (
         {mark.point: mark for mark in scan.frame.marks if mark.kind == "join"}
         for scan in read_measurement(halves / "out" / "measurement.db")
@@ -137,7 +137,7 @@ def test_joins_are_the_same_places_of_the_film(halves: Path) -> None:
     assert len(first) >= 40
     assert first.keys() == second.keys()
     places = [
-        camera_of(truth[image], np.array([mark.center_px for mark in of.values()]))
+        image_camera(truth[image], np.array([mark.center_px for mark in of.values()]))
         for image, of in (("fa", first), ("fb", second))
     ]
     sigma = np.array(
@@ -152,7 +152,7 @@ def test_joins_are_the_same_places_of_the_film(halves: Path) -> None:
 
 @pytest.mark.study
 def test_one_adjustment_knows_both_films_one_orientation_and_all_marks_in_one_frame(halves: Path) -> None:
-    truth, result = truth_of(halves), json.loads((halves / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    truth, result = read_truth(halves), json.loads((halves / "out" / "adjustment.json").read_text(encoding="utf-8"))
     assert result["converged"]
     assert result["images"]["fa"]["exterior"] == result["images"]["fb"]["exterior"]
     assert result["groups"]["join"]["redundancy"] > 60.0
@@ -162,14 +162,14 @@ def test_one_adjustment_knows_both_films_one_orientation_and_all_marks_in_one_fr
     for name, part in frame["parts"].items():
         corners = np.array([[0.0, 0.0], [0.0, 832.0], [499.0, 0.0], [499.0, 832.0]])
         own = {key: value for key, value in result["images"][name]["transformation"].items() if key != "mirrored"}
-        adjusted = camera_of({"transformation": own}, corners)
-        off_um = 1000.0 * np.hypot(*(adjusted - camera_of(truth[name], corners)).T)
+        adjusted = image_camera({"transformation": own}, corners)
+        off_um = 1000.0 * np.hypot(*(adjusted - image_camera(truth[name], corners)).T)
         assert off_um.max() < 5.0 * part["corner_sigma_um"]
     errors = []
     for mark in frame["marks"]:
         if mark["kind"] == "target":
             true = truth[mark["image"]]["targets"][mark["point"]]
-            place = camera_of(truth[mark["image"]], np.array([[true["ellipse_col_px"], true["ellipse_row_px"]]]))[0]
+            place = image_camera(truth[mark["image"]], np.array([[true["ellipse_col_px"], true["ellipse_row_px"]]]))[0]
             errors += [(mark["x_mm"] - place[0]) / mark["sx_mm"], (mark["y_mm"] - place[1]) / mark["sy_mm"]]
     assert len(errors) > 40
     assert np.sqrt(np.mean(np.square(errors))) < 2.0
@@ -200,11 +200,11 @@ def test_formats_of_resampled_frames_are_of_the_whole(
     out = tmp_path / format
     assert run(["export", str(halves / "project.toml"), format, str(out)]) == 0
     with tifffile.TiffFile(whole) as file:
-        said, shape = json.loads(file.pages.first.description), file.pages.first.shape
+        description, shape = json.loads(file.pages.first.description), file.pages.first.shape
     if format == "opencv":
         storage = cv2.FileStorage(str(out / "f.yml"), cv2.FILE_STORAGE_READ)
         assert [storage.getNode(f"image_{side}").real() for side in ("height", "width")] == list(shape[:2])
-    truth = truth_of(halves)
+    truth = read_truth(halves)
     rows = list(csv.DictReader((halves / "points.csv").read_text(encoding="utf-8").splitlines()))
     points = np.array([[float(row[axis]) for axis in "XYZ"] for row in rows])
     projected = reader(out, "f", points)
@@ -212,25 +212,31 @@ def test_formats_of_resampled_frames_are_of_the_whole(
         for row, place in zip(rows, projected, strict=True):
             true = truth[image]["targets"].get(row["point"])
             if true is not None and true["visible"]:
-                seen = np.array([[true["ellipse_col_px"], true["ellipse_row_px"]]])
-                at_mm = camera_of(truth[image], seen)[0]
-                there = np.array([at_mm[0] - said["x_mm"], said["y_mm"] - at_mm[1]]) / said["pitch_mm"]
+                view = np.array([[true["ellipse_col_px"], true["ellipse_row_px"]]])
+                at_mm = image_camera(truth[image], view)[0]
+                there = (
+                    np.array([at_mm[0] - description["x_mm"], description["y_mm"] - at_mm[1]]) / description["pitch_mm"]
+                )
                 assert np.hypot(*(place - there)) < 0.5, (image, row["point"])
 
 
 @pytest.mark.study
 def test_a_point_that_both_scans_show_goes_out_once(halves: Path, tmp_path: Path) -> None:
     comparator = read_comparator(halves / "comparator.csv")
-    seen = [mark.point for mark in comparator if mark.kind == "target" and mark.status.is_observation]
-    assert len(seen) > len(set(seen))  # in the overlap
+    measured_marks = [mark.point for mark in comparator if mark.kind == "target" and mark.status.is_observation]
+    assert len(measured_marks) > len(set(measured_marks))  # in the overlap
     assert run(["export", str(halves / "project.toml"), "colmap", str(tmp_path / "colmap")]) == 0
     model = pycolmap.Reconstruction(str(tmp_path / "colmap" / "sparse"))
     (image,) = model.images.values()
-    assert (image.name, len(image.points2D), model.num_points3D()) == ("f.tif", len(set(seen)), len(set(seen)))
+    assert (image.name, len(image.points2D), model.num_points3D()) == (
+        "f.tif",
+        len(set(measured_marks)),
+        len(set(measured_marks)),
+    )
     assert run(["export", str(halves / "project.toml"), "bingo", str(tmp_path / "bingo")]) == 0
     lines = (tmp_path / "bingo" / "bingo.txt").read_text(encoding="utf-8").split("\n")
     assert lines[0] == "f K"
-    assert len(lines) == 1 + len(set(seen)) + 1
+    assert len(lines) == 1 + len(set(measured_marks)) + 1
     assert run(["export", str(halves / "project.toml"), "mmvii", str(tmp_path / "mmvii")]) == 0  # the scans themselves
     assert len(list(tmp_path.glob("mmvii/**/MesIm-*.xml"))) == 4
 
@@ -239,21 +245,21 @@ def test_a_point_that_both_scans_show_goes_out_once(halves: Path, tmp_path: Path
 def test_the_whole_frame_is_resampled_from_both(halves: Path, whole: Path) -> None:
     """Targets lie where the truth has them, on either side of the seam, which the file states."""
     with tifffile.TiffFile(whole) as file:
-        said = json.loads(file.pages.first.description)
+        description = json.loads(file.pages.first.description)
         grey, mask = file.pages[0].asarray().astype(float), file.pages[1].asarray()
-    assert said["image"] == "f"
-    assert said["parts"] == ["fa", "fb"]
-    (seam,) = said["seams_mm"]
+    assert description["image"] == "f"
+    assert description["parts"] == ["fa", "fb"]
+    (seam,) = description["seams_mm"]
     assert np.ptp([y for _, y in seam]) > 40.0
     assert np.abs([x for x, _ in seam]).max() < 4.0
     assert mask.mean() > 0.97
     offs: dict[bool, list[np.ndarray]] = {True: [], False: []}
-    for image, true in truth_of(halves).items():
+    for image, true in read_truth(halves).items():
         for place in true["targets"].values():
             if not place["visible"]:
                 continue
-            at_mm = camera_of(true, np.array([[place["ellipse_col_px"], place["ellipse_row_px"]]]))[0]
-            col, row = (at_mm[0] - said["x_mm"]) / 0.06, (said["y_mm"] - at_mm[1]) / 0.06
+            at_mm = image_camera(true, np.array([[place["ellipse_col_px"], place["ellipse_row_px"]]]))[0]
+            col, row = (at_mm[0] - description["x_mm"]) / 0.06, (description["y_mm"] - at_mm[1]) / 0.06
             window = grey[round(row) - 6 : round(row) + 7, round(col) - 6 : round(col) + 7]
             light = np.clip(window - np.quantile(window, 0.7), 0.0, None)
             rows, cols = np.indices(window.shape)
@@ -266,7 +272,7 @@ def test_the_whole_frame_is_resampled_from_both(halves: Path, whole: Path) -> No
         assert np.abs(np.mean(side, axis=0)).max() < 0.12
 
 
-def test_scans_that_have_nothing_in_common_are_told(tmp_path: Path) -> None:
+def test_scans_that_have_nothing_in_common_are_reported(tmp_path: Path) -> None:
     parts = []
     for seed, name in enumerate(("a", "b")):
         noise = np.random.default_rng(seed).normal(30000.0, 3000.0, (300, 300))
@@ -286,10 +292,10 @@ def test_fiducials_that_contradict_the_joins_are_rejected(halves: Path) -> None:
     shifted = scans[1].frame.pixel_from_camera
     assert shifted is not None
     shifted = shifted + np.array([[0.0, 0.0, 50.0], [0.0, 0.0, 0.0]])
-    wrong = _with_frame(scans[1], shifted)
-    told = add_joins(project, [scans[0], wrong], lambda *_: None, None)
-    assert all("contradict those of" in " ".join(scan.frame.problems) for scan in told)
-    assert not any(mark.kind == "fiducial" and mark.status.is_observation for mark in told[1].frame.marks)
+    wrong = _set_frame(scans[1], shifted)
+    result = add_joins(project, [scans[0], wrong], lambda *_: None, None)
+    assert all("contradict those of" in " ".join(scan.frame.problems) for scan in result)
+    assert not any(mark.kind == "fiducial" and mark.status.is_observation for mark in result[1].frame.marks)
 
 
 def _project(folder: Path) -> Project:
@@ -301,7 +307,7 @@ def _bare(scan: MeasuredScan) -> MeasuredScan:
     return replace(scan, frame=replace(scan.frame, marks=marks, problems=()))
 
 
-def _with_frame(scan: MeasuredScan, pixel_from_camera: np.ndarray) -> MeasuredScan:
+def _set_frame(scan: MeasuredScan, pixel_from_camera: np.ndarray) -> MeasuredScan:
     return replace(scan, frame=replace(scan.frame, pixel_from_camera=pixel_from_camera))
 
 

@@ -37,8 +37,8 @@ def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered
         off_px = maps @ (6.0, 8.0)
         first, second = across(normals)
         far, _ = model.comparator_from_object(centers + radius * (6.0 * first + 8.0 * second))
-        seen_px = place_px + off_px / (1.0 + np.sum(perspective * off_px, axis=1))[:, None]
-        np.testing.assert_allclose(pixel_from_comparator(far, pitch), seen_px, atol=0.03)
+        projected_px = place_px + off_px / (1.0 + np.sum(perspective * off_px, axis=1))[:, None]
+        np.testing.assert_allclose(pixel_from_comparator(far, pitch), projected_px, atol=0.03)
         true_px = np.array([(place["col_px"], place["row_px"]) for place in shown.values()])
         ellipse_px = np.array([(place["ellipse_col_px"], place["ellipse_row_px"]) for place in shown.values()])
         np.testing.assert_allclose(place_px, true_px, atol=1e-6)

@@ -34,14 +34,14 @@ def written(folder: Path, camera: str = "", project: str = "") -> Path:
     return path
 
 
-def adjusted(path: Path) -> Adjustment:
+def adjust_network(path: Path) -> Adjustment:
     project = read_project(path)
     return adjust_marks(project, read_comparator(project.comparator, project.list_pitch_um))
 
 
 @pytest.mark.parametrize(("line", "pitch_mm"), [("", 0.005), ("pitch_um = 8.0\n", 0.008)])
 def test_a_digital_camera_comes_from_pixels_alone(tmp_path: Path, line: str, pitch_mm: float) -> None:
-    result = adjusted(written(tmp_path, project=line))
+    result = adjust_network(written(tmp_path, project=line))
     for name in ("c", "x0", "y0"):
         key = Parameter.interior("desk", name)
         assert abs(result.value(key) / pitch_mm - TRUTH[name] / DRAWN_MM) < 4.0 * result.sigma(key) / pitch_mm
@@ -51,4 +51,4 @@ def test_a_digital_camera_comes_from_pixels_alone(tmp_path: Path, line: str, pit
 def test_a_camera_file_in_mm_needs_the_size_of_a_pixel(tmp_path: Path) -> None:
     path = written(tmp_path, camera=f"frame_mm = [{FRAME_MM[0]}, {FRAME_MM[1]}]\n")
     with pytest.raises(InputError, match="Set pitch_um in"):
-        adjusted(path)
+        adjust_network(path)

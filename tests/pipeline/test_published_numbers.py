@@ -18,7 +18,7 @@ pytestmark = needs("film_numbers")
 Json = dict[str, Any]
 
 
-def adjusted(folder: Path, camera: str, project: str, rows: Iterable[Sequence[object]], points: str = "") -> Json:
+def adjust_network(folder: Path, camera: str, project: str, rows: Iterable[Sequence[object]], points: str = "") -> Json:
     """The result of `reseau adjust` on files; rows of comparator.csv in its own order."""
     (folder / "camera.toml").write_text(camera, encoding="utf-8")
     (folder / "points.csv").write_text("point,X,Y,Z,sX,sY,sZ\n" + points, encoding="utf-8")
@@ -53,7 +53,7 @@ def test_interior_orientation_of_eight_fiducials(tmp_path: Path) -> None:
         ("left", m["id"], "fiducial", float(m["x_px"]) * pitch_mm, -float(m["y_px"]) * pitch_mm, 1e-4, 1e-4)
         for m in marks
     ]
-    result = adjusted(tmp_path, 'name = "SJU"\n' + fiducials(marks, 1.0), "", rows)
+    result = adjust_network(tmp_path, 'name = "SJU"\n' + fiducials(marks, 1.0), "", rows)
     found = {key: part["value"] for key, part in result["images"]["left"]["transformation"].items() if key[0] in "ab"}
     per_px = [pitch_mm * found["a2"], -pitch_mm * found["a3"], pitch_mm * found["b2"], -pitch_mm * found["b3"]]
     assert per_px == pytest.approx([0.041989, 0.000144, 0.000147, -0.041985], abs=6e-7)
@@ -71,7 +71,7 @@ def test_interior_orientation_of_eight_fiducials(tmp_path: Path) -> None:
 )
 def test_fiducials_of_a_film_pair(kind: str, rms_um: Sequence[tuple[float, float]], tmp_path: Path) -> None:
     """A Wild RC30 pair, the calibrated fiducials held fixed."""
-    result = adjusted(tmp_path, *rc30(kind))
+    result = adjust_network(tmp_path, *rc30(kind))
     for image, expected in zip(("3574", "3575"), rms_um, strict=True):
         v = [(row["vx_um"], row["vy_um"]) for row in result["residuals"] if row["image"] == image]
         assert np.sqrt((np.array(v) ** 2).mean(axis=0)) == pytest.approx(expected, abs=0.06)
@@ -93,7 +93,7 @@ def test_a_film_pair_on_its_ground_points(tmp_path: Path) -> None:
         f"{row['name']},{row['X_m']},{row['Y_m']},{row['Z_m']},{'0.5,0.5,0.5' if row['X_m'] else ',,'}\n"
         for row in table(folder / "points.csv")
     )
-    result = adjusted(tmp_path, camera, project, [*marks, *rows], points)
+    result = adjust_network(tmp_path, camera, project, [*marks, *rows], points)
     assert result["redundancy"] == 42
     groups = result["groups"]
     assert max(groups["target"]["rms_x_um"], groups["target"]["rms_y_um"]) < 2.1
@@ -135,7 +135,7 @@ def test_a_self_calibration_of_2074_marks(tmp_path: Path) -> None:
     )
     free = "".join(f'{name} = "free"\n' for name in ("k1", "k2", "k3", "p1", "p2", "b1"))
     camera = f'name = "C4040Z"\n[distortion]\nfamily = "brown"\n[distortion.sigma]\n{free}'
-    result = adjusted(tmp_path, camera, '[adjust]\ntransformation = "none"\nmethod = "elements"\n', rows, points)
+    result = adjust_network(tmp_path, camera, '[adjust]\ntransformation = "none"\nmethod = "elements"\n', rows, points)
     assert result["redundancy"] == 3725
     assert 0.1 * result["sigma0"] == pytest.approx(0.16148, rel=1e-4)
     found = result["cameras"]["C4040Z"]

@@ -83,7 +83,7 @@ def crosshair(picture: str) -> NDArray[np.float64]:
     return np.asarray(ends.mean(axis=0))
 
 
-def picture_of(picture: str) -> NDArray[np.float64]:
+def take_picture(picture: str) -> NDArray[np.float64]:
     data = re.search(r"base64,([^\"]+)", picture)
     assert data
     image = cv2.imdecode(np.frombuffer(base64.b64decode(data[1]), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -100,7 +100,7 @@ def test_the_crosshair_stands_on_the_spot_in_the_picture(step: int) -> None:
     middle = (step - 1) / 2.0
     thumbnail = Thumbnail(1000.0 + 50.0 * pixels, (origin[0] + middle, origin[1] + middle), float(step))
     svg = mark_picture(mark(center), thumbnail, 1.0, SIZE_PX)
-    stored = picture_of(svg)
+    stored = take_picture(svg)
     weights = stored - stored.min()
     at = np.array(
         [
@@ -114,7 +114,7 @@ def test_the_crosshair_stands_on_the_spot_in_the_picture(step: int) -> None:
 
 def test_a_large_picture_is_stored_small_and_a_flat_one_is_no_error() -> None:
     svg = mark_picture(mark((50.0, 50.0)), Thumbnail(np.full((300, 200), 7, np.uint16), (0.0, 0.0)), 1.0, 92.0)
-    assert picture_of(svg).shape == (92, 61)
+    assert take_picture(svg).shape == (92, 61)
 
 
 def test_the_residual_points_up_where_y_grows() -> None:

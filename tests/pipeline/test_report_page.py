@@ -21,13 +21,13 @@ from pipeline.results.comparator_file import ComparatorPoint
 
 
 @pytest.fixture
-def measured() -> ReportData:
-    return made_up_calibration.measured()
+def measured_data() -> ReportData:
+    return made_up_calibration.measured_report()
 
 
 @pytest.fixture
-def adjusted() -> ReportData:
-    return made_up_calibration.adjusted()
+def adjusted_data() -> ReportData:
+    return made_up_calibration.adjusted_report()
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def rendered(data: ReportData) -> Document:
 @cache
 def good_page() -> str:
     """Of the good calibration, for all tests that look at it."""
-    return render_report(made_up_calibration.adjusted())
+    return render_report(made_up_calibration.adjusted_report())
 
 
 def test_a_good_calibration_says_so_first() -> None:
@@ -94,8 +94,8 @@ def test_a_good_calibration_says_so_first() -> None:
     ]  # fmt: skip
 
 
-def test_no_section_and_no_column_is_empty(adjusted: ReportData) -> None:
-    without = replace(adjusted, measurement=None, thumbnail=None, check=None, covariance=None)
+def test_no_section_and_no_column_is_empty(adjusted_data: ReportData) -> None:
+    without = replace(adjusted_data, measurement=None, thumbnail=None, check=None, covariance=None)
     for html in (good_page(), render_report(without), digital_page(), render_report(film_alone())):
         for section in re.findall(r"<section.*?</section>", html, re.DOTALL):
             assert len(Document(section).text.split()) > 5, section
@@ -105,7 +105,7 @@ def test_no_section_and_no_column_is_empty(adjusted: ReportData) -> None:
             assert all(any(cell.strip(" –") for cell in column) for column in zip(*cells, strict=False)), table
 
 
-def test_one_value_is_to_be_cited(adjusted: ReportData) -> None:
+def test_one_value_is_to_be_cited(adjusted_data: ReportData) -> None:
     """And the certificate's other reference is closed, and says that it is another."""
     html = good_page()
     (row,) = re.findall(r'<tr class="cite">.*?</tr>', html, re.DOTALL)
@@ -160,11 +160,11 @@ def test_an_archive_has_totals_first_and_corrections_in_words() -> None:
     assert "Residuals of all frames" not in document.text
 
 
-def test_marks_that_fit_badly_are_shown_and_all_others_closed(adjusted: ReportData) -> None:
-    assert adjusted.adjustment is not None
-    first, *others = adjusted.adjustment.residuals
+def test_marks_that_fit_badly_are_shown_and_all_others_closed(adjusted_data: ReportData) -> None:
+    assert adjusted_data.adjustment is not None
+    first, *others = adjusted_data.adjustment.residuals
     rows = (replace(first, w=-3.4), *others)
-    html = render_report(replace(adjusted, adjustment=replace(adjusted.adjustment, residuals=rows)))
+    html = render_report(replace(adjusted_data, adjustment=replace(adjusted_data.adjustment, residuals=rows)))
     shown, closed = html[html.index("<h2>Frames") :].split('<details id="marks">')
     assert shown.count('<div class="card"') == 1
     assert "w</dt><dd>−3.4" in shown
@@ -172,9 +172,11 @@ def test_marks_that_fit_badly_are_shown_and_all_others_closed(adjusted: ReportDa
     assert '<div class="card"' not in good_page().split('<details id="marks">')[0]
 
 
-def test_a_problem_has_cause_remedy_link_and_thumbnail(adjusted: ReportData) -> None:
-    lost = replace(adjusted.comparator[2], status=Status.REJECTED, reason="4.2 px off")
-    html = render_report(replace(adjusted, comparator=[*adjusted.comparator[:2], lost, *adjusted.comparator[3:]]))
+def test_a_problem_has_cause_remedy_link_and_thumbnail(adjusted_data: ReportData) -> None:
+    lost = replace(adjusted_data.comparator[2], status=Status.REJECTED, reason="4.2 px off")
+    html = render_report(
+        replace(adjusted_data, comparator=[*adjusted_data.comparator[:2], lost, *adjusted_data.comparator[3:]])
+    )
     (problem,) = re.findall(r"<li>.*?</li>", html[: html.index("<h2>Frames")], re.DOTALL)
     assert "<b>f1: 1 fiducial mark not measured" in problem
     assert 'class="step">Settle them with' in problem
@@ -221,69 +223,71 @@ def test_no_check_stands_where_the_redundancy_is_zero() -> None:
     )
 
 
-def test_a_priori_standard_deviations_are_named(adjusted: ReportData) -> None:
+def test_a_priori_standard_deviations_are_named(adjusted_data: ReportData) -> None:
     """One frame whose given coordinates only place the datum has redundancy, but none that tells sigma0."""
-    assert adjusted.adjustment is not None
-    content = replace(adjusted.adjustment, sigma0=1.0, sigma0_from=Sigma0Record(0.0, True, ()))
-    text = rendered(replace(adjusted, adjustment=content)).text
+    assert adjusted_data.adjustment is not None
+    content = replace(adjusted_data.adjustment, sigma0=1.0, sigma0_from=Sigma0Record(0.0, True, ()))
+    text = rendered(replace(adjusted_data, adjustment=content)).text
     assert text.count("Standard deviations are a priori ones") == 2  # as a note, and with the groups
 
 
-def test_an_adjustment_without_any_redundancy_is_not_called_good(adjusted: ReportData) -> None:
-    assert adjusted.adjustment is not None
+def test_an_adjustment_without_any_redundancy_is_not_called_good(adjusted_data: ReportData) -> None:
+    assert adjusted_data.adjustment is not None
     nothing = Sigma0Record(0.0, True, ())
-    content = replace(adjusted.adjustment, redundancy=0, sigma0=1.0, sigma0_from=nothing)
-    text = rendered(replace(adjusted, adjustment=content)).text
+    content = replace(adjusted_data.adjustment, redundancy=0, sigma0=1.0, sigma0_from=nothing)
+    text = rendered(replace(adjusted_data, adjustment=content)).text
     assert "Nothing checks the result" in text
     assert "The redundancy is 0: no check." in text
     assert "! Needs a look" in text
 
 
-def test_only_measured(measured: ReportData) -> None:
-    text = rendered(measured).text
+def test_only_measured(measured_data: ReportData) -> None:
+    text = rendered(measured_data).text
     assert "✓ Good" in text
     assert "Measured: 160 marks in 5 frames." in text
     assert "These marks are not adjusted yet: run `reseau adjust`." in text
 
 
-def test_a_frame_that_was_not_found_says_so_once(measured: ReportData) -> None:
+def test_a_frame_that_was_not_found_says_so_once(measured_data: ReportData) -> None:
     reason = "no fiducial was measured: the constellation does not fit"
-    absent = [replace(point, status=Status.ABSENT, reason=reason) for point in measured.comparator]
-    assert measured.measurement is not None
+    absent = [replace(point, status=Status.ABSENT, reason=reason) for point in measured_data.comparator]
+    assert measured_data.measurement is not None
     scans = {
         image: replace(scan, frame=FrameMeasurement(image, (), problems=(Reason(f"{reason}.", Code.NO_FRAME),)))
-        for image, scan in measured.measurement.items()
+        for image, scan in measured_data.measurement.items()
     }
-    text = rendered(replace(measured, comparator=tuple(absent), measurement=scans)).text
+    text = rendered(replace(measured_data, comparator=tuple(absent), measurement=scans)).text
     assert text.count(f"{reason}.") == 1
     assert "fiducial marks not measured" not in text
     assert "run `reseau adjust`" not in text
 
 
-def test_tie_points_are_not_called_targets(measured: ReportData) -> None:
-    points = [p if p.kind == "fiducial" else replace(p, kind="tie", status=Status.WEAK) for p in measured.comparator]
-    text = rendered(replace(measured, comparator=tuple(points), measurement=None, thumbnail=None)).text
+def test_tie_points_are_not_called_targets(measured_data: ReportData) -> None:
+    points = [
+        p if p.kind == "fiducial" else replace(p, kind="tie", status=Status.WEAK) for p in measured_data.comparator
+    ]
+    text = rendered(replace(measured_data, comparator=tuple(points), measurement=None, thumbnail=None)).text
     assert "Tie points" in text
     assert "sights of tie points weak" in text
     assert "targets" not in text[: text.index("Notes")]
 
 
-def test_given_coordinates_without_scans(adjusted: ReportData) -> None:
-    text = rendered(replace(adjusted, measurement=None, thumbnail=None)).text
+def test_given_coordinates_without_scans(adjusted_data: ReportData) -> None:
+    text = rendered(replace(adjusted_data, measurement=None, thumbnail=None)).text
     assert "There are no pictures: the scans are not at hand." in text
 
 
-def test_exterior_orientations_stand_in_the_users_unit(adjusted: ReportData) -> None:
+def test_exterior_orientations_stand_in_the_users_unit(adjusted_data: ReportData) -> None:
     assert "Exterior orientation (m, degrees)" in Document(good_page()).text
-    assert "Exterior orientation (mm, degrees)" in rendered(replace(adjusted, unit="mm")).text
+    assert "Exterior orientation (mm, degrees)" in rendered(replace(adjusted_data, unit="mm")).text
 
 
-def test_no_check_against_opencv_yet(adjusted: ReportData) -> None:
-    assert "It has not been made: run reseau check ." in rendered(replace(adjusted, check=None)).text
+def test_no_check_against_opencv_yet(adjusted_data: ReportData) -> None:
+    assert "It has not been made: run reseau check ." in rendered(replace(adjusted_data, check=None)).text
 
 
-def test_without_the_covariance_the_curves_are_left_out_with_a_word(adjusted: ReportData) -> None:
-    text = rendered(replace(adjusted, covariance=None)).text
+def test_without_the_covariance_the_curves_are_left_out_with_a_word(adjusted_data: ReportData) -> None:
+    text = rendered(replace(adjusted_data, covariance=None)).text
     assert "The camera has no distortion parameters, or their covariance is missing." in text
 
 
@@ -305,20 +309,25 @@ def test_a_singular_network_names_cause_and_remedy(singular: ReportData) -> None
     assert "There is no solution to draw the distortion from." in text
 
 
-def test_why_parameters_are_highly_correlated_stands_with_the_camera(adjusted: ReportData) -> None:
-    stored = adjusted.adjustment
+def test_why_parameters_are_highly_correlated_stands_with_the_camera(adjusted_data: ReportData) -> None:
+    stored = adjusted_data.adjustment
     assert stored is not None
     (camera,) = stored.cameras
     pair = CorrelationRecord((f"IO.{camera}.c", "EO.*.Z0"), 0.98, "c and Z0 trade off.", "Tilt.")
-    text = rendered(replace(adjusted, adjustment=replace(stored, correlations=(pair,)))).text
+    text = rendered(replace(adjusted_data, adjustment=replace(stored, correlations=(pair,)))).text
     assert "c and Z0 trade off. Tilt." in text
 
 
-def test_what_the_user_named_is_escaped(adjusted: ReportData) -> None:
+def test_what_the_user_named_is_escaped(adjusted_data: ReportData) -> None:
     name = '<script>alert("x")</script> & Co'
-    first = replace(adjusted.comparator[0], status=Status.WEAK, reason=name)
+    first = replace(adjusted_data.comparator[0], status=Status.WEAK, reason=name)
     html = render_report(
-        replace(adjusted, project=name, comparator=[first, *adjusted.comparator[1:]], problems=(Problem(name, name),))
+        replace(
+            adjusted_data,
+            project=name,
+            comparator=[first, *adjusted_data.comparator[1:]],
+            problems=(Problem(name, name),),
+        )
     )
     Document(html)
     assert "<script>alert" not in html
@@ -329,34 +338,38 @@ def _key(mark: ComparatorPoint) -> tuple[str, str, str]:
     return mark.image, mark.kind, mark.point
 
 
-def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted: ReportData) -> None:
+def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted_data: ReportData) -> None:
     reason = "4.2 px off the other marks' places."
-    rejected = replace(adjusted.comparator[2], status=Status.REJECTED, reason=reason)
-    rows = [*adjusted.comparator[:2], rejected, *adjusted.comparator[3:]]
-    assert adjusted.adjustment is not None
-    kept = tuple(row for row in adjusted.adjustment.residuals if (row.image, row.kind, row.point) != _key(rejected))
-    text = rendered(replace(adjusted, comparator=rows, adjustment=replace(adjusted.adjustment, residuals=kept))).text
+    rejected = replace(adjusted_data.comparator[2], status=Status.REJECTED, reason=reason)
+    rows = [*adjusted_data.comparator[:2], rejected, *adjusted_data.comparator[3:]]
+    assert adjusted_data.adjustment is not None
+    kept = tuple(
+        row for row in adjusted_data.adjustment.residuals if (row.image, row.kind, row.point) != _key(rejected)
+    )
+    text = rendered(
+        replace(adjusted_data, comparator=rows, adjustment=replace(adjusted_data.adjustment, residuals=kept))
+    ).text
     assert "! Needs a look" in text
     assert "1 thing needs a look" in text
     assert "f1: 1 fiducial mark not measured, 7 measured (3 rejected: 4.2 px off the other marks' places)." in text
     assert "7 of 8 (1 rejected)" in text
 
 
-def test_reasons_that_differ_by_their_numbers_are_told_once(measured: ReportData) -> None:
-    rows = list(measured.comparator)
+def test_reasons_that_differ_by_their_numbers_are_reported_once(measured_data: ReportData) -> None:
+    rows = list(measured_data.comparator)
     for index, off in ((2, 4.2), (4, 3.1)):
         rows[index] = replace(rows[index], status=Status.REJECTED, reason=f"{off} px off the other marks' places")
     names = f"{rows[2].point}, {rows[4].point}"
-    text = rendered(replace(measured, comparator=rows)).text
+    text = rendered(replace(measured_data, comparator=rows)).text
     assert f"6 measured ({names} rejected, such as {rows[2].point}: 4.2 px off the other marks' places)." in text
 
 
-def test_of_many_targets_the_worst_are_shown_and_all_fiducials(adjusted: ReportData) -> None:
+def test_of_many_targets_the_worst_are_shown_and_all_fiducials(adjusted_data: ReportData) -> None:
     """60 frames of 8 fiducials and 24 targets: 600 // 60 = 10 targets a frame."""
-    assert adjusted.adjustment is not None
+    assert adjusted_data.adjustment is not None
     names = [f"{image}-{copy}" for copy in range(12) for image in ("f1", "f2", "f3", "f4", "f5")]
-    rows = [replace(row, image=name) for name in names for row in adjusted.comparator if row.image == name[:2]]
-    data = replace(adjusted, comparator=rows, measurement=None, adjustment=None, check=None)
+    rows = [replace(row, image=name) for name in names for row in adjusted_data.comparator if row.image == name[:2]]
+    data = replace(adjusted_data, comparator=rows, measurement=None, adjustment=None, check=None)
     first = _copy_pictures(data)
     html = render_report(first)
     assert html.count("data:image/png") == 60 * (8 + 10)
@@ -371,31 +384,31 @@ def _copy_pictures(data: ReportData) -> ReportData:
     return replace(data, thumbnail=lambda image, point, kind: picture(image[:2], point, kind))
 
 
-def test_the_file_is_written_whole_and_the_same_each_time(adjusted: ReportData, tmp_path: Path) -> None:
-    write_report(adjusted, tmp_path / "report.html")
+def test_the_file_is_written_whole_and_the_same_each_time(adjusted_data: ReportData, tmp_path: Path) -> None:
+    write_report(adjusted_data, tmp_path / "report.html")
     first = (tmp_path / "report.html").read_bytes()
-    shuffled = replace(adjusted, comparator=list(reversed(adjusted.comparator)))
+    shuffled = replace(adjusted_data, comparator=list(reversed(adjusted_data.comparator)))
     write_report(shuffled, tmp_path / "report.html")
     assert (tmp_path / "report.html").read_bytes() == first
 
 
 @parametrize_with_studies("verdict", ["differs", "not possible"])
-def test_the_verdict_of_the_check_stands_with_its_reason(adjusted: ReportData, verdict: Any) -> None:
+def test_the_verdict_of_the_check_stands_with_its_reason(adjusted_data: ReportData, verdict: Any) -> None:
     check = Check(verdict=verdict, reason="One flat vertical frame.", cameras={})
-    text = rendered(replace(adjusted, check=check)).text
+    text = rendered(replace(adjusted_data, check=check)).text
     assert f"{verdict} : One flat vertical frame." in text
     assert ("! Needs a look" in text) == (verdict == "differs")
 
 
-def test_a_marks_sigma_is_told_by_its_causes(measured: ReportData) -> None:
-    page = render_report(measured)
+def test_a_marks_sigma_is_known_by_its_causes(measured_data: ReportData) -> None:
+    page = render_report(measured_data)
     assert "<dt>of which</dt>" in page
     assert re.search(r">noise 0\.041</span>, <span [^>]*>tone 0\.020</span> px", page)
 
 
-def test_marks_can_be_chosen_by_the_code_of_their_reason(measured: ReportData) -> None:
-    assert measured.measurement is not None
-    image, scan = next(iter(measured.measurement.items()))
+def test_marks_can_be_chosen_by_the_code_of_their_reason(measured_data: ReportData) -> None:
+    assert measured_data.measurement is not None
+    image, scan = next(iter(measured_data.measurement.items()))
     gone = Reason("half of it is gone", Code.COVERED, Code.SIZE)
     changed = [mark.point for mark in scan.frame.marks if mark.kind == "fiducial"][:2]
     marks = tuple(
@@ -406,10 +419,10 @@ def test_marks_can_be_chosen_by_the_code_of_their_reason(measured: ReportData) -
         replace(row, status=Status.WEAK, reason="a hair" if row.point == changed[1] else str(gone))
         if row.image == image and row.kind == "fiducial" and row.point in changed
         else row
-        for row in measured.comparator
+        for row in measured_data.comparator
     )
-    scans = {**measured.measurement, image: replace(scan, frame=replace(scan.frame, marks=marks))}
-    html = render_report(replace(measured, comparator=rows, measurement=scans))
+    scans = {**measured_data.measurement, image: replace(scan, frame=replace(scan.frame, marks=marks))}
+    html = render_report(replace(measured_data, comparator=rows, measurement=scans))
     assert html.count('data-codes="covered size"') == 2  # with its frame, and above; what a person wrote has no code
     assert '<option value="covered">covered (1)</option>' in html
     text = Document(html).text

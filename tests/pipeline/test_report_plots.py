@@ -21,7 +21,7 @@ NAMES = ("residuals", "coverage", "distortion", "uncertainty-infinity", "uncerta
 
 
 @pytest.fixture(scope="module")
-def adjusted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def adjusted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project of a simulated camera, adjusted."""
     rng, truth = np.random.default_rng(4), Truth()
     network, _ = simulated(rng, truth, points=field_points(rng, 20), free=dict.fromkeys(truth.distortion, np.inf))
@@ -30,8 +30,8 @@ def adjusted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return project
 
 
-def test_they_show_what_the_adjustment_shows(adjusted: Path) -> None:
-    project = read_project(adjusted)
+def test_they_show_what_the_adjustment_shows(adjusted_folder: Path) -> None:
+    project = read_project(adjusted_folder)
     ((plots, record),) = calibrated_cameras(report_data(project, lambda path: path))
     network, _ = build_network(project, read_comparator(project.comparator))
     of_result = adjust(network, approximate(network)).plots()
@@ -48,28 +48,28 @@ def test_they_show_what_the_adjustment_shows(adjusted: Path) -> None:
 
 
 @pytest.mark.study
-def test_every_plot_is_written_as_png_and_pdf(adjusted: Path, tmp_path: Path) -> None:
-    assert run(["report", str(adjusted), "--plots", str(tmp_path / "plots")]) in (0, 1)
+def test_every_plot_is_written_as_png_and_pdf(adjusted_folder: Path, tmp_path: Path) -> None:
+    assert run(["report", str(adjusted_folder), "--plots", str(tmp_path / "plots")]) in (0, 1)
     files = {path.name: path.read_bytes() for path in (tmp_path / "plots").iterdir()}
     assert files.keys() == {f"K-{name}.{ending}" for name in NAMES for ending in ("png", "pdf")}
     for name, content in files.items():
         assert content.startswith(b"%PDF" if name.endswith("pdf") else b"\x89PNG")
-    assert (adjusted.parent / "out" / "report.html").exists()
+    assert (adjusted_folder.parent / "out" / "report.html").exists()
 
 
 def test_without_matplotlib_one_message_says_what_to_install(
-    adjusted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    adjusted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert run(["report", str(adjusted), "--plots", str(tmp_path)]) == 2
+    assert run(["report", str(adjusted_folder), "--plots", str(tmp_path)]) == 2
     assert "--plots needs Matplotlib" in capsys.readouterr().err.replace("\n", " ")
     assert not list(tmp_path.iterdir())
 
 
 def test_without_an_adjustment_there_is_nothing_to_plot(
-    adjusted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    adjusted_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("camera.toml", "points.csv", "comparator.csv", "project.toml"):
-        (tmp_path / name).write_bytes((adjusted.parent / name).read_bytes())
+        (tmp_path / name).write_bytes((adjusted_folder.parent / name).read_bytes())
     assert run(["report", str(tmp_path / "project.toml"), "--plots", str(tmp_path / "plots")]) == 2
     assert "There is no calibrated camera to plot." in capsys.readouterr().err.replace("\n", " ")

@@ -23,13 +23,13 @@ from pipeline.results.measured_record import MeasuredScan
 
 
 @pytest.fixture
-def measured() -> ReportData:
-    return made_up_calibration.measured()
+def measured_data() -> ReportData:
+    return made_up_calibration.measured_report()
 
 
 @pytest.fixture
-def adjusted() -> ReportData:
-    return made_up_calibration.adjusted()
+def adjusted_data() -> ReportData:
+    return made_up_calibration.adjusted_report()
 
 
 def test_the_bounds_of_sigma0_are_those_of_the_chi_square_table() -> None:
@@ -49,7 +49,7 @@ def changed(data: ReportData, **values: Any) -> ReportData:
     return replace(data, adjustment=replace(data.adjustment, **values))
 
 
-def told(data: ReportData) -> str:
+def describe(data: ReportData) -> str:
     """All problems in one text, for a calibration that is not good."""
     verdict = judge(data)
     assert verdict.level == "look"
@@ -57,27 +57,27 @@ def told(data: ReportData) -> str:
     return " ".join(f"{problem.what} {problem.next_step}" for problem in verdict.problems)
 
 
-def test_good(adjusted: ReportData) -> None:
-    verdict = judge(adjusted)
+def test_good(adjusted_data: ReportData) -> None:
+    verdict = judge(adjusted_data)
     assert (verdict.level, verdict.exit_code, verdict.problems) == ("good", 0, ())
 
 
-def test_sigma0_above_and_below_its_bounds(adjusted: ReportData) -> None:
-    assert "σ₀ = 1.60 is above 1.11" in told(changed(adjusted, sigma0=1.6))
-    assert "film_sigma_um" in told(changed(adjusted, sigma0=1.6))
-    assert "(target 1.02, fiducial 0.97)" in told(changed(adjusted, sigma0=1.6)), "no group without a check"
+def test_sigma0_above_and_below_its_bounds(adjusted_data: ReportData) -> None:
+    assert "σ₀ = 1.60 is above 1.11" in describe(changed(adjusted_data, sigma0=1.6))
+    assert "film_sigma_um" in describe(changed(adjusted_data, sigma0=1.6))
+    assert "(target 1.02, fiducial 0.97)" in describe(changed(adjusted_data, sigma0=1.6)), "no group without a check"
     for sigma0, words in ((0.5, "σ₀ = 0.50 is below 0.89"), (0.8864, "σ₀ = 0.886 is below 0.887")):
-        verdict = judge(changed(adjusted, sigma0=sigma0))
+        verdict = judge(changed(adjusted_data, sigma0=sigma0))
         assert verdict.exit_code == 0, "better than promised is no harm"
         assert words in " ".join(verdict.notes)
 
 
-def test_what_explains_a_large_sigma0_stands_in_place_of_advice_on_gross_errors(adjusted: ReportData) -> None:
+def test_what_explains_a_large_sigma0_stands_in_place_of_advice_on_gross_errors(adjusted_data: ReportData) -> None:
     found = (Explanation("pixels", "The pixels are not square.", "Give b1.", 1e-9, (1.6, 1.0)),)
-    text = told(changed(adjusted, sigma0=1.6, explanations=found))
+    text = describe(changed(adjusted_data, sigma0=1.6, explanations=found))
     assert "larger than the standard deviations given. The pixels are not square. Give b1." in text
     assert "gross errors" not in text
-    assert told(changed(adjusted, explanations=found)) == "The pixels are not square. Give b1."
+    assert describe(changed(adjusted_data, explanations=found)) == "The pixels are not square. Give b1."
 
 
 def suspect(**values: Any) -> tuple[SuspectRecord]:
@@ -86,35 +86,35 @@ def suspect(**values: Any) -> tuple[SuspectRecord]:
     return (replace(row, **values),)
 
 
-def test_a_gross_error_is_named_with_its_image(adjusted: ReportData) -> None:
-    text = told(changed(adjusted, suspects=suspect()))
+def test_a_gross_error_is_named_with_its_image(adjusted_data: ReportData) -> None:
+    text = describe(changed(adjusted_data, suspects=suspect()))
     assert "1 gross error suspected: target 1 in image f2 (w = −9.3)." in text
     assert "snooping = true" in text
 
 
-def test_what_could_as_well_be_wrong_is_named_too(adjusted: ReportData) -> None:
-    text = told(changed(adjusted, suspects=suspect(alike=("control point 1 Z",))))
+def test_what_could_as_well_be_wrong_is_named_too(adjusted_data: ReportData) -> None:
+    text = describe(changed(adjusted_data, suspects=suspect(alike=("control point 1 Z",))))
     assert "target 1 in image f2 (w = −9.3; not distinguishable from control point 1 Z)." in text
 
 
-def test_what_was_left_out_needs_a_look(adjusted: ReportData) -> None:
+def test_what_was_left_out_needs_attention(adjusted_data: ReportData) -> None:
     given = suspect(name="given fiducial 7 (camera RC 20)", group="datum", removed=True)
-    text = told(changed(adjusted, suspects=given))
+    text = describe(changed(adjusted_data, suspects=given))
     assert "Left out as gross errors: given fiducial 7 (camera RC 20) (w = −9.3)." in text
 
 
-def test_warnings_of_the_adjustment_need_a_look(adjusted: ReportData) -> None:
-    assert "c is carried by its prior." in told(changed(adjusted, warnings=("c is carried by its prior.",)))
+def test_warnings_of_the_adjustment_need_attention(adjusted_data: ReportData) -> None:
+    assert "c is carried by its prior." in describe(changed(adjusted_data, warnings=("c is carried by its prior.",)))
 
 
-def test_no_convergence_is_no_result(adjusted: ReportData) -> None:
+def test_no_convergence_is_no_result(adjusted_data: ReportData) -> None:
     stopped: dict[str, Any] = {
         "converged": False,
         "termination": "iteration limit",
         "iterations": 50,
         "warnings": ("Not final.",),
     }
-    verdict = judge(changed(adjusted, **stopped))
+    verdict = judge(changed(adjusted_data, **stopped))
     assert verdict.level == "failed"
     assert "There is no calibration: the iteration did not come to rest." in verdict.sentence
     assert "iteration limit, 50 iterations" in verdict.problems[0].what
@@ -124,37 +124,37 @@ def test_no_convergence_is_no_result(adjusted: ReportData) -> None:
 def posed(data: ReportData) -> dict[str, MeasuredScan]:
     """Its scans, of whose poses nothing is decided."""
     pose = Pose("0", False, ("The marks are symmetric to 3 µm.",))
-    return {name: with_frame(scan, pose=pose) for name, scan in (data.measurement or {}).items()}
+    return {name: set_frame(scan, pose=pose) for name, scan in (data.measurement or {}).items()}
 
 
-def with_frame(scan: MeasuredScan, **changes: Any) -> MeasuredScan:
+def set_frame(scan: MeasuredScan, **changes: Any) -> MeasuredScan:
     return replace(scan, frame=replace(scan.frame, **changes))
 
 
-def test_an_assumed_pose_needs_a_look_once_for_all_frames(measured: ReportData) -> None:
-    assert measured.measurement is not None
-    data = replace(measured, measurement=posed(measured))
+def test_an_assumed_pose_needs_attention_once_for_all_frames(measured_data: ReportData) -> None:
+    assert measured_data.measurement is not None
+    data = replace(measured_data, measurement=posed(measured_data))
     assert len(judge(data).problems) == 1
-    assert "f1, f2, f3, f4, f5: pose assumed (0). The marks are symmetric to 3 µm." in told(data)
-    assert 'pose = "90"' in told(data)
+    assert "f1, f2, f3, f4, f5: pose assumed (0). The marks are symmetric to 3 µm." in describe(data)
+    assert 'pose = "90"' in describe(data)
 
 
-def test_a_pose_assumed_needs_a_look_where_fiducials_are_all_there_is_too(adjusted: ReportData) -> None:
-    assert adjusted.adjustment is not None
-    assert adjusted.measurement is not None
-    scans = posed(adjusted)
+def test_a_pose_assumed_needs_attention_where_fiducials_are_all_there_is_too(adjusted_data: ReportData) -> None:
+    assert adjusted_data.adjustment is not None
+    assert adjusted_data.measurement is not None
+    scans = posed(adjusted_data)
     bare = {
         name: replace(camera, principal_distance_mm=Quantity(153.0, np.nan))
-        for name, camera in adjusted.adjustment.cameras.items()
+        for name, camera in adjusted_data.adjustment.cameras.items()
     }
     check = Check(verdict="not possible", reason="No camera is calibrated.", cameras={})
-    data = replace(changed(adjusted, cameras=bare), measurement=scans, check=check)
+    data = replace(changed(adjusted_data, cameras=bare), measurement=scans, check=check)
     verdict = judge(data)
     assert verdict.exit_code == 1
     assert "pose assumed (0). The marks are symmetric to 3 µm." in verdict.problems[0].what
-    told = " ".join(verdict.notes)
-    assert "if two scans bear each other's names, nothing here shows it" in told
-    assert "OpenCV cannot check" not in told
+    result = " ".join(verdict.notes)
+    assert "if two scans bear each other's names, nothing here shows it" in result
+    assert "OpenCV cannot check" not in result
 
 
 def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
@@ -163,69 +163,69 @@ def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
     assert [line.split(" | ")[0].removeprefix("| ") for line in table.splitlines()] == list(NEEDS_A_LOOK)
 
 
-def test_problems_of_a_frame_and_of_the_caller_are_passed_on(measured: ReportData) -> None:
-    assert measured.measurement is not None
-    scans = {**measured.measurement, "f4": with_frame(measured.measurement["f4"], problems=("nearly black.",))}
-    data = replace(measured, measurement=scans, problems=(Problem("points.csv: 99 was not measured."),))
-    assert "f4: nearly black." in told(data)
-    assert "99 was not measured" in told(data)
+def test_problems_of_a_frame_and_of_the_caller_are_passed_on(measured_data: ReportData) -> None:
+    assert measured_data.measurement is not None
+    scans = {**measured_data.measurement, "f4": set_frame(measured_data.measurement["f4"], problems=("nearly black.",))}
+    data = replace(measured_data, measurement=scans, problems=(Problem("points.csv: 99 was not measured."),))
+    assert "f4: nearly black." in describe(data)
+    assert "99 was not measured" in describe(data)
 
 
-def test_what_a_scans_file_does_unusually_is_noted_once(measured: ReportData) -> None:
-    assert measured.measurement is not None
+def test_what_a_scans_file_does_unusually_is_noted_once(measured_data: ReportData) -> None:
+    assert measured_data.measurement is not None
     note = "The file's orientation tag (6) is not applied."
-    scans = {name: replace(scan, notes=(note,)) for name, scan in measured.measurement.items()}
-    verdict = judge(replace(measured, measurement=scans))
+    scans = {name: replace(scan, notes=(note,)) for name, scan in measured_data.measurement.items()}
+    verdict = judge(replace(measured_data, measurement=scans))
     assert verdict.level == "good"
     assert f"f1, f2, f3, f4, f5: {note}" in verdict.notes
 
 
-def test_marks_lost_for_one_reason_are_told_it_once(measured: ReportData) -> None:
+def test_marks_lost_for_one_reason_are_reported_it_once(measured_data: ReportData) -> None:
     rows = [
         replace(row, status=Status.ABSENT, reason="Nothing there.")
         if (row.image, row.kind) == ("f2", "fiducial")
         else row
-        for row in measured.comparator
+        for row in measured_data.comparator
     ]
-    assert told(replace(measured, comparator=rows)).count("Nothing there") == 1
+    assert describe(replace(measured_data, comparator=rows)).count("Nothing there") == 1
 
 
-def test_a_frame_without_any_target_needs_a_look(measured: ReportData) -> None:
+def test_a_frame_without_any_target_needs_attention(measured_data: ReportData) -> None:
     rows = [
         replace(row, status=Status.ABSENT, reason="Outside the scan.")
         if (row.image, row.kind) == ("f2", "target")
         else row
-        for row in measured.comparator
+        for row in measured_data.comparator
     ]
-    assert "f2: none of its 24 targets was measured." in told(replace(measured, comparator=rows))
+    assert "f2: none of its 24 targets was measured." in describe(replace(measured_data, comparator=rows))
 
 
-def test_single_targets_outside_the_scan_are_ordinary(measured: ReportData) -> None:
-    rows = [*measured.comparator]
+def test_single_targets_outside_the_scan_are_ordinary(measured_data: ReportData) -> None:
+    rows = [*measured_data.comparator]
     rows[-1] = replace(rows[-1], status=Status.ABSENT, reason="Outside the scan.")
-    assert judge(replace(measured, comparator=rows)).level == "good"
+    assert judge(replace(measured_data, comparator=rows)).level == "good"
 
 
-def test_when_opencv_differs_it_needs_a_look_and_when_it_cannot_it_is_a_note(adjusted: ReportData) -> None:
+def test_when_opencv_differs_it_needs_attention_and_when_it_cannot_it_is_a_note(adjusted_data: ReportData) -> None:
     check = Check(verdict="differs", reason="k1 differs by 7 sigma.", cameras={})
-    assert "k1 differs by 7 sigma." in told(replace(adjusted, check=check))
-    verdict = judge(replace(adjusted, check=replace(check, verdict="not possible", reason="One flat frame.")))
+    assert "k1 differs by 7 sigma." in describe(replace(adjusted_data, check=check))
+    verdict = judge(replace(adjusted_data, check=replace(check, verdict="not possible", reason="One flat frame.")))
     assert verdict.level == "good"
     assert "OpenCV cannot check this calibration. One flat frame." in verdict.notes
 
 
-def test_weights_that_the_adjustment_changed_are_noted(adjusted: ReportData) -> None:
-    assert adjusted.adjustment is not None
-    rows = [*adjusted.adjustment.residuals]
+def test_weights_that_the_adjustment_changed_are_noted(adjusted_data: ReportData) -> None:
+    assert adjusted_data.adjustment is not None
+    rows = [*adjusted_data.adjustment.residuals]
     rows[5] = replace(rows[5], weight=0.25)
     factors: dict[str, Any] = {"variance_factors": {"target": 4.0}, "variance_sigmas": {"target": 0.4}}
-    notes = " ".join(judge(changed(adjusted, residuals=tuple(rows), **factors)).notes)
+    notes = " ".join(judge(changed(adjusted_data, residuals=tuple(rows), **factors)).notes)
     assert "lowered the weight of 1 observation, most that of f1/6, to 0.25" in notes
     assert "the sigmas of the group target were multiplied by 2.00 ± 0.10" in notes
 
 
-def test_an_adjustment_without_its_comparator_file_is_judged_all_the_same(adjusted: ReportData) -> None:
-    verdict = judge(replace(adjusted, comparator=(), measurement=None))
+def test_an_adjustment_without_its_comparator_file_is_tested_all_the_same(adjusted_data: ReportData) -> None:
+    verdict = judge(replace(adjusted_data, comparator=(), measurement=None))
     assert verdict.level == "good"
     assert verdict.sentence.startswith("Calibrated from 160 marks in 5 frames")
 
@@ -267,46 +267,44 @@ def near_a_column(mark: MarkMeasurement, off_px: float) -> MarkMeasurement:
     return replace(mark, center_px=np.array([round(mark.center_px[0]) + off_px, mark.center_px[1]]))
 
 
-def test_locked_positions_need_a_look(measured: ReportData) -> None:
-    assert measured.measurement is not None
+def test_locked_positions_need_attention(measured_data: ReportData) -> None:
+    assert measured_data.measurement is not None
     scans = {
-        name: with_frame(scan, marks=tuple(near_a_column(mark, 0.02) for mark in scan.frame.marks))
-        for name, scan in measured.measurement.items()
+        name: set_frame(scan, marks=tuple(near_a_column(mark, 0.02) for mark in scan.frame.marks))
+        for name, scan in measured_data.measurement.items()
     }
-    text = told(replace(measured, measurement=scans))
+    text = describe(replace(measured_data, measurement=scans))
     assert "The column positions of the marks prefer parts of a pixel" in text
     assert "The row positions" not in text
 
 
-def test_marks_that_recur_in_one_place_are_no_pixel_locking(measured: ReportData) -> None:
+def test_marks_that_recur_in_one_place_are_no_pixel_locking(measured_data: ReportData) -> None:
     """A frame that lies in the same place of every scan: 4 marks, 38 times within 0.01 px of the same places."""
-    assert measured.measurement is not None
-    (name, scan), *_ = measured.measurement.items()
+    assert measured_data.measurement is not None
+    (name, scan), *_ = measured_data.measurement.items()
     rng = np.random.default_rng(6)
 
     def again() -> MeasuredScan:
-        return with_frame(
-            scan, marks=tuple(near_a_column(mark, rng.normal(0.0, 0.01)) for mark in scan.frame.marks[:4])
-        )
+        return set_frame(scan, marks=tuple(near_a_column(mark, rng.normal(0.0, 0.01)) for mark in scan.frame.marks[:4]))
 
     scans = {f"{name}-{k}": again() for k in range(38)}
-    recurring = replace(measured, comparator=(), measurement=scans)
+    recurring = replace(measured_data, comparator=(), measurement=scans)
     shots = frames(recurring)
     assert sum(mark.status.is_observation for frame in shots for mark in frame.marks) == 4 * 38
     assert all(len(positions) <= 4 for positions in places_px(shots).values())
     assert judge(recurring).level == "good"
 
 
-def test_a_lattice_that_lies_along_the_pixels_is_no_pixel_locking(measured: ReportData) -> None:
+def test_a_lattice_that_lies_along_the_pixels_is_no_pixel_locking(measured_data: ReportData) -> None:
     """A reseau of 20 x 20 crosses, 120.04 px apart: 20 columns and 20 rows, each measured 20 times."""
-    assert measured.measurement is not None
-    (name, scan), *_ = measured.measurement.items()
+    assert measured_data.measurement is not None
+    (name, scan), *_ = measured_data.measurement.items()
     mark = scan.frame.marks[0]
     rng = np.random.default_rng(8)
     places = np.stack(np.meshgrid(*[100.7 + 120.04 * np.arange(20)] * 2), axis=-1).reshape(-1, 2)
     places += rng.normal(0.0, 0.01, places.shape)
     marks = tuple(replace(mark, point=str(index), center_px=place) for index, place in enumerate(places))
-    lattice = replace(measured, comparator=(), measurement={name: with_frame(scan, marks=marks)})
+    lattice = replace(measured_data, comparator=(), measurement={name: set_frame(scan, marks=marks)})
     assert len(frames(lattice)[0].marks) == 400
     assert judge(lattice).level == "good"
 

@@ -84,7 +84,7 @@ def described(path: Path) -> dict[str, Any]:
     return content
 
 
-def place_of(description: dict[str, float], shape: tuple[int, ...]) -> Array:
+def find_place(description: dict[str, float], shape: tuple[int, ...]) -> Array:
     """Camera coordinates of all pixels, as the file's description says."""
     col, row = np.meshgrid(np.arange(shape[1], dtype=float), np.arange(shape[0], dtype=float))
     x = description["x_mm"] + description["pitch_mm"] * col
@@ -103,9 +103,9 @@ def test_marks_measured_in_the_frame_lie_where_the_transformation_puts_them(
     assert resampled(task(tmp_path / "scan.tif", tmp_path, FrameChain(PITCH_UM, transformation))).problem == ""
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         frame = file.pages[0].asarray().astype(float)
-    said = described(tmp_path / "a.tif")
-    to_mm, to_px = np.diag([PITCH_UM[0], -PITCH_UM[1]]) / 1000.0, np.diag([1.0, -1.0]) / said["pitch_mm"]
-    there = ((middles @ to_mm) @ matrix.T + shift - (said["x_mm"], said["y_mm"])) @ to_px
+    description = described(tmp_path / "a.tif")
+    to_mm, to_px = np.diag([PITCH_UM[0], -PITCH_UM[1]]) / 1000.0, np.diag([1.0, -1.0]) / description["pitch_mm"]
+    there = ((middles @ to_mm) @ matrix.T + shift - (description["x_mm"], description["y_mm"])) @ to_px
     off = mark_shifts(frame, there, to_px @ matrix @ to_mm)
     assert len(off) > 80
     assert np.sqrt(np.mean(np.square(off))) < 0.002
@@ -120,11 +120,11 @@ def mark_shifts(frame: Array, there: Array, form: Array) -> Array:
     for x, y in there:
         left, top = round(x), round(y)
         d = np.stack(np.meshgrid(at + left - x, at + top - y), axis=-1)
-        seen = frame[top - 9 : top + 10, left - 9 : left + 10]
+        view = frame[top - 9 : top + 10, left - 9 : left + 10]
         mark = np.exp(-np.einsum("ijk,kl,ijl->ij", d, inverse, d) / 2.0)
         slopes = 20000.0 * mark[..., None] * (d @ inverse)
         design = np.concatenate([np.stack([mark, np.ones_like(mark)], axis=-1), slopes], axis=-1).reshape(-1, 4)
-        off.append(np.linalg.lstsq(design, seen.ravel())[0][2:])
+        off.append(np.linalg.lstsq(design, view.ravel())[0][2:])
     return np.array(off)
 
 
@@ -138,9 +138,9 @@ def test_marks_of_both_scans_of_a_frame_lie_where_their_transformations_put_them
     ways = []
     for turn_deg, mirrored, side in ((0.4, False, -1.0), (180.3, True, 1.0)):
         transformation, matrix, shift = film(turn_deg, mirrored)
-        beside = side * (WIDTH * PITCH_UM[0] / 1000.0 - overlap_mm) / 2.0
-        parameters = transformation.parameters + np.array([beside, 0.0, 0.0, 0.0, 0.0, 0.0])
-        ways.append((replace(transformation, parameters=parameters), matrix, shift + np.array([beside, 0.0]), side))
+        neighbour = side * (WIDTH * PITCH_UM[0] / 1000.0 - overlap_mm) / 2.0
+        parameters = transformation.parameters + np.array([neighbour, 0.0, 0.0, 0.0, 0.0, 0.0])
+        ways.append((replace(transformation, parameters=parameters), matrix, shift + np.array([neighbour, 0.0]), side))
     one, two = (FrameChain(PITCH_UM, way[0]) for way in ways)
     both = replace(
         task(tmp_path / "scan.tif", tmp_path, one), part="l", others=(OtherScan("r", tmp_path / "scan.tif", two),)
@@ -148,14 +148,14 @@ def test_marks_of_both_scans_of_a_frame_lie_where_their_transformations_put_them
     assert resampled(both).problem == ""
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         frame = file.pages[0].asarray().astype(float)
-    said = described(tmp_path / "a.tif")
-    ((seam_x, _), *_) = said["seams_mm"][0]
+    description = described(tmp_path / "a.tif")
+    ((seam_x, _), *_) = description["seams_mm"][0]
     assert abs(seam_x - 0.3) < 0.3
-    to_px = np.diag([1.0, -1.0]) / said["pitch_mm"]
+    to_px = np.diag([1.0, -1.0]) / description["pitch_mm"]
     for _, matrix, shift, side in ways:
         places_mm = (middles @ to_mm) @ matrix.T + shift
         own = side * (places_mm[:, 0] - seam_x) > 0.4
-        there = (places_mm[own] - (said["x_mm"], said["y_mm"])) @ to_px
+        there = (places_mm[own] - (description["x_mm"], description["y_mm"])) @ to_px
         off = mark_shifts(frame, there, to_px @ matrix @ to_mm)
         assert len(off) > 60
         assert np.sqrt(np.mean(np.square(off))) < 0.002
@@ -175,7 +175,7 @@ def test_every_pose_shows_the_formula_where_it_should(
         description = json.loads(file.pages.first.description)
         assert pixels.dtype == np.uint16
         assert len(file.pages.first.pages or ()) >= 1
-    comparator = (place_of(description, pixels.shape) - shift) @ np.linalg.inv(matrix).T
+    comparator = (find_place(description, pixels.shape) - shift) @ np.linalg.inv(matrix).T
     col, row = comparator[..., 0] * 1000 / PITCH_UM[0], -comparator[..., 1] * 1000 / PITCH_UM[1]
     inside = (col >= -0.5) & (col <= WIDTH - 0.5) & (row >= -0.5) & (row <= HEIGHT - 0.5)
     unsure = (np.abs(col + 0.5) < 1e-6) | (np.abs(row + 0.5) < 1e-6)
@@ -194,7 +194,7 @@ def test_fast_is_less_true_and_linear_would_not_do(scan: Path, tmp_path: Path) -
         resampled(task(scan, tmp_path, FrameChain(PITCH_UM, transformation), degree))
         pixels = tifffile.imread(tmp_path / "a.tif", key=0)
         description = described(tmp_path / "a.tif")
-        comparator = (place_of(description, pixels.shape) - shift) @ np.linalg.inv(matrix).T
+        comparator = (find_place(description, pixels.shape) - shift) @ np.linalg.inv(matrix).T
         col, row = comparator[..., 0] * 1000 / PITCH_UM[0], -comparator[..., 1] * 1000 / PITCH_UM[1]
         inside = (col > 10) & (col < WIDTH - 10) & (row > 10) & (row < HEIGHT - 10)
         off[degree] = np.sqrt(np.mean(np.square(pixels[inside] - light(col[inside], row[inside]))))
@@ -215,10 +215,12 @@ def test_a_lens_is_taken_out_as_opencv_has_it(scan: Path, tmp_path: Path) -> Non
     pixels = tifffile.imread(tmp_path / "a.tif", key=0)
     description = described(tmp_path / "a.tif")
     assert description["lens"] is True
-    ray = (place_of(description, pixels.shape) - (x0, y0)) / c
+    ray = (find_place(description, pixels.shape) - (x0, y0)) / c
     rays = np.concatenate([ray.reshape(-1, 2) * (1, -1), np.ones((ray.size // 2, 1))], axis=1)
-    seen = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.diag([c, c, 1.0]), np.array([k1, 0.0, 0.0, 0.0]))[0]
-    observed = seen.reshape(ray.shape) * (1, -1) + (x0, y0)
+    projected = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.diag([c, c, 1.0]), np.array([k1, 0.0, 0.0, 0.0]))[
+        0
+    ]
+    observed = projected.reshape(ray.shape) * (1, -1) + (x0, y0)
     comparator = (observed - shift) @ np.linalg.inv(matrix).T
     col, row = comparator[..., 0] * 1000 / PITCH_UM[0], -comparator[..., 1] * 1000 / PITCH_UM[1]
     inside = (col > 8) & (col < WIDTH - 8) & (row > 8) & (row < HEIGHT - 8)

@@ -35,11 +35,11 @@ from pipeline.summary import summarise
 SAID = pytest.CaptureFixture[str]
 
 
-def shown(folder: Path) -> tuple[int, dict[str, Any]]:
+def load_summary(folder: Path) -> tuple[int, dict[str, Any]]:
     """Exit code and summary that `reseau report` has of what stands in the folder."""
     data = adjusted_data(read_project(folder / "project.toml"), lambda path: path)
-    told = summarise(data, {})
-    return told.verdict.exit_code, told.as_json()
+    own_summary = summarise(data, {})
+    return own_summary.verdict.exit_code, own_summary.as_json()
 
 
 def summary(folder: Path, capsys: SAID, command: str) -> tuple[int, dict[str, Any]]:
@@ -48,7 +48,7 @@ def summary(folder: Path, capsys: SAID, command: str) -> tuple[int, dict[str, An
     return code, json.loads(capsys.readouterr().out)
 
 
-def said(told: dict[str, Any]) -> str:
+def join_problems(told: dict[str, Any]) -> str:
     return " ".join(problem["what"] for problem in told["problems"])
 
 
@@ -70,31 +70,31 @@ def one_scan_more(folder: Path) -> MeasuredScan:
 
 def test_a_finished_project_is_current(finished: tuple[Path, int]) -> None:
     project, code = finished
-    after, told = shown(project)
+    after, own_summary = load_summary(project)
     assert after == code
-    assert told["adjustment"] is not None
-    assert told["check"] is not None
+    assert own_summary["adjustment"] is not None
+    assert own_summary["check"] is not None
     assert not [name for name in os.listdir(project / "out") if name.startswith(".")]
 
 
 def test_an_adjustment_of_one_scan_less_is_not_shown(project: Path, capsys: SAID) -> None:
     more = one_scan_more(project)
     measured_as(project, (*read_measurement(project / "out" / "measurement.db"), more))
-    code, told = summary(project, capsys, "report")
+    code, own_summary = summary(project, capsys, "report")
     assert code == 1
-    assert told["sentence"].startswith("Measured: ")
-    assert told["adjustment"] is told["check"] is None
-    assert "adjustment.json is of other marks than there are now: it is not shown." in said(told)
+    assert own_summary["sentence"].startswith("Measured: ")
+    assert own_summary["adjustment"] is own_summary["check"] is None
+    assert "adjustment.json is of other marks than there are now: it is not shown." in join_problems(own_summary)
     assert "Calibrated" not in (project / "out" / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_scan_that_is_not_measured_yet_is_named(project: Path, capsys: SAID) -> None:
     one_scan_more(project)
-    for code, told in (shown(project), summary(project, capsys, "adjust")):
+    for code, own_summary in (load_summary(project), summary(project, capsys, "adjust")):
         assert code == 1
-        assert told["adjustment"] is not None  # it is of these marks
-        assert "Not measured yet: frame4." in said(told)
-        assert "other settings" not in said(told)
+        assert own_summary["adjustment"] is not None  # it is of these marks
+        assert "Not measured yet: frame4." in join_problems(own_summary)
+        assert "other settings" not in join_problems(own_summary)
 
 
 def another_scan(folder: Path) -> None:
@@ -143,7 +143,7 @@ def old_measurement(folder: Path) -> None:
     keep_scans(folder / "out" / "measurement.db", scans[:2])
 
 
-def of_an_earlier_version(folder: Path) -> None:
+def drop_provenance(folder: Path) -> None:
     path = folder / "out" / "adjustment.json"
     content = json.loads(path.read_text(encoding="utf-8"))
     del content["made_from"]
@@ -178,18 +178,18 @@ def moved_point(folder: Path) -> None:
         (surer_camera, "adjustment.json is of other cameras than there are now", set()),
         (old_check, "check.json is of another adjustment: it is not shown.", {"adjustment"}),
         (old_covariance, "adjustment.npz goes with another adjustment.json: both are not shown.", set()),
-        (of_an_earlier_version, "adjustment.json is of what it does not say: it is not shown.", set()),
+        (drop_provenance, "adjustment.json is of what it does not say: it is not shown.", set()),
         (old_measurement, "measurement.db is of other marks than comparator.csv", {"adjustment", "check"}),
     ],
 )  # fmt: skip
-def test_what_was_made_from_something_else_is_said_and_not_shown(
+def test_what_was_made_from_something_else_is_stated_and_not_shown(
     project: Path, change: Callable[[Path], None], words: str, kept: set[str]
 ) -> None:
     change(project)
-    code, told = shown(project)
+    code, own_summary = load_summary(project)
     assert code == 1
-    assert words in said(told)
-    assert {name for name in ("adjustment", "check") if told[name] is not None} == kept
+    assert words in join_problems(own_summary)
+    assert {name for name in ("adjustment", "check") if own_summary[name] is not None} == kept
 
 
 def test_a_check_writes_nothing_but_its_own_file(project: Path, capsys: SAID) -> None:
@@ -212,7 +212,7 @@ def test_a_check_writes_nothing_but_its_own_file(project: Path, capsys: SAID) ->
 
 def test_files_that_say_the_same_in_other_letters_are_the_same(project: Path, tmp_path: Path) -> None:
     """Moved, saved by an editor with other line ends, lines exchanged and commented: nothing is new."""
-    code, _ = shown(project)
+    code, _ = load_summary(project)
     moved = tmp_path / "elsewhere"
     shutil.move(project, moved)
     for name in ("points.csv", "camera.toml", "project.toml", "comparator.csv"):
@@ -222,14 +222,14 @@ def test_files_that_say_the_same_in_other_letters_are_the_same(project: Path, tm
             lines[1:] = reversed(lines[1:])
         path.write_bytes("\r\n".join([*lines, "# saved"]).encode())
     os.utime(moved / "scans" / "frame1.tif", (1, 1))
-    after, told = shown(moved)
+    after, own_summary = load_summary(moved)
     assert after == code
-    assert told["adjustment"] is not None
-    assert told["check"] is not None
-    assert told["poses"]
+    assert own_summary["adjustment"] is not None
+    assert own_summary["check"] is not None
+    assert own_summary["poses"]
 
 
-def fails_with(error: BaseException) -> Callable[..., Any]:
+def make_failing(error: BaseException) -> Callable[..., Any]:
     def fail(*_: object) -> None:
         raise error
 
@@ -238,7 +238,7 @@ def fails_with(error: BaseException) -> Callable[..., Any]:
 
 def test_an_end_after_measuring_leaves_all_as_it_was(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = results(project)
-    monkeypatch.setattr(stages, "adjust_marks", fails_with(KeyboardInterrupt()))
+    monkeypatch.setattr(stages, "adjust_marks", make_failing(KeyboardInterrupt()))
     assert run(["run", str(project / "project.toml")]) == 130
     assert results(project) == before
 
@@ -248,13 +248,13 @@ def test_marks_that_cannot_be_adjusted_are_kept_and_the_earlier_adjustment_is_no
     project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one_scan_more(project)
-    monkeypatch.setattr(stages, "adjust_marks", fails_with(AdjustmentError("a wrong point number")))
+    monkeypatch.setattr(stages, "adjust_marks", make_failing(AdjustmentError("a wrong point number")))
     assert run(["run", str(project / "project.toml")]) == 2
     assert "frame4" in {point.image for point in read_comparator(project / "comparator.csv")}
-    code, told = shown(project)
+    code, own_summary = load_summary(project)
     assert code == 1
-    assert told["adjustment"] is None
-    assert "it is not shown" in said(told)
+    assert own_summary["adjustment"] is None
+    assert "it is not shown" in join_problems(own_summary)
 
 
 @pytest.mark.study
@@ -264,11 +264,11 @@ def test_a_scan_that_vanishes_before_the_second_visit_keeps_what_the_first_gave(
     (project / "comparator.csv").unlink()  # what is shown is new
     gone = MeasurementError("frame2.tif: there is no scan any more.")
     monkeypatch.setattr("pipeline.adjusting.second_visit._is_missed", lambda *_: True)
-    monkeypatch.setattr("pipeline.adjusting.second_visit.open_scan", fails_with(gone))
-    code, told = summary(project, capsys, "run")
+    monkeypatch.setattr("pipeline.adjusting.second_visit.open_scan", make_failing(gone))
+    code, own_summary = summary(project, capsys, "run")
     assert code == 1
-    assert told["adjustment"] is not None
-    assert "It second pass failed: frame2.tif: there is no scan any more." in said(told)
+    assert own_summary["adjustment"] is not None
+    assert "It second pass failed: frame2.tif: there is no scan any more." in join_problems(own_summary)
 
 
 @pytest.mark.study
@@ -278,20 +278,20 @@ def test_a_process_that_is_ended_on_the_second_visit_costs_nothing_that_the_firs
     """The visits are shared among processes as the first ones are: one of them is ended over frame2."""
 
     def is_deadly(_: object, args: tuple[Any, ...]) -> bool:
-        asked.append(args[0])
+        requests.append(args[0])
         return isinstance(args[0], second_visit.Visit) and args[0].image == "frame2"
 
-    asked = list[Any]()
+    requests = list[Any]()
     monkeypatch.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: nullcontext(Loses(is_deadly)))
     monkeypatch.setattr(second_visit, "_is_missed", lambda *_: True)
     (project / "comparator.csv").unlink()  # what is shown is new
-    code, told = summary(project, capsys, "run")
+    code, own_summary = summary(project, capsys, "run")
     assert code == 1
-    assert told["adjustment"] is not None
-    problems = [one for one in told["problems"] if "second pass failed" in one["what"]]
+    assert own_summary["adjustment"] is not None
+    problems = [one for one in own_summary["problems"] if "second pass failed" in one["what"]]
     assert [one["what"].split(":")[0] for one in problems] == ["frame2"]
     assert "its process was ended" in problems[0]["what"]
-    assert {visit.image for visit in asked if isinstance(visit, second_visit.Visit)} > {"frame1", "frame2"}
+    assert {visit.image for visit in requests if isinstance(visit, second_visit.Visit)} > {"frame1", "frame2"}
 
 
 def test_a_disk_that_fills_up_while_results_are_written_changes_none(
@@ -299,7 +299,7 @@ def test_a_disk_that_fills_up_while_results_are_written_changes_none(
 ) -> None:
     before = results(project)
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr("pipeline.stages.write_report", fails_with(full))
+    monkeypatch.setattr("pipeline.stages.write_report", make_failing(full))
     surer_camera(project)
     assert run(["report", str(project / "project.toml")]) == 2
     assert "Make room" in capsys.readouterr().err
@@ -311,12 +311,12 @@ def test_a_place_that_cannot_be_taken_is_named_with_those_that_were(
 ) -> None:
     whole = os.replace
 
-    def held(source: Path, target: Path) -> None:
+    def refuse(source: Path, target: Path) -> None:
         if target == project / "out" / "adjustment.npz":
             raise PermissionError(errno.EACCES, "held by another program")
         whole(source, target)
 
-    monkeypatch.setattr("pipeline.publishing.publishing.os.replace", held)
+    monkeypatch.setattr("pipeline.publishing.publishing.os.replace", refuse)
     assert run(["adjust", str(project / "project.toml")]) == 2
     message = capsys.readouterr().err
     assert "adjustment.npz: cannot be written (held by another program)" in message
@@ -392,8 +392,10 @@ def test_the_projects_own_inputs_are_never_outputs(project: Path, capsys: SAID, 
 
 def test_a_folder_outside_the_projects_is_named(project: Path, tmp_path: Path, capsys: SAID) -> None:
     replaced(project / "project.toml", 'output = "out"', 'output = "../elsewhere"')
-    _, told = summary(project, capsys, "adjust")
-    assert any(f"outside the project's folder: to {tmp_path.resolve() / 'elsewhere'}" in note for note in told["notes"])
+    _, own_summary = summary(project, capsys, "adjust")
+    assert any(
+        f"outside the project's folder: to {tmp_path.resolve() / 'elsewhere'}" in note for note in own_summary["notes"]
+    )
 
 
 def test_what_an_ended_process_left_is_cleared(project: Path) -> None:
@@ -429,12 +431,12 @@ def test_a_scan_counts_as_another_wherever_a_piece_of_it_changes(tmp_path: Path)
         file = tmp_path / "scan.tif"
         data = bytearray(np.random.default_rng(size).bytes(size))
         file.write_bytes(data)
-        seen = {scan_fingerprint(file)}
+        found = {scan_fingerprint(file)}
         places = range(0, size, max(size // 7, 1)) if size <= 200_000 else (0, 30_000, 2_130_000, size - 1)
         for at in list(places)[:8]:
             changed = data.copy()
             changed[at] ^= 1
             file.write_bytes(changed)
-            seen.add(scan_fingerprint(file))
-        assert len(seen) == 1 + len(list(places)[:8]), size
+            found.add(scan_fingerprint(file))
+        assert len(found) == 1 + len(list(places)[:8]), size
     assert scan_fingerprint(tmp_path / "none.tif") == ""

@@ -22,7 +22,7 @@ from pipeline.review.session import Filters, Session
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def measured_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project's folder, measured once."""
     project = write_faults(tmp_path_factory.mktemp("review") / "faults")
     assert run(["measure", str(project)]) == 1
@@ -30,15 +30,15 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(measured: Path) -> Iterator[Served]:
-    with served(measured / "project.toml") as one:
+def server(measured_folder: Path) -> Iterator[Served]:
+    with served(measured_folder / "project.toml") as one:
         yield one
 
 
 @pytest.fixture
-def page(browser: Browser, server: Served, measured: Path) -> Iterator[Page]:
+def page(browser: Browser, server: Served, measured_folder: Path) -> Iterator[Page]:
     """The page, nothing being decided yet."""
-    (measured / "decisions.jsonl").unlink(missing_ok=True)
+    (measured_folder / "decisions.jsonl").unlink(missing_ok=True)
     with browser_page(browser) as one:
         one.goto(server.address)
         expect(one.locator("#left")).to_contain_text("3 left: 1 frame, 2 marks")
@@ -48,7 +48,7 @@ def page(browser: Browser, server: Served, measured: Path) -> Iterator[Page]:
 # --- who may ask
 
 
-def asked(
+def request(
     server: Served, path: str, headers: Mapping[str, str] | None = None, method: str = "GET", body: str = ""
 ) -> tuple[int, Mapping[str, str], str]:
     """Status, headers and text of an answer. A Host of None is the server's own."""
@@ -62,8 +62,8 @@ def asked(
         connection.close()
 
 
-def cookie_of(server: Served) -> str:
-    status, headers, _ = asked(server, f"/?{urlsplit(server.address).query}")
+def get_cookie(server: Served) -> str:
+    status, headers, _ = request(server, f"/?{urlsplit(server.address).query}")
     assert (status, headers["location"]) == (303, "/")
     cookie = headers["set-cookie"]
     assert "HttpOnly" in cookie
@@ -73,9 +73,9 @@ def cookie_of(server: Served) -> str:
 
 def test_only_who_has_the_address_is_answered(server: Served) -> None:
     for path in ("/", "/?token=guessed", "/api/queue", "/static/review.js", "/api/frame.png?image=good"):
-        assert asked(server, path)[0] == 403
-    cookie = {"Cookie": cookie_of(server)}
-    status, headers, text = asked(server, "/api/queue", cookie)
+        assert request(server, path)[0] == 403
+    cookie = {"Cookie": get_cookie(server)}
+    status, headers, text = request(server, "/api/queue", cookie)
     assert status == 200
     assert json.loads(text)["total"] == 3
     assert "default-src 'none'" in headers["content-security-policy"]
@@ -85,15 +85,15 @@ def test_only_who_has_the_address_is_answered(server: Served) -> None:
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "0.0.0.0:1"])
 def test_another_host_name_is_refused(host: str, server: Served) -> None:
-    assert asked(server, "/api/queue", {"Cookie": cookie_of(server), "Host": host})[0] == 403
+    assert request(server, "/api/queue", {"Cookie": get_cookie(server), "Host": host})[0] == 403
 
 
 @pytest.mark.parametrize("origin", [None, "http://evil.example", "null", "https://127.0.0.1"])
-def test_only_the_page_itself_may_decide(origin: str | None, server: Served, measured: Path) -> None:
+def test_only_the_page_itself_may_decide(origin: str | None, server: Served, measured_folder: Path) -> None:
     decision = {"image": GOOD, "point": "1", "kind": "fiducial", "decision": "accept"}
-    headers = {"Cookie": cookie_of(server)} | ({} if origin is None else {"Origin": origin})
-    assert asked(server, "/api/decide", headers, "POST", json.dumps({"decisions": [decision]}))[0] == 403
-    assert not (measured / "decisions.jsonl").exists()
+    headers = {"Cookie": get_cookie(server)} | ({} if origin is None else {"Origin": origin})
+    assert request(server, "/api/decide", headers, "POST", json.dumps({"decisions": [decision]}))[0] == 403
+    assert not (measured_folder / "decisions.jsonl").exists()
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_only_the_page_itself_may_decide(origin: str | None, server: Served, mea
     ],
 )
 def test_images_and_marks_are_names_and_never_paths(path: str, server: Served) -> None:
-    assert asked(server, path, {"Cookie": cookie_of(server)})[0] == 404
+    assert request(server, path, {"Cookie": get_cookie(server)})[0] == 404
 
 
 @pytest.mark.parametrize(
@@ -125,23 +125,23 @@ def test_images_and_marks_are_names_and_never_paths(path: str, server: Served) -
         ("accept", "object"),
     ],
 )
-def test_what_cannot_be_decided_is_refused_and_nothing_is_written(
-    decision: object, words: str, server: Served, measured: Path
+def test_what_cannot_be_settled_is_refused_and_nothing_is_written(
+    decision: object, words: str, server: Served, measured_folder: Path
 ) -> None:
     right = {"image": GOOD, "point": "1", "kind": "fiducial", "decision": "absent"}
-    headers = {"Cookie": cookie_of(server), "Origin": server.origin}
-    status, _, text = asked(server, "/api/decide", headers, "POST", json.dumps({"decisions": [right, decision]}))
+    headers = {"Cookie": get_cookie(server), "Origin": server.origin}
+    status, _, text = request(server, "/api/decide", headers, "POST", json.dumps({"decisions": [right, decision]}))
     assert status == 400
     assert words in text
-    assert not (measured / "decisions.jsonl").exists()
+    assert not (measured_folder / "decisions.jsonl").exists()
 
 
 # --- a person's session
 
 
 @needs_browser
-def test_a_session_by_keyboard_alone_leads_to_the_right_marks(page: Page, measured: Path) -> None:
-    rows = comparator(measured)
+def test_a_session_by_keyboard_alone_leads_to_the_right_marks(page: Page, measured_folder: Path) -> None:
+    rows = comparator(measured_folder)
     place_frame_by_keys(page)
     expect(page.locator("#left")).to_contain_text("2 left: 2 marks")
     for done in range(2):
@@ -152,20 +152,20 @@ def test_a_session_by_keyboard_alone_leads_to_the_right_marks(page: Page, measur
         if done == 0:
             expect(page.locator("#title")).not_to_have_text(name)
     expect(page.locator("#left")).to_have_text("Nothing is left. Run reseau measure.")
-    told = decisions(measured)
-    assert {(one["image"], one.get("point"), one["decision"]) for one in told} == {
+    result = decisions(measured_folder)
+    assert {(one["image"], one.get("point"), one["decision"]) for one in result} == {
         (BARE, "3", "absent"),
         (SCRATCHED, "3", "accept"),
         *((TURNED, point, "place") for point in "123"),
     }
-    assert all(one["who"] == "ann" and one["fingerprint"] and one["when"] for one in told)
-    check_measured_again(measured, rows)
+    assert all(one["who"] == "ann" and one["fingerprint"] and one["when"] for one in result)
+    check_measured_again(measured_folder, rows)
 
 
 @pytest.mark.study
 @needs_browser
-def test_a_session_by_mouse_alone_leads_to_the_same(page: Page, measured: Path) -> None:
-    rows = comparator(measured)
+def test_a_session_by_mouse_alone_leads_to_the_same(page: Page, measured_folder: Path) -> None:
+    rows = comparator(measured_folder)
     whole = page.locator("#whole")
     for point in "123":
         page.get_by_role("radio", name=point).click()
@@ -183,17 +183,17 @@ def test_a_session_by_mouse_alone_leads_to_the_same(page: Page, measured: Path) 
         if done == 0:
             expect(page.locator("#title")).not_to_have_text(name)
     expect(page.locator("#left")).to_have_text("Nothing is left. Run reseau measure.")
-    check_measured_again(measured, rows)
+    check_measured_again(measured_folder, rows)
 
 
 @needs_browser
-def test_a_click_in_a_marks_picture_places_it(page: Page, measured: Path) -> None:
+def test_a_click_in_a_marks_picture_places_it(page: Page, measured_folder: Path) -> None:
     open_entry(page, BARE)
     canvas = page.locator("#mark")
     where = middle(page, "#mark")
     canvas.click(position={"x": where["x"] + 56, "y": where["y"]})  # a tenth of the picture's width
     expect(page.locator("#left")).to_contain_text("2 left")
-    (one,) = decisions(measured)
+    (one,) = decisions(measured_folder)
     assert (one["decision"], one["image"], one["point"]) == ("place", BARE, "3")
     off_px = np.array([one["col_px"], one["row_px"]]) - mark_px(BARE, "3")
     assert off_px == pytest.approx((0.1 * one["window"][2], 0.0), abs=1.0)
@@ -201,24 +201,24 @@ def test_a_click_in_a_marks_picture_places_it(page: Page, measured: Path) -> Non
 
 @pytest.mark.study
 @needs_browser
-def test_undo_takes_back_the_last_decision(page: Page, measured: Path) -> None:
+def test_undo_takes_back_the_last_decision(page: Page, measured_folder: Path) -> None:
     open_entry(page, SCRATCHED)
     page.keyboard.press("c")
     page.keyboard.type("a hair")
     page.keyboard.press("Enter")
     page.keyboard.press("r")
     expect(page.locator("#left")).to_contain_text("2 left")
-    assert decisions(measured)[0]["note"] == "a hair"
+    assert decisions(measured_folder)[0]["note"] == "a hair"
     open_entry(page, SCRATCHED)
     expect(page.locator("#decided")).to_contain_text("Decided: reject by ann")
     page.keyboard.press("u")
     expect(page.locator("#left")).to_contain_text("3 left")
-    assert [one["decision"] for one in decisions(measured)] == ["reject", "undo"]
+    assert [one["decision"] for one in decisions(measured_folder)] == ["reject", "undo"]
 
 
 @pytest.mark.study
 @needs_browser
-def test_two_windows_see_one_anothers_decisions(page: Page, server: Served, measured: Path) -> None:
+def test_two_windows_see_one_anothers_decisions(page: Page, server: Served, measured_folder: Path) -> None:
     other = page.context.new_page()
     other.goto(server.origin)  # the cookie is the browser's
     expect(other.locator("#left")).to_contain_text("3 left")
@@ -230,7 +230,7 @@ def test_two_windows_see_one_anothers_decisions(page: Page, server: Served, meas
     expect(page.locator("#decided")).to_contain_text("accept by ann")
     page.keyboard.press("r")  # the last one counts
     expect(other.locator("#queue")).to_contain_text("reject, ann")
-    assert [one["decision"] for one in decisions(measured)] == ["accept", "reject"]
+    assert [one["decision"] for one in decisions(measured_folder)] == ["accept", "reject"]
 
 
 @needs_browser
@@ -242,10 +242,10 @@ def test_names_are_shown_as_text(page: Page) -> None:
 
 @pytest.mark.study
 @needs_browser
-def test_a_server_that_was_killed_goes_on_where_it_stopped(browser: Browser, measured: Path) -> None:
-    (measured / "decisions.jsonl").unlink(missing_ok=True)
+def test_a_server_that_was_killed_goes_on_where_it_stopped(browser: Browser, measured_folder: Path) -> None:
+    (measured_folder / "decisions.jsonl").unlink(missing_ok=True)
     with browser_page(browser) as page:
-        with served(measured / "project.toml") as first:
+        with served(measured_folder / "project.toml") as first:
             page.goto(first.address)
             open_entry(page, SCRATCHED)
             page.keyboard.press("a")
@@ -255,7 +255,7 @@ def test_a_server_that_was_killed_goes_on_where_it_stopped(browser: Browser, mea
             page.keyboard.press("j")
             page.keyboard.press("n")
             expect(page.locator("#told")).to_contain_text("The server does not answer")
-        with served(measured / "project.toml") as second:
+        with served(measured_folder / "project.toml") as second:
             page.goto(second.address)
             expect(page.locator("#left")).to_contain_text("2 left")
 
@@ -322,7 +322,9 @@ def check_measured_again(folder: Path, before: Mapping[tuple[str, str], Mapping[
 
 @pytest.mark.study
 @needs_browser
-def test_a_marks_frame_shows_how_it_lies_and_takes_another_pose_and_that_back(page: Page, measured: Path) -> None:
+def test_a_marks_frame_shows_how_it_lies_and_takes_another_pose_and_that_back(
+    page: Page, measured_folder: Path
+) -> None:
     open_entry(page, SCRATCHED)
     page.keyboard.press("f")
     expect(page.locator("#whole-view")).to_be_visible()
@@ -334,8 +336,8 @@ def test_a_marks_frame_shows_how_it_lies_and_takes_another_pose_and_that_back(pa
     expect(page.locator('#poses button[aria-pressed="true"]')).to_contain_text("90")
     page.keyboard.press("2")
     expect(page.locator("#left")).to_have_text("3 left: 1 frame, 2 marks")
-    told = [(one["image"], one["decision"], one.get("pose")) for one in decisions(measured)]
-    assert told == [(SCRATCHED, "pose", "90"), (SCRATCHED, "undo", None)]
+    result = [(one["image"], one["decision"], one.get("pose")) for one in decisions(measured_folder)]
+    assert result == [(SCRATCHED, "pose", "90"), (SCRATCHED, "undo", None)]
 
 
 @pytest.mark.study
@@ -358,10 +360,10 @@ def test_filters_and_search_show_only_what_they_let_through(page: Page) -> None:
     expect(page.locator("#queue button")).to_have_count(1)
 
 
-def test_the_next_question_that_is_left_is_told_wherever_it_stands(measured: Path) -> None:
+def test_the_next_question_that_is_left_is_reported_wherever_it_stands(measured_folder: Path) -> None:
     """Of the frame and the two marks that are asked about, beginning behind the frame."""
-    (measured / "decisions.jsonl").unlink(missing_ok=True)
-    session = Session(read_project(measured / "project.toml"), "bob")
+    (measured_folder / "decisions.jsonl").unlink(missing_ok=True)
+    session = Session(read_project(measured_folder / "project.toml"), "bob")
     for expected, entry in zip((1, 2), session.page(Filters())["entries"][1:], strict=True):
         assert session.page(Filters(), start=1)["next_left"] == expected
         about = (entry["image"], Choice.ABSENT, entry["point"], "fiducial")

@@ -111,10 +111,10 @@ def test_marks_of_one_scan_are_saved_as_a_camera_file(project: Path) -> None:
     px = {point: (place + off).tolist() for point, place in zip("1234", true_px("a"), strict=True)}
     with pytest.raises(InputError, match="click 4, too"):
         answers.save_learned(Query({}), {"image": "a", "px": {p: px[p] for p in "123"}, "file": "own"})
-    told = answers.save_learned(Query({}), {"image": "a", "px": px, "file": "own"})
+    result = answers.save_learned(Query({}), {"image": "a", "px": px, "file": "own"})
     pictures.close()
-    assert "own.toml with 4 marks" in told["text"]
-    assert 'name it in the project, camera = "own.toml"' in told["text"]
+    assert "own.toml with 4 marks" in result["text"]
+    assert 'name it in the project, camera = "own.toml"' in result["text"]
     project.write_text(PROJECT.replace("camera.toml", "own.toml").replace("*.tif", "b.tif"), encoding="utf-8")
     assert run(["measure", str(project)]) == 0
     rows = comparator(project.parent)
@@ -142,7 +142,7 @@ def project_clicks(project: Path) -> tuple[str, str] | None:
     return None if clicks is None else (clicks.scan, clicks.who)
 
 
-def test_what_the_camera_file_shows_is_not_decided_again(project: Path) -> None:
+def test_what_the_camera_file_shows_is_not_settled_again(project: Path) -> None:
     with project.with_name("camera.toml").open("a") as camera:
         camera.write('[clicks]\nscan = "b.tif"\n[clicks.px]\n' + "".join(f"{point} = [5, 5]\n" for point in "1234"))
     append_decisions(project.with_name("decisions.jsonl"), [learn("a")])

@@ -25,7 +25,7 @@ def check(ledger: Ledger, path: Path) -> None:
         }
 
 
-def test_only_what_is_new_is_told(tmp_path: Path) -> None:
+def test_only_what_is_new_is_reported(tmp_path: Path) -> None:
     path, rng = tmp_path / "decisions.jsonl", random.Random(3)
     ledger = Ledger(path)
     assert ledger.update() == frozenset()  # there is no file yet

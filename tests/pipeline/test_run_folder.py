@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from drawn_project import CAMERA, write_project
 from PIL import Image
-from test_init import of_camera, scan
+from test_init import identify_camera, scan
 
 from measure.boards.find import recognise_board
 from measure.scans.opening import open_scan, read_head
@@ -57,7 +57,7 @@ def drawn_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         groups = []
         for group in grouped.groups:
             names = () if group.head.camera or group.head.height_px < 100 else ("small",)
-            groups.append(replace(group, samples=(of_camera(group.paths[0], *names),)))
+            groups.append(replace(group, samples=(identify_camera(group.paths[0], *names),)))
         return replace(grouped, groups=tuple(groups))
 
     monkeypatch.setattr(new_project, "name_cameras", samples)
@@ -78,15 +78,15 @@ def test_a_folder_is_measured_by_one_command_and_by_the_same_again(
     scan(drawn_library / "odd.tif")
     (drawn_library / "broken.tif").write_bytes(b"II*\0")
     assert run(["run", str(drawn_library), "--quiet", "--workers", "1"]) == 1
-    said = capsys.readouterr()
-    assert said.err == ""
+    captured = capsys.readouterr()
+    assert captured.err == ""
     assert (
         "4 files examined: 1 of 4 scans can be measured (1 without a camera, 1 by a digital camera, 1 broken)."
-        in said.out
+        in captured.out
     )
-    assert "1 of 1 scan measured" in said.out
-    steps = [line for line in said.out.splitlines() if line.startswith("Next: ")]
-    assert said.out.rstrip().splitlines()[-len(steps) :] == steps
+    assert "1 of 1 scan measured" in captured.out
+    steps = [line for line in captured.out.splitlines() if line.startswith("Next: ")]
+    assert captured.out.rstrip().splitlines()[-len(steps) :] == steps
     assert len(steps) <= 3
     assert steps[0].startswith(f"Next: edit {drawn_library / 'images.csv'}  # 1 scan without a camera")
     assert steps[1].startswith(f"Next: reseau calibrate {drawn_library} --board")
@@ -99,9 +99,9 @@ def test_a_folder_is_measured_by_one_command_and_by_the_same_again(
 def test_a_folder_of_photographs_alone_is_refused_with_the_command_that_takes_it(tmp_path: Path, capsys: SAID) -> None:
     photograph(tmp_path / "p" / "IMG_1.jpg", board=(7, 5))
     assert run(["run", str(tmp_path / "p"), "--out", str(tmp_path / "o")]) == 2
-    said = capsys.readouterr().err
-    assert f"reseau calibrate {tmp_path / 'p'} --board 7x5 --square SIZE" in said
-    assert "taken by Canon EOS 80D, 35 mm" in said
+    message = capsys.readouterr().err
+    assert f"reseau calibrate {tmp_path / 'p'} --board 7x5 --square SIZE" in message
+    assert "taken by Canon EOS 80D, 35 mm" in message
     assert not (tmp_path / "o").exists()
 
 
@@ -140,7 +140,7 @@ def test_at_most_three_candidates_are_named_with_what_tells_them_apart(tmp_path:
         scan(tmp_path / f"{number}.tif")
     names = sorted(read_library())
     (group,) = catalogue([tmp_path], lambda *_: None).groups
-    samples = tuple(of_camera(path, *names[3 * n : 3 * n + 3]) for n, path in enumerate(group.paths))
+    samples = tuple(identify_camera(path, *names[3 * n : 3 * n + 3]) for n, path in enumerate(group.paths))
     group = replace(group, samples=samples)
     assert len(group.candidates) == 3
     assert group.why_not().count(" in 1") == 3
@@ -157,7 +157,7 @@ def test_scans_that_were_all_tried_have_each_its_own_camera(tmp_path: Path) -> N
         scan(tmp_path / f"{number}.tif")
 
     def identified(path: Path) -> Identification | str:
-        return of_camera(path, "wild-rc5-153" if path.stem == "0" else "zeiss-rmk-a-153")
+        return identify_camera(path, "wild-rc5-153" if path.stem == "0" else "zeiss-rmk-a-153")
 
     found = catalogue([tmp_path], lambda *_: None)
     named = name_cameras(GroupedScans(found.groups, {}), identified, Reporter(quiet=True), None)

@@ -27,7 +27,7 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def adjusted(folder: Path) -> CameraRecord:
+def adjust_network(folder: Path) -> CameraRecord:
     return read_adjustment(folder / "out" / "adjustment.json").cameras["K"]
 
 
@@ -40,19 +40,19 @@ def test_a_second_project_with_the_saved_camera_is_both_together(
     archives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["cameras", "--save", str(archives / "a" / "project.toml"), "--out", str(tmp_path / "saved")]) == 0
-    told = " ".join(capsys.readouterr().out.split())
+    output = " ".join(capsys.readouterr().out.split())
     frames = len(read_adjustment(archives / "a" / "out" / "adjustment.json").images)
-    assert f"adjusted from {frames} frames of 1 scanner in a" in told
+    assert f"adjusted from {frames} frames of 1 scanner in a" in output
     camera = read_camera(tmp_path / "saved" / "camera.toml")
     assert camera.source is not None
     assert (camera.source.frames, camera.source.scanners, camera.source.archives) == (frames, 1, 1)
-    first = quantities(adjusted(archives / "a"))
+    first = quantities(adjust_network(archives / "a"))
     assert camera.principal_distance_mm == pytest.approx(first["c"].value, abs=1e-12)
     later = shutil.copytree(archives / "b", tmp_path / "later", ignore=shutil.ignore_patterns("out"))
     text = (later / "project.toml").read_text(encoding="utf-8").replace("camera.toml", "../saved/camera.toml", 1)
     (later / "project.toml").write_text(text, encoding="utf-8")
     assert run(["adjust", str(later / "project.toml")]) in (0, 1)
-    second, joint = quantities(adjusted(later)), quantities(adjusted(archives / "+"))
+    second, joint = quantities(adjust_network(later)), quantities(adjust_network(archives / "+"))
     for name, both in joint.items():
         if both.sigma > 0.0:
             assert second[name].value == pytest.approx(both.value, abs=0.1 * both.sigma), name
@@ -64,7 +64,7 @@ def test_two_archives_are_joined_to_what_both_together_give(archives: Path, tmp_
     projects = [read_project(archives / name / "project.toml") for name in "ab"]
     (saved,) = save_cameras(projects, tmp_path)
     assert (saved.source.archives, saved.source.text.split(" in ")[1]) == (2, "a, b")
-    joint, camera = quantities(adjusted(archives / "+")), read_camera(saved.path)
+    joint, camera = quantities(adjust_network(archives / "+")), read_camera(saved.path)
     assert camera.calibration is not None
     held = dict(zip((one.quantity for one in camera.calibration.parameters), camera.calibration.values, strict=True))
     for name in ("c", "k3", "x0"):

@@ -56,17 +56,17 @@ def truth(folder: Path, image: str) -> Array:
     return np.array([[places[id]["col_px"], places[id]["row_px"]] for id in CORNERS])
 
 
-def measured(folder: Path, image: str) -> MeasuredScan:
+def measure_picture(folder: Path, image: str) -> MeasuredScan:
     (task,) = scan_tasks(read_project(folder / "project.toml"), [image])
     return measured_scan(task)
 
 
-def test_what_a_scan_shows_beside_the_frame_that_was_measured_needs_a_look(roll: Path) -> None:
-    scan = measured(roll, "roll")
-    told = " ".join(scan.frame.problems)
-    assert "2 pictures of full size (pages 1, 2), and page 1 was measured" in told
-    assert "shows a second frame" in told or "shows another frame" in told
-    assert "in images.csv" in told
+def test_what_a_scan_shows_next_to_the_frame_that_was_measured_needs_attention(roll: Path) -> None:
+    scan = measure_picture(roll, "roll")
+    finding = " ".join(scan.frame.problems)
+    assert "2 pictures of full size (pages 1, 2), and page 1 was measured" in finding
+    assert "shows a second frame" in finding or "shows another frame" in finding
+    assert "in images.csv" in finding
 
 
 def test_pages_and_windows_are_images_of_their_own(roll: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -86,9 +86,9 @@ def test_pages_and_windows_are_images_of_their_own(roll: Path, capsys: pytest.Ca
             assert row.status is Status.MEASURED
             assert row.xy_mm is not None
             np.testing.assert_allclose(row.xy_mm / 0.05 * (1, -1), place, atol=0.1)
-    told = capsys.readouterr().out
-    assert "second frame" not in told
-    assert "pictures of full size" not in told
+    output = capsys.readouterr().out
+    assert "second frame" not in output
+    assert "pictures of full size" not in output
     (roll / "images.csv").write_text("image,window\nother,0 0 10 10\n")
     assert run(["measure", str(whole)]) == WRONG_INPUT
     assert "no scan is called as it begins" in capsys.readouterr().err

@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def found(folder: Path, *patterns: str, exclude: tuple[str, ...] = ()) -> list[str]:
+def find_scans_case(folder: Path, *patterns: str, exclude: tuple[str, ...] = ()) -> list[str]:
     files = find_scans(Table({}, folder / "project.toml", ""), patterns, exclude).files.values()
     return sorted(os.path.relpath(file, folder) for file in files)
 
@@ -44,7 +44,7 @@ def test_links_to_parents_bring_nothing_twice(folder: Path) -> None:
     (folder / "others" / "6.tif").touch()
     for name, target in {"up": "..", "a/again": "../a", "a/b/top": str(folder / "scans")}.items():
         (folder / "scans" / name).symlink_to(target)
-    assert found(folder, "scans/**/*.tif") == ["scans/1.tif", "scans/a/2.tif", "scans/a/b/3.tif"]
+    assert find_scans_case(folder, "scans/**/*.tif") == ["scans/1.tif", "scans/a/2.tif", "scans/a/b/3.tif"]
 
 
 def test_a_file_is_one_scan_however_many_links_lead_to_it(folder: Path) -> None:
@@ -55,17 +55,17 @@ def test_a_file_is_one_scan_however_many_links_lead_to_it(folder: Path) -> None:
     (scans / "0.tif").symlink_to("1.tif")
     (scans / "twin").symlink_to("a")
     there = ["scans/1.tif", "scans/a/2.tif", "scans/a/b/3.tif", "scans/elsewhere/6.tif"]
-    assert found(folder, "scans/**/*.tif", "scans/twin/*.tif", "scans/*.tif") == there
-    assert found(folder, "scans/**/*.tif", exclude=("scans/twin/2.tif",)) == [there[0], *there[2:]]
-    assert found(folder, "scans/0.tif") == ["scans/0.tif"]  # named as it is
+    assert find_scans_case(folder, "scans/**/*.tif", "scans/twin/*.tif", "scans/*.tif") == there
+    assert find_scans_case(folder, "scans/**/*.tif", exclude=("scans/twin/2.tif",)) == [there[0], *there[2:]]
+    assert find_scans_case(folder, "scans/0.tif") == ["scans/0.tif"]  # named as it is
 
 
 def test_a_link_that_leads_nowhere_is_a_scan_that_cannot_be_read(folder: Path) -> None:
     (folder / "scans" / "7.tif").symlink_to("nowhere.tif")
-    assert "scans/7.tif" in found(folder, "scans/**/*.tif")
+    assert "scans/7.tif" in find_scans_case(folder, "scans/**/*.tif")
 
 
-def test_init_looks_at_each_folder_once(folder: Path) -> None:
+def test_init_reads_each_folder_once(folder: Path) -> None:
     (folder / "scans" / "up").symlink_to("..")
     files = catalogue([folder / "scans"], lambda *_: None).broken
     assert len(files) == 3  # empty files, which no scan is

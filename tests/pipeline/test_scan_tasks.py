@@ -40,7 +40,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_project(tmp_path_factory.mktemp("two"), ["a", "b"])
 
 
-def tasks_of(folder: Path, project: str = PROJECT, camera: str = CAMERA) -> tuple[ScanTask, ...]:
+def make_tasks(folder: Path, project: str = PROJECT, camera: str = CAMERA) -> tuple[ScanTask, ...]:
     """Of a project of two scans with these files; nothing is measured."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("a.tif", "b.tif"):
@@ -56,8 +56,8 @@ def tasks_of(folder: Path, project: str = PROJECT, camera: str = CAMERA) -> tupl
 
 
 def test_scans_that_have_all_in_common_have_equal_options(tmp_path: Path) -> None:
-    a, b = tasks_of(tmp_path / "here")
-    there, _ = tasks_of(tmp_path / "there")
+    a, b = make_tasks(tmp_path / "here")
+    there, _ = make_tasks(tmp_path / "there")
     assert a.options_json() == b.options_json() == there.options_json()
     assert pickle.loads(pickle.dumps(a)).options_json() == a.options_json()
     assert json.loads(a.options_json())
@@ -81,7 +81,7 @@ def test_scans_that_have_all_in_common_have_equal_options(tmp_path: Path) -> Non
     ],
 )
 def test_what_may_change_the_result_changes_the_options(changed: Changed, tmp_path: Path) -> None:
-    before, after = tasks_of(tmp_path), tasks_of(tmp_path, *changed(PROJECT, CAMERA))
+    before, after = make_tasks(tmp_path), make_tasks(tmp_path, *changed(PROJECT, CAMERA))
     assert before[0].options_json() != after[0].options_json()
 
 
@@ -96,14 +96,14 @@ def test_what_may_change_the_result_changes_the_options(changed: Changed, tmp_pa
     ],
 )
 def test_what_changes_no_scan_leaves_its_options(changed: Changed, tmp_path: Path) -> None:
-    before, after = tasks_of(tmp_path), tasks_of(tmp_path, *changed(PROJECT, CAMERA))
+    before, after = make_tasks(tmp_path), make_tasks(tmp_path, *changed(PROJECT, CAMERA))
     assert before[0].options_json() == after[0].options_json()
 
 
 def test_where_targets_are_sought_the_lens_and_the_orientation_of_the_scan_count(tmp_path: Path) -> None:
-    a, b = tasks_of(tmp_path, PROJECT + TARGETS)
-    longer, _ = tasks_of(tmp_path, PROJECT + TARGETS, CAMERA.replace("distance_mm = 30.0", "distance_mm = 31.0"))
-    larger, _ = tasks_of(tmp_path, PROJECT + TARGETS.replace("30.0", "31.0"))
+    a, b = make_tasks(tmp_path, PROJECT + TARGETS)
+    longer, _ = make_tasks(tmp_path, PROJECT + TARGETS, CAMERA.replace("distance_mm = 30.0", "distance_mm = 31.0"))
+    larger, _ = make_tasks(tmp_path, PROJECT + TARGETS.replace("30.0", "31.0"))
     assert len({task.options_json() for task in (a, b, longer, larger)}) == 4
     assert b"points.csv" not in pickle.dumps(a)  # the project does not travel with it
 
@@ -116,7 +116,7 @@ def test_the_marks_of_another_camera_do_not_count(tmp_path: Path) -> None:
             CAMERA.replace('"K"', '"L"').replace("line_mm = 0.1", f"line_mm = {line_mm}"), encoding="utf-8"
         )
         tmp_path.joinpath("cameras.csv").write_text("image,camera\na,\nb,other.toml\n", encoding="utf-8")
-        return tasks_of(tmp_path, given)
+        return make_tasks(tmp_path, given)
 
     before, after = both("0.1"), both("0.12")
     assert before[0].options_json() == after[0].options_json()
@@ -158,20 +158,20 @@ class Watched:
 def test_results_come_one_by_one_and_few_tasks_are_handed_out_at_a_time(two: Path) -> None:
     a, _ = scan_tasks(read_project(two), ["a", "b"])
     lost = replace(a, scan="nowhere.tif")
-    asked: list[int] = []
+    requests: list[int] = []
 
     def tasks() -> Iterator[ScanTask]:
         for number in range(20):
-            asked.append(number)
+            requests.append(number)
             yield replace(lost, name=str(number))
 
     watched = Watched(20, holds=3)
     results = measure_scans(tasks(), watched, in_flight=3)
     first = next(results)
     assert first.failure is not None
-    assert len(asked) == 3
+    assert len(requests) == 3
     second = next(results)
-    assert len(asked) == 4
+    assert len(requests) == 4
     assert {first.frame.image, second.frame.image, *(scan.frame.image for scan in results)} == {
         str(number) for number in range(20)
     }
@@ -212,7 +212,7 @@ def test_whatever_happens_in_a_scan_is_a_result(
 
 
 def test_a_failed_scan_has_a_row_for_each_target(tmp_path: Path) -> None:
-    a, _ = tasks_of(tmp_path, PROJECT + BOARD)
+    a, _ = make_tasks(tmp_path, PROJECT + BOARD)
     scan = measured_scan(a)  # an empty file
     assert scan.failure is not None
     assert scan.failure.code is FailureCode.UNREADABLE
@@ -220,7 +220,7 @@ def test_a_failed_scan_has_a_row_for_each_target(tmp_path: Path) -> None:
     assert (kinds.count("fiducial"), kinds.count("target")) == (4, 20)
 
 
-def rows_of(project: Path, images: str) -> list[str]:
+def read_rows(project: Path, images: str) -> list[str]:
     lines = (project.parent / "comparator.csv").read_text(encoding="utf-8").splitlines()
     return [line for line in lines if line[1:2] == "," and line[0] in images]
 
@@ -239,9 +239,9 @@ def test_damaged_and_missing_scans_cost_the_others_nothing(tmp_path: Path, capsy
     (four.parent / "g.tif").symlink_to("moved away.tif")
     capsys.readouterr()
     assert run(["run", str(four), "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert told["adjustment"]["converged"]
-    whats = [problem["what"] for problem in told["problems"]]
+    output = json.loads(capsys.readouterr().out)
+    assert output["adjustment"]["converged"]
+    whats = [problem["what"] for problem in output["problems"]]
     assert [what for what in whats if what.startswith("d: ") and "d.tif" in what]
     assert [what for what in whats if what.startswith("e: images.csv names it, and the project has no scan of")]
     assert [what for what in whats if what.startswith("g: there is no scan") and "g.tif" in what]
@@ -267,10 +267,10 @@ def test_where_no_scan_can_be_measured_the_message_names_each(tmp_path: Path, ca
     for name in ("a.tif", "b.tif"):
         (tmp_path / name).write_bytes(b"no picture")
     assert run(["measure", str(project)]) == 2
-    said = capsys.readouterr().err
-    assert "a.tif" in said
-    assert "b.tif" in said
-    assert "Traceback" not in said
+    message = capsys.readouterr().err
+    assert "a.tif" in message
+    assert "b.tif" in message
+    assert "Traceback" not in message
     assert not (tmp_path / "comparator.csv").exists()
 
 

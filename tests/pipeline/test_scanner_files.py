@@ -90,7 +90,7 @@ def test_without_the_key_there_is_no_scanner(tmp_path: Path) -> None:
     assert 'id="scanners"' not in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
-def test_frames_that_lie_alike_end_in_a_look(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_that_lie_alike_end_in_a_question(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     network = films([0.0] * 4, TRUTH, {}, np.random.default_rng(1))
     assert run(["adjust", str(project(tmp_path, network, '"auto"'))]) == LOOK
     assert "all frames lie alike in the scanner" in " ".join(capsys.readouterr().out.split())
@@ -107,7 +107,7 @@ def test_frames_that_lie_alike_end_in_a_look(tmp_path: Path, capsys: pytest.Capt
         ('"bend"\nscanner_sigma_um = 0.0', "would fix every term at 0"),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str, words: str) -> None:
+def test_what_is_wrong_is_stated(tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str, words: str) -> None:
     assert run(["adjust", str(project(tmp_path, films([0.0], {}, {}), setting))]) == WRONG_INPUT
     assert words in capsys.readouterr().err
 
@@ -142,7 +142,7 @@ def test_a_rendered_scanner_is_the_one_that_is_adjusted() -> None:
         assert result.value(f"SC.S.{name}") == pytest.approx(value / 1000.0, abs=1e-6)
 
 
-def test_a_rendered_project_of_a_bent_scanner_looks_for_it(tmp_path: Path) -> None:
+def test_a_rendered_project_of_a_bent_scanner_appears_for_it(tmp_path: Path) -> None:
     text = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
     bent = text.replace("# bend_um = {a20 = 20.0, b11 = -15.0}", "bend_um = {a20 = 20.0, b11 = -15.0}")
     assert bent != text
@@ -153,7 +153,7 @@ def test_a_rendered_project_of_a_bent_scanner_looks_for_it(tmp_path: Path) -> No
     assert 'scanner = "auto"' in (tmp_path / "project.toml").read_text(encoding="utf-8")
 
 
-def test_a_design_says_what_cannot_be_told_of_the_scanner(tmp_path: Path) -> None:
+def test_a_design_says_what_cannot_be_known_of_the_scanner(tmp_path: Path) -> None:
     """The template's second frame turned by 180 degrees against the first, and laid like it, which tells less."""
     text = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
     text = text.replace('scanner = "none"  ', 'scanner = ["a20"]  ').replace(

@@ -287,7 +287,7 @@ def test_a_wrong_scene_file_says_what_is_wrong(tmp_path: Path, old: str, new: st
         assert word in message
 
 
-def test_a_missing_scene_file_says_where_it_was_looked_for(tmp_path: Path) -> None:
+def test_a_missing_scene_file_says_where_it_was_inspected_for(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere\.toml: there is no such file"):
         read_scene(tmp_path / "nowhere.toml")
 

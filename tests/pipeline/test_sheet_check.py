@@ -37,7 +37,7 @@ def rotation(axis: int, angle: float) -> Array:
     return np.roll(np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]), axis, (0, 1))
 
 
-def seen(rng: np.random.Generator, xyz: Array) -> Array:
+def view_points(rng: np.random.Generator, xyz: Array) -> Array:
     """(n, 2) px: up to 40 degrees oblique, rolled, with 8 % of barrel distortion, not about the picture's middle."""
     turned = rotation(2, rng.uniform(0.0, 6.28)) @ rotation(0, np.pi - rng.uniform(0.3, 0.7))
     camera = (xyz - xyz.mean(axis=0)) @ (turned @ rotation(2, rng.uniform(0.0, 6.28))).T + (0.0, 0.0, 260.0)
@@ -46,7 +46,7 @@ def seen(rng: np.random.Generator, xyz: Array) -> Array:
     return np.asarray(bent * 2000.0 + (WIDTH / 2, HEIGHT / 2) + rng.normal(0.0, NOISE_PX, ideal.shape))
 
 
-def measured(rng: np.random.Generator, project: Project, name: str, wrong: dict[str, float]) -> MeasuredScan:
+def measure_picture(rng: np.random.Generator, project: Project, name: str, wrong: dict[str, float]) -> MeasuredScan:
     """One picture, some of its points so many px off in some direction."""
     assert project.targets is not None
     assert project.targets.board is not None
@@ -54,7 +54,7 @@ def measured(rng: np.random.Generator, project: Project, name: str, wrong: dict[
     xyz[BUCKLED] = xyz[BUCKLED] + (0.0, 0.0, 1.0)
     xyz[MISPRINTED] = xyz[MISPRINTED] + (0.4, -0.3, 0.0)
     marks = []
-    for id, place in zip(xyz, seen(rng, np.array(list(xyz.values()))), strict=True):
+    for id, place in zip(xyz, view_points(rng, np.array(list(xyz.values()))), strict=True):
         angle = rng.uniform(0.0, 6.28)
         off = wrong.get(id, 0.0) * np.array([np.cos(angle), np.sin(angle)])
         marks.append(
@@ -73,12 +73,12 @@ def test_what_one_picture_alone_shows_off_its_place_is_refused(tmp_path: Path) -
     project = board(tmp_path)
     wrong = {"p0": {"r0c0": 1.5, "r3c4": 0.8}, "p2": {"r7c8": 2.0, BUCKLED: 1.0}, "p4": {"r4c4": 40.0, "r6c1": 0.6}}
     names = [f"p{number}" for number in range(5)]
-    checked = check_sheet(project, [measured(rng, project, name, wrong.get(name, {})) for name in names])
+    checked = check_sheet(project, [measure_picture(rng, project, name, wrong.get(name, {})) for name in names])
     assert all(scan.frame.marks[0].status is Status.MEASURED for scan in checked)  # a fiducial of a point's name
     assert status(checked, Status.REJECTED) == {(name, id) for name, ids in wrong.items() for id in ids}
     assert not status(checked, Status.WEAK)
     assert check_sheet(project, []) == ()
-    alone = check_sheet(project, [measured(rng, project, "p0", {"r3c4": 3.0, "r1c1": 400.0})])
+    alone = check_sheet(project, [measure_picture(rng, project, "p0", {"r3c4": 3.0, "r1c1": 400.0})])
     doubted = status(alone, Status.WEAK)
     assert status(alone, Status.REJECTED) == {("p0", "r1c1")}
     assert ("p0", "r3c4") in doubted

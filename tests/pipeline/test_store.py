@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from made_records import FOLDER, changed, content, dump, failed, kept, measured, stored
+from made_records import FOLDER, changed, content, dump, failed, kept_result, measured_scan, stored
 
 from measure.flags import Code, Reason, Status
 from pipeline.archive.checked_statuses import (
@@ -39,7 +39,7 @@ from pipeline.results.comparator_file import mark_rows
 from pipeline.results.measured_record import MeasuredScan
 
 LOOK = Reason("look", Code.PITCH)
-LOOKED_AT = measured(problems=(LOOK,))
+LOOKED_AT = measured_scan(problems=(LOOK,))
 
 
 def contents(store: Store, judging: Judging) -> list[tuple[object, ...]]:
@@ -54,33 +54,33 @@ def path(tmp_path: Path) -> Path:
 
 def test_a_record_comes_back_without_loss(path: Path) -> None:
     with Store(path) as store:
-        row = store.keep(kept(3), "box/3")
-        other = store.keep(kept(4))
+        row = store.keep(kept_result(3), "box/3")
+        other = store.keep(kept_result(4))
     with Store(path) as store:
-        assert stored(store, row, "3") == content(measured(3))
-        assert stored(store, other, "4") == content(measured(4))
-        assert store.fingerprints() == {kept(3).fingerprint: row, kept(4).fingerprint: other}
-        assert store.identities() == {"scans/3.tif": kept(3).identity, "scans/4.tif": kept(4).identity}
+        assert stored(store, row, "3") == content(measured_scan(3))
+        assert stored(store, other, "4") == content(measured_scan(4))
+        assert store.fingerprints() == {kept_result(3).fingerprint: row, kept_result(4).fingerprint: other}
+        assert store.identities() == {"scans/3.tif": kept_result(3).identity, "scans/4.tif": kept_result(4).identity}
 
 
 def test_a_result_that_is_there_is_not_kept_twice(path: Path) -> None:
     with Store(path) as store:
-        assert store.keep(kept(3)) == store.keep(kept(3))
-        assert store.keep(kept(3, options='{"pose": "90"}')) != store.keep(kept(3))
+        assert store.keep(kept_result(3)) == store.keep(kept_result(3))
+        assert store.keep(kept_result(3, options='{"pose": "90"}')) != store.keep(kept_result(3))
         assert len(store.fingerprints()) == 2
 
 
 def test_the_view_has_the_columns_and_numbers_of_comparator_csv(path: Path) -> None:
     with Store(path) as store:
-        row = store.keep(kept(3), "box/3")
-        judge(store, {}, "input", [CheckedResult(row, measured(3, image="box/3"))])
+        row = store.keep(kept_result(3), "box/3")
+        judge(store, {}, "input", [CheckedResult(row, measured_scan(3, image="box/3"))])
     with sqlite3.connect(path) as db:
         view = db.execute("select * from mark_view")
         names = [column[0] for column in view.description]
         rows = view.fetchall()
     assert names == ["image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status",
                      "reason"]  # fmt: skip
-    mark = measured(3).frame.marks[0]
+    mark = measured_scan(3).frame.marks[0]
     assert mark.center_px is not None
     assert mark.covariance_px2 is not None
     (variance_x, covariance), (_, variance_y) = mark.covariance_px2.tolist()
@@ -91,11 +91,11 @@ def test_the_view_has_the_columns_and_numbers_of_comparator_csv(path: Path) -> N
     assert len(rows) == 8
 
 
-def test_a_judging_changes_what_is_seen_and_not_what_was_measured(path: Path) -> None:
+def test_a_judging_changes_what_is_visible_and_not_what_was_measured(path: Path) -> None:
     with Store(path) as store:
-        rows = [store.keep(kept(seed), str(seed)) for seed in (1, 2)]
-        doubted = changed(measured(1), [2], Status.WEAK, Reason("the others say otherwise", Code.OFF_GIVEN))
-        now = [doubted, measured(2, problems=(Reason("it is the frame of 1.", Code.COPY),))]
+        rows = [store.keep(kept_result(seed), str(seed)) for seed in (1, 2)]
+        doubted = changed(measured_scan(1), [2], Status.WEAK, Reason("the others say otherwise", Code.OFF_GIVEN))
+        now = [doubted, measured_scan(2, problems=(Reason("it is the frame of 1.", Code.COPY),))]
         frames = [CheckedResult(row, scan) for row, scan in zip(rows, now, strict=True)]
         digest = judge(store, {"settings": "a"}, "input", frames)
         judging = find_judging(store, digest)
@@ -103,30 +103,32 @@ def test_a_judging_changes_what_is_seen_and_not_what_was_measured(path: Path) ->
         assert judging.made_from == {"settings": "a"}
         assert contents(store, judging) == [content(scan) for scan in now]
         assert [stored(store, row, name) for row, name in zip(rows, "12", strict=True)] == [
-            content(measured(1)),
-            content(measured(2)),
+            content(measured_scan(1)),
+            content(measured_scan(2)),
         ]
-        seen = store.connection.execute("select image, status from mark_view where status = 'weak'").fetchall()
-        assert seen == [("1", "weak")]
+        measured_marks = store.connection.execute(
+            "select image, status from mark_view where status = 'weak'"
+        ).fetchall()
+        assert measured_marks == [("1", "weak")]
         assert store.connection.execute("select count(*) from judged").fetchone() == (8,)  # of the first alone
 
 
-def test_a_lot_whose_input_was_judged_is_not_judged_again(path: Path) -> None:
-    asked = list[str]()
+def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
+    requests = list[str]()
 
     def lot(input_hash: str, *seeds: int) -> Lot:
         def frames() -> Iterator[CheckedResult]:
-            asked.append(input_hash)
+            requests.append(input_hash)
             for seed in seeds:
-                now = changed(measured(seed), [seed], Status.WEAK, Reason(f"by {input_hash}", Code.OFF_GIVEN))
-                yield CheckedResult(store.keep(kept(seed), str(seed)), now)
+                now = changed(measured_scan(seed), [seed], Status.WEAK, Reason(f"by {input_hash}", Code.OFF_GIVEN))
+                yield CheckedResult(store.keep(kept_result(seed), str(seed)), now)
 
         return Lot(input_hash, frames)
 
     with Store(path) as store:
         first = judge_lots(store, {}, "1", [lot("a", 1, 2), lot("b", 3)])
         second = judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)])
-        assert asked == ["a", "b", "c"]
+        assert requests == ["a", "b", "c"]
         assert first != second
         drop_all_but(store, second)
         judging = find_judging(store, second)
@@ -151,9 +153,9 @@ def test_a_lot_whose_input_was_judged_is_not_judged_again(path: Path) -> None:
 
 def test_one_judging_takes_the_place_of_another(path: Path) -> None:
     with Store(path) as store:
-        row = store.keep(kept(1), "1")
-        first = judge(store, {}, "a", [CheckedResult(row, measured())])
-        same = judge(store, {}, "a", [CheckedResult(row, measured())])
+        row = store.keep(kept_result(1), "1")
+        first = judge(store, {}, "a", [CheckedResult(row, measured_scan())])
+        same = judge(store, {}, "a", [CheckedResult(row, measured_scan())])
         second = judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
         assert first == same != second
         assert find_judging(store, first) is not None
@@ -175,8 +177,8 @@ def test_a_store_of_an_earlier_version_is_brought_to_this_one(path: Path, versio
     db.close()
     with Store(path) as store:
         assert store.connection.execute("pragma user_version").fetchone() == (VERSION,)
-        row = store.keep(kept(1), "1")
-        assert stored(store, row) == content(measured())
+        row = store.keep(kept_result(1), "1")
+        assert stored(store, row) == content(measured_scan())
         assert store.connection.execute("select count(*) from options").fetchone() == (1 + bool(version),)
 
 
@@ -185,12 +187,12 @@ def test_results_of_an_earlier_version_get_their_digests(has_secret: bool, path:
     """Of a store whose rows had none: all is taken as it stands but for addresses with a secret; a later change
     is noticed."""
     with Store(path) as store:
-        row = store.keep(kept(1), "1", current=True)
+        row = store.keep(kept_result(1), "1", current=True)
         digest = judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
     secret = "https://ann:hunter2@h.org/2.tif?sig=hunter2"
     with Store(path) as store:
         if has_secret:
-            store.keep(kept(2), "2", current=True)
+            store.keep(kept_result(2), "2", current=True)
     with sqlite3.connect(path) as db:
         db.execute("update scan set uri = ? where name = '2'", (secret,))
         db.execute("drop view mark_view")
@@ -204,7 +206,7 @@ def test_results_of_an_earlier_version_get_their_digests(has_secret: bool, path:
         db.execute("create view mark_view as select 1")
         db.execute("pragma user_version = 3")
     with Store(path) as store:
-        assert stored(store, row) == content(measured())
+        assert stored(store, row) == content(measured_scan())
         judging = find_judging(store, digest)
         assert (judging is None) == has_secret  # it is made anew
         if judging is not None:
@@ -222,7 +224,7 @@ def test_results_of_an_earlier_version_get_their_digests(has_secret: bool, path:
 
 def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Store(path) as store:
-        row = store.keep(kept(1), "1")
+        row = store.keep(kept_result(1), "1")
     step = "alter table scan add column box text; update scan set box = 'a'"
     monkeypatch.setattr("pipeline.archive.schema.MIGRATIONS", (*MIGRATIONS, f"{step}; insert into nowhere values (1)"))
     with pytest.raises(InputError, match="nowhere"):
@@ -231,7 +233,7 @@ def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monke
     with Store(path) as store:
         assert store.connection.execute("select name, box from scan").fetchall() == [("1", "a")]
         assert store.connection.execute("pragma user_version").fetchone() == (VERSION + 1,)
-        assert stored(store, row) == content(measured())
+        assert stored(store, row) == content(measured_scan())
 
 
 def test_a_file_of_another_kind_or_of_a_later_version_is_refused(path: Path) -> None:
@@ -270,27 +272,27 @@ def test_what_was_kept_survives_a_kill_and_nothing_is_half(path: Path) -> None:
         [sys.executable, "-c", WRITER, str(path)], env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE
     )
     assert writer.stdout is not None
-    told = [writer.stdout.readline() for _ in range(50)]
+    output = [writer.stdout.readline() for _ in range(50)]
     time.sleep(0.05)
     writer.send_signal(signal.SIGKILL)
-    told += writer.stdout.readlines()
+    output += writer.stdout.readlines()
     writer.wait()
     writer.stdout.close()
     with Store(path) as store:
         found = store.fingerprints()
-        complete = sum(line.endswith(b"\n") for line in told)
+        complete = sum(line.endswith(b"\n") for line in output)
         assert complete <= len(found) <= complete + 1
         assert all(store.scan(row, "", FOLDER).frame.marks for row in found.values())
         assert store.connection.execute("pragma integrity_check").fetchone() == ("ok",)
 
 
-def test_failed_scans_are_tried_again_only_when_asked(path: Path) -> None:
+def test_failed_scans_are_tried_again_only_when_requested(path: Path) -> None:
     with Store(path) as store:
-        store.keep(kept(1), "1")
-        row = store.keep(kept(2, scan=failed(2)), "2")
+        store.keep(kept_result(1), "1")
+        row = store.keep(kept_result(2, scan=failed(2)), "2")
         assert store.connection.execute("select verdict from result where id = ?", (row,)).fetchone() == ("failed",)
         assert store.forget_failed() == 1
-        assert list(store.fingerprints()) == [kept(1).fingerprint]
+        assert list(store.fingerprints()) == [kept_result(1).fingerprint]
         assert store.forget_failed() == 0
 
 
@@ -299,7 +301,7 @@ def test_stores_of_shards_become_one(tmp_path: Path) -> None:
     for seed in range(20):
         for place in (whole, shards[shard_number(str(seed), 2) - 1]):
             with Store(place) as store:
-                store.keep(kept(seed, options=f"[{seed % 3}]"), str(seed))
+                store.keep(kept_result(seed, options=f"[{seed % 3}]"), str(seed))
     with Store(joined) as store:
         first, second = merge(store, shards)
         assert first.new + second.new == first.results + second.results == 20
@@ -324,34 +326,34 @@ def test_shards_are_the_same_everywhere() -> None:
 
 
 def test_verdicts_of_scans() -> None:
-    good, decided = measured(), {"ann": 1}
+    good, counts = measured_scan(), {"ann": 1}
     answered = changed(good, [0], Status.REJECTED, Reason("rejected by ann", Code.DECIDED))
     assert good.frame.pose is not None
     verdicts: list[tuple[MeasuredScan, Verdict]] = [
         (good, Verdict.GOOD),
-        (measured(status=Status.WEAK), Verdict.LOOK),
-        (measured(problems=(LOOK,)), Verdict.LOOK),
-        (measured(pose=replace(good.frame.pose, decided=False)), Verdict.LOOK),
-        (measured(status=Status.ABSENT), Verdict.POOR),
-        (measured(pixel_from_camera=None), Verdict.POOR),
+        (measured_scan(status=Status.WEAK), Verdict.LOOK),
+        (measured_scan(problems=(LOOK,)), Verdict.LOOK),
+        (measured_scan(pose=replace(good.frame.pose, decided=False)), Verdict.LOOK),
+        (measured_scan(status=Status.ABSENT), Verdict.POOR),
+        (measured_scan(pixel_from_camera=None), Verdict.POOR),
         (changed(good, range(2, 8), Status.REJECTED, LOOK), Verdict.POOR),
         (failed(), Verdict.FAILED),
-        (replace(answered, decided_by=decided), Verdict.DECIDED),
-        (replace(answered, frame=replace(answered.frame, problems=(LOOK,)), decided_by=decided), Verdict.LOOK),
-        (replace(good, decided_by=decided), Verdict.DECIDED),
-        (replace(measured(status=Status.WEAK), decided_by=decided), Verdict.LOOK),
+        (replace(answered, decided_by=counts), Verdict.DECIDED),
+        (replace(answered, frame=replace(answered.frame, problems=(LOOK,)), decided_by=counts), Verdict.LOOK),
+        (replace(good, decided_by=counts), Verdict.DECIDED),
+        (replace(measured_scan(status=Status.WEAK), decided_by=counts), Verdict.LOOK),
     ]
     assert [scan_verdict(scan) for scan, _ in verdicts] == [verdict for _, verdict in verdicts]
     assert set(MEANING) == set(NEXT_STEP) == set(Verdict)
 
 
 def test_the_key_depends_on_all_that_it_names() -> None:
-    base = kept(1)
-    others = [kept(1, options="[1]"), kept(1, mtime_ns=2), kept(2)]
+    base = kept_result(1)
+    others = [kept_result(1, options="[1]"), kept_result(1, mtime_ns=2), kept_result(2)]
     keys = {base.fingerprint, *(other.fingerprint for other in others)}
     keys.add(result_key(base.identity, options_hash("{}"), revision=-1))
     assert len(keys) == 5
-    assert base.fingerprint == kept(1, scan=failed()).fingerprint
+    assert base.fingerprint == kept_result(1, scan=failed()).fingerprint
 
 
 def test_parts_tell_scans_apart_that_share_head_and_tables(rendered_demo: Path, tmp_path: Path) -> None:
@@ -384,13 +386,13 @@ def test_the_identity_of_what_is_no_scan(tmp_path: Path) -> None:
 
 def test_a_store_in_a_folder_that_cannot_be_written_is_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Store(path) as store:
-        row = store.keep(kept(3), "box/3")
+        row = store.keep(kept_result(3), "box/3")
     monkeypatch.setattr("pipeline.archive.schema.os.access", lambda *_: False)
     with Store(path) as store:
         assert store.scan(row, "box/3", FOLDER).frame.marks
         assert [file.name for file in path.parent.iterdir()] == [path.name]  # SQLite would put two files beside it
         with pytest.raises(sqlite3.OperationalError, match="readonly"):
-            store.keep(kept(4), "box/4")
+            store.keep(kept_result(4), "box/4")
 
 
 @pytest.mark.parametrize(
@@ -399,7 +401,7 @@ def test_a_store_in_a_folder_that_cannot_be_written_is_read(path: Path, monkeypa
 def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -> None:
     """Else what each scan gave would stand for what all together say of it."""
     with Store(path) as store:
-        row = store.keep(kept(1), "1", current=True)
+        row = store.keep(kept_result(1), "1", current=True)
         judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
     with sqlite3.connect(path) as db:
         db.execute(change)
@@ -408,4 +410,4 @@ def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -
             latest(store)
         store.forget_damaged()
         assert latest(store) is None
-        assert stored(store, row) == content(measured())
+        assert stored(store, row) == content(measured_scan())

@@ -19,15 +19,15 @@ from pipeline.results.thumbnail import cut
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def measured_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_project(tmp_path_factory.mktemp("thumbnails"), ["a", "b", "c"]).parent
     assert run(["measure", str(folder / "project.toml")]) == 0
     return folder
 
 
 @pytest.fixture
-def folder(measured: Path, tmp_path: Path) -> Path:
-    shutil.copytree(measured, tmp_path / "p")
+def folder(measured_folder: Path, tmp_path: Path) -> Path:
+    shutil.copytree(measured_folder, tmp_path / "p")
     return tmp_path / "p"
 
 
@@ -120,9 +120,9 @@ def test_pictures_follow_results_that_are_moved_or_merged(folder: Path) -> None:
 
 
 @pytest.mark.study
-def test_stores_of_shards_bring_their_pictures(measured: Path, tmp_path: Path) -> None:
+def test_stores_of_shards_bring_their_pictures(measured_folder: Path, tmp_path: Path) -> None:
     parts = tmp_path / "parts"
-    shutil.copytree(measured, parts, ignore=lambda *_: ["out", "comparator.csv"])
+    shutil.copytree(measured_folder, parts, ignore=lambda *_: ["out", "comparator.csv"])
     project = str(parts / "project.toml")
     for k in (1, 2):
         run(["measure", project, "--shard", f"{k}/5", "--workers", "1"])

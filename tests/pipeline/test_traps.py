@@ -82,5 +82,5 @@ def test_trap_two_blas_threads_a_worker() -> None:
         "main()\n"
     )
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
-    said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
-    assert said.stdout.split() == ["1"]
+    text = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert text.stdout.split() == ["1"]

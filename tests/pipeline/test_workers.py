@@ -55,12 +55,12 @@ def begin(kind: str, told: Path) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_worker_ends_with_the_process_that_started_it(kind: str, tmp_path: Path) -> None:
-    told = tmp_path / "pid"
-    program = f"from pathlib import Path; from test_workers import begin; begin({kind!r}, Path({str(told)!r}))"
+    result = tmp_path / "pid"
+    program = f"from pathlib import Path; from test_workers import begin; begin({kind!r}, Path({str(result)!r}))"
     paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[2])])
     parent = subprocess.Popen([sys.executable, "-c", program], env=os.environ | {"PYTHONPATH": paths})
-    _wait(lambda: told.is_file() and told.read_text(encoding="utf-8") != "", 120.0)
-    worker = int(told.read_text(encoding="utf-8"))
+    _wait(lambda: result.is_file() and result.read_text(encoding="utf-8") != "", 120.0)
+    worker = int(result.read_text(encoding="utf-8"))
     assert is_alive(worker)
     time.sleep(0.3)
     parent.send_signal(signal.SIGKILL)

@@ -67,14 +67,16 @@ def test_empty_columns_of_images_csv_are_filled_and_nothing_else_is_touched(tmp_
     path = tmp_path / "images.csv"
     before = "# by hand\r\nimage,camera,run,frame,date,height\r\na.tif,c.toml,,,1970-01-01,\r\nb,,5,,,\r\n"
     path.write_bytes(before.encode())
-    told = for_images([scan("a", [line(text) for text in TITLES]), scan("b", [line("1/3/85"), line("RUN 8")])], WRITTEN)
-    assert told == {"a": {"run": "7", "frame": "8617", "date": "1968-05-16", "height": "14000 ft"}, "b": {"run": "8"}}
-    fill_images(path, told)
+    result = for_images(
+        [scan("a", [line(text) for text in TITLES]), scan("b", [line("1/3/85"), line("RUN 8")])], WRITTEN
+    )
+    assert result == {"a": {"run": "7", "frame": "8617", "date": "1968-05-16", "height": "14000 ft"}, "b": {"run": "8"}}
+    fill_images(path, result)
     assert path.read_bytes().decode() == before.replace("c.toml,,,1970-01-01,", "c.toml,7,8617,1970-01-01,14000 ft")
     assert dict(read_images(path).camera) == {"a": "c.toml", "b": ""}
 
 
-def test_two_scans_that_say_the_same_frame_are_told() -> None:
+def test_two_scans_that_say_the_same_frame_are_reported() -> None:
     lines = [line(text) for text in TITLES]
     first, second, other = note_same_frames(
         [scan("a", lines), scan("b", lines), scan("c", lines[:-2])], lambda image: ""
@@ -105,8 +107,8 @@ CAMERA = {"frame_mm": [230.0, 230.0], "fiducial": [{"id": "1", "xy_mm": [1.0, 2.
 
 
 def test_a_camera_file_says_where_it_writes(tmp_path: Path) -> None:
-    asked = ["left: reads upward", "right: plate reads downward", "top"]
-    camera = parse_camera(Table({**CAMERA, "writing": asked, "number": "13182"}, tmp_path / "camera.toml", ""))
+    requests = ["left: reads upward", "right: plate reads downward", "top"]
+    camera = parse_camera(Table({**CAMERA, "writing": requests, "number": "13182"}, tmp_path / "camera.toml", ""))
     assert camera.layout if camera.writing == (*WILD, WrittenPlace("top")) else None
     camera.path.write_text(camera_text(camera, lambda name, _: name), encoding="utf-8")
     assert read_camera(camera.path).writing == camera.writing
@@ -174,7 +176,7 @@ def test_one_stamp_on_many_frames_tells_no_more_than_one() -> None:
     assert not any(pose.decided for pose in poses.values())
 
 
-def test_a_frame_that_is_decided_tells_the_others_how_they_lie() -> None:
+def test_a_frame_that_is_settled_tells_the_others_how_they_lie() -> None:
     known = posed("a", "90", TITLE, places=())
     known = replace(known, frame=replace(known.frame, pose=replace(known.frame.pose, decided=True)))  # type: ignore[type-var]
     poses = poses_of_roll([known, posed("b", "180", TITLE, name="90", places=())], ())
@@ -212,17 +214,17 @@ def roll_tasks(images: Sequence[str], writing: Reads = "pose") -> list[ScanTask]
 
 
 def test_a_few_frames_of_a_roll_are_read_and_the_others_know_by_what() -> None:
-    asked = list[str]()
+    requests = list[str]()
 
     def measure(tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
         for task in tasks:
-            asked.append(task.name)
+            requests.append(task.name)
             yield replace(scan(task.name, None), frame=frame_of_roll(task.name, "0", f"DEVELOPMENT {task.name}"))
 
     tasks = roll_tasks([f"{number:04d}" for number in range(200)])
     knowing, read = add_known_lines(tasks, measure, Reporter(Console(quiet=True)))
     assert [task.name for task in knowing] == [task.name for task in tasks]
-    assert sorted(asked) == sorted(read)
+    assert sorted(requests) == sorted(read)
     assert len(read) == 4
     for task in knowing:
         known = task.options.fiducials.known_lines
@@ -261,7 +263,7 @@ def test_a_plate_is_held_against_the_cameras_file() -> None:
     assert other.notes == ()
 
 
-def test_plates_of_two_cameras_under_one_file_are_told() -> None:
+def test_plates_of_two_cameras_under_one_file_are_reported() -> None:
     first, second, mute = add_plates(
         RC10, [scan("a", [line("Nr 13043")]), scan("b", [line("Nr 13022")]), scan("c", [])], {}
     )
@@ -284,13 +286,15 @@ def test_a_number_tells_two_cameras_of_a_type_apart() -> None:
 def test_the_library_names_a_camera_by_its_plate_or_says_that_it_is_none() -> None:
     trial = Trial(("rc10-153", "rc10-305"), 4, 4, 0.9, 9.0, 0.9, None, None, None, "", 1.0, 1e-9)
     plate = {"camera_number": "13043", "principal_distance_mm": "152.75"}
-    told = Identification(Path("a.tif"), (trial,), plate=plate, contradicted={"rc10-305": ["it gives 152.75 mm"]})
-    assert told.sentence().endswith("Its plate says Nr 13043, principal distance 152.75 mm; of these that is rc10-153.")
-    none = replace(told, contradicted={name: ["another"] for name in trial.cameras})
+    result = Identification(Path("a.tif"), (trial,), plate=plate, contradicted={"rc10-305": ["it gives 152.75 mm"]})
+    assert result.sentence().endswith(
+        "Its plate says Nr 13043, principal distance 152.75 mm; of these that is rc10-153."
+    )
+    none = replace(result, contradicted={name: ["another"] for name in trial.cameras})
     assert none.sentence().endswith("which none of them is.")
 
 
-def test_the_report_draws_lines_in_place_and_those_that_told_stand_out() -> None:
+def test_the_report_draws_lines_in_place_and_those_that_settled_it_stand_out() -> None:
     outline = ((10.0, 10.0), (20.0, 10.0), (20.0, 90.0), (10.0, 90.0))
     lines = [replace(line(text, "90m"), outline_px=outline) for text in ("RUN 7", "8617")]
     pose = Pose("0", True, ('of 2 lines of writing "RUN 7" speak most',))
@@ -361,7 +365,7 @@ pose = "90m"
 
 
 @pytest.mark.study
-def test_a_rendered_frame_is_read_and_its_pose_decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rendered_frame_is_read_and_its_pose_settled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "scene.toml").write_text(SCENE, encoding="utf-8")
     render_project(tmp_path / "scene.toml", tmp_path / "p")
     project = tmp_path / "p" / "project.toml"

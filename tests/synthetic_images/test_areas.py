@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 WINDOW = (-3, 5, 24, 20)  # col0, row0, width, height
 
 
-def moved(area: Area, by: tuple[float, float]) -> Area:
+def shift_area(area: Area, by: tuple[float, float]) -> Area:
     return tuple(outline + by for outline in area)
 
 
@@ -40,20 +40,20 @@ def test_optics_blur_before_pixels_average() -> None:
     sharp = (np.hypot(x[None, :] - 0.23, x[:, None] + 0.41) < 2.0).astype(float)
     expected = gaussian_filter(sharp, 0.6 * 40).reshape(20, 40, 20, 40).mean(axis=(1, 3))
     # The window's pixel (0, 0) is centred at -9.5 of the fine grid's axes.
-    seen = seen_coverage((disk((9.5 + 0.23, 9.5 - 0.41), 2.0),), 0, 0, 20, 20, 0.6)
-    assert np.abs(seen - expected).max() < 2e-3
+    view = seen_coverage((disk((9.5 + 0.23, 9.5 - 0.41), 2.0),), 0, 0, 20, 20, 0.6)
+    assert np.abs(view - expected).max() < 2e-3
 
 
 @pytest.mark.parametrize("blur_px", [0.0, 0.9])
 def test_blocks_leave_no_seams(blur_px: float) -> None:
     """A great disk, block by block, against the same in one piece."""
     area = disk((101.3, 97.8), 80.4)
-    seen = seen_coverage((area,), 3, 2, 150, 170, blur_px)
+    view = seen_coverage((area,), 3, 2, 150, 170, blur_px)
     reach = 6
     fine = coverage((area,), 3 - reach, 2 - reach, 150 + 2 * reach, 170 + 2 * reach, 4).astype(np.float64)
     smooth = gaussian_filter(fine, 4 * blur_px, truncate=6.0) if blur_px else fine
     whole = smooth.reshape(170 + 2 * reach, 4, 150 + 2 * reach, 4).mean(axis=(1, 3))
-    assert np.abs(seen - whole[reach:-reach, reach:-reach]).max() < 2e-5
+    assert np.abs(view - whole[reach:-reach, reach:-reach]).max() < 2e-5
 
 
 def test_a_slanted_polygon_agrees_with_counting_points() -> None:
@@ -108,7 +108,7 @@ def test_an_outline_may_run_either_way_round() -> None:
 
 
 def test_a_window_cuts_and_changes_nothing() -> None:
-    area = moved(disk((0.0, 0.0), 9.0), (7.6, 14.2))
+    area = shift_area(disk((0.0, 0.0), 9.0), (7.6, 14.2))
     col0, row0, width, height = -10, -5, 40, 40
     whole = coverage((area,), col0, row0, width, height)
     part = coverage((area,), 4, 9, 7, 6)

@@ -65,7 +65,7 @@ def test_a_term_that_there_is_not_is_refused() -> None:
 
 
 @pytest.mark.parametrize("pose", ["0", "90m"])
-def test_film_photographed_by_a_tilted_camera_is_seen_as_a_pinhole_sees_it(tmp_path: Path, pose: str) -> None:
+def test_film_photographed_by_a_tilted_camera_is_visible_as_a_pinhole_sees_it(tmp_path: Path, pose: str) -> None:
     """The film's points turned about an axis in it and projected, by the collinearity of a pinhole 80 mm away."""
     image = replace(OBLIQUE, pose=pose)
     film = Film("projective", tilt_deg=8.0, tilt_direction_deg=30.0, photographed_from_mm=80.0)
@@ -81,8 +81,8 @@ def test_film_photographed_by_a_tilted_camera_is_seen_as_a_pinhole_sees_it(tmp_p
     geometry = truth.frames[0].geometry
     camera_mm = np.random.default_rng(1).uniform(-5.5, 5.5, (20, 2))
     np.testing.assert_allclose(geometry.camera_from_scan(geometry.pixel_from_camera(camera_mm)), camera_mm, atol=1e-10)
-    told = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))["images"][image.name]["transformation"]
-    assert {"a1", "b3", "c1", "c2"} < told.keys()
+    summary = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))["images"][image.name]["transformation"]
+    assert {"a1", "b3", "c1", "c2"} < summary.keys()
 
 
 def test_film_that_a_tilted_camera_photographed_is_projective() -> None:

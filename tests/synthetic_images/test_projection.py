@@ -109,5 +109,5 @@ def test_the_rotation_turns_the_axes_as_the_angles_say() -> None:
 def test_points_that_no_lens_images_have_no_place() -> None:
     camera = SceneCamera("c", (60.0, 60.0), 52.0)
     points = np.array([[0.0, 0.0, 9.0], [90.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
-    seen = np.isfinite(camera_from_object(camera, (0.0, 0.0, 5.0, 0.0, 0.0, 0.0), points)).all(axis=1)
-    assert seen.tolist() == [False, False, True]
+    projected = np.isfinite(camera_from_object(camera, (0.0, 0.0, 5.0, 0.0, 0.0, 0.0), points)).all(axis=1)
+    assert projected.tolist() == [False, False, True]

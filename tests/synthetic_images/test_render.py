@@ -95,7 +95,7 @@ def test_a_chip_lies_with_its_origin_on_the_mark(tmp_path: Path) -> None:
         assert np.abs(centroid(picture, position.center_px, 14) - position.center_px).max() < 0.01
 
 
-def test_what_cannot_be_seen_is_said(tmp_path: Path) -> None:
+def test_what_cannot_be_visible_is_stated(tmp_path: Path) -> None:
     camera = replace(CAMERA, fiducials=(*CAMERA.fiducials, SceneFiducial("e", (9.0, 0.0), CROSS)))
     targets = (
         DiskTarget("seen", (0.0, 0.0, 0.0)),
@@ -203,7 +203,7 @@ def test_eccentricity_follows_the_closed_form() -> None:
         assert position.figure_px - position.center_px == pytest.approx(e_mm / 0.04, abs=1e-5)
 
 
-def test_light_reaches_pockets_beside_the_frame_and_nowhere_twice(tmp_path: Path) -> None:
+def test_light_reaches_pockets_next_to_the_frame_and_nowhere_twice(tmp_path: Path) -> None:
     """Of a mark 0.5 mm beyond the frame's edge: its pocket reaches 0.3 mm into the frame."""
     fiducials = (SceneFiducial("e", (6.5, 0.0), None),)
     image = SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))

@@ -75,7 +75,7 @@ def test_white_is_zero_changes_the_file_and_not_the_picture(tmp_path: Path) -> N
         assert file.pages.first.tags["PhotometricInterpretation"].value == 0
 
 
-def test_grain_and_noise_have_the_strength_and_the_correlation_asked_for(tmp_path: Path) -> None:
+def test_grain_and_noise_have_the_strength_and_the_correlation_requested(tmp_path: Path) -> None:
     sigma = 1.2
     made = scene(
         film=Film(grain=0.03, grain_px=sigma),
@@ -87,10 +87,10 @@ def test_grain_and_noise_have_the_strength_and_the_correlation_asked_for(tmp_pat
     picture, _ = rendered(tmp_path, made)
     noise = picture - picture.mean()
     assert noise.std() == pytest.approx(np.hypot(0.03, 0.01), rel=0.02)
-    beside = float((noise[:, 1:] * noise[:, :-1]).mean())
+    neighbour = float((noise[:, 1:] * noise[:, :-1]).mean())
     below = float((noise[2:] * noise[:-2]).mean())
     # White noise after a Gaussian is correlated by exp(-d^2 / (4 sigma^2)); across the seams of the strips too.
-    assert beside == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.05)
+    assert neighbour == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.05)
     assert below == pytest.approx(0.03**2 * np.exp(-4 / (4 * sigma**2)), rel=0.07)
     seam = float((noise[255] * noise[256]).mean())
     assert seam == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.35)

@@ -44,7 +44,7 @@ def crosswise(distortion: Distortion = BROWN, relief: float = 8.0) -> Scene:
 
 
 @pytest.mark.parametrize("distortion", [BROWN, OPENCV, Distortion()])
-def test_rays_lead_to_terrain_that_is_seen_at_the_same_pixel(distortion: Distortion) -> None:
+def test_rays_lead_to_terrain_that_is_visible_at_the_same_pixel(distortion: Distortion) -> None:
     scene = crosswise(distortion)
     geometry = frame_geometry(scene, 1)
     pixels = np.random.default_rng(1).uniform(60.0, 440.0, (50, 2))
@@ -53,7 +53,7 @@ def test_rays_lead_to_terrain_that_is_seen_at_the_same_pixel(distortion: Distort
     assert np.abs(geometry.pixel_from_object(places) - pixels).max() < 1e-6
 
 
-def test_relief_has_the_rms_that_is_asked_for_and_its_slopes_are_its_derivatives() -> None:
+def test_relief_has_the_rms_that_is_requested_and_its_slopes_are_its_derivatives() -> None:
     terrain = scene_terrain(crosswise())
     plan = np.random.default_rng(2).uniform(-5e4, 5e4, (20000, 2))
     assert np.std(terrain.heights(plan)) == pytest.approx(8.0, rel=0.03)
@@ -72,13 +72,13 @@ def test_the_same_terrain_has_the_same_tone_in_both_frames() -> None:
     inside = ((places > 2.0) & (places < 496.0)).all(axis=1)
     col, row = np.floor(places[inside]).astype(int).T
     fraction = places[inside] - np.floor(places[inside])
-    seen = sum(
+    view = sum(
         b[row + j, col + i] * np.abs(1 - i - fraction[:, 0]) * np.abs(1 - j - fraction[:, 1])
         for i in (0, 1)
         for j in (0, 1)
     )
     here = a[rows, columns][inside]
-    assert np.corrcoef(here, seen)[0, 1] > 0.98
+    assert np.corrcoef(here, view)[0, 1] > 0.98
     plane = replace(scene, relief=0.0)
     flat = transferred(np.array([[200.0, 220.0]]), frame_geometry(plane, 0), frame_geometry(plane, 1))
     hilly = transferred(np.array([[200.0, 220.0]]), first, second)

@@ -20,25 +20,25 @@ from synthetic_images.writing import FONTS, written_area
 Array = NDArray[np.float64]
 
 
-def drawn(text: str, font: str, size: int = 60) -> Array:
+def draw_text(text: str, font: str, size: int = 60) -> Array:
     """A line as a picture of 20 px a capital's height, its middle in the middle."""
     pixels = tuple(outline * (20.0, -20.0) + ((size - 1) / 2, (size - 1) / 2) for outline in written_area(text, font))
     return np.asarray(coverage((pixels,), 0, 0, size, size), float)
 
 
 @pytest.mark.parametrize("font", FONTS)
-def test_letters_are_as_high_as_asked_and_have_their_holes(font: str) -> None:
-    high = drawn("H", font).sum(axis=1)
+def test_letters_are_as_high_as_requested_and_have_their_holes(font: str) -> None:
+    high = draw_text("H", font).sum(axis=1)
     rows = np.flatnonzero(high > 0.1 * high.max())
     assert np.ptp(rows) + 1 == pytest.approx(20, abs=4)
-    ring = drawn("O", font)
+    ring = draw_text("O", font)
     assert ring[30, 30] == 0.0
     assert ring[30].max() > 0.8
 
 
 def test_letters_stand_upright() -> None:
     """Most of an L is low and left, of a T high."""
-    letter, top = drawn("L", "DejaVu Sans"), drawn("T", "DejaVu Sans")
+    letter, top = draw_text("L", "DejaVu Sans"), draw_text("T", "DejaVu Sans")
     assert letter[30:].sum() > 1.5 * letter[:30].sum()
     assert letter[:, :30].sum() > 1.5 * letter[:, 30:].sum()
     assert top[:30].sum() > 1.5 * top[30:].sum()
@@ -50,16 +50,16 @@ def written(folder: Path, **changes: object) -> tuple[Array, SceneImage]:
     image = replace(OBLIQUE, writing=(line,))
     grey, truth = rendered(folder / "with", scene(images=(image,)))
     bare, _ = rendered(folder / "without", scene(images=(OBLIQUE,)))
-    told = json.loads(truth_json(truth))["images"]["f"]["writing"]
-    assert [each["text"] for each in told] == ["LENS 7"]
+    summary = json.loads(truth_json(truth))["images"]["f"]["writing"]
+    assert [each["text"] for each in summary] == ["LENS 7"]
     difference = grey - bare
     row, col = np.nonzero(difference > 0.3)
-    assert (col.min() + col.max()) / 2 == pytest.approx(told[0]["col_px"], abs=1.0)
-    assert (row.min() + row.max()) / 2 == pytest.approx(told[0]["row_px"], abs=1.0)
+    assert (col.min() + col.max()) / 2 == pytest.approx(summary[0]["col_px"], abs=1.0)
+    assert (row.min() + row.max()) / 2 == pytest.approx(summary[0]["row_px"], abs=1.0)
     return difference[row.min() - 2 : row.max() + 3, col.min() - 2 : col.max() + 3], image
 
 
-def test_a_line_is_painted_where_the_truth_says_turned_and_mirrored_as_asked(tmp_path: Path) -> None:
+def test_a_line_is_painted_where_the_truth_says_turned_and_mirrored_as_requested(tmp_path: Path) -> None:
     upright, _ = written(tmp_path / "upright")
     mirrored, _ = written(tmp_path / "mirrored", mirrored=True)
     turned, _ = written(tmp_path / "turned", turn_deg=90.0, xy_mm=(-6.5, 1.0))
