@@ -111,7 +111,7 @@ class LinearFit:
         pixels = 4 * np.pi * _SMOOTH_PX**2  # that are one, smoothed
         noise_dn2 = float(np.sum(self.noise.autocovariance_dn2 * np.exp(-lag2 / (4 * _SMOOTH_PX**2))) / pixels)
         chance = 3 * np.sqrt(2 * SCALE_VARIANCE * pixels / side.sum())
-        beyond_dn2 = robust_scale(smooth[side]) ** 2 - noise_dn2
+        beyond_dn2 = robust_scale(np.asarray(smooth[side], np.float64)) ** 2 - noise_dn2
         return beyond_dn2 if beyond_dn2 > chance * noise_dn2 else 0.0
 
     @property
