@@ -65,8 +65,10 @@ class Surroundings:
         return about * (chip - np.average(chip, weights=about)), about
 
     def _template_mask(self, template: Array, detail_px: float) -> Map:
-        """1 on the drawing and beside it, 0 elsewhere."""
+        """1 on the drawing and beside it, 0 elsewhere; 1 on all that is known where no ground is known about it."""
         rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
+        if np.isnan(rim).all():
+            return np.asarray(~np.isnan(template), np.float32)
         drawn = np.nan_to_num(np.abs(template - np.nanmedian(rim)))
         # Of a line far thinner than a pixel hardly anything is left.
         beside = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)

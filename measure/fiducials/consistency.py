@@ -298,23 +298,31 @@ def frame_consistency(
     states = _states(marks, film, affinity)
     reduced, n = marks._beyond_congruent, len(marks.given_mm)
     residual = marks.off_mm.ravel() - marks.affine @ affinity.mean
-    columns = reduced.basis.T @ np.column_stack([marks.affine, marks.perspective, residual, np.eye(2 * n)])
+    effects = reduced.basis.T @ np.column_stack([marks.affine, marks.perspective])
+    shifts = np.column_stack([reduced.basis.T @ residual, reduced.basis.T])
     spread = reduced.variances + states.film[:, None]
-    gram = np.einsum("mi,sm,mj->sij", columns, 1 / spread, columns, optimize=True)
     known = states.log_prior - 0.5 * np.log(spread).sum(axis=1)
     width = np.sqrt(states.effects)
-    inner = np.eye(5) + width[:, :, None] * gram[:, :5, :5] * width[:, None, :]
-    cross = width[:, :, None] * gram[:, :5, 5:]
-    gram = gram[:, 5:, 5:] - np.einsum("sij,sik->sjk", cross, np.linalg.solve(inner, cross))
-    known = known - 0.5 * (np.linalg.slogdet(inner)[1] + gram[:, 0, 0])
-    pulls = gram[:, 0, 1:].reshape(-1, n, 2)
-    blocks = gram[:, 1:, 1:].reshape(-1, n, 2, n, 2)[:, np.arange(n), :, np.arange(n)].swapaxes(0, 1)
+    weighted = width[:, :, None] * effects.T / spread[:, None]
+    inner = np.eye(5) + weighted @ effects * width[:, None, :]
+    cross = weighted @ shifts
+    taken = np.linalg.solve(inner, cross)
+    chi_square = (shifts[:, 0] ** 2 / spread).sum(axis=1) - (cross[:, :, 0] * taken[:, :, 0]).sum(axis=1)
+    known = known - 0.5 * (np.linalg.slogdet(inner)[1] + chi_square)
+    pulls = (shifts[:, 0] / spread) @ shifts[:, 1:] - np.einsum("sp,spj->sj", cross[:, :, 0], taken[:, :, 1:])
+    pulls = pulls.reshape(-1, n, 2)
+    # Of the coordinates' weights only those within a mark are needed: all of many marks would take minutes.
+    own, by_mark = shifts[:, 1:].reshape(-1, n, 2), (len(spread), 5, n, 2)
+    blocks = (1 / spread) @ (own[..., :, None] * own[..., None, :]).reshape(len(own), -1)
+    blocks = blocks.reshape(-1, n, 2, 2) - np.einsum(
+        "spka,spkb->skab", cross[:, :, 1:].reshape(by_mark), taken[:, :, 1:].reshape(by_mark)
+    )
     off_variances = _widths(_MOST_OFF_MM)[:, None, None, None] ** 2
     wider = np.eye(2) + off_variances[..., None] * blocks
     shifted = np.linalg.solve(wider, (off_variances * pulls)[..., None])[..., 0]
     gain = 0.5 * (shifted * pulls).sum(axis=-1) - 0.5 * np.log(np.linalg.det(wider))
-    by_mark = logsumexp(gain, axis=0) - np.log(_WIDTHS) + _PRIOR
-    every = known[:, None] + np.column_stack([np.zeros(len(known)), by_mark])
+    with_mark = logsumexp(gain, axis=0) - np.log(_WIDTHS) + _PRIOR
+    every = known[:, None] + np.column_stack([np.zeros(len(known)), with_mark])
     evidence = np.array([logsumexp(every[states.hypothesis == each], axis=0) for each in Hypothesis])
     evidence[Hypothesis.SOUND, 0] = -np.inf
     weights = np.exp(every - logsumexp(every, axis=0))

@@ -21,7 +21,7 @@ from measure.fiducials.significance import doubt_frame
 from measure.fiducials.stages import find_frame, likeliest_pose
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason, Status
 from measure.geometry import up_from_camera
-from measure.marks.frame_border import limit_to_frame
+from measure.marks.frame_border import limit_to_crossings, limit_to_frame
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement, Pose
 from measure.scans.opening import crop_scan
@@ -55,7 +55,7 @@ def measure_fiducials(
     picture shows: statuses, reasons and problems say it.
     """
     options = options or FiducialOptions()
-    layout = limit_to_frame(layout)
+    layout = limit_to_crossings(limit_to_frame(layout))
     if scan.is_lost:
         return lost_frame(scan, layout)
     if is_shown(layout, options):

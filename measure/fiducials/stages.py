@@ -33,6 +33,7 @@ Result = tuple[list[Placement], list[tuple[float, Frame]]]
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _NOTHING = Reason("no two of the camera's marks were found in the scan", Code.NO_FRAME)
 _GAINED = 3  # marks: one more than what a perspective has of parameters may fit besides by chance
+_LACKED = 0.3  # of the marks: so many an affine transformation lacks under a perspective that hides any
 _OBLIQUE = 6  # marks that a perspective is shown by: four fit any, and two more check it
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 
@@ -58,8 +59,10 @@ class Found:
 
     @property
     def lacks_few_marks(self) -> bool:
-        """Whether a frame is taken that lacks no more marks than another film model has to find besides."""
-        return self.is_taken and self.frame is not None and self.frame.inside - self.frame.measured_count < _GAINED
+        """Whether a frame is taken that lacks fewer marks than film which was photographed obliquely would."""
+        if self.frame is None or not self.is_taken:
+            return False
+        return self.frame.inside - self.frame.measured_count < max(_GAINED, _LACKED * self.frame.inside)
 
     @property
     def is_undoubted(self) -> bool:

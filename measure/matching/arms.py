@@ -16,8 +16,8 @@ _LEAST = 0.1  # of the drawn mark's contrast
 
 
 def is_cross(mark: MarkShape) -> bool:
-    """Whether a mark is drawn of lines alone, whose ends are those of its arms."""
-    return all(isinstance(part, Bar) for part in mark.parts)
+    """Whether a mark is drawn of lines alone, whose ends are those of its arms and known."""
+    return mark.known_mm is None and all(isinstance(part, Bar) for part in mark.parts)
 
 
 def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit) -> tuple[Array, Array]:

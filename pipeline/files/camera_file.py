@@ -24,7 +24,8 @@ from pipeline.text.tables import Table, read_toml
 from pipeline.text.text_file import SMALLEST_SIGMA
 from pipeline.text.wording import did_you_mean
 
-FIELD_RATIO = 50.0  # of principal distance and half the diagonal, either way: 2.3 degrees of field to 178
+FIELD_RATIO = 50.0  # of half the diagonal and principal distance, or the fiducials' extent: 178 degrees of field
+LONGEST_RATIO = 500.0  # of principal distance and half the diagonal: small plates of astrographs of 10 m
 
 NO_MARK = "none"  # a fiducial that is not to be looked for in scans
 CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says
@@ -44,7 +45,7 @@ def check_units(
     """
     frame = f"the frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm"
     half_diagonal = math.hypot(*frame_mm) / 2
-    if distance_mm is not None and not 1 / FIELD_RATIO < distance_mm / half_diagonal < FIELD_RATIO:
+    if distance_mm is not None and not 1 / FIELD_RATIO < distance_mm / half_diagonal < LONGEST_RATIO:
         raise table.error("principal_distance_mm", f"{distance_mm:g} mm is impossible for {frame}. Give both in mm.")
     places = [xy for _, xy, _ in fiducials]
     apart_mm = float(np.ptp(places, axis=0).max()) if len(places) > 1 else math.inf

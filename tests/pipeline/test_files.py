@@ -77,6 +77,14 @@ def refused(read: Callable[[Path], object], path: Path) -> str:
     return str(error.value)
 
 
+def test_an_astrograph_of_10_m_with_small_plates_is_a_camera(tmp_path: Path) -> None:
+    for frame, distance in (("160.0, 160.0", 3437.0), ("40.0, 60.0", 10000.0)):
+        path = written(
+            tmp_path, "camera.toml", f'name = "c"\nframe_mm = [{frame}]\nprincipal_distance_mm = {distance}\n'
+        )
+        assert read_camera(path).principal_distance_mm == distance
+
+
 def test_camera_file_gives_priors_and_marks(tmp_path: Path) -> None:
     file = read_camera(written(tmp_path, "camera.toml", CAMERA))
     camera = file.camera()
