@@ -105,7 +105,7 @@ class LinearFit:
 
     def _texture_dn2(self, side: Mask) -> float:
         """The variance of smoothed residuals, dust left out, beyond what the noise leaves of itself and chance."""
-        smooth = cv2.GaussianBlur(np.where(side, self.residuals, 0.0), (0, 0), _SMOOTH_PX)
+        smooth = np.asarray(cv2.GaussianBlur(np.where(side, self.residuals, 0.0), (0, 0), _SMOOTH_PX), float)
         reach = len(self.noise.autocovariance_dn2) // 2
         lag2 = np.add.outer(*2 * [np.arange(-reach, reach + 1) ** 2])
         pixels = 4 * np.pi * _SMOOTH_PX**2  # that are one, smoothed

@@ -22,7 +22,7 @@ from pipeline.review.camera_drawing import (
 from pipeline.review.drawing_view import drawing_json, drawn_mark, take_step
 from pipeline.review.frame_view import camera_as_shown
 from pipeline.review.pictures import Pictures
-from pipeline.review.query import Query
+from pipeline.review.query import Query, parse_places
 from pipeline.review.session import Session
 
 _WIDEST_PX = 2000  # half the window about a mark
@@ -72,7 +72,7 @@ class DrawingAnswers:
         """A camera of the project written with its marks as one scan shows them at clicked places."""
         image, path = str(_part(body, "image")), camera_path(self._session.folder, str(body.get("file", "")))
         self._session.scan_location(image)  # raises for one that is none
-        px = {str(point): (float(col), float(row)) for point, (col, row) in _part(body, "px").items()}
+        px = parse_places(_part(body, "px"))
         project = self._session.project
         camera = project.image_camera(image)
         if missing := [one.id for one in camera.learned if one.id not in px]:

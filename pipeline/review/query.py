@@ -6,6 +6,8 @@ from typing import Any
 
 from pipeline.errors import InputError
 
+_MOST_PX = 1e7  # of a place, far beyond any scan
+
 
 class Query:
     """The values of a request's query."""
@@ -37,6 +39,20 @@ def parse_json(text: str | bytes) -> Any:
         return json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError):
         raise InputError("that is no JSON.") from None
+
+
+def parse_places(given: Any) -> dict[str, tuple[float, float]]:
+    """Columns and rows by fiducial. Raises InputError for what is none."""
+    if not isinstance(given, dict) or not all(isinstance(one, list) and len(one) == 2 for one in given.values()):
+        raise InputError("px is column and row by fiducial.")
+    return {str(point): (parse_pixels(col), parse_pixels(row)) for point, (col, row) in given.items()}
+
+
+def parse_pixels(given: Any) -> float:
+    """A column, a row or a size in px. Raises InputError for what is none."""
+    if isinstance(given, bool) or not isinstance(given, int | float) or not abs(given) < _MOST_PX:
+        raise InputError(f"a column or row is a number of pixels, not {str(given)[:40]!r}.")
+    return float(given)
 
 
 def _refuse_constant(text: str) -> float:

@@ -29,7 +29,7 @@ from pipeline.results.measured_record import MeasuredScan
 from pipeline.review.drawing_answers import DrawingAnswers
 from pipeline.review.frame_view import mark_json, measured_as_shown, measured_from_clicks
 from pipeline.review.pictures import Pictures
-from pipeline.review.query import Query, parse_json
+from pipeline.review.query import Query, parse_json, parse_pixels, parse_places
 from pipeline.review.safety import Guard
 from pipeline.review.session import Filters, Session
 
@@ -228,7 +228,9 @@ class _Answers:
         self._session.looking.view(image)  # raises for one that is none
         if not isinstance(clicks, list) or len(clicks) < 3:
             raise InputError("three clicks on named marks or more are needed.")
-        given = [Click(str(one["point"]), float(one["col_px"]), float(one["row_px"])) for one in clicks]
+        if not all(isinstance(one, dict) and {"point", "col_px", "row_px"} <= set(one) for one in clicks):
+            raise InputError("a click has point, col_px and row_px.")
+        given = [Click(str(one["point"]), parse_pixels(one["col_px"]), parse_pixels(one["row_px"])) for one in clicks]
         return _trial_json(measured_from_clicks(self._session.learned, image, given))
 
     def learn(self, query: Query, body: Any) -> Any:
@@ -238,7 +240,7 @@ class _Answers:
         shown, image = str(body.get("image", "")), str(body.get("of", ""))
         for name in (shown, image):
             self._session.scan_location(name)  # raises for one that is none
-        return _trial_json(measured_as_shown(self._session.project, shown, _places(body["px"]), image))
+        return _trial_json(measured_as_shown(self._session.project, shown, parse_places(body["px"]), image))
 
     def _scan(self, query: Query) -> str:
         return self._session.scan_location(query.text("image"))
@@ -260,17 +262,11 @@ def _decision(given: Any) -> Decision:
         raise InputError("a decision about a mark needs its name.")
     if (texts["kind"] == LEARNED) != (choice is Choice.LEARN) and choice is not Choice.UNDO:
         raise InputError("how marks look is learned.")
-    px = _places(given.get("px")) if choice is Choice.LEARN else {}
+    px = parse_places(given.get("px")) if choice is Choice.LEARN else {}
     numbers: Any = {name: given.get(name) for name in ("col_px", "row_px")} if choice is Choice.PLACE else {}
     if not all(isinstance(one, int | float) and abs(one) < 1e7 for one in numbers.values()):
         raise InputError("place needs col_px and row_px.")
     return Decision(decision=choice, window=_four(given.get("window")), px=px, **texts, **numbers)
-
-
-def _places(given: Any) -> dict[str, tuple[float, float]]:
-    if not isinstance(given, dict) or not all(isinstance(one, list) and len(one) == 2 for one in given.values()):
-        raise InputError("px is column and row by fiducial.")
-    return {str(point): (float(col), float(row)) for point, (col, row) in given.items()}
 
 
 def _trial_json(scan: MeasuredScan) -> Any:
@@ -289,7 +285,7 @@ def _four(window: Any) -> tuple[float, float, float, float] | None:
         return None
     if not isinstance(window, list) or len(window) != 4:
         raise InputError("window is four numbers.")
-    col, row, width, height = (float(one) for one in window)
+    col, row, width, height = map(parse_pixels, window)
     return col, row, width, height
 
 
