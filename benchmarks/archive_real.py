@@ -51,15 +51,15 @@ def draw(folder: Path, scans: int, side: int) -> None:
         f'camera = "camera.toml"\nscans = ["scans/**/*.tif"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n',
         encoding="utf-8",
     )
-    layout, said_s = read_camera(folder / "camera.toml").layout(), time.monotonic()
+    layout, begin_s = read_camera(folder / "camera.toml").layout(), time.monotonic()
     for number in range(scans):
         file = folder / "scans" / f"box{number // _A_FOLDER:02d}" / f"{number % _A_FOLDER:04d}.tif"
         if not file.exists():
             file.parent.mkdir(parents=True, exist_ok=True)
             grey = drawn_frame(layout, side, np.random.default_rng(number))
             tifffile.imwrite(file, grey, tile=(256, 256), compression="zlib", metadata=None)
-        if time.monotonic() - said_s > _TOLD_S:
-            said_s = time.monotonic()
+        if time.monotonic() - begin_s > _TOLD_S:
+            begin_s = time.monotonic()
             print(f"{number + 1} of {scans} drawn", flush=True)
 
 

@@ -52,8 +52,8 @@ def write_project(folder: Path, scans: int, a_folder: int = 1000) -> Path:
 def stand_in(task: ScanTask) -> MeasuredFile:
     """Measured in the time that RESEAU_STAND_IN_S says, 0 by default; RESEAU_STAND_IN_LOG: where its begin is told;
     RESEAU_STAND_IN_WEAK: how many of its marks are weak."""
-    if told := os.environ.get("RESEAU_STAND_IN_LOG"):
-        with Path(told).open("a", encoding="utf-8") as file:
+    if result := os.environ.get("RESEAU_STAND_IN_LOG"):
+        with Path(result).open("a", encoding="utf-8") as file:
             file.write(f"{task.name}\n")
     time.sleep(float(os.environ.get("RESEAU_STAND_IN_S", "0")))
     digest = hashlib.sha256(Path(task.scan).read_bytes()).digest()

@@ -177,9 +177,9 @@ def click_control(comparator: Path, scene: Scene, seed: int) -> None:
     lines = comparator.read_text(encoding="utf-8").splitlines()
     for index, image in enumerate(scene.images):
         geometry = frame_geometry(scene, index)
-        seen = geometry.pixel_from_object(true)
-        for number in np.flatnonzero((np.abs(geometry.camera_from_scan(seen)) < half).all(axis=1)):
-            px = seen[number] + rng.normal(0.0, CLICK_PX, 2)
+        view = geometry.pixel_from_object(true)
+        for number in np.flatnonzero((np.abs(geometry.camera_from_scan(view)) < half).all(axis=1)):
+            px = view[number] + rng.normal(0.0, CLICK_PX, 2)
             (mm, sigma) = comparator_from_pixel(px, pitch), CLICK_PX * pitch[0] / 1000.0
             place = f"{mm[0]:.6f},{mm[1]:.6f},{sigma:.6f},{sigma:.6f},0,{px[0]:.4f},{px[1]:.4f}"
             lines.append(f"{image.name},control-{number},target,{place},measured,")

@@ -74,9 +74,9 @@ def in_series(count: int = 300) -> None:
         series = [
             compare([drawn(rng, change * (year - YEARS[0])) for year in YEARS], HALF, YEARS) for _ in range(count)
         ]
-        told = np.mean([each.probability < LEVEL for each in series])
+        result = np.mean([each.probability < LEVEL for each in series])
         trends = np.mean([each.trend is not None and each.trend.probability < LEVEL for each in series])
-        print(f"c changes by {sigmas:g} joint sigmas: drift {told:.3f}, trend {trends:.3f}", flush=True)
+        print(f"c changes by {sigmas:g} joint sigmas: drift {result:.3f}, trend {trends:.3f}", flush=True)
 
 
 def in_adjustments(pairs: int = 200) -> None:

@@ -71,22 +71,22 @@ def cameras_in(marks: Path) -> list[str]:
 
 def draw_case(camera: Path, index: int, turn: int) -> Case:
     """The index-th frame of a camera. turn: by which poses and landscapes are taken, other ones for every camera."""
-    learned_dn, seen_dn = LANDSCAPES_DN[turn % len(LANDSCAPES_DN)]
+    learned_dn, view_dn = LANDSCAPES_DN[turn % len(LANDSCAPES_DN)]
     round_, pose = index // len(LANDSCAPES_DN), POSES[(3 * index + turn) % len(POSES)]
-    grey, places = composed(crops_of(camera), np.random.default_rng([index, 1]), seen_dn)
+    grey, places = composed(crops_of(camera), np.random.default_rng([index, 1]), view_dn)
     up, origins = up_from_camera(pose), origins_px(round_)
     centers = {side: FLIP @ up @ FLIP @ (places[side] + origins[side] - MIDDLE_PX) + MIDDLE_PX for side in SIDES}
     return Case(
         kind=camera.name,
         symmetry="different marks",
-        picture=f"{learned_dn}, seen beside {seen_dn}",
+        picture=f"{learned_dn}, seen beside {view_dn}",
         layout=learned_layout(camera, learned_dn, round_),
         pose=pose,
         pitch_um=1000 * PITCH_MM,
         scan=scan_of("measured", posed(grey, pose)),
         centers_px=centers,
         hidden=frozenset(),
-        without_marks=lambda: landscape(np.random.default_rng([index, 2]), (SIZE_PX, SIZE_PX), seen_dn),
+        without_marks=lambda: landscape(np.random.default_rng([index, 2]), (SIZE_PX, SIZE_PX), view_dn),
     )
 
 

@@ -133,8 +133,10 @@ def _rays() -> Array:
     pixels = np.stack(np.meshgrid(col, row), axis=-1).reshape(-1, 2)
     rays = (pixels - MATRIX[:2, 2]) / 700.0
     for _ in range(8):
-        seen = cv2.projectPoints(np.column_stack([rays, np.ones(len(rays))]), np.zeros(3), np.zeros(3), MATRIX, LENS)[0]
-        rays = rays + (pixels - seen.reshape(-1, 2)) / 700.0
+        projected = cv2.projectPoints(
+            np.column_stack([rays, np.ones(len(rays))]), np.zeros(3), np.zeros(3), MATRIX, LENS
+        )[0]
+        rays = rays + (pixels - projected.reshape(-1, 2)) / 700.0
     return np.asarray(rays)
 
 

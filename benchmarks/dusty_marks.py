@@ -49,9 +49,9 @@ class DustyMark:
 
 def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -> tuple[Array, Mask]:
     """The picture with dark specks on so much of the pixels near the mark, and which pixels they leave."""
-    speckled, seen = grey.copy(), np.ones(grey.shape, dtype=bool)
+    speckled, view = grey.copy(), np.ones(grey.shape, dtype=bool)
     rows, cols = np.nonzero(mark.near)
-    while (mark.near & ~seen).sum() < share * mark.near.sum():
+    while (mark.near & ~view).sum() < share * mark.near.sum():
         radius = min(float(rng.lognormal(0.3, 0.5)), 4.0) * rng.uniform(0.7, 1.3, 12)
         angle = np.arange(12) * (2 * np.pi / 12)
         pixel = rng.integers(len(rows))
@@ -62,8 +62,8 @@ def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -
         height, width = speckled[near].shape
         cover = seen_coverage(((outline,),), int(col0), int(row0), width, height, mark.blur_px)
         speckled[near] = speckled[near] * (1 - cover) + (GROUND - CONTRAST) * cover
-        seen[near] &= cover < 0.5 / DUST_SNR
-    return speckled, seen
+        view[near] &= cover < 0.5 / DUST_SNR
+    return speckled, view
 
 
 def frame_layout(kind: Kind, count: int, at: float = AT_MM) -> FiducialLayout:
@@ -98,12 +98,12 @@ def frame_of_disks(
         contrast = CONTRAST * np.exp(rng.normal(0, CONTRAST_SPREAD))
         grey = ground + sign * contrast * mark.picture + CONTRAST / snr * rng.standard_normal((tile, tile))
         corner = tile * np.array(divmod(number, DISKS_A_SIDE)[::-1])
-        speckled, seen = dusty(mark, grey, float(share), rng)
+        speckled, view = dusty(mark, grey, float(share), rng)
         frame[corner[1] :, corner[0] :][:tile, :tile] = speckled
         form = scale * (np.eye(2) + rng.normal(0, FORM_SPREAD, (2, 2))) @ mark.place[:, :2]
         about = corner + mark.place[:, 2] + rng.normal(0, DISK_OFF_PX, 2)
         predictions.append(TargetPrediction(str(number), about, form, 3.0))
-        parts.append((mark, speckled, seen, corner))
+        parts.append((mark, speckled, view, corner))
     found = []
     for each, (*_, corner) in zip(measure_disks(scan_of(frame), predictions), parts, strict=True):
         place, flagged = each.center_px, "" if each.status is Status.MEASURED else each.reason

@@ -71,11 +71,11 @@ def measured(pattern: str, spec: ChessboardSpec) -> list[Corners]:
             marks.append(measure_board(scan, spec).marks)
     found = []
     for each in one_definition(marks):
-        seen = [mark for mark in each if mark.status.is_observation]
-        if len(seen) >= 4:
-            places = np.array([mark.center_px for mark in seen])
-            covariances = np.array([mark.covariance.px2 for mark in seen if mark.covariance is not None])
-            found.append(Corners(np.array([points[mark.point] for mark in seen]), places, covariances))
+        measured_marks = [mark for mark in each if mark.status.is_observation]
+        if len(measured_marks) >= 4:
+            places = np.array([mark.center_px for mark in measured_marks])
+            covariances = np.array([mark.covariance.px2 for mark in measured_marks if mark.covariance is not None])
+            found.append(Corners(np.array([points[mark.point] for mark in measured_marks]), places, covariances))
     return found
 
 

@@ -62,9 +62,9 @@ def frame(xyz: Array, normals: Array, share: float, rng: np.random.Generator, zo
     p = camera[:, :2] / -camera[:, 2:]
     p *= 1.0 + rng.uniform(-0.03, 0.03) * (p**2).sum(axis=1, keepdims=True) / 0.18 * zoom**2
     xy = C_MM * zoom * (1.0 + rng.normal(0.0, 0.02)) * p + rng.normal(0.0, SIGMA_PX * PITCH_MM, p.shape)
-    seen = np.flatnonzero((np.abs(xy) < HALF_MM).all(axis=1) & (camera[:, 2] < 0.0))
-    kept = seen[rng.random(len(seen)) >= share]
-    false = rng.uniform(-HALF_MM, HALF_MM, (round(share * len(seen)), 2))
+    view = np.flatnonzero((np.abs(xy) < HALF_MM).all(axis=1) & (camera[:, 2] < 0.0))
+    kept = view[rng.random(len(view)) >= share]
+    false = rng.uniform(-HALF_MM, HALF_MM, (round(share * len(view)), 2))
     marks, point = np.concatenate([xy[kept], false]), np.concatenate([kept, np.full(len(false), -1)])
     order = rng.permutation(len(marks))
     return Frame(xyz, normals, marks[order], point[order])

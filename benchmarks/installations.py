@@ -109,10 +109,10 @@ def tried(python: str, distribution: Path, bounds: Path | None, environment: Pat
     start = time.monotonic()
     demonstration = run([bin / "reseau", "demo", environment / "demo"])
     seconds = time.monotonic() - start
-    told = "runs" if demonstration.returncode == 0 else f"ends with {last_lines(demonstration.stderr)}"
+    message = "runs" if demonstration.returncode == 0 else f"ends with {last_lines(demonstration.stderr)}"
     done = run([*install, f"{distribution}[{','.join(user_extras())}]"])
     extras = f"not installed: {last_lines(done.stderr)}" if done.returncode else with_extras(environment)
-    return f"{told} | {seconds:.0f} | {extras or 'all run'}", bool(demonstration.returncode) + bool(extras)
+    return f"{message} | {seconds:.0f} | {extras or 'all run'}", bool(demonstration.returncode) + bool(extras)
 
 
 def with_extras(environment: Path) -> str:

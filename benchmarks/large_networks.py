@@ -87,8 +87,8 @@ def _scene(
     rng: np.random.Generator, points: Array, stations: Array, angles: Array, task: str, sigma: Array, error: float
 ) -> Scene:
     """What OpenCV projects, with noise; approximations wrong by an error in object units, hundredths of it in rad."""
-    seen = _projected(rng, points, stations, angles)
-    network = _network(points, sigma, ESTIMATED[task], seen)
+    projected = _projected(rng, points, stations, angles)
+    network = _network(points, sigma, ESTIMATED[task], projected)
     start = Approximations(
         {"K": np.array([FOCAL_MM * 1.005, 0.0, 0.0])},
         {
@@ -100,14 +100,14 @@ def _scene(
         {},
         {str(i): xyz + error * rng.normal(size=3) for i, xyz in enumerate(points)},
     )
-    return Scene(network, start, points, seen)
+    return Scene(network, start, points, projected)
 
 
 def _projected(rng: np.random.Generator, points: Array, stations: Array, angles: Array) -> list[Seen]:
     """What each image shows of the points that two show at least."""
     matrix = np.diag([FOCAL_MM, FOCAL_MM, 1.0])
     lens = np.array([TRUE["k1"], TRUE["k2"], 0.0, 0.0, 0.0])
-    seen = []
+    view = []
     for station, rotation in zip(stations, FLIP @ rotation_from_angles(angles), strict=True):
         vector = cv2.Rodrigues(rotation)[0]
         near = np.flatnonzero((np.abs(points - station) < 2.0 * FRAME_MM).all(axis=1))
@@ -115,9 +115,9 @@ def _projected(rng: np.random.Generator, points: Array, stations: Array, angles:
         shown = (np.abs(projected) < FRAME_MM / 2).all(axis=1)
         inside = near[shown]
         places = projected[shown] * (1.0, -1.0) + SIGMA_MM * rng.normal(size=(len(inside), 2))
-        seen.append((inside, places))
-    rays = np.bincount(np.concatenate([inside for inside, _ in seen]), minlength=len(points))
-    return [(inside[rays[inside] > 1], places[rays[inside] > 1]) for inside, places in seen]
+        view.append((inside, places))
+    rays = np.bincount(np.concatenate([inside for inside, _ in view]), minlength=len(points))
+    return [(inside[rays[inside] > 1], places[rays[inside] > 1]) for inside, places in view]
 
 
 def _network(points: Array, sigma: Array, estimated: Sequence[str], seen: Sequence[Seen]) -> Network:

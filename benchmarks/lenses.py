@@ -114,8 +114,8 @@ def lens_network(name: Family, rng: np.random.Generator | None) -> Network:
     rows: list[tuple[int, int, Array]] = []
     for i, angles in enumerate(ATTITUDES):
         station = rotation_from_angles(np.array(angles)).T @ np.array([0.0, 0.0, 1.3])
-        seen = camera_from_object(camera, (*station, *angles), field)
-        rows += [(i, int(k), seen[k]) for k in np.flatnonzero((np.abs(seen) < half).all(axis=1))]
+        projected = camera_from_object(camera, (*station, *angles), field)
+        rows += [(i, int(k), projected[k]) for k in np.flatnonzero((np.abs(projected) < half).all(axis=1))]
     free = dict.fromkeys(values, Prior(0.0, np.inf))
     return network_of(
         Camera("C", Prior(c * 1.03, np.inf), None, None, Distortion(name, free, r0_mm=R0_MM)), field, rows, rng
@@ -137,8 +137,8 @@ def board_network(rng: np.random.Generator | None) -> tuple[Network, Array, Arra
             np.array([[20.0, 0.0, 0.1], [0.0, 20.0, 0.05], [0.0, 0.0, 1.0]]),
             np.array([-0.08, 0.0, 0.0, 0.0]),
         )
-        seen, _ = cv2.projectPoints(real, rotation.as_rotvec(), shift, matrix, lens)
-        rows += [(i, k, place) for k, place in enumerate(np.reshape(seen, (-1, 2)) * [1.0, -1.0])]
+        projected, _ = cv2.projectPoints(real, rotation.as_rotvec(), shift, matrix, lens)
+        rows += [(i, k, place) for k, place in enumerate(np.reshape(projected, (-1, 2)) * [1.0, -1.0])]
         poses.append(np.concatenate([rotation.as_rotvec(), shift]))
     camera = Camera("C", None, None, None, Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
     board = Board("board", {f"t{k}": place for k, place in enumerate(flat)})
@@ -190,11 +190,11 @@ def beside_mrcal() -> None:
     task = {"pixels": pixels.reshape(len(TURNS), ROWS, COLUMNS, 2).tolist(), "start": start, "frames": poses.tolist()}
     text = json.dumps(task | {"spacing": SPACING_MM})
     done = subprocess.run(["/usr/bin/python3", "-c", MRCAL], input=text, capture_output=True, text=True, check=True)
-    told = json.loads(done.stdout)
-    fx, fy, cx, cy, *lens = told["intrinsics"]
+    output = json.loads(done.stdout)
+    fx, fy, cx, cy, *lens = output["intrinsics"]
     theirs = {
-        "BD.board.bend_x": told["warp"][0],
-        "BD.board.bend_y": told["warp"][1],
+        "BD.board.bend_x": output["warp"][0],
+        "BD.board.bend_y": output["warp"][1],
         "IO.C.c": fy * pixel_mm,
         "IO.C.b1": fx / fy - 1.0,
         "IO.C.x0": (cx - middle[0]) * pixel_mm,

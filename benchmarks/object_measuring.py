@@ -70,14 +70,14 @@ def main() -> None:
             )
             with range_server(folder) as server:
                 start_s = time.process_time()
-                seen = _measured(folder, f"{server.url}/{name}")
+                found = _measured(folder, f"{server.url}/{name}")
                 cpu_s = time.process_time() - start_s
                 share = server.sent_bytes / (folder / name).stat().st_size
-                marks = seen.scan.frame.marks
-                told = f"{sum(mark.status == 'measured' for mark in marks)} of {len(marks)}"
+                marks = found.scan.frame.marks
+                result = f"{sum(mark.status == 'measured' for mark in marks)} of {len(marks)}"
                 kind = f"{tile_px} | {'yes' if overviews else 'no'} | {off_px}"
                 took = f"{server.gets} | {server.sent_bytes:,} | {100 * share:.1f} % | {cpu_s:.1f}"
-                print(f"| {kind} | {told} | {took} |", flush=True)
+                print(f"| {kind} | {result} | {took} |", flush=True)
 
 
 def _measured(folder: Path, address: str) -> MeasuredFile:

@@ -74,8 +74,8 @@ def spoilt(scene: Scene, percent: int) -> Scene:
     xy_mm[rows] += rng.uniform(-GROSS_MM, GROSS_MM, (len(rows), 2))
     network = replace(scene.network, observations=replace(scene.network.observations, xy_mm=xy_mm))
     ends = np.cumsum([len(inside) for inside, _ in scene.seen])[:-1]
-    seen = [(inside, xy) for (inside, _), xy in zip(scene.seen, np.split(xy_mm, ends), strict=True)]
-    return replace(scene, network=network, seen=seen)
+    view = [(inside, xy) for (inside, _), xy in zip(scene.seen, np.split(xy_mm, ends), strict=True)]
+    return replace(scene, network=network, seen=view)
 
 
 Found = tuple[float, float | None]  # c in mm, and CPU seconds where another process took them
@@ -248,8 +248,8 @@ def bundles(_: Sequence[int]) -> None:
     for images, points in BUNDLES:
         found = _rounds(("reseau", "ceres"), partial(_bundle, images=images, points=points))
         ours, theirs = (statistics.median(each["seconds"] for each in figures) for figures in found.values())
-        told = ", ".join(f"{program} {_told(figures)}" for program, figures in found.items())
-        print(f"{images} images, {points} points: {told}; ratio {ours / theirs:.2f}", flush=True)
+        result = ", ".join(f"{program} {_told(figures)}" for program, figures in found.items())
+        print(f"{images} images, {points} points: {result}; ratio {ours / theirs:.2f}", flush=True)
 
 
 def _bundle(program: str, images: int, points: int) -> Figures:
@@ -268,9 +268,9 @@ def gross(views_of_tables: Sequence[int]) -> None:
                         {} if shape == "relief" and program == "mrcal" else _once(program, views, shape, c, percent)
                         for program in PROGRAMS
                     ]
-                    told = [f"{each['sigmas']:.1f} in {each['seconds']:.2f} s" if each else "-" for each in found]
+                    result = [f"{each['sigmas']:.1f} in {each['seconds']:.2f} s" if each else "-" for each in found]
                     print(
-                        f"{views:5} {shape:7} {c:6} {percent:3}" + "".join(f"{each:>20}" for each in told), flush=True
+                        f"{views:5} {shape:7} {c:6} {percent:3}" + "".join(f"{each:>20}" for each in result), flush=True
                     )
 
 

@@ -285,9 +285,9 @@ def exposed(optics: Optics, image: str, exterior: Array, film: Film, xyz: Array)
     """The points (n, 3) in an image's frame, and its fiducials, without errors."""
     camera, rotation = optics.camera, rotation_from_angles(exterior[3:])
     model = ImageModel(Lens(camera.distortion, optics.interior, optics.lens), rotation, exterior[:3], film)
-    xy, seen = model.camera_from_object(xyz)
+    xy, projected = model.camera_from_object(xyz)
     comparator = model.comparator_from_camera(xy)[0]
-    inside = np.flatnonzero(seen & (np.abs(xy) < optics.half_mm).all(axis=1))
+    inside = np.flatnonzero(projected & (np.abs(xy) < optics.half_mm).all(axis=1))
     rows: list[Row] = [(image, f"p{j}", "target", comparator[j]) for j in inside]
     for id_, mark in camera.fiducials.items():
         place = np.array([mark.x_mm.value, mark.y_mm.value])

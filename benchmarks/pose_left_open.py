@@ -159,14 +159,18 @@ def other_statuses(one: FrameMeasurement, other: FrameMeasurement) -> int:
 def right(case: Case, frame: FrameMeasurement) -> list[np.ndarray]:
     """Places of the marks found that are those of marks of the camera, whatever their names."""
     truth = np.array(list(case.centers_px.values()))
-    seen = [mark.center_px for mark in frame.marks if mark.status.is_observation and mark.center_px is not None]
-    return [place for place in seen if np.hypot(*(truth - place).T).min() < SAME_PX]
+    measured_marks = [
+        mark.center_px for mark in frame.marks if mark.status.is_observation and mark.center_px is not None
+    ]
+    return [place for place in measured_marks if np.hypot(*(truth - place).T).min() < SAME_PX]
 
 
 def lost(found: list[np.ndarray], auto: FrameMeasurement) -> int:
     """How many of the places found are none of those that are found with the pose left open."""
-    seen = [mark.center_px for mark in auto.marks if mark.status.is_observation and mark.center_px is not None]
-    return sum(not any(np.hypot(*(place - other)) < SAME_PX for other in seen) for place in found)
+    measured_marks = [
+        mark.center_px for mark in auto.marks if mark.status.is_observation and mark.center_px is not None
+    ]
+    return sum(not any(np.hypot(*(place - other)) < SAME_PX for other in measured_marks) for place in found)
 
 
 def report(rows: Sequence[Row]) -> Iterator[str]:

@@ -143,8 +143,8 @@ def shift_rms_px(picture: Array, places: Array, blur_px: float) -> float:
         form = np.outer(np.exp(-(dy**2) / (2 * blur_px**2)), np.exp(-(dx**2) / (2 * blur_px**2)))
         slopes = [form * dx / blur_px**2, form * dy[:, None] / blur_px**2]
         design = np.stack([form, np.ones_like(form), *(PEAK * slope for slope in slopes)], axis=-1).reshape(-1, 4)
-        seen = picture[row - WINDOW_PX : row + WINDOW_PX + 1, col - WINDOW_PX : col + WINDOW_PX + 1]
-        off.append(np.linalg.lstsq(design, seen.ravel())[0][2:])
+        view = picture[row - WINDOW_PX : row + WINDOW_PX + 1, col - WINDOW_PX : col + WINDOW_PX + 1]
+        off.append(np.linalg.lstsq(design, view.ravel())[0][2:])
     return float(np.sqrt(np.mean(np.square(off))))
 
 
@@ -169,12 +169,12 @@ def compare(side: int) -> None:
         seconds = (time.process_time() - start) / 3.0
         twice = [method(each, *back) for each in once]
         cells = []
-        for (seen, grain, waves), places, blur_px in (
+        for (view, grain, waves), places, blur_px in (
             (once, moved(middles, side), BLUR_PX / SCALE),
             (twice, middles, BLUR_PX),
         ):
             contrast = waves[inner, inner].std() / (1000.0 / np.sqrt(2))
-            cells += [f"{shift_rms_px(seen, places, blur_px):.4f}", f"{grain[inner, inner].std() / 100.0:.3f}"]
+            cells += [f"{shift_rms_px(view, places, blur_px):.4f}", f"{grain[inner, inner].std() / 100.0:.3f}"]
             cells += [f"{contrast:.3f}"]
         print(f"| {name} | {' | '.join(cells)} | {seconds:.2f} |", flush=True)
 

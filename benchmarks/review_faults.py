@@ -194,10 +194,10 @@ def planted(folder: Path, rng: np.random.Generator) -> dict[str, Truth]:
     (folder / "project.toml").write_text(PROJECT, encoding="utf-8")
     for left in ("images.csv", "points.csv"):
         (folder / left).unlink(missing_ok=True)
-    told = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["images"]
+    summary = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["images"]
     truths = {}
     for name, fault in faults.items():
-        px = {id: np.array([one["col_px"], one["row_px"]]) for id, one in told[name]["fiducials"].items()}
+        px = {id: np.array([one["col_px"], one["row_px"]]) for id, one in summary[name]["fiducials"].items()}
         plant(folder / "scans" / f"{name}.tif", fault, px, rng)
         gone = {str(fault.mark)} if fault.kind in ("hidden", "false mark", "missing") else set()
         truths[name] = Truth(fault.pose, px, frozenset(px.keys() - gone))
@@ -277,15 +277,15 @@ class Person:
 
     def answers(self) -> None:
         self.page.wait_for_function(_READY)
-        image, _, asked = self.page.inner_text("#title").partition(": ")
+        image, _, requests = self.page.inner_text("#title").partition(": ")
         truth = self.truths[image.split(" and ")[0]]
-        if asked == "how it lies":
+        if requests == "how it lies":
             self.press(str(POSES.index(truth.pose) + 1), "pose")
-        elif asked == "no mark was found":
+        elif requests == "no mark was found":
             self.shows_frame(truth)
         else:
             before = self.session.keys
-            self.judges(asked.split()[-1], truth)
+            self.judges(requests.split()[-1], truth)
             self.session.marks += 1
             self.session.keys_of_marks += self.session.keys - before
 

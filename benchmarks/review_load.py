@@ -74,10 +74,10 @@ def archive(scans: int, decided: int) -> None:
             file.unlink()
             file.symlink_to(folder / "one" / "0000.tif")
         images = [file.relative_to(folder / "scans").with_suffix("").as_posix() for file in files]
-        with (folder / "decisions.jsonl").open("w") as told:
+        with (folder / "decisions.jsonl").open("w") as result:
             for image in images[:decided]:
                 line = {"image": image, "decision": "accept", "point": "1", "kind": "fiducial", "who": "ann"}
-                told.write(json.dumps(line) + "\n")
+                result.write(json.dumps(line) + "\n")
         print(f"{scans} stand-ins, {decided} of them decided before")
         review(project, DECIDED_HERE)
 
@@ -90,16 +90,16 @@ def review(project: Path, most: int) -> None:
         address = server.stdout.readline().strip()
         ready_s = time.monotonic() - began
         try:
-            told = reviewed(address, most)
+            done = reviewed(address, most)
             memory_mb = peak_mb(server.pid)
         finally:
             server.kill()
-    next_ms = 1000 * np.array(told.next_s)
+    next_ms = 1000 * np.array(done.next_s)
     print(
-        f"server ready after {ready_s:.1f} s, page open after {told.opened_s:.2f} s, server's memory {memory_mb:.0f} MB"
+        f"server ready after {ready_s:.1f} s, page open after {done.opened_s:.2f} s, server's memory {memory_mb:.0f} MB"
     )
     print(
-        f"marks decided: {len(next_ms) + 1}, one key each, {told.clock_s:.1f} s, of which {LOOKED_MS} ms a mark to look"
+        f"marks decided: {len(next_ms) + 1}, one key each, {done.clock_s:.1f} s, of which {LOOKED_MS} ms a mark to look"
     )
     median, most_ms = np.median(next_ms), next_ms.max()
     print(f"next mark, ms: median {median:.0f}, 90 % {np.quantile(next_ms, 0.9):.0f}, most {most_ms:.0f}")

@@ -134,16 +134,18 @@ def main() -> None:
     ):
         methods: dict[str, Callable[..., Found]] = {"own": own}
         for usac in (False, True):
-            for said, gate in GATES_MM.items():
-                methods[f"{'USAC' if usac else 'RANSAC'}, {said}"] = _told(theirs, gate, usac)
+            for text, gate in GATES_MM.items():
+                methods[f"{'USAC' if usac else 'RANSAC'}, {text}"] = _told(theirs, gate, usac)
         for relief in (200.0, 0.0):
             for points, share in ((12, 0.0), (12, 1 / 4), (12, 1 / 3), (40, 1 / 3)):
-                told = []
+                result = []
                 for name, method in methods.items():
                     start = time.process_time()
                     right = sum(study(method, points, share, relief, number) for number in range(count))
-                    told.append(f"{name} {right}, {1000 * (time.process_time() - start) / count:.1f} ms")
-                print(f"{what}, {points} points, {share:.0%} wrong, relief {relief:g} m: {'; '.join(told)}", flush=True)
+                    result.append(f"{name} {right}, {1000 * (time.process_time() - start) / count:.1f} ms")
+                print(
+                    f"{what}, {points} points, {share:.0%} wrong, relief {relief:g} m: {'; '.join(result)}", flush=True
+                )
 
 
 def _told(theirs: Callable[..., Found], gate_mm: float, usac: bool) -> Callable[..., Found]:

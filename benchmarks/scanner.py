@@ -56,8 +56,8 @@ def main() -> None:
         print(f"{words}: {len(terms)} terms free\n  {_ratios(count, terms, made)}", flush=True)
     few = max(count // 10, 5)
     alike = (laid((0.0,) * 8, EVEN, np.random.default_rng(seed), dict.fromkeys(EVEN, FREE)) for seed in range(few))
-    told = sum(_told(adjust(*network)) for network in alike)
-    print(f"\nframes that all lie alike, 6 terms free: told in {told} of {few} networks")
+    result = sum(_told(adjust(*network)) for network in alike)
+    print(f"\nframes that all lie alike, 6 terms free: told in {result} of {few} networks")
     for truth, words in ((CHOSEN, ", ".join(CHOSEN)), ({}, "none")):
         chosen = Counter(_chosen(truth, seed) for seed in range(few))
         print(f"terms that bend: {words}; chosen by the tests, of {few} networks:")

@@ -145,22 +145,22 @@ def agreeing_marks(count: int) -> str:
 
 
 def _outliers_told(frames: int, marks_mm: Array, off: int) -> str:
-    rng, told = np.random.default_rng(SEED), {"RANSAC": [0, 0], "one by one": [0, 0]}
+    rng, result = np.random.default_rng(SEED), {"RANSAC": [0, 0], "one by one": [0, 0]}
     for number in range(frames):
         x, y = marks_mm.T / 106.0
         bend = np.stack([x * x, x * y, y * y], axis=1) @ rng.normal(0.0, BENT_MM, (3, 2))
-        seen = marks_mm + bend + FILM_MM * rng.standard_normal(marks_mm.shape)
-        wrong, angle = rng.choice(len(seen), off, replace=False), rng.uniform(0, 2 * np.pi, off)
-        seen[wrong] += GROSS_MM * np.column_stack([np.cos(angle), np.sin(angle)])
-        truth = np.isin(np.arange(len(seen)), wrong)
-        _, kept = ransac((marks_mm, seen), AffineTransform, 3, GATE_MM, max_trials=60, rng=number)
-        marks = FrameMarks.from_places(marks_mm, seen, np.zeros((len(seen), 2, 2)))
+        view = marks_mm + bend + FILM_MM * rng.standard_normal(marks_mm.shape)
+        wrong, angle = rng.choice(len(view), off, replace=False), rng.uniform(0, 2 * np.pi, off)
+        view[wrong] += GROSS_MM * np.column_stack([np.cos(angle), np.sin(angle)])
+        truth = np.isin(np.arange(len(view)), wrong)
+        _, kept = ransac((marks_mm, view), AffineTransform, 3, GATE_MM, max_trials=60, rng=number)
+        marks = FrameMarks.from_places(marks_mm, view, np.zeros((len(view), 2, 2)))
         one_by_one = gross_errors(marks, Scatter(FILM_MM), GATE_MM)
         for name, out in (("RANSAC", ~kept if kept is not None else ~truth), ("one by one", one_by_one)):
-            told[name][0] += np.array_equal(out, truth)
-            told[name][1] += bool((out & ~truth).any())
-    told_of = [f"{name} right in {right}, a true one out in {extra}" for name, (right, extra) in told.items()]
-    return f"{off} of {len(marks_mm)} off, {frames} frames: {' | '.join(told_of)}"
+            result[name][0] += np.array_equal(out, truth)
+            result[name][1] += bool((out & ~truth).any())
+    estimate = [f"{name} right in {right}, a true one out in {extra}" for name, (right, extra) in result.items()]
+    return f"{off} of {len(marks_mm)} off, {frames} frames: {' | '.join(estimate)}"
 
 
 def corners(count: int) -> str:
@@ -202,18 +202,18 @@ def film(count: int) -> str:
             x, y = xy.T / 106.0
             return np.asarray(xy + np.stack([x * x, x * y, y * y], axis=1) @ bend.T)
 
-        seen = bent(MARKS_MM) + 0.003 * rng.standard_normal(MARKS_MM.shape)
-        piecewise = PiecewiseAffineTransform.from_estimate(seen, MARKS_MM)
-        polynomial = PolynomialTransform.from_estimate(seen, MARKS_MM, order=2)
-        parameters, mirrored = fit_transformation("polynomial(2)", seen, MARKS_MM)
+        view = bent(MARKS_MM) + 0.003 * rng.standard_normal(MARKS_MM.shape)
+        piecewise = PiecewiseAffineTransform.from_estimate(view, MARKS_MM)
+        polynomial = PolynomialTransform.from_estimate(view, MARKS_MM, order=2)
+        parameters, mirrored = fit_transformation("polynomial(2)", view, MARKS_MM)
         places = bent(inside)
         errors["PiecewiseAffine"].append(piecewise(places) - inside)
         errors["Polynomial"].append(polynomial(places) - inside)
         own = film_kind("polynomial(2)", mirrored).apply(parameters, places)
         errors["film transformation"].append(own - inside)
     lost = np.isnan(np.concatenate(errors["PiecewiseAffine"])).any(axis=1).mean()
-    told = [f"{name} {1000 * np.sqrt(np.nanmean(np.square(each))):.2f} um" for name, each in errors.items()]
-    return f"{' | '.join(told)}; {lost:.0%} of the places outside of all triangles"
+    result = [f"{name} {1000 * np.sqrt(np.nanmean(np.square(each))):.2f} um" for name, each in errors.items()]
+    return f"{' | '.join(result)}; {lost:.0%} of the places outside of all triangles"
 
 
 def _rms(errors: Sequence[Array]) -> str:

@@ -88,8 +88,8 @@ def is_wrong(case: Case, mark: MarkMeasurement, result: FrameMeasurement) -> boo
     """Whether a mark lies where none of that name is; where the pose is only assumed, where there is none at all."""
     assert mark.center_px is not None
     assert mark.covariance_px2 is not None
-    decided = result.pose is not None and result.pose.decided
-    names = {mark.point} if decided else set(case.centers_px)
+    counts = result.pose is not None and result.pose.decided
+    names = {mark.point} if counts else set(case.centers_px)
     errors = [mark.center_px - case.centers_px[id] for id in names - case.hidden]
     if not errors:
         return True

@@ -80,7 +80,9 @@ def report(rows: list[Row]) -> None:
     }
     for name, own in classes.items():
         counts = Counter(outcome(row) for row in own)
-        print(f"{name}: {len(own)} frames: {', '.join(f'{count} {told}' for told, count in sorted(counts.items()))}")
+        print(
+            f"{name}: {len(own)} frames: {', '.join(f'{count} {result}' for result, count in sorted(counts.items()))}"
+        )
     for row in rows:
         if "WRONG" in outcome(row):
             print(row)
@@ -123,9 +125,9 @@ def turn_lead(row: Row) -> tuple[float, bool]:
 
 
 def table(name: str, leads: Iterable[tuple[float, bool]]) -> None:
-    told = list(leads)
+    result = list(leads)
     for low, high in pairwise(BINS):
-        inside = [right for lead, right in told if low <= lead < high]
+        inside = [right for lead, right in result if low <= lead < high]
         if inside:
             print(f"  {name} {low:.1f} to {high:.1f}: {len(inside):4d} frames, {sum(inside):4d} right")
 
@@ -168,10 +170,12 @@ def row_of(index: int, written: bool) -> Row:
 
 def titles(rng: Generator, side: Side, way: str) -> list[Writing]:
     """6 to 40 characters in one to four lines."""
-    asked, lines, letters = int(rng.integers(6, 41)), list[Writing](), 0
-    while letters < asked and len(lines) < 4:
+    requests, lines, letters = int(rng.integers(6, 41)), list[Writing](), 0
+    while letters < requests and len(lines) < 4:
         text = str(rng.choice(ALIKE)) if rng.random() < 0.2 else line_text(rng)
-        if len(text) > asked - letters + 3 or is_plate(Line({"0": Reading(text, 1.0, 1.0)}, "0", ((0, 0),) * 4, side)):
+        if len(text) > requests - letters + 3 or is_plate(
+            Line({"0": Reading(text, 1.0, 1.0)}, "0", ((0, 0),) * 4, side)
+        ):
             continue
         lines.append(line(rng, text, side, way, len(lines)))
         letters += len(text.replace(" ", ""))

@@ -46,9 +46,9 @@ def main() -> None:
     scans, first = (int(text) for text in (*sys.argv[1:], "250", "0")[:2])
     mirror, turn, short = [], [], []
     for index in range(first, first + scans):
-        for told_mirror, told_turn, legible in told_by(index):
-            mirror.append(told_mirror)
-            turn.append(told_turn)
+        for found_mirror, found_turn, legible in told_by(index):
+            mirror.append(found_mirror)
+            turn.append(found_turn)
             short.append(legible)
     print(f"{len(mirror)} lines read of {4 * scans}")
     table("mirrored or not, by how many more characters are legible", np.array(mirror))

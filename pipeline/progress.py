@@ -69,13 +69,13 @@ class Reporter:
 
     def _lines(self, line: Callable[[str, int, int, float | None], str]) -> TimedCount:
         """The first line, the last one, and those between at intervals."""
-        said_s = -_EVERY_S
+        shown_s = -_EVERY_S
 
         def show(what: str, done: int, total: int, /, left_s: float | None = None) -> None:
-            nonlocal said_s
+            nonlocal shown_s
             now_s = time.monotonic()
-            if now_s - said_s >= _EVERY_S or (done == total and total > 1):
-                said_s = now_s
+            if now_s - shown_s >= _EVERY_S or (done == total and total > 1):
+                shown_s = now_s
                 self.say(line(what, done, total, left_s))
 
         return show

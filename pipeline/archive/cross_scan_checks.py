@@ -175,9 +175,9 @@ def _checked_result(scan: MeasuredScan, work: Work) -> CheckedResult:
 
 def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:
     """A scan of which none of the marks counts, for they count in another one."""
-    told = Reason(f"its file is a copy of that of {original}, which counts", Code.COPY)
+    reason = Reason(f"its file is a copy of that of {original}, which counts", Code.COPY)
     marks = [
-        replace(mark, status=Status.REJECTED, reason=told) if mark.status.is_observation else mark
+        replace(mark, status=Status.REJECTED, reason=reason) if mark.status.is_observation else mark
         for mark in scan.frame.marks
     ]
     sentence = f"its file is byte for byte that of {original}: its marks count once. Name one of both in `exclude`."

@@ -149,18 +149,20 @@ def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeas
     by = f"by {decision.who or 'somebody'}{f' ({decision.note})' if decision.note else ''}"
     match decision.decision:
         case Choice.ACCEPT if mark.covariance is not None and mark.center_px is not None:
-            told = Reason(f"accepted {by}{f': {mark.reason}' if mark.reason else ''}", Code.DECIDED, *mark.reason.codes)
-            return replace(mark, status=Status.MEASURED, reason=told)
+            reason = Reason(
+                f"accepted {by}{f': {mark.reason}' if mark.reason else ''}", Code.DECIDED, *mark.reason.codes
+            )
+            return replace(mark, status=Status.MEASURED, reason=reason)
         case Choice.REJECT:
             return replace(mark, status=Status.REJECTED, reason=Reason(f"rejected {by}", Code.DECIDED))
         case Choice.ABSENT:
-            told = Reason(f"absent, {by}", Code.DECIDED)
-            return replace(mark, status=Status.ABSENT, center_px=None, covariance=None, reason=told)
+            reason = Reason(f"absent, {by}", Code.DECIDED)
+            return replace(mark, status=Status.ABSENT, center_px=None, covariance=None, reason=reason)
         case Choice.PLACE if mark.kind != "fiducial":  # fiducials are matched from there
             place = np.array([decision.col_px, decision.row_px], dtype=np.float64)
             covariance = Covariance({Cause.CLICK: CLICK_SIGMA_PX**2 * np.eye(2)})
-            told = Reason(f"placed {by}", Code.DECIDED)
-            return replace(mark, status=Status.WEAK, center_px=place, covariance=covariance, reason=told)
+            reason = Reason(f"placed {by}", Code.DECIDED)
+            return replace(mark, status=Status.WEAK, center_px=place, covariance=covariance, reason=reason)
     return mark
 
 

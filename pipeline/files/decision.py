@@ -77,9 +77,9 @@ class Decision:
 
 def decision_line(decision: Decision) -> str:
     values = {key: getattr(decision, key) for key in _CHECKS}
-    told = {key: value for key, value in values.items() if value not in (None, "", {})}
+    content = {key: value for key, value in values.items() if value not in (None, "", {})}
     try:
-        line = json.dumps(told, ensure_ascii=False, allow_nan=False)
+        line = json.dumps(content, ensure_ascii=False, allow_nan=False)
         decisions_of_lines([(0, line.encode())])
     except (LineError, ValueError) as error:
         about = f"{decision.image}{f', {decision.point}' if decision.point else ''}"
@@ -143,10 +143,10 @@ def _json_object(line: bytes) -> Any:
 def _decisions(objects: Sequence[Any], numbers: Sequence[int]) -> list[Decision]:
     """Objects of lines, checked key by key, each key for all lines that have the same keys and decide the same."""
     groups = defaultdict[tuple[str, ...], list[tuple[int, dict[str, Any]]]](list)
-    for number, told in zip(numbers, objects, strict=True):
-        if not isinstance(told, dict):
-            raise LineError(f"must be a JSON object, not {quote_value(told)}.")
-        groups[str(told.get("decision")), *told].append((number, told))
+    for number, content in zip(numbers, objects, strict=True):
+        if not isinstance(content, dict):
+            raise LineError(f"must be a JSON object, not {quote_value(content)}.")
+        groups[str(content.get("decision")), *content].append((number, content))
     decisions = [
         one for (_, *keys), group in groups.items() for one in _decisions_alike(keys, *zip(*group, strict=True))
     ]

@@ -149,9 +149,9 @@ def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[Wr
         assert frame.pose is not None
         for line in frame.writing or ():
             texts.setdefault(re.sub(r"[\W\d]", "", line.text) or re.sub(r"\d", "0", line.text), (frame.pose, line))
-    decided_turns = {_turn(frame.pose) for frame in frames if frame.pose and frame.pose.decided}
+    certain_turns = {_turn(frame.pose) for frame in frames if frame.pose and frame.pose.decided}
     scores = [sum(line_score(line, places, _scan_pose(pose, turn)) for pose, line in texts.values()) for turn in _TURNS]
-    likelihoods = bounded(np.array(scores)) - [DECIDED if decided_turns - {turn} else 0.0 for turn in _TURNS]
+    likelihoods = bounded(np.array(scores)) - [DECIDED if certain_turns - {turn} else 0.0 for turn in _TURNS]
     return dict(zip(_TURNS, (likelihoods - likelihoods.max()).tolist(), strict=True))
 
 

@@ -44,19 +44,19 @@ def collect_tones(
     before = {kind: memory.recall(key) for kind, key in keys.items()}
     samples = {kind: sample_names(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
-    said = {name: read_tone_information(one) for kept in before.values() for name, one in (kept or {}).items()}
+    known = {name: read_tone_information(one) for kept in before.values() for name, one in (kept or {}).items()}
     with reporter.stage("tone curve estimated from") as tell:
         for done, scan in enumerate(measure(tasks), 1):
             tell(scan.frame.image, done, len(tasks))
             if scan.frame.tone is not None and scan.frame.tone.information is not None:
-                said[scan.frame.image] = scan.frame.tone.information
+                known[scan.frame.image] = scan.frame.tone.information
     for kind, names_of in samples.items():
-        memory.remember(keys[kind], {name: tone_information_record(said[name]) for name in names_of if name in said})
+        memory.remember(keys[kind], {name: tone_information_record(known[name]) for name in names_of if name in known})
     by_image = dict[str, tuple[ToneInformation, ...]]()
     for kind, kept in before.items():
         of_kind = samples[kind] if kept is None else list(kept)
-        by_others = {name: tuple(said[one] for one in of_kind if one in said and one != name) for name in of_kind}
-        by_all = tuple(said[one] for one in of_kind if one in said)
+        by_others = {name: tuple(known[one] for one in of_kind if one in known and one != name) for name in of_kind}
+        by_all = tuple(known[one] for one in of_kind if one in known)
         by_image |= {name: by_others.get(name, by_all) for name in kinds[kind]}
     return by_image
 

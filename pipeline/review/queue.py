@@ -107,7 +107,7 @@ class _Frame:
     verdict: str
     marks: int
     pose: str
-    is_decided: bool
+    is_certain: bool
     evidence: str
     roll: str
     problem: str
@@ -136,11 +136,11 @@ def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
     found: dict[int, int] = dict(db.execute(_FOUND, (judging,)).fetchall())
     for image, result, key, camera, verdict, pose_json, problem in db.execute(_FRAMES, (judging,)):
         pose = json.loads(pose_json) if pose_json else None
-        name, is_decided = ("", True) if pose is None else (pose["name"], bool(pose["decided"]))
+        name, is_certain = ("", True) if pose is None else (pose["name"], bool(pose["decided"]))
         evidence = "" if pose is None else " ".join(pose["evidence"])
         roll = "" if pose is None else pose["roll"]
         count = found.get(result, 0)
-        yield _Frame(image, result, key, camera, verdict, count, name, is_decided, evidence, roll, problem)
+        yield _Frame(image, result, key, camera, verdict, count, name, is_certain, evidence, roll, problem)
 
 
 def _cameras(project: Project, with_marks: Collection[str]) -> Iterator[Entry]:
@@ -160,7 +160,7 @@ def _poses(frames: Sequence[_Frame]) -> Iterator[Entry]:
     """One for each roll's question, and for each frame that is asked about by itself: those first that concern many."""
     groups = defaultdict[tuple[str, str], list[_Frame]](list)
     for frame in sorted(frames, key=lambda frame: frame.image):
-        if not frame.is_decided and frame.marks:
+        if not frame.is_certain and frame.marks:
             groups[frame.camera, frame.roll or frame.image].append(frame)
     for group in sorted(groups.values(), key=lambda group: (-len(group), group[0].image)):
         first = group[0]

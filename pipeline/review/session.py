@@ -135,8 +135,8 @@ class _Shown:
     def from_queue(cls, filters: Filters, queue: Sequence[Entry]) -> "_Shown":
         entries = tuple(filter(filters.lets_through, queue))
         keys = tuple(entry.key for entry in entries)
-        asked = (key for key, entry in zip(keys, entries, strict=True) if entry.is_left)
-        return cls(filters, entries, keys, frozenset(asked))
+        open_keys = (key for key, entry in zip(keys, entries, strict=True) if entry.is_left)
+        return cls(filters, entries, keys, frozenset(open_keys))
 
 
 class Session:
@@ -187,7 +187,7 @@ class Session:
             if key:
                 entry = self._by_key[key]
                 frames = tuple(zip(entry.images, entry.fingerprints, strict=True))
-                decisions = [replace(one, image=image, fingerprint=seen) for one in decisions for image, seen in frames]
+                decisions = [replace(one, image=image, fingerprint=own) for one in decisions for image, own in frames]
             complete = [replace(self._add_fingerprint(one), who=self.who, when=when) for one in decisions]
             append_decisions(self.project.decisions_path, complete)
             self.refresh()
