@@ -32,7 +32,7 @@ def pixel(folder: Path, name: str = "f2.tif", out: str = "f2.tif") -> None:
     tifffile.imwrite(folder / out, pixels)
 
 
-def moved(folder: Path) -> None:
+def move_files(folder: Path) -> None:
     (folder / "box").mkdir()
     (folder / "f2.tif").rename(folder / "box" / "f2.tif")
     rewritten("project.toml", 'scans = ["*.tif"]', 'scans = ["**/*.tif"]')(folder)
@@ -41,7 +41,7 @@ def moved(folder: Path) -> None:
 CHANGES: dict[str, Callable[[Path], object]] = {
     "nothing": lambda folder: None,
     "one file touched": lambda folder: os.utime(folder / "f2.tif", ns=(1, 1)),
-    "one file moved to another folder": moved,
+    "one file moved to another folder": move_files,
     "one file renamed": lambda folder: (folder / "f2.tif").rename(folder / "g.tif"),
     "one pixel of one file changed": pixel,
     "one setting of [measure]": rewritten("project.toml", 'pose = "0"', 'pose = "0"\ntone = "linear"'),
@@ -64,12 +64,12 @@ def case(change: str) -> Row:
     """All is measured, then changed, then measured twice."""
     with TemporaryDirectory() as place:
         folder = write_project(Path(place), NAMES).parent
-        measured(folder)
+        count_measured(folder)
         CHANGES[change](folder)
-        return {"measured again": measured(folder), "and once more": measured(folder)}
+        return {"measured again": count_measured(folder), "and once more": count_measured(folder)}
 
 
-def measured(folder: Path) -> int:
+def count_measured(folder: Path) -> int:
     """How many results a call of `reseau measure` adds."""
     before = results(folder)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):

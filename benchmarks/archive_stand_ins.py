@@ -92,12 +92,12 @@ def keep_results(project: Project) -> None:
 def _frames(project: Project, store: Store, home: Path) -> Iterator[CheckedResult]:
     for number, task in enumerate(scan_tasks(project, tuple(project.scans))):
         scan = stand_in(task).scan
-        scan, path = _with_loss(scan) if number % _LOSES == 1 else scan, Path(task.scan)
+        scan, path = _lose_marks(scan) if number % _LOSES == 1 else scan, Path(task.scan)
         identity = Identity(file_state(path, home), parts_hash(path))
         yield CheckedResult(store.keep(Kept(identity, "{}", scan), task.name, current=True), scan)
 
 
-def _with_loss(scan: MeasuredScan) -> MeasuredScan:
+def _lose_marks(scan: MeasuredScan) -> MeasuredScan:
     first, *others = scan.frame.marks
     lost = MarkMeasurement(first.point, first.kind, None, None, Status.ABSENT, Reason("it is covered", Code.COVERED))
     return replace(scan, frame=replace(scan.frame, marks=(lost, *others)))

@@ -338,7 +338,7 @@ def _coordinates(kind: Kind, own: Sequence[Report]) -> list[TypicalMark]:
     marks = []
     for group in (CORNERS, SIDES):
         places = [place for place in group if place in kind.places]
-        used = _within(kind, own, places) if places else []
+        used = _select_reports(kind, own, places) if places else []
         for place in places:
             xy = np.array([report.marks_mm[place] for report in used])
             x, y = np.median(xy, axis=0)
@@ -350,7 +350,7 @@ def _coordinates(kind: Kind, own: Sequence[Report]) -> list[TypicalMark]:
     return marks
 
 
-def _within(kind: Kind, own: Sequence[Report], places: Sequence[str]) -> list[Report]:
+def _select_reports(kind: Kind, own: Sequence[Report], places: Sequence[str]) -> list[Report]:
     """The reports with all of these marks, each within the gate of its median."""
     whole = [report for report in own if all(place in report.marks_mm for place in places)]
     xy = np.array([[report.marks_mm[place] for place in places] for report in whole])

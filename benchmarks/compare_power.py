@@ -40,7 +40,7 @@ def covariance() -> Array:
     return whole
 
 
-def drawn(rng: np.random.Generator, change: Array) -> CameraCalibration:
+def draw_camera(rng: np.random.Generator, change: Array) -> CameraCalibration:
     error = rng.multivariate_normal(np.zeros(18), covariance())
     values = error[:10]
     values[AT] += TRUE + change
@@ -49,7 +49,9 @@ def drawn(rng: np.random.Generator, change: Array) -> CameraCalibration:
 
 
 def share(rng: np.random.Generator, change: Array, pairs: int) -> float:
-    same = (compare([drawn(rng, 0 * change), drawn(rng, change)], HALF).same.probability for _ in range(pairs))
+    same = (
+        compare([draw_camera(rng, 0 * change), draw_camera(rng, change)], HALF).same.probability for _ in range(pairs)
+    )
     return float(np.mean([probability < LEVEL for probability in same]))
 
 
@@ -65,21 +67,21 @@ def main(pairs: int = 300) -> None:
         print(f"{sigmas:g} joint sigmas | {share(rng, c, pairs):.2f} | {share(rng, k5, pairs):.2f}")
 
 
-def in_series(count: int = 300) -> None:
+def print_series(count: int = 300) -> None:
     """Drift as it is told, and the trend's own test; the change is that from the first to the last."""
     rng = np.random.default_rng(10)
     for sigmas in (0.0, 2.0, 3.0, 5.0):
         change = np.zeros(len(NAMES))
         change[0] = sigmas * np.sqrt(2) * SIGMAS[0] / np.ptp(YEARS)
         series = [
-            compare([drawn(rng, change * (year - YEARS[0])) for year in YEARS], HALF, YEARS) for _ in range(count)
+            compare([draw_camera(rng, change * (year - YEARS[0])) for year in YEARS], HALF, YEARS) for _ in range(count)
         ]
         result = np.mean([each.probability < LEVEL for each in series])
         trends = np.mean([each.trend is not None and each.trend.probability < LEVEL for each in series])
         print(f"c changes by {sigmas:g} joint sigmas: drift {result:.3f}, trend {trends:.3f}", flush=True)
 
 
-def in_adjustments(pairs: int = 200) -> None:
+def print_adjustments(pairs: int = 200) -> None:
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
     from test_earlier_calibrations import contradicted
 
@@ -90,8 +92,8 @@ def in_adjustments(pairs: int = 200) -> None:
 if __name__ == "__main__":
     given = [int(word) for word in sys.argv[1:] if word.isdigit()]
     if "--adjustment" in sys.argv:
-        in_adjustments(*given)
+        print_adjustments(*given)
     elif "--series" in sys.argv:
-        in_series(*given)
+        print_series(*given)
     else:
         main(*given)

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.search import OUTCOMES, POSE_OUTCOMES, judged, lines, print_table
+from benchmarks.search import OUTCOMES, POSE_OUTCOMES, judge_case, lines, print_table
 from benchmarks.search_frames import Case
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark
@@ -52,18 +52,18 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--first", type=int, default=0)
     given = parser.parse_args()
-    cameras = cameras_in(given.marks)
+    cameras = find_cameras(given.marks)
     done = {(line["kind"], line["frame"]) for line in lines(given.out)}
     for index in range(given.first, given.first + given.frames):
         for number, name in enumerate(cameras):
             if (name, index) not in done:
-                line = judged(draw_case(given.marks / name, index, index + number))
+                line = judge_case(draw_case(given.marks / name, index, index + number))
                 with given.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps({"frame": index, **line, "kind": name}) + "\n")
     tell(lines(given.out), cameras)
 
 
-def cameras_in(marks: Path) -> list[str]:
+def find_cameras(marks: Path) -> list[str]:
     """The folders that hold four crops."""
     folders = sorted({path.parent for path in marks.rglob("*.*")})
     return [str(each.relative_to(marks)) for each in folders if set(SIDES) <= {path.stem for path in each.iterdir()}]
@@ -73,7 +73,7 @@ def draw_case(camera: Path, index: int, turn: int) -> Case:
     """The index-th frame of a camera. turn: by which poses and landscapes are taken, other ones for every camera."""
     learned_dn, view_dn = LANDSCAPES_DN[turn % len(LANDSCAPES_DN)]
     round_, pose = index // len(LANDSCAPES_DN), POSES[(3 * index + turn) % len(POSES)]
-    grey, places = composed(crops_of(camera), np.random.default_rng([index, 1]), view_dn)
+    grey, places = composed(cut_crops(camera), np.random.default_rng([index, 1]), view_dn)
     up, origins = up_from_camera(pose), origins_px(round_)
     centers = {side: FLIP @ up @ FLIP @ (places[side] + origins[side] - MIDDLE_PX) + MIDDLE_PX for side in SIDES}
     return Case(
@@ -83,7 +83,7 @@ def draw_case(camera: Path, index: int, turn: int) -> Case:
         layout=learned_layout(camera, learned_dn, round_),
         pose=pose,
         pitch_um=1000 * PITCH_MM,
-        scan=scan_of("measured", posed(grey, pose)),
+        scan=make_scan("measured", posed(grey, pose)),
         centers_px=centers,
         hidden=frozenset(),
         without_marks=lambda: landscape(np.random.default_rng([index, 2]), (SIZE_PX, SIZE_PX), view_dn),
@@ -91,7 +91,7 @@ def draw_case(camera: Path, index: int, turn: int) -> Case:
 
 
 @cache
-def crops_of(camera: Path) -> Crops:
+def cut_crops(camera: Path) -> Crops:
     return {path.stem: np.asarray(cv2.imread(str(path), 0), np.uint8) for path in camera.iterdir()}
 
 
@@ -104,9 +104,9 @@ def origins_px(round_: int) -> dict[str, Array]:
 @cache
 def learned_layout(camera: Path, learned_dn: float, round_: int) -> FiducialLayout:
     """The camera's marks, learned from three frames."""
-    crops, origins, marks = crops_of(camera), origins_px(round_), []
+    crops, origins, marks = cut_crops(camera), origins_px(round_), []
     frames = [composed(crops, np.random.default_rng([round_, 3, seed]), learned_dn) for seed in range(3)]
-    scans = [(scan_of(f"learned {number}", grey), places) for number, (grey, places) in enumerate(frames)]
+    scans = [(make_scan(f"learned {number}", grey), places) for number, (grey, places) in enumerate(frames)]
     for side, direction in SIDES.items():
         spare_px = 8 + 2 * float(np.abs(origins[side]).max())
         size_mm = PITCH_MM * (min(crops[side].shape) / fold(crops[side]) - spare_px)
@@ -157,7 +157,7 @@ def posed(grey: NDArray[np.uint8], pose: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(np.rot90(mirrored, int(pose.removesuffix("m")) // 90))
 
 
-def scan_of(name: str, grey: NDArray[np.uint8]) -> Scan:
+def make_scan(name: str, grey: NDArray[np.uint8]) -> Scan:
     return Scan(Path(name), WholePicture(grey[..., None]), NO_TAGS)
 
 

@@ -73,7 +73,7 @@ def frame_layout(kind: Kind, count: int, at: float = AT_MM) -> FiducialLayout:
     return FiducialLayout(tuple(marks), (FRAME_MM, FRAME_MM))
 
 
-def about_right(linear: Array, middle: Array, sign: int, count: int, rng: np.random.Generator) -> Placement:
+def start_placement(linear: Array, middle: Array, sign: int, count: int, rng: np.random.Generator) -> Placement:
     """Where a frame lies, (2, 2) px per mm about its middle (2,), as a search gives it; sign: of its marks."""
     scale, turn = rng.normal(0, PLACED, 2)
     about = np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ linear

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from true_marks import KIND, KINDS, Kind, TrueMark, some_mark
 
-from benchmarks.dusty_marks import BLUR_SPREAD, PX_PER_MM, about_right, frame_layout
+from benchmarks.dusty_marks import BLUR_SPREAD, PX_PER_MM, frame_layout, start_placement
 from benchmarks.harness import Row
 from benchmarks.measured_marks import CONTRAST, GROUND, Cell, Found, best_errors
 from measure.fiducials.measure_frame import measure_frame
@@ -77,7 +77,7 @@ def measured_faint(
         col, row = corner - BESIDE_PX
         picture[row:, col:, 0][: len(grey), : len(grey)] = np.rint(grey)
         noises.append(sign * noise[inner] / share)
-    placement = about_right(frame.linear, frame.middle, sign, MARKS, rng)
+    placement = start_placement(frame.linear, frame.middle, sign, MARKS, rng)
     scan = Scan(Path("faint.tif"), WholePicture(picture), NO_TAGS)
     result = measure_frame(scan, frame.layout, placement, FiducialOptions())
     for number in FAINT:

@@ -63,7 +63,7 @@ class BoardSet:
     corners: Callable[[], Sequence[Corners]]
 
 
-def measured(pattern: str, spec: ChessboardSpec) -> list[Corners]:
+def measure_pattern(pattern: str, spec: ChessboardSpec) -> list[Corners]:
     """Corners of pictures, measured by this program."""
     marks, points = [], spec.object_points()
     for path in sorted(DATA.glob(pattern)):
@@ -110,16 +110,18 @@ def listed(folder: Path, pitch_mm: float) -> list[Corners]:
 BOUGUET = "chessboards/bouguet/Image*.tif"
 SETS = {
     "OpenCV left": BoardSet(
-        (640, 480), "opencv4", partial(measured, "chessboards/opencv/left[01]*.jpg", ChessboardSpec(9, 6, 25.0))
+        (640, 480), "opencv4", partial(measure_pattern, "chessboards/opencv/left[01]*.jpg", ChessboardSpec(9, 6, 25.0))
     ),
     "OpenCV right": BoardSet(
-        (640, 480), "opencv4", partial(measured, "chessboards/opencv/right[01]*.jpg", ChessboardSpec(9, 6, 25.0))
+        (640, 480), "opencv4", partial(measure_pattern, "chessboards/opencv/right[01]*.jpg", ChessboardSpec(9, 6, 25.0))
     ),
     "Bouguet left": BoardSet((640, 480), "opencv4", partial(published, "Calib_Results_left.mat")),
     "Bouguet right": BoardSet((640, 480), "opencv4", partial(published, "Calib_Results_right.mat")),
-    "Bouguet, 25 pictures": BoardSet((640, 480), "opencv4", partial(measured, BOUGUET, ChessboardSpec(13, 12, 30.0))),
+    "Bouguet, 25 pictures": BoardSet(
+        (640, 480), "opencv4", partial(measure_pattern, BOUGUET, ChessboardSpec(13, 12, 30.0))
+    ),
     "BoofCV": BoardSet(
-        (640, 480), "opencv4", partial(measured, "circles/boofcv/*_Chess/frame*.jpg", ChessboardSpec(6, 4, 30.0))
+        (640, 480), "opencv4", partial(measure_pattern, "circles/boofcv/*_Chess/frame*.jpg", ChessboardSpec(6, 4, 30.0))
     ),
     "carnd_34": BoardSet(
         (1280, 960), "opencv5", partial(listed, DATA.parent / "reports" / "calibration" / "carnd_34", 0.01)
@@ -193,7 +195,7 @@ def calibrated(chosen: BoardSet, pictures: Sequence[Corners]) -> Mapping[str, tu
     return {
         "ours": (values, np.array([camera.values[name].sigma for name in QUANTITIES])),
         "model": (values, np.array([camera.values[name].sigma_model for name in QUANTITIES])),
-        "opencv": by_opencv(chosen, pictures),
+        "opencv": calibrate_opencv(chosen, pictures),
     }
 
 
@@ -223,7 +225,7 @@ def board_network(chosen: BoardSet, pictures: Sequence[Corners]) -> Network:
     )
 
 
-def by_opencv(chosen: BoardSet, pictures: Sequence[Corners]) -> tuple[Array, Array]:
+def calibrate_opencv(chosen: BoardSet, pictures: Sequence[Corners]) -> tuple[Array, Array]:
     flags = cv2.CALIB_FIX_K3 if chosen.lens == "opencv4" else 0
     points, places = ([np.asarray(part, np.float32) for part in each] for each in zip(
         *((each.points * [1, 1, 0], each.places_px) for each in pictures), strict=True

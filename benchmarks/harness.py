@@ -140,7 +140,7 @@ def _chosen(module: ModuleType, options: Mapping[str, Any]) -> list[Row]:
 
 
 def _computed(module: ModuleType, cells: Sequence[Row], options: argparse.Namespace) -> Iterator[Row]:
-    kept = _kept(options.keep)
+    kept = _read_rows(options.keep)
     keys = [json.dumps(cell, sort_keys=True, default=_plain) for cell in cells]
     missing = [(key, cell) for key, cell in zip(keys, cells, strict=True) if key not in kept]
     new = _rows(module, [cell for _, cell in missing], options.processes)
@@ -153,7 +153,7 @@ def _computed(module: ModuleType, cells: Sequence[Row], options: argparse.Namesp
         yield kept[key]
 
 
-def _kept(path: Path | None) -> dict[str, Row]:
+def _read_rows(path: Path | None) -> dict[str, Row]:
     lines = path.read_text(encoding="utf-8").splitlines() if path and path.exists() else []
     return dict(json.loads(text) for text in lines)
 
@@ -167,7 +167,7 @@ def _rows(module: ModuleType, cells: Sequence[Row], processes: int) -> Iterator[
     spawn = multiprocessing.get_context("spawn")  # nothing of what this process has held counts
     per_child = 1 if own_process else None
     with ProcessPoolExecutor(processes, spawn, initializer=_import_helpers, max_tasks_per_child=per_child) as pool:
-        yield from pool.map(_measured if own_process else _row, [module.__name__] * len(cells), cells)
+        yield from pool.map(_timed_row if own_process else _row, [module.__name__] * len(cells), cells)
 
 
 def _import_helpers() -> None:
@@ -178,7 +178,7 @@ def _row(module: str, cell: Row) -> Row:
     return dict(import_module(module).case(**cell))
 
 
-def _measured(module: str, cell: Row) -> Row:
+def _timed_row(module: str, cell: Row) -> Row:
     case = import_module(module).case
     start_s, before_s = time.perf_counter(), time.process_time()
     row = case(**cell)

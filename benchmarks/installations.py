@@ -49,7 +49,7 @@ def main(pythons: Sequence[str], kinds: Sequence[str], versions: Sequence[str]) 
                     environment = folder / "environment"
                     line, failed = tried(python, built[kind], bounds if which == "lowest" else None, environment)
                     problems += failed
-                    print(f"{version_of(python)} | {kind} | {which} | {line}", flush=True)
+                    print(f"{read_version(python)} | {kind} | {which} | {line}", flush=True)
                     shutil.rmtree(environment, ignore_errors=True)
     return min(problems, 1)
 
@@ -111,11 +111,11 @@ def tried(python: str, distribution: Path, bounds: Path | None, environment: Pat
     seconds = time.monotonic() - start
     message = "runs" if demonstration.returncode == 0 else f"ends with {last_lines(demonstration.stderr)}"
     done = run([*install, f"{distribution}[{','.join(user_extras())}]"])
-    extras = f"not installed: {last_lines(done.stderr)}" if done.returncode else with_extras(environment)
+    extras = f"not installed: {last_lines(done.stderr)}" if done.returncode else install_extras(environment)
     return f"{message} | {seconds:.0f} | {extras or 'all run'}", bool(demonstration.returncode) + bool(extras)
 
 
-def with_extras(environment: Path) -> str:
+def install_extras(environment: Path) -> str:
     """What fails of all commands and modules; empty where nothing does."""
     bin = environment / "bin"
     (environment / "small").mkdir()
@@ -161,7 +161,7 @@ def last_lines(text: str) -> str:
     return " / ".join(line for line in text.strip().splitlines()[-LAST_LINES:])
 
 
-def version_of(python: str) -> str:
+def read_version(python: str) -> str:
     return run([python, "--version"]).stdout.strip().removeprefix("Python ")
 
 

@@ -64,17 +64,17 @@ def _errors(count: int, overlap_mm: float, turned: bool, seed: int) -> dict[str,
     simulated = halves(np.random.default_rng(seed), count, overlap_mm, turned=turned)
     adjustment = adjust(simulated.network)
     joins = [
-        _in_sigmas(adjustment, f"JOIN.{frame}.{point}.{axis}", true)
+        _error_sigmas(adjustment, f"JOIN.{frame}.{point}.{axis}", true)
         for (frame, point), xy in simulated.joins.items()
         for axis, true in zip("xy", xy, strict=True)
     ]
     films = [
-        _in_sigmas(adjustment, f"T.{name}.{parameter}", true)
+        _error_sigmas(adjustment, f"T.{name}.{parameter}", true)
         for name, film in simulated.films.items()
         for parameter, true in zip(("a1", "a2", "a3", "b1", "b2", "b3"), film, strict=True)
     ]
     orientations = [
-        _in_sigmas(adjustment, f"EO.f{i}.{element}", true)
+        _error_sigmas(adjustment, f"EO.f{i}.{element}", true)
         for i in range(4)
         for element, true in zip(ELEMENTS, [*simulated.truth.stations[i], *simulated.truth.attitudes[i]], strict=True)
     ]
@@ -82,17 +82,17 @@ def _errors(count: int, overlap_mm: float, turned: bool, seed: int) -> dict[str,
         "joins": np.array(joins),
         "films": np.array(films),
         "orientations": np.array(orientations),
-        "c": np.array([_in_sigmas(adjustment, "IO.K.c", simulated.truth.c)]),
-        "corner": _at_corners_um(simulated, adjustment),
+        "c": np.array([_error_sigmas(adjustment, "IO.K.c", simulated.truth.c)]),
+        "corner": _corner_errors_um(simulated, adjustment),
         "sigma0": np.array([adjustment.sigma0]),
     }
 
 
-def _in_sigmas(adjustment: Adjustment, name: str, true: float) -> float:
+def _error_sigmas(adjustment: Adjustment, name: str, true: float) -> float:
     return (adjustment.value(name) - true) / adjustment.sigma(name)
 
 
-def _at_corners_um(simulated: Halves, adjustment: Adjustment) -> Array:
+def _corner_errors_um(simulated: Halves, adjustment: Adjustment) -> Array:
     """How far each half's film puts the frame's outer corners beside their places."""
     off = []
     for name, true in simulated.films.items():

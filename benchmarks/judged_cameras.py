@@ -89,12 +89,12 @@ def scattering(layout: FiducialLayout, count: int, rng: np.random.Generator) -> 
 
 
 def one_mark(off_px: float) -> Made:
-    def made(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
+    def make_frames_and_fault(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
         frames, angle = good(layout, count, rng)[0], rng.uniform(0, 2 * np.pi)
         frames[0] = shift_mark(frames[0], 2, (off_px * np.cos(angle), off_px * np.sin(angle)))
         return frames, "mark"
 
-    return made
+    return make_frames_and_fault
 
 
 def bent(layout: FiducialLayout, count: int, rng: np.random.Generator, film_mm: float = 0.03) -> tuple[Frames, str]:

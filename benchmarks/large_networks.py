@@ -37,7 +37,7 @@ class Scene:
     seen: list[Seen]
 
 
-def known(views: int, relief: float = 0.05) -> Scene:
+def make_board(views: int, relief: float = 0.05) -> Scene:
     """A board of 100 points with some relief, all of them in every view."""
     rng = np.random.default_rng(views)
     grid = (np.arange(10) - 4.5) * 0.1

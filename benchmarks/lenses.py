@@ -71,7 +71,7 @@ print(json.dumps({"warp": inputs["calobject_warp"].tolist(), "intrinsics": input
 
 def main() -> None:
     if sys.argv[1:] == ["mrcal"]:
-        beside_mrcal()
+        compare_mrcal()
         return
     sets = int(sys.argv[1]) if len(sys.argv) > 1 else 200
     print(
@@ -117,7 +117,7 @@ def lens_network(name: Family, rng: np.random.Generator | None) -> Network:
         projected = camera_from_object(camera, (*station, *angles), field)
         rows += [(i, int(k), projected[k]) for k in np.flatnonzero((np.abs(projected) < half).all(axis=1))]
     free = dict.fromkeys(values, Prior(0.0, np.inf))
-    return network_of(
+    return make_network(
         Camera("C", Prior(c * 1.03, np.inf), None, None, Distortion(name, free, r0_mm=R0_MM)), field, rows, rng
     )
 
@@ -142,11 +142,11 @@ def board_network(rng: np.random.Generator | None) -> tuple[Network, Array, Arra
         poses.append(np.concatenate([rotation.as_rotvec(), shift]))
     camera = Camera("C", None, None, None, Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
     board = Board("board", {f"t{k}": place for k, place in enumerate(flat)})
-    network = network_of(camera, flat, rows, rng, (board,))
+    network = make_network(camera, flat, rows, rng, (board,))
     return network, np.array(poses), network.observations.xy_mm.reshape(len(TURNS), -1, 2)
 
 
-def network_of(
+def make_network(
     camera: Camera,
     points: Array,
     rows: list[tuple[int, int, Array]],
@@ -171,7 +171,7 @@ def network_of(
     )
 
 
-def beside_mrcal() -> None:
+def compare_mrcal() -> None:
     """The same noisy views through both, with one lens: fx, fy, cx, cy, k1, k2, p1, p2 and the bends."""
     pixel_mm = 0.005
     network, poses, places = board_network(np.random.default_rng(SEED))

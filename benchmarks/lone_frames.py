@@ -30,7 +30,7 @@ def lone_frame(
     return Scene(name=name, seed=seed, camera=camera, field=DiskField((), 1.0), images=(image,), **parts)
 
 
-def image_of(
+def make_image(
     pose: str, turn_deg: float, scale: Iterable[float], shear: float, height_mm: float = 100.0, **parts: Any
 ) -> SceneImage:
     """Its only image, straight down; scale: of its film along both axes; parts: where it lies and what is beside it."""
@@ -52,6 +52,6 @@ def painted(scene: Scene, *more: Paint) -> NDArray[np.uint16]:
     return np.concatenate(list(grey_strips(frame, 0, scene_background(scene))))
 
 
-def fiducials_of(marks: Iterable[LayoutMark]) -> tuple[SceneFiducial, ...]:
+def make_fiducials(marks: Iterable[LayoutMark]) -> tuple[SceneFiducial, ...]:
     """The marks of a layout as they are drawn at their given places."""
     return tuple(SceneFiducial(mark.id, mark.xy_mm, scene_mark(mark.mark)) for mark in marks)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from true_marks import KIND, KINDS, Kind, TrueMark, grain_correlation, grainy, some_mark, whitened_rms
 
 from benchmarks.harness import Row, rms, table
-from benchmarks.measured_marks import CONTRAST, GROUND, Cell, Found, best_errors, drawn, measured, start_off
+from benchmarks.measured_marks import CONTRAST, GROUND, Cell, Found, best_errors, draw_mark, measure_mark, start_off
 from measure.scans.jpeg import rounding_step_dn
 
 Array = NDArray[np.float64]
@@ -68,11 +68,11 @@ def cell(
     for number in range(count):
         mark = marks[number % len(marks)]
         noise = noise_of(mark.size, rng) / snr
-        grey, sign = drawn(mark, rng)
+        grey, sign = draw_mark(mark, rng)
         off = start_off(mark, rng)
         best = best_errors(mark, sign * noise, 1 / snr, off, correlation)
         bound = mark.bound(1 / snr, None, correlation)
-        found.add(mark, measured(mark, grey + CONTRAST * noise, rng, off=off), best, bound)
+        found.add(mark, measure_mark(mark, grey + CONTRAST * noise, rng, off=off), best, bound)
     return found.words()
 
 
@@ -114,7 +114,9 @@ def bias(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
 def clean_error(mark: TrueMark, rng: np.random.Generator, full_scale: int) -> Array:
     """The error without noise, with rotation and scale known exactly where they come from the frame."""
     contrast, ground = (CONTRAST, GROUND) if full_scale > 255 else (120.0, 60.0)
-    found = measured(mark, drawn(mark, rng, contrast, ground)[0], rng, full_scale, off=start_off(mark, rng, exact=True))
+    found = measure_mark(
+        mark, draw_mark(mark, rng, contrast, ground)[0], rng, full_scale, off=start_off(mark, rng, exact=True)
+    )
     if found is None:
         return np.full(2, np.inf)
     return np.asarray(found.center_px - mark.place[:, 2])
@@ -132,11 +134,11 @@ def clipping(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
                 grey = 65535 + CONTRAST * (beyond + sign * mark.picture - (sign + 1) / 2)
                 noise = white(mark.size, rng) / CLIPPED_SNR
                 if number < len(marks):
-                    sharp = measured(mark, grey, rng, off=start_off(mark, rng, exact=True))
+                    sharp = measure_mark(mark, grey, rng, off=start_off(mark, rng, exact=True))
                     clean_off.append(np.inf if sharp is None else np.abs(sharp.center_px - mark.place[:, 2]).max())
                 off = start_off(mark, rng)
                 best = best_errors(mark, sign * noise, 1 / CLIPPED_SNR, off)
-                one = measured(mark, grey + CONTRAST * noise, rng, off=off)
+                one = measure_mark(mark, grey + CONTRAST * noise, rng, off=off)
                 found.add(mark, one, best, mark.bound(1 / CLIPPED_SNR))
             row[f"{'ground' if sign < 0 else 'mark'} {beyond:g}"] = f"{max(clean_off):.4f} {found.words()}"
     return row
@@ -150,7 +152,7 @@ def jpeg(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
             rng = np.random.default_rng([*seeds, quality])
             marks, errors, covariances = pool(kind, 1.0, min(POOL, count), rng), [], []
             for mark in (marks[number % len(marks)] for number in range(count)):
-                found = in_jpeg(mark, contrast, quality, rng)
+                found = measure_jpeg(mark, contrast, quality, rng)
                 if found is not None and not found.flagged:
                     errors.append(found.center_px - mark.place[:, 2])
                     covariances.append(found.covariance_px2)
@@ -158,10 +160,10 @@ def jpeg(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
     return row
 
 
-def in_jpeg(mark: TrueMark, contrast: float, quality: int, rng: np.random.Generator) -> Found | None:
+def measure_jpeg(mark: TrueMark, contrast: float, quality: int, rng: np.random.Generator) -> Found | None:
     noise = white(mark.size, rng) / JPEG_SNR
-    shown, step_dn = compressed(drawn(mark, rng, contrast, 60.0)[0] + contrast * noise, quality, rng)
-    return measured(mark, shown, rng, 255, step_dn=step_dn)
+    shown, step_dn = compressed(draw_mark(mark, rng, contrast, 60.0)[0] + contrast * noise, quality, rng)
+    return measure_mark(mark, shown, rng, 255, step_dn=step_dn)
 
 
 def compressed(grey: Array, quality: int, rng: np.random.Generator) -> tuple[Array, float]:
@@ -184,9 +186,9 @@ def misfit(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
         for mark in (marks[number % len(marks)] for number in range(count)):
             if name in noises:
                 noise = noises[name](mark.size, rng)
-                found = measured(mark, drawn(mark, rng)[0] + CONTRAST * noise / GRAIN_SNR, rng)
+                found = measure_mark(mark, draw_mark(mark, rng)[0] + CONTRAST * noise / GRAIN_SNR, rng)
             else:
-                found = in_jpeg(mark, JPEG_CONTRASTS[0], QUALITIES[1], rng)
+                found = measure_jpeg(mark, JPEG_CONTRASTS[0], QUALITIES[1], rng)
             if found is not None and not found.flagged:
                 errors.append(found.center_px - mark.place[:, 2])
                 claimed.append(found.covariance_px2)

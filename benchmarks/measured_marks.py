@@ -99,7 +99,7 @@ def best_errors(mark: TrueMark, noise: Array, sigma: float, off: Array, correlat
     return mark.best_errors(noise, sigma, None, correlation, off if np.isfinite(mark.kind.known) else None)
 
 
-def measured(
+def measure_mark(
     mark: TrueMark,
     grey: Array,
     rng: np.random.Generator,
@@ -131,7 +131,7 @@ def grey_is_light(mark: TrueMark, grey: Array) -> bool:
     return float((grey * (mark.picture - mark.picture.mean())).sum()) > 0
 
 
-def drawn(
+def draw_mark(
     mark: TrueMark, rng: np.random.Generator, contrast: float = CONTRAST, ground: float = GROUND
 ) -> tuple[Array, int]:
     """The mark, light (1) or dark (-1), on a ground with a gradient of up to a third of its contrast."""

@@ -63,7 +63,7 @@ def many(case: Exact, r0_mm: float, count: int) -> Runs:
         if not result.converged:
             raise RuntimeError(f"run {run} ended with {result.termination}")
         names = tuple(name for name in result.names if name in case.truth and result.sigma(name) > 0.0)
-        errors.append([error_of(result.value(name) - case.truth[name], name) for name in names])
+        errors.append([parameter_error(result.value(name) - case.truth[name], name) for name in names])
         sigmas.append([result.sigma(name) for name in names])
         vpv.append(result.vpv)
         curves.append(normalised_curve(result, case, r0_mm))
@@ -71,7 +71,7 @@ def many(case: Exact, r0_mm: float, count: int) -> Runs:
     return Runs(names, *columns, result.redundancy, np.array(curves))
 
 
-def error_of(difference: float, name: str) -> float:
+def parameter_error(difference: float, name: str) -> float:
     """An angle's within half a turn."""
     is_angle = name.rsplit(".", 1)[1] in ("omega", "phi", "kappa")
     return float((difference + np.pi) % (2.0 * np.pi) - np.pi) if is_angle else difference
@@ -86,7 +86,7 @@ def normalised_curve(result: Adjustment, case: Exact, r0_mm: float) -> Array:
     return np.asarray(error / (result.sigma0 * np.sqrt(variance)))
 
 
-def kind_of(name: str) -> str:
+def parameter_kind(name: str) -> str:
     """What kind of parameter an unknown is."""
     owner, quantity = name.split(".")[0], name.rsplit(".", 1)[1]
     match owner:
@@ -108,7 +108,7 @@ def print_table(runs: Runs) -> None:
     """The figures of one case."""
     ratio = np.sqrt((runs.errors**2).mean(axis=0) / (runs.sigmas**2).mean(axis=0))
     mean = runs.errors.mean(axis=0) / np.sqrt((runs.sigmas**2).mean(axis=0) / len(runs.errors))
-    kinds = np.array([kind_of(name) for name in runs.names])
+    kinds = np.array([parameter_kind(name) for name in runs.names])
     print(f"{'realised over claimed':30} {'number':>7} {'average':>8} {'least':>7} {'most':>7} {'mean error':>11}")
     for kind in dict.fromkeys(kinds):
         of_kind = ratio[kinds == kind]

@@ -70,7 +70,7 @@ def main() -> None:
             )
             with range_server(folder) as server:
                 start_s = time.process_time()
-                found = _measured(folder, f"{server.url}/{name}")
+                found = _measure(folder, f"{server.url}/{name}")
                 cpu_s = time.process_time() - start_s
                 share = server.sent_bytes / (folder / name).stat().st_size
                 marks = found.scan.frame.marks
@@ -80,7 +80,7 @@ def main() -> None:
                 print(f"| {kind} | {result} | {took} |", flush=True)
 
 
-def _measured(folder: Path, address: str) -> MeasuredFile:
+def _measure(folder: Path, address: str) -> MeasuredFile:
     """As `reseau measure` does it."""
     text = f'camera = "camera.toml"\nscans = ["{address}"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n'
     (folder / "project.toml").write_text(text, encoding="utf-8")

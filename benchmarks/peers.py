@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Prior
 from adjust.solution.adjustment import Options, adjust
-from benchmarks.large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, known
-from benchmarks.scale import ONE_THREAD, measured
+from benchmarks.large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, make_board
+from benchmarks.scale import ONE_THREAD, measure_program
 
 Array = NDArray[np.float64]
 Figures = dict[str, Any]
@@ -58,7 +58,7 @@ def main() -> None:
 
 def one(program: str, views: int, relief: bool, given: bool, percent: int) -> Figures:
     """Seconds, and how far c is off in the standard deviations of an adjustment without gross errors."""
-    clean = known(views, 0.05 if relief else 0.0)
+    clean = make_board(views, 0.05 if relief else 0.0)
     begin = time.process_time()
     c_mm, cpu_s = PROGRAMS[program](spoilt(clean, percent), relief, given, percent > 0)
     seconds = time.process_time() - begin if cpu_s is None else cpu_s
@@ -217,7 +217,7 @@ def _rounds(programs: Sequence[str], measure: Callable[[str], Figures]) -> dict[
     return found
 
 
-def _told(figures: Sequence[Figures]) -> str:
+def _describe(figures: Sequence[Figures]) -> str:
     if not all(figures):
         return "fails"
     seconds = [each["seconds"] for each in figures]
@@ -240,7 +240,7 @@ def _cell(figures: Sequence[Figures]) -> str:
     if not figures:
         return "-"
     off = any(each and abs(each["sigmas"]) > SOLVED_SIGMAS for each in figures)
-    return _told(figures) + (" wrong" if off else "")
+    return _describe(figures) + (" wrong" if off else "")
 
 
 def bundles(_: Sequence[int]) -> None:
@@ -248,12 +248,12 @@ def bundles(_: Sequence[int]) -> None:
     for images, points in BUNDLES:
         found = _rounds(("reseau", "ceres"), partial(_bundle, images=images, points=points))
         ours, theirs = (statistics.median(each["seconds"] for each in figures) for figures in found.values())
-        result = ", ".join(f"{program} {_told(figures)}" for program, figures in found.items())
+        result = ", ".join(f"{program} {_describe(figures)}" for program, figures in found.items())
         print(f"{images} images, {points} points: {result}; ratio {ours / theirs:.2f}", flush=True)
 
 
 def _bundle(program: str, images: int, points: int) -> Figures:
-    found = measured("unknown", program, images, points)
+    found = measure_program("unknown", program, images, points)
     return found | {"seconds": found["seconds"] + found.get("covariance_seconds", 0.0)} if "seconds" in found else {}
 
 
@@ -283,7 +283,7 @@ def commands(_: Sequence[int]) -> None:
         arguments = {"--help": ["--help"]} | {name: [name, project] for name in ("status", "adjust", "check", "report")}
         found = _rounds(list(arguments), lambda name: _run_once([command, *arguments[name]]))
     for name, figures in found.items():
-        print(f"reseau {name}: {_told(figures)}", flush=True)
+        print(f"reseau {name}: {_describe(figures)}", flush=True)
 
 
 def _run_once(command: Sequence[str]) -> Figures:

@@ -224,7 +224,7 @@ def film_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, kno
         Film("affine", np.array([3.0, np.cos(turn), -np.sin(turn), -2.0, np.sin(turn), np.cos(turn)]), np.zeros(2))
         for turn in 0.3 + np.arange(len(exteriors))
     ]
-    return simulated(rng, Optics(camera, lens, 115.0, 0.005), exteriors, films, points_of(xyz, known))
+    return simulated(rng, Optics(camera, lens, 115.0, 0.005), exteriors, films, make_points(xyz, known))
 
 
 def digital_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, known: str) -> Scene:
@@ -233,10 +233,10 @@ def digital_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, 
     camera = Camera("K", Prior(8.0, np.inf), nothing, nothing, Distortion("brown", {"k1": nothing, "k2": nothing}))
     lens = np.array([1e-3, -2e-5, 0.0, 0.0, 0.0, 0.0, 0.0])
     films = [Film("none", np.empty(0), np.zeros(2))] * len(exteriors)
-    return simulated(rng, Optics(camera, lens, 5.0, 0.0003), exteriors, films, points_of(xyz, known))
+    return simulated(rng, Optics(camera, lens, 5.0, 0.0003), exteriors, films, make_points(xyz, known))
 
 
-def points_of(xyz: Array, known: str) -> list[tuple[ObjectPoint, Array]]:
+def make_points(xyz: Array, known: str) -> list[tuple[ObjectPoint, Array]]:
     """The points as they are given, and where they are (3,)."""
     corners = {int(np.argmax(xyz[:, :2] @ np.array(corner))) for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1))}
     sigmas = {"fixed": (0.0, 0.0, 0.0), "unknown": (np.inf,) * 3, "heights": (np.inf, np.inf, 0.05)}

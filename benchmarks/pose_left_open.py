@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.harness import Row, table
-from benchmarks.search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, Case, case_of, draw_case
+from benchmarks.search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, Case, draw_case, make_case
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
@@ -74,7 +74,7 @@ def some_case(seed: int, index: int, pitch_um: float) -> Case:
         beyond = max(x for x, _ in outline) == 0.0
         at = EDGE_MM - (min(x for x, _ in outline) + OVERLAP_MM if beyond else max(x for x, _ in outline))
         layout = solid_layout(rng, outline, at)
-        return case_of(rng, kind, "alike", layout, f"{index}.tif", SOLID_TONES, pitch_um=pitch_um)
+        return make_case(rng, kind, "alike", layout, f"{index}.tif", SOLID_TONES, pitch_um=pitch_um)
     layout = solid_layout(rng, outline, EDGE_MM - INSIDE_MM, UNEVEN_MM)
     border = float(rng.uniform(0.04, 0.25))
     tones = Tones(
@@ -86,7 +86,7 @@ def some_case(seed: int, index: int, pitch_um: float) -> Case:
         dark_mark=border,
     )
     gamma = float(rng.choice([0.8, 1.0, 1.6, 2.2]))
-    return case_of(rng, kind, "uneven", layout, f"{index}.tif", tones, gamma, pitch_um)
+    return make_case(rng, kind, "uneven", layout, f"{index}.tif", tones, gamma, pitch_um)
 
 
 def solid_layout(rng: np.random.Generator, outline: Outline, at_mm: float, uneven_mm: float = 0.0) -> FiducialLayout:
@@ -107,10 +107,10 @@ def solid_layout(rng: np.random.Generator, outline: Outline, at_mm: float, uneve
 
 def compared(case: Case, only_auto: bool) -> Row:
     """How many marks are found with the pose left open, with the true one and with the one that auto took set."""
-    auto = measured(case, "auto")
+    auto = measure_frame(case, "auto")
     taken = auto.pose.name if auto.pose else case.pose
-    true = auto if only_auto else measured(case, case.pose)
-    same = true if only_auto or taken == case.pose else measured(case, taken)
+    true = auto if only_auto else measure_frame(case, case.pose)
+    same = true if only_auto or taken == case.pose else measure_frame(case, taken)
     return {
         "kind": case.kind,
         "symmetry": case.symmetry,
@@ -126,7 +126,7 @@ def compared(case: Case, only_auto: bool) -> Row:
     }
 
 
-def measured(case: Case, pose: str) -> FrameMeasurement:
+def measure_frame(case: Case, pose: str) -> FrameMeasurement:
     """As `reseau measure` has a frame that is its camera's only one, of marks as a user would draw them: neither light
     nor dark."""
     pitch = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)

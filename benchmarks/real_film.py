@@ -105,11 +105,11 @@ def case(scan: str, tone: str = "auto", against: str | None = None) -> Row:
         "cpu_s": cpu_s,
         "marks": marks,
         "problems": [str(problem) for problem in frame.problems],
-        "changes": changes(_marks_of(Path(against), scan), marks) if against else [],
+        "changes": changes(_mark_counts(Path(against), scan), marks) if against else [],
     }
 
 
-def _marks_of(kept: Path, scan: str) -> Row:
+def _mark_counts(kept: Path, scan: str) -> Row:
     rows = (json.loads(text)[1] for text in kept.read_text(encoding="utf-8").splitlines())
     return next((dict(row["marks"]) for row in rows if row["scan"] == scan), {})
 

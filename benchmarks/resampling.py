@@ -37,7 +37,7 @@ SPACING_PX, WINDOW_PX = 40, 8
 HALF_NYQUIST = 0.25  # cycles a pixel
 
 
-def by_opencv(kind: int) -> Method:
+def opencv_method(kind: int) -> Method:
     def method(picture: Array, cols: Array, rows: Array) -> Array:
         maps = cols.astype(np.float32), rows.astype(np.float32)
         return np.asarray(cv2.remap(picture.astype(np.float32), *maps, kind, borderMode=cv2.BORDER_REFLECT), float)
@@ -45,11 +45,11 @@ def by_opencv(kind: int) -> Method:
     return method
 
 
-def by_spline(degree: Degree) -> Method:
+def spline_method(degree: Degree) -> Method:
     return lambda picture, cols, rows: np.asarray(map_coordinates(picture, [rows, cols], order=degree, mode="mirror"))
 
 
-def by_vips(kind: str) -> Method:
+def vips_method(kind: str) -> Method:
     """libvips' mapim, whose places count from the first pixel's centre."""
 
     def method(picture: Array, cols: Array, rows: Array) -> Array:
@@ -63,7 +63,7 @@ def by_vips(kind: str) -> Method:
     return method
 
 
-def by_gdal(kind: str) -> Method:
+def gdal_method(kind: str) -> Method:
     """GDAL's warp between two affine frames, without its own approximation."""
 
     def method(picture: Array, cols: Array, rows: Array) -> Array:
@@ -83,15 +83,15 @@ def by_gdal(kind: str) -> Method:
 
 
 METHODS: dict[str, Method] = {
-    "reseau (spline 5)": by_spline(5),
-    "reseau --fast (spline 3)": by_spline(3),
-    "OpenCV linear": by_opencv(cv2.INTER_LINEAR),
-    "OpenCV cubic": by_opencv(cv2.INTER_CUBIC),
-    "OpenCV Lanczos4": by_opencv(cv2.INTER_LANCZOS4),
-    "libvips bicubic": by_vips("bicubic"),
-    "libvips nohalo": by_vips("nohalo"),
-    "GDAL cubic": by_gdal("cubic"),
-    "GDAL Lanczos": by_gdal("lanczos"),
+    "reseau (spline 5)": spline_method(5),
+    "reseau --fast (spline 3)": spline_method(3),
+    "OpenCV linear": opencv_method(cv2.INTER_LINEAR),
+    "OpenCV cubic": opencv_method(cv2.INTER_CUBIC),
+    "OpenCV Lanczos4": opencv_method(cv2.INTER_LANCZOS4),
+    "libvips bicubic": vips_method("bicubic"),
+    "libvips nohalo": vips_method("nohalo"),
+    "GDAL cubic": gdal_method("cubic"),
+    "GDAL Lanczos": gdal_method("lanczos"),
 }
 
 
@@ -128,7 +128,7 @@ def target_places(side: int) -> tuple[Array, Array]:
     )
 
 
-def moved(middles: Array, side: int) -> Array:
+def shift_middles(middles: Array, side: int) -> Array:
     """Where marks (n, 2) of the picture lie in the result."""
     u, v = (middles - side / 2).T / SCALE
     return np.stack([np.cos(TURN) * u + np.sin(TURN) * v, -np.sin(TURN) * u + np.cos(TURN) * v], axis=1) + side / 2
@@ -170,7 +170,7 @@ def compare(side: int) -> None:
         twice = [method(each, *back) for each in once]
         cells = []
         for (view, grain, waves), places, blur_px in (
-            (once, moved(middles, side), BLUR_PX / SCALE),
+            (once, shift_middles(middles, side), BLUR_PX / SCALE),
             (twice, middles, BLUR_PX),
         ):
             contrast = waves[inner, inner].std() / (1000.0 / np.sqrt(2))
@@ -196,14 +196,14 @@ def make_scan(path: Path, side: int) -> None:
     path.with_suffix(".raw").unlink()
 
 
-def by_reseau(folder: Path, degree: Degree) -> str:
+def resample_reseau(folder: Path, degree: Degree) -> str:
     chain = FrameChain((1000.0 * PITCH_MM,) * 2, Film("affine", TURNED, np.zeros(2)))
     task = ResampleTask("a", "K", folder / "scan.tif", chain, "90", PITCH_MM, degree, None, folder / "a.tif")
     done = resampled(task)
     return done.problem or f"{done.width_px} x {done.height_px}"
 
 
-def by_vips_bicubic(folder: Path, _: Degree) -> str:
+def resample_vips(folder: Path, _: Degree) -> str:
     """The same turn by libvips' affine, stored alike: tiles, deflate, predictor."""
     import pyvips
 
@@ -216,13 +216,13 @@ def by_vips_bicubic(folder: Path, _: Degree) -> str:
 
 
 PROGRAMS: dict[str, tuple[Callable[[Path, Degree], str], Degree]] = {
-    "reseau (spline 5)": (by_reseau, BEST),
-    "reseau --fast (spline 3)": (by_reseau, FAST),
-    "libvips bicubic": (by_vips_bicubic, FAST),
+    "reseau (spline 5)": (resample_reseau, BEST),
+    "reseau --fast (spline 3)": (resample_reseau, FAST),
+    "libvips bicubic": (resample_vips, FAST),
 }
 
 
-def measured(name: str, folder: Path) -> None:
+def print_measures(name: str, folder: Path) -> None:
     """Run one program in this process, and print what it took."""
     program, degree = PROGRAMS[name]
     start = time.perf_counter()
@@ -242,7 +242,10 @@ def large(side: int = 11500) -> None:
         folder = Path(name)
         print(f"a scan of {side} px, 16 bit, LZW in strips of {STRIP_PX} rows, turned by 90 degrees", flush=True)
         print("| program | result, px | CPU s | wall s | peak MiB |\n|---|---|---|---|---|", flush=True)
-        work = [partial(make_scan, folder / "scan.tif", side), *(partial(measured, of, folder) for of in PROGRAMS)]
+        work = [
+            partial(make_scan, folder / "scan.tif", side),
+            *(partial(print_measures, of, folder) for of in PROGRAMS),
+        ]
         for each in work:
             process = spawn.Process(target=each)
             process.start()

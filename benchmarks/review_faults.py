@@ -120,16 +120,16 @@ class Session:
 def main(seed: int, folder: Path) -> int:
     truths = planted(folder, np.random.default_rng(seed))
     project = folder / "project.toml"
-    measured(project)
+    measure_project(project)
     before, session = rows(folder), Session()
     for _ in range(ROUNDS):
         if reviewed(project, truths, session) == 0:
             break
-        measured(project)
-    return told(seed, truths, before, rows(folder), decisions(folder), session)
+        measure_project(project)
+    return print_outcome(seed, truths, before, rows(folder), decisions(folder), session)
 
 
-def told(
+def print_outcome(
     seed: int, truths: Mapping[str, Truth], before: Rows, after: Rows, made: list[dict[str, Any]], session: Session
 ) -> int:
     """Print what came of it; 1 where a mark is not right, or a row changed that nobody decided about."""
@@ -348,7 +348,7 @@ _SHOWN = """() => {
 # --- files
 
 
-def measured(project: Path) -> None:
+def measure_project(project: Path) -> None:
     subprocess.run([sys.executable, "-c", START, "measure", str(project)], check=False, capture_output=True)
 
 

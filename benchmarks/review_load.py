@@ -185,7 +185,7 @@ def reviewed(address: str, most: int) -> Reviewed:
         page.goto(address)
         page.wait_for_selector("#mark-view:not([hidden])")
         opened_s = time.monotonic() - began
-        next_s = [decided(page) for _ in range(most - 1)]
+        next_s = [decide_next(page) for _ in range(most - 1)]
         page.keyboard.press("a")
         page.wait_for_timeout(1000)
         clock_s = time.monotonic() - began - 1.0
@@ -193,7 +193,7 @@ def reviewed(address: str, most: int) -> Reviewed:
     return Reviewed(opened_s, next_s, clock_s)
 
 
-def decided(page: Page) -> float:
+def decide_next(page: Page) -> float:
     """Seconds from a key until the next mark is there."""
     page.wait_for_timeout(LOOKED_MS)
     title = page.inner_text("#title")

@@ -36,20 +36,20 @@ def pose(rng: np.random.Generator) -> Pose:
     return Pose(np.asarray(turn, float), np.array([*rng.normal(0.0, 100.0, 2), 1000.0]))
 
 
-def seen(of: Pose, xyz: Array) -> Array:
+def view_points(of: Pose, xyz: Array) -> Array:
     """(n, 2) mm, y up."""
     u, v, w = of.rotation @ (xyz - of.center).T
     return np.stack([-C_MM * u / w, -C_MM * v / w], axis=1)
 
 
-def with_errors(xy_mm: Array, share: float, rng: np.random.Generator) -> Array:
+def add_errors(xy_mm: Array, share: float, rng: np.random.Generator) -> Array:
     xy_mm = xy_mm + rng.normal(0.0, SIGMA_MM, xy_mm.shape)
     wrong = rng.permutation(len(xy_mm))[: round(share * len(xy_mm))]
     xy_mm[wrong] = rng.uniform(-HALF_MM, HALF_MM, (len(wrong), 2))
     return xy_mm
 
 
-def of_opencv(rotation: Array, shift: Array) -> Pose:
+def pose_from_opencv(rotation: Array, shift: Array) -> Pose:
     turned = FLIP @ rotation
     return Pose(turned, -rotation.T @ shift.ravel())
 
@@ -73,7 +73,7 @@ def solved_pnp(gate_mm: float, usac: bool, xyz: Array, xy_mm: Array, _rng: np.ra
             )
     except cv2.error:
         return []
-    return [of_opencv(np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift))] if done else []
+    return [pose_from_opencv(np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift))] if done else []
 
 
 def essential(gate_mm: float, usac: bool, first: Array, second: Array, _rng: np.random.Generator) -> Found:
@@ -97,9 +97,9 @@ def one_image(method: Callable[..., Found], points: int, share: float, relief: f
     rng = np.random.default_rng([SEED, number])
     xyz = np.column_stack([rng.uniform(-600.0, 600.0, (points, 2)), rng.uniform(0.0, relief, points)])
     true = pose(rng)
-    clean = seen(true, xyz)
-    found = method(xyz, with_errors(clean, share, rng), rng)
-    return any(np.sqrt(np.mean((seen(each, xyz) - clean) ** 2)) < 10 * SIGMA_MM for each in found)
+    clean = view_points(true, xyz)
+    found = method(xyz, add_errors(clean, share, rng), rng)
+    return any(np.sqrt(np.mean((view_points(each, xyz) - clean) ** 2)) < 10 * SIGMA_MM for each in found)
 
 
 def two_images(method: Callable[..., Found], points: int, share: float, relief: float, number: int) -> bool:
@@ -108,7 +108,7 @@ def two_images(method: Callable[..., Found], points: int, share: float, relief: 
     true = [pose(rng), pose(rng)]
     true[1].center[0] += 600.0
     found = method(
-        *(with_errors(seen(each, xyz), wrong, rng) for each, wrong in zip(true, (0.0, share), strict=True)), rng
+        *(add_errors(view_points(each, xyz), wrong, rng) for each, wrong in zip(true, (0.0, share), strict=True)), rng
     )
     rotation = true[1].rotation @ true[0].rotation.T
     base = true[0].rotation @ (true[1].center - true[0].center)
@@ -135,7 +135,7 @@ def main() -> None:
         methods: dict[str, Callable[..., Found]] = {"own": own}
         for usac in (False, True):
             for text, gate in GATES_MM.items():
-                methods[f"{'USAC' if usac else 'RANSAC'}, {text}"] = _told(theirs, gate, usac)
+                methods[f"{'USAC' if usac else 'RANSAC'}, {text}"] = _select_found(theirs, gate, usac)
         for relief in (200.0, 0.0):
             for points, share in ((12, 0.0), (12, 1 / 4), (12, 1 / 3), (40, 1 / 3)):
                 result = []
@@ -148,7 +148,7 @@ def main() -> None:
                 )
 
 
-def _told(theirs: Callable[..., Found], gate_mm: float, usac: bool) -> Callable[..., Found]:
+def _select_found(theirs: Callable[..., Found], gate_mm: float, usac: bool) -> Callable[..., Found]:
     return lambda *given: theirs(gate_mm, usac, *given)
 
 

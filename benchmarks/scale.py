@@ -34,7 +34,17 @@ from adjust.least_squares.numbering import Numbering
 from adjust.problem.network import Exterior
 from adjust.problem.problem import ABSENT, number
 from adjust.solution.adjustment import adjust
-from benchmarks.large_networks import CONTROL_EVERY, FLIP, FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, known, strip, unknown
+from benchmarks.large_networks import (
+    CONTROL_EVERY,
+    FLIP,
+    FOCAL_MM,
+    FRAME_MM,
+    SIGMA_MM,
+    Scene,
+    make_board,
+    strip,
+    unknown,
+)
 
 Array = NDArray[np.float64]
 Figures = dict[str, Any]
@@ -58,25 +68,25 @@ def main() -> None:
     print("start: approximations from the points alone, where none are given")
     print(f"{'views':>7} {'reseau':>16} {'OpenCV':>16} {'ratio':>7} {'tests':>9} {'start':>9}")
     for views in VIEWS:
-        ours, theirs = measured("known", "reseau", views), measured("known", "opencv", views)
+        ours, theirs = run_timed("known", "reseau", views), run_timed("known", "opencv", views)
         ratio = f"{theirs['seconds'] / ours['seconds']:7.1f}" if "seconds" in theirs else f"{'':>7}"
         print(f"{views:7} {_figures(ours)} {_figures(theirs)} {ratio} {_besides(ours, views)}")
     for views in VIEWS_OF_RESEAU_ALONE:
-        ours = measured("known", "reseau", views)
+        ours = run_timed("known", "reseau", views)
         print(f"{views:7} {_figures(ours)} {'':24} {_besides(ours, views)}")
     print("\nUnknown points; the covariance that each gives in the time behind +")
     for images, points in NETWORKS:
         print(f"{images} images, {points} points")
         _compare("unknown", images, points)
     images, points = NETWORK_OF_RESEAU_ALONE
-    print(f"{images} images, {points} points\n    reseau   {_figures(measured('unknown', 'reseau', images, points))}")
+    print(f"{images} images, {points} points\n    reseau   {_figures(run_timed('unknown', 'reseau', images, points))}")
     for images in STRIPS:
         print(f"A strip of {images} images")
         _compare("strip", images)
     for images in STRIPS_OF_RESEAU_ALONE:
-        ours = measured("strip", "reseau", images)
+        ours = run_timed("strip", "reseau", images)
         print(f"A strip of {images} images\n    reseau   {_figures(ours)}")
-    ours = measured("strip", "reseau", HANGING, 0)
+    ours = run_timed("strip", "reseau", HANGING, 0)
     print(f"A strip of {HANGING} images, known points in the first two alone\n    reseau   {_figures(ours)}")
 
 
@@ -84,7 +94,7 @@ def _compare(task: str, *sizes: int) -> None:
     """All programs on one network, and whether they have come to the same minimum."""
     vpv = {}
     for program in ("reseau", "scipy", "ceres"):
-        found = measured(task, program, *sizes)
+        found = run_timed(task, program, *sizes)
         print(f"    {program:8} {_figures(found)}  {found.get('says', '')}")
         if "vpv" in found and found.get("finished", True):
             vpv[program] = found["vpv"]
@@ -95,7 +105,7 @@ def _compare(task: str, *sizes: int) -> None:
         sys.exit(f"another minimum: {', '.join(f'{name} {vpv[name]:.6f}' for name in different)}")
 
 
-def measured(task: str, program: str, *sizes: int) -> Figures:
+def run_timed(task: str, program: str, *sizes: int) -> Figures:
     """The figures of one measurement in a process of its own."""
     command = [sys.executable, __file__, task, program, *map(str, sizes)]
     try:
@@ -118,7 +128,7 @@ def _figures(found: Figures) -> str:
 
 def _besides(ours: Figures, views: int) -> str:
     """Seconds of the tests, and of approximations."""
-    start = measured("known", "start", views)
+    start = run_timed("known", "start", views)
     return " ".join(f"{each['seconds']:7.2f} s" for each in ({"seconds": ours["tests_seconds"]}, start))
 
 
@@ -285,10 +295,10 @@ def ceres(scene: Scene) -> Figures:
 
 
 PROGRAMS: dict[tuple[str, str], Callable[..., Figures]] = {
-    ("known", "reseau"): lambda views: reseau(known(views)),
-    ("known", "start"): lambda views: start(known(views)),
-    ("known", "nothing"): lambda views: nothing(known(views)),
-    ("known", "opencv"): lambda views: opencv(known(views)),
+    ("known", "reseau"): lambda views: reseau(make_board(views)),
+    ("known", "start"): lambda views: start(make_board(views)),
+    ("known", "nothing"): lambda views: nothing(make_board(views)),
+    ("known", "opencv"): lambda views: opencv(make_board(views)),
     ("unknown", "reseau"): lambda images, points: reseau(unknown(images, points)),
     ("unknown", "scipy"): lambda images, points: scipy(unknown(images, points)),
     ("strip", "reseau"): lambda images, control=CONTROL_EVERY: reseau(strip(images, control)),

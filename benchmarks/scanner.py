@@ -56,7 +56,7 @@ def main() -> None:
         print(f"{words}: {len(terms)} terms free\n  {_ratios(count, terms, made)}", flush=True)
     few = max(count // 10, 5)
     alike = (laid((0.0,) * 8, EVEN, np.random.default_rng(seed), dict.fromkeys(EVEN, FREE)) for seed in range(few))
-    result = sum(_told(adjust(*network)) for network in alike)
+    result = sum(_names_bend(adjust(*network)) for network in alike)
     print(f"\nframes that all lie alike, 6 terms free: told in {result} of {few} networks")
     for truth, words in ((CHOSEN, ", ".join(CHOSEN)), ({}, "none")):
         chosen = Counter(_chosen(truth, seed) for seed in range(few))
@@ -101,7 +101,7 @@ def _ratios(count: int, terms: Sequence[str], made: Made) -> str:
     )
 
 
-def _told(result: Adjustment) -> bool:
+def _names_bend(result: Adjustment) -> bool:
     return any("lie alike in the scanner" in text for text in result.warnings)
 
 

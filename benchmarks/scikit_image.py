@@ -27,7 +27,7 @@ from true_marks import KIND, TrueMark, some_mark
 
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
-from benchmarks.measured_marks import CONTRAST, GROUND, drawn, measured, start_off
+from benchmarks.measured_marks import CONTRAST, GROUND, draw_mark, measure_mark, start_off
 from measure.boards.corners import junctions
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.noise.damage import _opened
@@ -48,15 +48,15 @@ def ellipse_model(count: int) -> str:
     rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
     for _number in range(count):
         mark = some_mark(KIND["ellipse"], 1.0, rng)
-        grey, _sign = drawn(mark, rng)
+        grey, _sign = draw_mark(mark, rng)
         noisy = grey + CONTRAST / SNR * rng.standard_normal(grey.shape)
-        found, place = measured(mark, noisy, rng, off=start_off(mark, rng)), mark.place[:, 2]
+        found, place = measure_mark(mark, noisy, rng, off=start_off(mark, rng)), mark.place[:, 2]
         ours += [] if found is None else [found.center_px - place]
-        theirs += [by_contour(noisy, place) - place]
+        theirs += [contour_center(noisy, place) - place]
     return f"{_rms(theirs)} px | least-squares matching {_rms(ours)} px"
 
 
-def by_contour(grey: Array, about_px: Array) -> Array:
+def contour_center(grey: Array, about_px: Array) -> Array:
     """(2,) the centre of an ellipse through the contour half way between the ground and the mark that lies about a
     place."""
     col, row = np.rint(about_px).astype(int)
@@ -80,7 +80,7 @@ def phase_correlation(count: int) -> str:
             for each in (first, second)
         ]
         here, there = (
-            measured(each, grey, rng, off=start_off(each, rng))
+            measure_mark(each, grey, rng, off=start_off(each, rng))
             for each, grey in zip((first, second), pictures, strict=True)
         )
         if here is not None and there is not None:
@@ -124,10 +124,10 @@ def _first_looks(picture: Array, truth: Array) -> str:
             [each.center_px for each in disk_candidates(scan_of(picture), DiskSearch((5.0, 30.0), "light"))]
         )
 
-    return " | ".join(f"{method.__name__}: {_told(method, truth)}" for method in (regions, laplacians, own))
+    return " | ".join(f"{method.__name__}: {_count_outliers(method, truth)}" for method in (regions, laplacians, own))
 
 
-def _told(method: Callable[[], Array], truth: Array) -> str:
+def _count_outliers(method: Callable[[], Array], truth: Array) -> str:
     start = time.process_time()
     found = method().reshape(-1, 2)
     seconds = time.process_time() - start

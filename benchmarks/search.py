@@ -47,7 +47,7 @@ def main() -> None:
     for index in range(given.first, given.first + given.frames):
         if index not in done:
             with given.out.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"frame": index, **judged(draw_case(given.seed, index))}) + "\n")
+                file.write(json.dumps({"frame": index, **judge_case(draw_case(given.seed, index))}) + "\n")
     print_tables(lines(given.out))
 
 
@@ -56,10 +56,10 @@ def lines(path: Path) -> list[Json]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
-def judged(case: Case) -> Json:
+def judge_case(case: Case) -> Json:
     """Measure a frame, and compare it with its truth."""
     begin = time.perf_counter()
-    result = measured(case)
+    result = measure_case(case)
     seconds = time.perf_counter() - begin
     marks = {mark.point: mark for mark in result.marks}
     observed = {id for id, mark in marks.items() if mark.status.is_observation}
@@ -79,7 +79,7 @@ def judged(case: Case) -> Json:
     }
 
 
-def measured(case: Case) -> FrameMeasurement:
+def measure_case(case: Case) -> FrameMeasurement:
     pitch = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)
     return measure_fiducials(case.scan, case.layout, pitch, FiducialOptions())
 
@@ -139,7 +139,7 @@ def print_table(
 
 def tell(case: Case, picture: Path) -> None:
     """One frame, mark by mark."""
-    result = measured(case)
+    result = measure_case(case)
     print(f"{case.kind}, {case.symmetry}, {case.picture}; true pose {case.pose}; hidden {sorted(case.hidden)}")
     print(f"pose {result.pose}\nproblems {result.problems}")
     for mark in result.marks:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.lone_frames import image_of, lone_frame, painted
+from benchmarks.lone_frames import lone_frame, make_image, painted
 from measure.marks.shapes import (
     Disk,
     FiducialLayout,
@@ -78,7 +78,7 @@ def draw_case(seed: int, index: int, pitch_um: float = PITCH_UM) -> Case:
     """The index-th frame of the study of that seed."""
     rng = np.random.default_rng([seed, index])
     kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
-    return case_of(rng, kind, symmetry, _layout(rng, kind, symmetry), f"{index}.tif", pitch_um=pitch_um)
+    return make_case(rng, kind, symmetry, _layout(rng, kind, symmetry), f"{index}.tif", pitch_um=pitch_um)
 
 
 def is_overexposed(seed: int, index: int) -> bool:
@@ -89,7 +89,7 @@ def is_overexposed(seed: int, index: int) -> bool:
     return kind != "wing" and _tones(rng)[1] == "overexposed"
 
 
-def case_of(
+def make_case(
     rng: Generator,
     kind: str,
     symmetry: str,
@@ -173,11 +173,11 @@ def _tones(rng: Generator) -> tuple[Tones, str]:
 
 
 def _scene(rng: Generator, layout: FiducialLayout, tones: Tones) -> Scene:
-    fiducials = tuple(SceneFiducial(mark.id, _made(rng, mark), scene_mark(mark.mark)) for mark in layout.marks)
+    fiducials = tuple(SceneFiducial(mark.id, _draw_place(rng, mark), scene_mark(mark.mark)) for mark in layout.marks)
     ids = [mark.id for mark in layout.marks]
     covered = rng.choice(ids, int(rng.integers(1, len(ids) // 2)), replace=False) if rng.random() < 0.2 else ()
     scale = 1.0 + rng.normal(0.0, 0.001, 2)
-    image = image_of(
+    image = make_image(
         str(rng.choice(POSES)),
         float(rng.normal(0.0, 1.0)),
         offset_mm=(float(rng.normal(0.0, 0.4)), float(rng.normal(0.0, 0.4))),
@@ -210,7 +210,7 @@ def _scene(rng: Generator, layout: FiducialLayout, tones: Tones) -> Scene:
     )
 
 
-def _made(rng: Generator, mark: LayoutMark) -> tuple[float, float]:
+def _draw_place(rng: Generator, mark: LayoutMark) -> tuple[float, float]:
     """Where the camera has its mark: beside its given place by the given standard deviation."""
     x, y = rng.normal(mark.xy_mm, mark.sigma_mm)
     return float(x), float(y)

@@ -19,7 +19,7 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 
-from benchmarks.lone_frames import fiducials_of, image_of, lone_frame, painted
+from benchmarks.lone_frames import lone_frame, make_fiducials, make_image, painted
 from benchmarks.search_frames import SIDES
 from benchmarks.writing_lines import ALIKE, line_text
 from measure.annotations.fields import Line, Reading, is_plate
@@ -61,7 +61,7 @@ def main() -> None:
     for index in range(total):
         if index not in rows:
             bare = (index + 1) * without // total > index * without // total  # spread over the run
-            rows[index] = row_of(index, not bare)
+            rows[index] = make_row(index, not bare)
             if path:
                 with path.open("a") as file:
                     file.write(json.dumps(rows[index]) + "\n")
@@ -132,7 +132,7 @@ def table(name: str, leads: Iterable[tuple[float, bool]]) -> None:
             print(f"  {name} {low:.1f} to {high:.1f}: {len(inside):4d} frames, {sum(inside):4d} right")
 
 
-def row_of(index: int, written: bool) -> Row:
+def make_row(index: int, written: bool) -> Row:
     """One frame, rendered and measured."""
     rng = np.random.default_rng([SEED, index])
     side = SIDES[rng.integers(4)]
@@ -140,7 +140,7 @@ def row_of(index: int, written: bool) -> Row:
     plate_way = TURNED[way] if rng.random() < 0.7 else way
     lines = titles(rng, side, way)
     lines += plate(rng, OPPOSITE[side], plate_way) if rng.random() < 0.4 else []
-    lines += by_hand(rng) if rng.random() < 0.4 else []
+    lines += draw_handwriting(rng) if rng.random() < 0.4 else []
     known = (WrittenPlace(side, way), WrittenPlace(OPPOSITE[side], plate_way, plate=True))
     places = known if rng.random() < 0.75 else ()
     mark = MarkShape(ring_cross(0.5, 0.1, 0.8, 0.1))
@@ -188,7 +188,7 @@ def plate(rng: Generator, side: Side, way: str) -> list[Writing]:
     return [line(rng, text, side, way, index) for index, text in enumerate(texts)]
 
 
-def by_hand(rng: Generator) -> list[Writing]:
+def draw_handwriting(rng: Generator) -> list[Writing]:
     side = SIDES[rng.integers(4)]
     way = str(rng.choice(("0", "180") if side in ("top", "bottom") else ("90", "270")))
     return [line(rng, str(int(rng.integers(1, 9999))), side, way, 4, HANDWRITING)]
@@ -206,7 +206,7 @@ def line(rng: Generator, text: str, side: Side, way: str, slot: int, font: str |
 
 def scene(rng: Generator, marks: tuple[LayoutMark, ...], lines: tuple[Writing, ...]) -> Scene:
     scale = 1.0 + rng.normal(0.0, 0.001, 2)
-    image = image_of(
+    image = make_image(
         str(rng.choice(POSES)),
         float(rng.normal(0.0, 0.8)),
         scale,
@@ -225,7 +225,7 @@ def scene(rng: Generator, marks: tuple[LayoutMark, ...], lines: tuple[Writing, .
         "written",
         int(rng.integers(2**31)),
         FRAME_MM,
-        fiducials_of(marks),
+        make_fiducials(marks),
         image,
         scanner=scanner,
         film=Film(deformation_um=3.0, grain=float(rng.uniform(0.0, 0.03)), grain_px=1.0, dust=30, scratches=3, hairs=3),

@@ -46,7 +46,7 @@ def main() -> None:
     scans, first = (int(text) for text in (*sys.argv[1:], "250", "0")[:2])
     mirror, turn, short = [], [], []
     for index in range(first, first + scans):
-        for found_mirror, found_turn, legible in told_by(index):
+        for found_mirror, found_turn, legible in count_turns(index):
             mirror.append(found_mirror)
             turn.append(found_turn)
             short.append(legible)
@@ -72,7 +72,7 @@ def slope(lead: Array) -> float:
     return float(trials[np.argmin([np.logaddexp(0.0, -each * lead).sum() for each in trials])])
 
 
-def told_by(index: int) -> list[tuple[float, float, float]]:
+def count_turns(index: int) -> list[tuple[float, float, float]]:
     """Of each line that was found: by how many characters the truth leads, of mirror and of turn; its legible ones."""
     rng = np.random.default_rng([SEED, index])
     pose = str(rng.choice(POSES))
@@ -85,12 +85,12 @@ def told_by(index: int) -> list[tuple[float, float, float]]:
     found = []
     for line in read_writing(scan, nets):
         legible = {pose_in_camera(each, pose): reading.legible for each, reading in line.ways.items()}
-        right, down, *mirrored = (legible.get(each, -1.0) for each in _ways_of(legible))
+        right, down, *mirrored = (legible.get(each, -1.0) for each in _possible_turns(legible))
         found.append((max(right, down) - max(mirrored), right - down, max(legible.values())))
     return found
 
 
-def _ways_of(legible: dict[str, float]) -> Sequence[str]:
+def _possible_turns(legible: dict[str, float]) -> Sequence[str]:
     """The true way, upside down, and both mirrored: lines read upright above and below, upward at the sides."""
     return ("0", "180", "0m", "180m") if "0" in legible else ("90", "270", "90m", "270m")
 
