@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.lens import Prior
 from adjust.solution.adjustment import Options, adjust
 from benchmarks.large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, make_board
-from benchmarks.scale import ONE_THREAD, measure_program
+from benchmarks.scale import ONE_THREAD, run_timed
 
 Array = NDArray[np.float64]
 Figures = dict[str, Any]
@@ -253,7 +253,7 @@ def bundles(_: Sequence[int]) -> None:
 
 
 def _bundle(program: str, images: int, points: int) -> Figures:
-    found = measure_program("unknown", program, images, points)
+    found = run_timed("unknown", program, images, points)
     return found | {"seconds": found["seconds"] + found.get("covariance_seconds", 0.0)} if "seconds" in found else {}
 
 
