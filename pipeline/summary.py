@@ -20,7 +20,7 @@ from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
 from pipeline.files.project_file import Project
 from pipeline.report.camera_values import CameraValue, camera_values
 from pipeline.report.data import Problem, ReportData
-from pipeline.report.fiducials import Figure, correction_sentences, figure
+from pipeline.report.fiducials import Distance, correction_sentence, figure
 from pipeline.report.many_frames import frame_counts
 from pipeline.report.marks import current_scans
 from pipeline.report.marks import frames as report_frames
@@ -34,15 +34,16 @@ from pipeline.text.wording import counted
 
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
 FRAME_ROWS = 8  # of frames in a table in the terminal: the report has all
+WHOLE_PROBLEMS = 6  # of more the terminal has the first sentence
 NOTES = 3  # that are printed: the report has all
 
 
 @dataclass(frozen=True)
 class Summary:
     """The end of a command. poses: of the scans, each with its evidence, as measurement.db has them. files: what was
-    written, by a word for it. forms: of the fiducials of cameras of which nothing else was adjusted; values: of the
-    calibrated cameras; unit: of lengths in images. verdicts: numbers of scans. parts: in how many the scans are
-    measured, where these are those of one."""
+    written, by a word for it. corrections: to the fiducials of cameras of which nothing else was adjusted, in words,
+    and distances between them; values: of the calibrated cameras; unit: of lengths in images. verdicts: numbers of
+    scans. parts: in how many the scans are measured, where these are those of one."""
 
     verdict: ReportVerdict
     frames: Mapping[str, Mapping[str, int]]
@@ -50,7 +51,7 @@ class Summary:
     adjustment: AdjustmentRecord | None
     check: Check | None
     files: Mapping[str, Path] = field(default_factory=dict)
-    forms: Mapping[str, Figure] = field(default_factory=dict)
+    corrections: Mapping[str, tuple[str, Sequence[Distance]]] = field(default_factory=dict)
     values: Mapping[str, Sequence[CameraValue]] = field(default_factory=dict)
     unit: ImageUnit = FILM_UNIT
     verdicts: Mapping[Verdict, int] = field(default_factory=dict)
@@ -85,16 +86,31 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     cameras = data.adjustment.cameras if data.adjustment else {}
     values = {name: camera_values(data, name) for name, camera in cameras.items() if camera.is_calibrated}
     unit = next(iter(data.image_units.values()), FILM_UNIT)
-    return Summary(judge(data), frames, poses, data.adjustment, data.check, files, _forms(data), values, unit, verdicts)
+    return Summary(
+        judge(data),
+        frames,
+        poses,
+        data.adjustment,
+        data.check,
+        files,
+        corrections=_corrections(data),
+        values=values,
+        unit=unit,
+        verdicts=verdicts,
+    )
 
 
-def _forms(data: ReportData) -> dict[str, Figure]:
+def _corrections(data: ReportData) -> dict[str, tuple[str, Sequence[Distance]]]:
     stored, covariance = data.adjustment, data.covariance
     if stored is None or covariance is None or not stored.converged:
         return {}
     uncalibrated = [name for name, camera in stored.cameras.items() if not camera.is_calibrated]
     found = {name: figure(name, stored, covariance) for name in uncalibrated}
-    return {name: form for name, form in found.items() if form is not None}
+    return {
+        name: (correction_sentence(form, stored.cameras[name].fiducials, data.given_by_of(name)), form.distances)
+        for name, form in found.items()
+        if form is not None
+    }
 
 
 def print_summary(summary: Summary, console: Console) -> None:
@@ -102,21 +118,23 @@ def print_summary(summary: Summary, console: Console) -> None:
     console.print(Text(summary.verdict.sentence, style=STYLES[summary.verdict.level]))
     if summary.adjustment and summary.values and summary.adjustment.converged:
         console.print(_camera_table(summary.adjustment, summary.values))
+    is_brief = len(summary.verdict.problems) > WHOLE_PROBLEMS
     for next_step, problems in groupby(summary.verdict.problems, attrgetter("next_step")):
         for problem in problems:
-            console.print(Text(f"- {problem.what}"))
+            console.print(Text(f"- {problem.cause if is_brief else problem.what}"))
         if next_step:
             console.print(Text(f"  {next_step}", style="dim"))
+    if is_brief:
+        console.print(Text("The report has more of each, with pictures.", style="dim"))
     if any(summary.verdicts.values()) and (counts := f"{scan_counts(summary.verdicts)}.") != summary.verdict.sentence:
         console.print(Text(counts))
     if summary.frames:
         console.print(_frame_table(summary))
     if summary.adjustment and not summary.values:
         console.print(Text(f"Film transformations: {_quality(summary.adjustment)}."))
-        for name, form in summary.forms.items():
-            for sentence in correction_sentences(form, summary.adjustment.cameras[name].fiducials):
-                console.print(Text(f"{name}: {sentence}"))
-            for each in form.distances[:FRAME_ROWS]:
+        for name, (sentence, distances) in summary.corrections.items():
+            console.print(Text(f"{name}: {sentence}"))
+            for each in distances[:FRAME_ROWS]:
                 change = f"{each.change_um:+.3f} µm from the given one, standard deviation {each.sigma_um:.3f} µm"
                 console.print(Text(f"{each.start} to {each.end}: {each.length_mm:.4f} mm, {change}"))
     notes = summary.verdict.notes

@@ -30,6 +30,7 @@ from pipeline.measuring.tone_stage import tone_before
 from pipeline.provenance import parts_hash
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails
+from pipeline.text.wording import capitalised
 from pipeline.workers import Submits, iterate_results
 
 SecondPass = Callable[[Scan, MeasuredScan], None]
@@ -145,10 +146,10 @@ def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     tone = tone_before(options.tone, options.said, scan.path)
     frame = replace(_fiducials(options, scan.replace_tone(tone)), image=task.name)
     pitch, problems, notes = _pitch(options, scan, frame)
-    of_file = (Reason(f"{problem[0].upper()}{problem[1:]}.", Code.SECOND_PICTURE) for problem in scan.problems)
+    of_file = (Reason(f"{capitalised(problem)}.", Code.SECOND_PICTURE) for problem in scan.problems)
     frame = replace(frame, problems=(*of_file, *frame.problems, *problems))
     curve = (frame.tone.note,) if frame.tone else ()
-    file_notes = (f"{note[0].upper()}{note[1:]}." for note in scan.notes)
+    file_notes = (f"{capitalised(note)}." for note in scan.notes)
     notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame), *_unknown_lens(options))
     measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, notes)
     if misplaced := misplaced_principal_point(options.camera, measured):
@@ -191,7 +192,7 @@ def _missed_reading(options: ScanOptions, frame: FrameMeasurement) -> tuple[str,
     writing = options.fiducials.writing
     undecided = writing == "pose" and frame.pose is not None and not frame.pose.decided
     is_requested = writing == "all" or undecided
-    return (f"{MISSING[0].upper()}{MISSING[1:]}.",) if is_requested and networks() is None else ()
+    return (f"{capitalised(MISSING)}.",) if is_requested and networks() is None else ()
 
 
 def _unknown_lens(options: ScanOptions) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from pipeline.files.target_table import TieSettings
 from pipeline.measuring.sheet_check import check_sheet
 from pipeline.progress import Count, Reporter
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.text.wording import capitalised
 
 Array = NDArray[np.float64]
 
@@ -163,7 +164,7 @@ def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> Mea
         f"them {off_mm:.1f} mm apart"
     )
     problem = Reason(
-        f"{what[0].upper()}{what[1:]}. One of the frames lies elsewhere than it was found, or in another pose: look at "
+        f"{capitalised(what)}. One of the frames lies elsewhere than it was found, or in another pose: look at "
         "both, and place the marks or set the pose in a review.",
         Code.AMBIGUOUS,
     )

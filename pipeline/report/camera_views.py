@@ -64,6 +64,7 @@ class CameraView:
     observed: int
     maps: list[tuple[str, Markup]]
     corrections: fiducials.Figure | None
+    corrections_sentence: str
     corrections_plot: Markup | None
     check: CameraCheck | None
 
@@ -104,6 +105,9 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
         observed=len(places),
         maps=list(_uncertainty_maps(camera, on, data.unit)) if on is not None else [],
         corrections=figure,
+        corrections_sentence=fiducials.correction_sentence(figure, camera.fiducials, data.given_by_of(name))
+        if figure
+        else "",
         corrections_plot=fiducials.figure_plot(figure) if figure else None,
         check=data.check.cameras.get(name) if data.check else None,
     )

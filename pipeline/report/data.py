@@ -1,6 +1,7 @@
 """What the report is made from: the files of the stages, any of which may be missing."""
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,6 +18,7 @@ from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.thumbnail import Thumbnail
 
 MarkKey = tuple[str, str, str]  # image, kind, point
+_SENTENCE = re.compile(r"(?<=[.:]) (?=[A-Z])")
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,16 @@ class Problem:
     images: tuple[str, ...] = field(default=(), compare=False)
     marks: tuple[MarkKey, ...] = field(default=(), compare=False)
     section: str = field(default="", compare=False)
+
+    @property
+    def cause(self) -> str:
+        """Its first sentence."""
+        return _SENTENCE.split(self.what, maxsplit=1)[0]
+
+    @property
+    def detail(self) -> str:
+        """What follows it."""
+        return "".join(_SENTENCE.split(self.what, maxsplit=1)[1:])
 
 
 @dataclass(frozen=True)
@@ -58,8 +70,9 @@ class ReportData:
     adjustment.json and check.json keep them; covariance: adjustment.npz. frame_mm: width and height of the exposed
     frame by camera name. pitch_um: of the scans whose pixel positions are known, across and down. thumbnail: from
     image, point and kind (a fiducial and a target may share a name) to the mark's picture. problems, notes: what the
-    caller has to say beyond the files. made_from: their fingerprints by name. unit: of the object coordinates. totals:
-    of all frames where they are many; comparator and measurement are then of those that are shown.
+    caller has to say beyond the files. made_from: their fingerprints by name. unit: of the object coordinates.
+    given_by: by camera what its fiducials' given coordinates come from. totals: of all frames where they are many;
+    comparator and measurement are then of those that are shown.
     """
 
     project: str
@@ -75,6 +88,7 @@ class ReportData:
     notes: tuple[str, ...] = ()
     made_from: Mapping[str, str] = field(default_factory=dict)
     unit: str = "m"
+    given_by: Mapping[str, str] = field(default_factory=dict)
     totals: FrameTotals | None = None
 
     @property
@@ -101,6 +115,10 @@ class ReportData:
         if any(len(each) != 1 or math.isnan(min(each)) for each in sizes.values()):
             return {}
         return {name: ImageUnit(min(each)) for name, each in sizes.items()}
+
+    def given_by_of(self, camera: str) -> str:
+        """What the given coordinates of a camera's fiducials come from."""
+        return self.given_by.get(camera, "the given coordinates")
 
     def unit_of_camera(self, camera: str) -> ImageUnit:
         return self.image_units.get(camera, FILM_UNIT)

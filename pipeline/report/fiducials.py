@@ -65,9 +65,9 @@ class Figure:
         return np.sqrt(np.maximum(np.diag(self.covariance_um2), 0.0)).reshape(-1, 2)
 
 
-def correction_sentences(form: Figure, fiducials: Mapping[str, FiducialRecord]) -> list[str]:
-    """What the corrections say of the certificate, in words: against the larger of their own standard deviations and of
-    those of the given coordinates, where these do more than place the datum."""
+def correction_sentence(form: Figure, fiducials: Mapping[str, FiducialRecord], given_by: str) -> str:
+    """What the corrections say of the given coordinates, in words: against the larger of their own standard deviations
+    and of those of the given coordinates, where these do more than place the datum. given_by: what these come from."""
     size = np.hypot(*form.change_um.T)
     worst, rms = int(size.argmax()), float(np.sqrt(np.mean(form.change_um**2)))
     pairs = [(fiducials[id].x_mm.given, fiducials[id].y_mm.given) for id in form.ids]
@@ -77,17 +77,16 @@ def correction_sentences(form: Figure, fiducials: Mapping[str, FiducialRecord]) 
     moved = [id for id, each in zip(form.ids, excess_um.tolist(), strict=True) if each > 0.0]
     taken = "shift, rotation and scale" if form.transformation == "none" else f"{form.transformation} transformation"
     found = (
-        f"The marks lie where the camera file has them but for {rms:.1f} µm (rms of a coordinate), mark "
-        f"{form.ids[worst]} farthest off ({size[worst]:.1f} µm); a common {taken} is taken out."
+        f"Corrections to {given_by}, after a common {taken}: {rms:.1f} µm rms of a coordinate, the largest "
+        f"{size[worst]:.1f} µm (mark {form.ids[worst]})."
     )
     if not moved:
-        return [found, f"No correction exceeds {SIGNIFICANT:g} standard deviations: the certificate agrees."]
-    names = f"mark {moved[0]} differs" if len(moved) == 1 else f"marks {listed(moved)} differ"
-    return [
-        found,
-        f"From the certificate {names} by more than {SIGNIFICANT:g} standard deviations: compare the camera file with "
-        "it, and take the coordinates below where the file is right.",
-    ]
+        return f"{found} None exceeds {SIGNIFICANT:g} standard deviations."
+    names = f"mark {moved[0]} exceeds" if len(moved) == 1 else f"marks {listed(moved)} exceed"
+    return (
+        f"{found} Those of {names} {SIGNIFICANT:g} standard deviations: compare the camera file with {given_by}, and "
+        "take the adjusted coordinates where the file is right."
+    )
 
 
 def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figure | None:

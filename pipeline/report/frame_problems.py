@@ -3,13 +3,12 @@
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import TypeVar
 
 from pipeline.report.data import Problem
 from pipeline.report.fractions import fraction_test
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
-from pipeline.text.wording import LISTED, counted, drop_file_name, listed
+from pipeline.text.wording import LISTED, capitalised, counted, drop_file_name, listed
 from pipeline.types import Array
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
@@ -19,7 +18,7 @@ _ONE_ANSWER = (
     'writing = ["left: reads upward"].'
 )
 
-Sentence = TypeVar("Sentence", Problem, str)
+Gathered = dict[tuple[str, str], tuple[Problem, list[str]]]  # by their words: the first, and the images of all
 
 
 def single_frame_problems(frame: Frame) -> Iterator[Problem]:
@@ -34,17 +33,31 @@ def masked_text(sentence: str) -> str:
 
 
 def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
-    """What the frames have to say, said once where several frames say the same; of their poses first."""
+    """What the frames have to say, of their poses first; once where several say the same but for numbers."""
     for evidence in (_assumed_pose, _measurement_problems):
-        for problem, images in images_by_sentence(shots, evidence).items():
-            yield replace(problem, what=f"{listed(images)}: {problem.what}", images=tuple(images))
+        gathered: Gathered = {}
+        for frame in shots:
+            gather(gathered, frame.image, evidence(frame))
+        yield from (named_problem(*each) for each in gathered.values())
 
 
-def images_by_sentence(
-    shots: list[Frame], evidence: Callable[[Frame], Iterable[Sentence]]
-) -> dict[Sentence, list[str]]:
+def gather(gathered: Gathered, image: str, problems: Iterable[Problem]) -> None:
+    """Add the problems of an image to those of others, which may say the same but for numbers."""
+    for problem in problems:
+        alike = masked_text(problem.what), problem.next_step
+        gathered.setdefault(alike, (problem, []))[1].append(image)
+
+
+def named_problem(problem: Problem, images: list[str]) -> Problem:
+    """The problem of the first of some images, with the names of all."""
+    has_numbers = len(images) > 1 and masked_text(problem.what) != problem.what
+    of_first = " The numbers are those of the first." if has_numbers else ""
+    return replace(problem, what=f"{listed(images)}: {problem.what}{of_first}", images=tuple(images))
+
+
+def images_by_sentence(shots: list[Frame], evidence: Callable[[Frame], Iterable[str]]) -> dict[str, list[str]]:
     """The frames' names by what they say."""
-    images: dict[Sentence, list[str]] = {}
+    images: dict[str, list[str]] = {}
     for frame in shots:
         for sentence in evidence(frame):
             images.setdefault(sentence, []).append(frame.image)
@@ -59,7 +72,7 @@ def _assumed_pose(frame: Frame) -> Iterator[Problem]:
         yield Problem(f"pose assumed: {pose.roll}.", _ONE_ANSWER)
     else:
         yield Problem(
-            f"pose assumed ({pose.name}). {' '.join(pose.evidence)}",
+            f"pose assumed ({pose.name}). {capitalised(' '.join(pose.evidence))}",
             'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
         )
 
@@ -75,7 +88,7 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
     found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
     if lost and (found or pose):  # a frame that was not found at all has said so
         yield Problem(
-            f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured ({_reasons(lost)}).",
+            f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured. Reasons: {_reasons(lost)}.",
             "Settle them with `reseau review`."
             + (" The frame is used; its film transformation is less precise." if found else ""),
             marks=tuple((frame.image, mark.kind, mark.point) for mark in lost),

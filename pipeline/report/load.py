@@ -9,6 +9,7 @@ from pipeline.archive.measurement import StoredMarks, measured_scans, read_input
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import inapplicable
 from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.provenance import hash_file
 from pipeline.publishing.made_from import (
@@ -61,6 +62,7 @@ def measured_data(
         pitch_um=pitch_um,
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
+        given_by={camera.name: _given_by(camera) for camera in project.cameras.values()},
         notes=tuple(filter(None, [outside_note(project), describe_decisions(read_decision_counts(comparator))])),
         made_from={project.comparator.name: hash_file(comparator)},
     )
@@ -92,6 +94,13 @@ def measured_data(
         lines = inapplicable(store, digest)
     idle = [Problem(f"{project.decisions_path.name}, {line}", "It does not count.") for line in lines]
     return _add_problems(data, *damaged, *idle, *unlike)
+
+
+def _given_by(camera: CameraFile) -> str:
+    """What the given coordinates of its fiducials come from, as far as its file says that."""
+    if camera.source is None:
+        return "the certificate"
+    return "the camera file" if camera.source.frames else "the library's typical coordinates"
 
 
 def frame_count(data: ReportData) -> int:

@@ -14,13 +14,13 @@ from pipeline.archive.measurement import MarkColumns, StoredFrame, StoredMarks
 from pipeline.archive.verdicts import Verdict, frame_verdict, has_problem, scan_counts
 from pipeline.report.data import FrameTotals, Problem, ReportData
 from pipeline.report.fractions import centers_px, places_apart
-from pipeline.report.frame_problems import masked_text, single_frame_problems
+from pipeline.report.frame_problems import Gathered, gather, named_problem, single_frame_problems
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.marks import Frame, frames
 from pipeline.report.verdict import suspect_rows
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.text.wording import counted, listed
+from pipeline.text.wording import counted
 
 MOST_FRAMES = 200  # that a report shows with their marks
 _MOST_PROBLEMS = 50  # different ones that it lists
@@ -35,16 +35,14 @@ class _Totals:
     marks: dict[str, Counter[str]] = field(default_factory=dict)
     of_targets: Counter[tuple[str, str]] = field(default_factory=Counter)
     verdicts: dict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    problems: dict[tuple[str, str], tuple[Problem, list[str]]] = field(default_factory=dict)
+    problems: Gathered = field(default_factory=dict)
     centers_px: "array[float]" = field(default_factory=lambda: array("d"))
 
     def add(self, frame: Frame, kind: tuple[str, str], verdict: Verdict, problems: Iterable[Problem]) -> None:
         self.verdicts[kind][verdict] += 1
         self.marks[frame.image] = Counter(str(mark.status) for mark in frame.marks)
         self.of_targets.update((mark.kind, mark.status) for mark in frame.marks if not mark.is_fiducial)
-        for problem in problems:
-            alike = masked_text(problem.what), problem.next_step
-            self.problems.setdefault(alike, (problem, []))[1].append(frame.image)
+        gather(self.problems, frame.image, problems)
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
 
@@ -150,16 +148,10 @@ def _verdict(frame: Frame) -> Verdict:
     return frame_verdict(marks, scan.frame.pixel_from_camera is not None, has_problem(scan), bool(scan.decided_by))
 
 
-def _listed(problems: dict[tuple[str, str], tuple[Problem, list[str]]]) -> Iterator[Problem]:
+def _listed(problems: Gathered) -> Iterator[Problem]:
     """What most frames say first."""
     ordered = sorted(problems.values(), key=lambda each: -len(each[1]))
-    for problem, images in ordered[:_MOST_PROBLEMS]:
-        of_first = (
-            " (The numbers are those of the first.)"
-            if len(images) > 1 and masked_text(problem.what) != problem.what
-            else ""
-        )
-        yield replace(problem, what=f"{listed(images)}: {problem.what}{of_first}", images=tuple(images))
+    yield from (named_problem(*each) for each in ordered[:_MOST_PROBLEMS])
     rest = sum(len(images) for _, images in ordered[_MOST_PROBLEMS:])
     if rest:
         yield Problem(f"{counted(rest, 'more problem')} of frames, all different.", "`reseau status --csv` has them.")

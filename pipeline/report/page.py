@@ -1,6 +1,5 @@
 """report.html: one file, no network, readable without scripts and on paper."""
 
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,6 @@ from measure import flags
 from pipeline.drawing import svg
 from pipeline.report.camera_views import camera_views
 from pipeline.report.data import Problem, ReportData
-from pipeline.report.fiducials import correction_sentences
 from pipeline.report.fractions import (
     LEAST_MARKS,
     FractionTest,
@@ -48,7 +46,6 @@ SECTIONS = {
     "check": "Check against OpenCV",
     "fractions": "Histograms",
 }
-_SENTENCE = re.compile(r"(?<=[.:]) (?=[A-Z])")
 
 
 def write_report(data: ReportData, path: Path) -> None:
@@ -85,7 +82,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals["drawing_css"] = Markup(svg.style())
-    words = (value_and_sigma, axes_sentence, group_sentences, correction_sentences)
+    words = (value_and_sigma, axes_sentence, group_sentences)
     environment.globals |= {function.__name__: function for function in words}
     environment.filters |= {"fixed": fixed, "fixed_list": fixed_list, "significant": significant}
     return environment
@@ -172,8 +169,7 @@ class ProblemView:
 
 def _problem_view(problem: Problem, views: Sequence[FrameView]) -> ProblemView:
     """A problem without a next step has its remedy in its last sentences."""
-    cause, *rest = _SENTENCE.split(problem.what, maxsplit=1)
-    detail, remedy = ("".join(rest), problem.next_step) if problem.next_step else ("", "".join(rest))
+    detail, remedy = (problem.detail, problem.next_step) if problem.next_step else ("", problem.detail)
     known = {view.frame.image: view for view in views}
     images = dict.fromkeys((*problem.images, *(image for image, *_ in problem.marks)))
     links = [(image, f"#{known[image].id}") for image in images if image in known][:LINKS]
@@ -187,7 +183,7 @@ def _problem_view(problem: Problem, views: Sequence[FrameView]) -> ProblemView:
         if (card.mark.kind, card.mark.point) == (kind, point)
     )
     picture = next((card.picture for card in marks if card.picture), None)
-    return ProblemView(cause, detail, remedy, links, picture)
+    return ProblemView(problem.cause, detail, remedy, links, picture)
 
 
 def _points_word(shots: list[Frame]) -> str:

@@ -16,6 +16,7 @@ from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.results.adjustment_record import CameraRecord, GivenQuantity, GroupTestRecord, Quantity
 from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
+from pipeline.text.wording import capitalised
 
 MOSTLY_PRIOR = 0.9  # of the prior's sigma is left: the data have told little
 HIGH_CORRELATION = 0.9
@@ -85,7 +86,7 @@ def high_correlations(name: str, camera: CameraRecord, covariance: Covariance) -
 def group_sentences(tests: Sequence[GroupTestRecord]) -> list[str]:
     """Which parameters the data need together, as sentences."""
     return [
-        f"{test.group[0].upper()}{test.group[1:]} ({', '.join(test.parameters)}) together: "
+        f"{capitalised(test.group)} ({', '.join(test.parameters)}) together: "
         + _tested(f"F = {significant(test.F, 3)}", test.p)
         for test in tests
     ]

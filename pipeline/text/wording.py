@@ -42,6 +42,11 @@ def count_sentence(what: str, done: int, of: int, rest: Mapping[str, int]) -> st
     return f"{done} of {counted(of, 'scan')} {what}" + (f" ({others})" if others else "")
 
 
+def capitalised(sentence: str) -> str:
+    """The sentence with a capital at its beginning; the rest as it is."""
+    return sentence[:1].upper() + sentence[1:]
+
+
 def drop_file_name(sentence: str, file: str) -> str:
     """The sentence without the name of the file that it begins with."""
     name = f"{PurePosixPath(file.replace(chr(92), '/')).name}: "

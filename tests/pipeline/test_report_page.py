@@ -155,8 +155,10 @@ def test_an_archive_has_totals_first_and_corrections_in_words() -> None:
         "verdict", "totals", "problems", "frames", "marks", "fiducials", "reliability", "notes",
     ]  # fmt: skip
     assert "5 of 5 scans measured (5 good)." in document.text
-    assert "corrections to the certificate" in document.text
-    assert re.search(r"The marks lie where the camera file has them but for \d+\.\d µm", document.text)
+    library = rendered(replace(film_alone(), given_by={"RC 20": "the library's typical coordinates"})).text
+    assert "Corrections to the library's typical coordinates, after" in library
+    assert "certificate" not in library
+    assert re.search(r"Corrections to the given coordinates, after a common [\w, ]+: \d+\.\d µm rms", document.text)
     assert "Residuals of all frames" not in document.text
 
 
@@ -351,7 +353,9 @@ def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted_data: ReportD
     ).text
     assert "! Needs a look" in text
     assert "1 thing needs a look" in text
-    assert "f1: 1 fiducial mark not measured, 7 measured (3 rejected: 4.2 px off the other marks' places)." in text
+    assert (
+        "f1: 1 fiducial mark not measured, 7 measured. Reasons: 3 rejected: 4.2 px off the other marks' places." in text
+    )
     assert "7 of 8 (1 rejected)" in text
 
 
@@ -361,7 +365,8 @@ def test_reasons_that_differ_by_their_numbers_are_reported_once(measured_data: R
         rows[index] = replace(rows[index], status=Status.REJECTED, reason=f"{off} px off the other marks' places")
     names = f"{rows[2].point}, {rows[4].point}"
     text = rendered(replace(measured_data, comparator=rows)).text
-    assert f"6 measured ({names} rejected, such as {rows[2].point}: 4.2 px off the other marks' places)." in text
+    reasons = f"{names} rejected, such as {rows[2].point}: 4.2 px off the other marks' places."
+    assert f"6 measured. Reasons: {reasons}" in text
 
 
 def test_of_many_targets_the_worst_are_shown_and_all_fiducials(adjusted_data: ReportData) -> None:

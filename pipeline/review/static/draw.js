@@ -278,6 +278,7 @@ function drawMark(pen) {
     if (drag?.key === key || handles.length < 8) view.name(pen, px, key.split(".").at(-1).replace(/_(mm|deg)$/, ""), COLOUR.handle);
   }
   view.canvas.dataset.handles = JSON.stringify(Object.fromEntries(handles.map(({ key, px }) => [key, view.canvasXY(...px)])));
+  view.canvas.dataset.view = JSON.stringify({ center: view.center, zoom: view.zoom }); // for tests, which click places of the scan
 }
 
 // --- what a person does
