@@ -20,7 +20,7 @@ from measure.marks.shapes import FiducialLayout
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan
 
-_LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well
+LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well
 _LEAST_SIGNIFICANCE = 4.5  # of the contrast: what texture feigns stays below it
 _FAINT_SIGNIFICANCE = 2.0  # the same where noise hardly makes what is seen: contrast there is, at 95 %
 _ROUNDS = 2  # of detecting faint marks: the first ones tell where the others are
@@ -105,7 +105,7 @@ def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
     detection = detect_mark(frame.scan, expected, replace(frame.options.match, tells_sharpening=True))
     fit, closer = detection.fit, frame.placement.surroundings.robust
     sure = closer and detection.false_alarms <= FAINT_MARK_BY_NOISE
-    likeness, significance = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
+    likeness, significance = (0.0, _FAINT_SIGNIFICANCE) if sure else (LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
     if fit is not None and (fit.likeness < likeness or fit.significance < significance):
         return Detection(detection.predicted_px, True, None, not_found(expected.search_px))
     return detection

@@ -45,13 +45,14 @@ _NO_PITCH = (
 @checked_dataclass(frozen=True)
 class ClickedMark:
     """A mark that was clicked. xy_mm: its coordinates, None where they are not known. turn_deg, blur_px: of its picture
-    against the drawing, clockwise in the scan, as far as it was fitted."""
+    against the drawing, clockwise in the scan, as far as it was fitted; unfitted: why the drawing did not fit there."""
 
     id: str
     px: tuple[float, float]
     xy_mm: tuple[float | None, float | None] = (None, None)
     turn_deg: float = 0.0
     blur_px: float = 0.8
+    unfitted: str = ""
 
     @property
     def given_mm(self) -> Point | None:
@@ -289,6 +290,8 @@ def _remarks(drawing: CameraDrawing, placement: FramePlacement) -> list[str]:
         lines.append(f"xy_mm of {listed(found)}: from their places in the scan and its pixel, not from a certificate.")
     if len(found) < len(drawing.marks):
         lines.append(f"xy_mm of {listed([one.id for one in drawing.marks if one.given_mm])}: as given.")
+    if unfitted := [one.id for one in drawing.marks if one.unfitted]:
+        lines.append(f"The drawing did not fit at {listed(unfitted)}: as they were clicked.")
     if not drawing.given_frame_mm:
         lines.append("frame_mm: between two corners clicked in the scan.")
     if drawing.principal_distance_mm is None:

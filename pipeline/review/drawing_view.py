@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import Detection, detect_mark
+from measure.fiducials.measure_frame import LEAST_LIKENESS
 from measure.geometry import Affine, linear_scale
+from measure.marks.frame_border import limit_to_frame
 from measure.marks.rendering import reach_px
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, Point
 from measure.matching.options import MatchOptions
@@ -97,6 +99,7 @@ def drawing_json(drawing: CameraDrawing, placement: FramePlacement) -> Json:
                 "found_mm": list(placement.camera_mm(one.px)),
                 "turn_deg": one.turn_deg,
                 "blur_px": one.blur_px,
+                "unfitted": one.unfitted,
             }
             for one in drawing.marks
         ],
@@ -193,32 +196,36 @@ def take_step(drawing: CameraDrawing, placement: FramePlacement, step: Mapping[s
 
 
 def _move_drawing(drawing: CameraDrawing, px: Point) -> CameraDrawing:
-    marks = tuple(replace(one, px=px) if one.id == drawing.point else one for one in drawing.marks)
+    marks = tuple(replace(one, px=px, unfitted="") if one.id == drawing.point else one for one in drawing.marks)
     return replace(drawing, marks=marks)
 
 
 def fit_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan) -> CameraDrawing:
-    """Every mark matched as `measure` matches it: its place and blur; and all of them turned, and the drawing larger,
-    by the median over the marks. Raises InputError where none looks like the drawing."""
+    """Every mark matched as `measure` matches it, at the frame's edge as far as its drawing is true there: its place
+    and blur; and all of them turned, and the drawing larger, by the median over the marks. Raises InputError where none
+    matches the drawing."""
     if drawing.is_picture:
         raise InputError("a square of the scan is its own picture: there is nothing to fit.")
     camera = drawn_camera(drawing, placement, _NO_FILE)
     marks, scales, turns_deg, reasons = list[ClickedMark](), list[float](), list[float](), list[str]()
-    for one, fiducial in zip(drawing.marks, camera.fiducials, strict=True):
+    known = camera.layout_marks if camera.frame_mm is None else limit_to_frame(camera.layout()).marks
+    for one, fiducial in zip(drawing.marks, known, strict=True):
         start = _pixel_from_mark(placement, replace(one, turn_deg=0.0))
         found = _match(scan, fiducial.mark, start)
-        if found.fit is None:
-            reasons.append(f"{one.id}: {found.reason}")
-            marks.append(one)
+        if found.fit is None or found.fit.likeness < LEAST_LIKENESS:
+            reason = str(found.reason) or "nothing there matches its drawing"
+            reasons.append(f"{one.id}: {reason}")
+            marks.append(replace(one, unfitted=reason))
             continue
         change = found.fit.pixel_from_mark[:, :2] @ np.linalg.inv(start[:, :2])
         col, row = found.fit.center_px.round(3).tolist()
         turns_deg.append(math.degrees(math.atan2(change[1, 0] - change[0, 1], change[0, 0] + change[1, 1])))
-        marks.append(replace(one, px=(col, row), blur_px=max(float(found.fit.blur_px), 0.1)))
+        marks.append(replace(one, px=(col, row), blur_px=max(float(found.fit.blur_px), 0.1), unfitted=""))
         if not isinstance(fiducial.mark, FrameCorner):
             scales.append(linear_scale(change))
     if len(reasons) == len(marks):
-        raise InputError(f"nothing was fitted. {'; '.join(reasons) or 'Click a mark first.'}")
+        of_edge = "" if camera.frame_mm else " Of a mark at the frame's edge give the frame's size first."
+        raise InputError(f"nothing was fitted. {'; '.join(reasons) or 'Click a mark first'}.{of_edge}")
     mark = scaled_mark(drawing.mark, median(scales)) if scales else drawing.mark
     turned = tuple(replace(one, turn_deg=median(turns_deg)) for one in marks)
     return replace(drawing, marks=turned, mark=dict(mark))

@@ -4,6 +4,7 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -138,6 +139,21 @@ def test_a_fit_finds_places_and_the_size(scan: Path) -> None:
     np.testing.assert_allclose([one.px for one in fitted.marks], true_px(), atol=0.05)
     assert fitted.mark["ring_mm"] == pytest.approx(0.5, rel=0.01)
     assert fitted.marks[0].blur_px == pytest.approx(0.8, abs=0.15)
+
+
+def test_a_mark_that_the_drawing_does_not_fit_is_named_and_keeps_its_click(scan: Path, tmp_path: Path) -> None:
+    """The fifth click is on bare ground."""
+    marks = (*marks_at(true_px()), ClickedMark("5", (200.0, 230.0)))
+    drawing = CameraDrawing("a", {"kind": "ring-cross", **SIZES}, marks, "1", frame_mm=(17.0, 17.0))
+    with open_scan(scan) as opened:
+        fitted = take_step(drawing, placed(drawing), {"fit": True}, opened)
+        assert [bool(one.unfitted) for one in fitted.marks] == [False] * 4 + [True]
+        assert fitted.marks[4].px == (200.0, 230.0)
+        save_drawing(fitted, placed(fitted), opened, tmp_path / "camera.toml")
+    text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
+    assert "# The drawing did not fit at 5: as they were clicked.\n" in text
+    moved = take_step(replace(fitted, point="5"), placed(fitted), {"drag": "place", "px": [60.0, 60.0]}, opened)
+    assert moved.marks[4].unfitted == ""
 
 
 @pytest.mark.parametrize("kind", [kind for kind in MARK_TABLES if kind != "polygon"])

@@ -63,7 +63,7 @@ const number = (id) => (by(`draw-${id}`).value.trim() === "" ? null : Number(by(
 const sent = () => ({
   image: drawing.image,
   mark: drawing.mark ?? { kind: "dot", radius_mm: 1 },
-  marks: drawing.marks.map(({ id, px, xy_mm, turn_deg, blur_px }) => ({ id, px, xy_mm, turn_deg, blur_px })),
+  marks: drawing.marks.map(({ id, px, xy_mm, turn_deg, blur_px, unfitted }) => ({ id, px, xy_mm, turn_deg, blur_px, unfitted })),
   point: drawing.point,
   name: by("draw-name").value.trim(),
   pose: by("draw-pose").value,
@@ -109,8 +109,11 @@ async function answered({ step, edit }) {
 }
 
 function fitted() {
-  const blurs = reply.marks.map(({ id, blur_px: blur }) => `${id}: ${blur.toFixed(2)} px`);
-  return `Fitted: turned by ${reply.marks[0].turn_deg.toFixed(2)}°; blur of mark ${blurs.join(", ")}.`;
+  const fits = reply.marks.filter(({ unfitted }) => !unfitted);
+  const blurs = fits.map(({ id, blur_px: blur }) => `${id}: ${blur.toFixed(2)} px`);
+  const lost = reply.marks.filter(({ unfitted }) => unfitted).map(({ id, unfitted }) => ` Not mark ${id}: ${unfitted}.`);
+  const remedy = lost.length ? " Look at these, and click them again or take them out." : "";
+  return `Fitted: turned by ${fits[0].turn_deg.toFixed(2)}°; blur of mark ${blurs.join(", ")}.${lost.join("")}${remedy}`;
 }
 
 function look(shown) {
@@ -294,7 +297,7 @@ function clickedWhole(col, row) {
   return take({ select: "" }, () => {
     let free = 1;
     while (drawing.marks.some(({ id }) => id === String(free))) free += 1;
-    drawing.marks.push({ id: String(free), px: [col, row], xy_mm: [null, null], turn_deg: 0, blur_px: 0.8 });
+    drawing.marks.push({ id: String(free), px: [col, row], xy_mm: [null, null], turn_deg: 0, blur_px: 0.8, unfitted: "" });
     drawing.point = String(free);
   });
 }
@@ -330,6 +333,7 @@ canvas.addEventListener("pointerup", (event) => {
   const done = drag;
   drag = null;
   if (done && !done.key) take({ click: view.scan(...view.eventXY(event)) });
+  else if (done?.key === "place" && !done.moved) take({ click: reply.shown.center }); // a corner of a polygon in the mark's point
   else view.draw();
 });
 canvas.addEventListener("pointercancel", () => (drag = null));

@@ -47,7 +47,7 @@ function showQueue() {
   const { left, total, shown, shown_left: shownLeft, start } = state.page;
   const kinds = [["camera", "cameras"], ["pose", "poses"], ["frame", "frames"], ["mark", "marks"]];
   const parts = kinds.filter(([one]) => left[one]).map(([one, many]) => `${left[one]} ${left[one] === 1 ? one : many}`);
-  by("left").textContent = left.all ? `${left.all} left: ${parts.join(", ")}` : "Nothing is left. Run reseau measure.";
+  by("left").textContent = left.all ? `${left.all} left: ${parts.join(", ")}` : total ? "Nothing is left. Run reseau measure." : "Nothing to decide yet.";
   by("progress").max = Math.max(total, 1);
   by("progress").value = total ? total - left.all : 1;
   const last = start + state.entries.length;
