@@ -143,7 +143,7 @@ def test_a_fit_finds_places_and_the_size(scan: Path) -> None:
 
 def test_a_mark_that_the_drawing_does_not_fit_is_named_and_keeps_its_click(scan: Path, tmp_path: Path) -> None:
     """The fifth click is on bare ground."""
-    marks = (*marks_at(true_px()), ClickedMark("5", (200.0, 230.0)))
+    marks = (*place_clicks(true_px()), ClickedMark("5", (200.0, 230.0)))
     drawing = CameraDrawing("a", {"kind": "ring-cross", **SIZES}, marks, "1", frame_mm=(17.0, 17.0))
     with open_scan(scan) as opened:
         fitted = take_step(drawing, placed(drawing), {"fit": True}, opened)
