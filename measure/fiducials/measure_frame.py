@@ -32,14 +32,19 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
     frame = detect_frame(scan, layout, placement, options)
     sharpened = sharpen_frame(frame)
     if sharpened.scan.tone.sharpening and not scan.tone.sharpening:
-        sharpened = sharpen_frame(_detect_missing(_detect_unfitted(sharpened)))
+        sharpened = sharpen_frame(detect_missing_marks(_detect_unfitted(sharpened)))
     return refit_frame(sharpened)
 
 
 def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
     """Measure a frame without the refit: which of its marks are there, and how they look."""
+    return detect_missing_marks(detect_clear_marks(scan, layout, placement, options))
+
+
+def detect_clear_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
+    """Detect the marks of a frame that are clear where its placement puts them."""
     frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
-    return _detect_missing(orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px)))
+    return orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px))
 
 
 def _detect_unfitted(frame: Frame) -> Frame:
@@ -67,11 +72,11 @@ def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:
         )
     )
     unclear = [index for index in range(len(frame.detections)) if not renamed.is_clear(index)]
-    renamed = refit_frame(_detect_missing(orient_frame(_detect(renamed, unclear, renamed.first_search_px))))
+    renamed = refit_frame(detect_missing_marks(orient_frame(_detect(renamed, unclear, renamed.first_search_px))))
     return renamed if renamed.inliers.sum() >= frame.inliers.sum() else frame
 
 
-def _detect_missing(frame: Frame) -> Frame:
+def detect_missing_marks(frame: Frame) -> Frame:
     """Detect the marks that are not clear where the others put them."""
     if frame.accepted:
         frame = orient_frame(_detect_closer(frame))

@@ -230,18 +230,26 @@ def has_sensor_size(head: ScanHead) -> bool:
     return is_whole and head.pitch.um is None and any(abs(long / short / shape - 1) < 1e-3 for shape in _SHAPES)
 
 
-Try = Callable[[Path], Identification | str]
+Sample = tuple[Path, tuple[str, ...]]  # a scan, and cameras that another one of its group shows
+Try = Callable[[Sample], Identification | str]
 
 
 def name_cameras(grouped: GroupedScans, identified: Try, reporter: Reporter, workers: Executor | None) -> GroupedScans:
-    """The groups with what their samples show. identified: of a scan, or why it cannot be read."""
-    samples = [path for group in grouped.groups for path in group.to_try]
+    """The groups with what their samples show. identified: of a scan, or why it cannot be read. Cameras that the first
+    sample of a group shows are the first to be tried on the others."""
+    total = sum(len(group.to_try) for group in grouped.groups)
     of_groups = f"scans of {counted(len(grouped.groups), 'group')} on the camera library"
     answers = dict[Path, Identification | str]()
     with reporter.stage("tried") as count:
-        for done, (path, answer) in enumerate(zip(samples, map_items(workers, identified, samples), strict=True), 1):
-            answers[path] = answer
-            count(of_groups, done, len(samples))
+        for is_first in (True, False):
+            samples: list[Sample] = [
+                (path, () if is_first else _camera_names(answers[group.to_try[0]]))
+                for group in grouped.groups
+                for path in (group.to_try[:1] if is_first else group.to_try[1:])
+            ]
+            for (path, _), answer in zip(samples, map_items(workers, identified, samples), strict=True):
+                answers[path] = answer
+                count(of_groups, len(answers), total)
     groups = [
         replace(
             group, samples=tuple(answer for path in group.to_try if isinstance(answer := answers[path], Identification))
@@ -262,20 +270,27 @@ def _split_cameras(group: ScanGroup) -> list[ScanGroup]:
     return [replace(group, paths=tuple(one.scan for one in own), samples=tuple(own)) for own in parts.values()]
 
 
+def _camera_names(answer: Identification | str) -> tuple[str, ...]:
+    """Those that a sample shows."""
+    best = answer.best if isinstance(answer, Identification) else ()
+    return tuple(name for trial in best for name in trial.cameras)
+
+
 def trial_of_cameras(cameras: Mapping[str, CameraFile], pitch_um: float | None, max_pixels: int | None) -> Try:
     """What tries cameras on a scan, in any process."""
     return partial(_identified, cameras=cameras, pitch_um=pitch_um, max_pixels=max_pixels)
 
 
 def _identified(
-    path: Path, cameras: Mapping[str, CameraFile], pitch_um: float | None, max_pixels: int | None
+    sample: Sample, cameras: Mapping[str, CameraFile], pitch_um: float | None, max_pixels: int | None
 ) -> Identification | str:
+    path, likely = sample
     try:
         head = read_head(path, max_pixels)
         board = _board(path, max_pixels) if head.camera or has_sensor_size(head) else ""
         if board or head.camera:
             return Identification(path, (), board=board)
-        found = identify(path, cameras, pitch_um, Reporter(Console(quiet=True)), max_pixels)
+        found = identify(path, cameras, pitch_um, Reporter(Console(quiet=True)), max_pixels, likely)
         is_scan = head.pitch.um is not None
         return found if found.best or is_scan else replace(found, board=_board(path, max_pixels))
     except MeasurementError as error:

@@ -1,13 +1,14 @@
 """Which camera a scan is of: every camera whose marks are drawn is tried on it, at reduced size."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
@@ -44,6 +45,7 @@ _STRETCHES = (-0.025, 0.025)  # of pixels longer one way: each reaches those of 
 _ALIKE_MM = 0.1  # two cameras whose marks lie so near to one another look alike in a scan
 _BOLD = 4  # marks that are looked for, at least
 _ENOUGH = 12  # marks that are looked at: of more, as of a lattice, only every second
+_SAME_FIGURE = 0.06  # of the root mean square distance of marks from their middle
 _STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is so deformed
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
@@ -173,17 +175,19 @@ def identify(
     pitch_um: float | None,
     reporter: Reporter,
     max_pixels: int | None = None,
+    likely: Collection[str] = (),
 ) -> Identification:
     """Try every camera with drawn marks on the scan, those with the same marks once.
 
-    Raises MeasurementError for a scan that cannot be read.
+    likely: names that scans of the same kind show. Where one of them stands out beyond chance, only cameras with marks
+    at the same places are tried beside it. Raises MeasurementError for a scan that cannot be read.
     """
     picture, times, its_pitch_um = _picture(path, max_pixels)
     given, search = its_pitch_um if pitch_um is None else (pitch_um, pitch_um), LayoutSearch(picture)
     layouts = {names: _limit_drawings(cameras[names[0]].layout()) for names in _alike(cameras)}
     pitch = None if given is None else (times * given[0], times * given[1])
     with reporter.stage("trying") as count:
-        trials, tries = _first_that_stand_out(search, layouts, pitch, count)
+        trials, tries = _first_that_stand_out(search, layouts, _layouts_like(layouts, likely), pitch, count)
     alike = _alike_in_scan(search, trials, tries, drawn_alike(layouts))
     del search, tries  # and the correlations that they hold
     sources = {name: camera.source for name, camera in cameras.items()}
@@ -195,6 +199,24 @@ def identify(
     against_plate = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in against_plate.items() if against}
     return Identification(path, ranked, unreported, given, plate, contradicted, alike, reports)
+
+
+def _layouts_like(layouts: Mapping[Names, FiducialLayout], likely: Collection[str]) -> dict[Names, FiducialLayout]:
+    """Layouts whose boldest marks form the same figure, whatever its size, as those of one with a likely name."""
+    figures = {names: _figure(layout) for names, layout in layouts.items()}
+    known = [figure for names, figure in figures.items() if not {*likely}.isdisjoint(names)]
+    return {names: layout for names, layout in layouts.items() if any(_is_same(figures[names], each) for each in known)}
+
+
+def _figure(layout: FiducialLayout) -> Array:
+    """(n, 2) the places of the boldest marks about their mean, at a mean square distance of 1."""
+    places = np.array([mark.xy_mm for mark in _boldest(layout).marks])
+    places = places - places.mean(axis=0)
+    return np.asarray(places / np.sqrt((places**2).sum(axis=1).mean()))
+
+
+def _is_same(figure: Array, other: Array) -> bool:
+    return len(figure) == len(other) and bool(cdist(figure, other).min(axis=1).max() < _SAME_FIGURE)
 
 
 def _picture(path: Path, max_pixels: int | None) -> tuple[Scan, float, tuple[float, float] | None]:
@@ -238,23 +260,42 @@ def _alike_in_scan(
 
 
 def _first_that_stand_out(
-    search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float] | None, count: Count
+    search: LayoutSearch,
+    layouts: Mapping[Names, FiducialLayout],
+    likely: Mapping[Names, FiducialLayout],
+    pitch_um: tuple[float, float] | None,
+    count: Count,
 ) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """The trials, and how the scan answered to each, at the given pitch, where marks answer there that chance does not
-    put so; where none of them stands out, with pixels that may be longer one way; where still none does, at any pitch.
+    """The trials, and how the scan answered to each: of the likely layouts, where one stands out beyond chance; of all
+    at the given pitch, where marks answer there that chance does not put so; where none of them stands out, with pixels
+    that may be longer one way; where still none does, at any pitch.
     """
+    if likely:
+        trials, tries = _try_pitch(search, likely, pitch_um, count)
+        if any(trial.stands_out and trial.expected <= CAMERA_BY_CHANCE for trial in trials):
+            return trials, tries
     if pitch_um is not None:
-        given = _each(layouts, partial(search.try_pitch, pitch_um=pitch_um), count)
-        if any(each.answer.expected <= CAMERA_BY_CHANCE for each in given.values()):
-            trials = _trials(search, given, count)
-            if any(trial.stands_out for trial in trials):
-                return trials, given
+        trials, given = _try_pitch(search, layouts, pitch_um, count)
+        if any(trial.stands_out for trial in trials):
+            return trials, given
         longer = _each(layouts, partial(search.longer_one_way, pitch_um=pitch_um), count)
         likelier = {names: min(each, longer[names], key=_expected) for names, each in given.items()}
         trials = _trials(search, likelier, count)
         if any(trial.stands_out for trial in trials):
             return trials, likelier
     return _try_any_pitch(search, layouts, count)
+
+
+def _try_pitch(
+    search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float] | None, count: Count
+) -> tuple[list[Trial], Mapping[Names, Tried]]:
+    """The trials at the given pitch, none where no marks answer there that chance does not put so; at any pitch where
+    none is given."""
+    if pitch_um is None:
+        return _try_any_pitch(search, layouts, count)
+    given = _each(layouts, partial(search.try_pitch, pitch_um=pitch_um), count)
+    is_beyond_chance = any(each.answer.expected <= CAMERA_BY_CHANCE for each in given.values())
+    return _trials(search, given, count) if is_beyond_chance else [], given
 
 
 def _expected(each: Tried) -> float:

@@ -13,7 +13,7 @@ from range_server import range_server
 
 from pipeline.archive import new_project
 from pipeline.archive.catalogue import catalogue
-from pipeline.archive.scan_groups import GroupedScans, ScanGroup, group_scans, name_cameras
+from pipeline.archive.scan_groups import GroupedScans, Sample, ScanGroup, group_scans, name_cameras
 from pipeline.cli import run
 from pipeline.files.library import read_library
 from pipeline.files.project_file import read_project
@@ -186,7 +186,11 @@ def test_where_no_camera_is_reported_all_scans_are_of_the_one_that_the_user_draw
 
 
 def test_of_each_group_in_each_folder_three_are_tried(box: Path) -> None:
-    def identified(path: Path) -> Identification | str:
+    likely = dict[str, tuple[str, ...]]()
+
+    def identified(sample: Sample) -> Identification | str:
+        path = sample[0]
+        likely[path.name] = sample[1]
         return "cannot be decoded" if path.name == "0004.tif" else identify_camera(path, "wild-rc5-153")
 
     for number in range(5, 9):
@@ -198,6 +202,7 @@ def test_of_each_group_in_each_folder_three_are_tried(box: Path) -> None:
     samples = next(group.samples for group in named.groups if len(group.paths) > 3)
     assert [sample.scan.name for sample in samples] == ["0001.tif", "0005.tif", "0008.tif"]
     assert named.unread == {box / "1952/0004.tif": "cannot be decoded"}
+    assert likely["0005.tif"] == likely["0008.tif"] == ("wild-rc5-153",)
 
 
 def test_init_and_cameras_group_scans_alike(box: Path) -> None:

@@ -255,6 +255,42 @@ def test_marks_are_inspected_at_once_a_search_answers_that_chance_does_not_make(
     assert view == looked_at
 
 
+@pytest.mark.parametrize(
+    ("shown", "likely", "searched"),
+    [
+        ("wild-rc5-153", "wild-rc5-153", 2),  # beside the ring-crosses at the same places
+        ("wild-rc10-153", "wild-rc5-153", 2),
+        ("zeiss-rmk-a-153", "wild-rc5-153", 3),
+        ("wild-rc5-153", "", 3),
+    ],
+)
+def test_cameras_of_other_scans_are_tried_first_and_hide_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shown: str, likely: str, searched: int
+) -> None:
+    tifffile.imwrite(tmp_path / "scan.tif", np.full((60, 60), 9, np.uint8), resolution=(25, 25), resolutionunit=3)
+    few = {name: LIBRARY[name] for name in ("wild-rc5-153", "wild-rc10-153", "zeiss-rmk-a-153")}
+    known = list[FiducialLayout]()
+
+    def answer(_: Scan, layout: FiducialLayout, *__: Any) -> Answer:
+        known.append(layout)
+        return Answer(1e-6 if _parts(layout) == _parts(few[shown].layout()) else 10.0, ())
+
+    def measure_marks(_: LayoutSearch, names: tuple[str, ...], each: Tried, __: float) -> Trial:
+        return replace(trial(names, 0.9 if each.answer.expected < 1 else 0.0, None), expected=each.answer.expected)
+
+    monkeypatch.setattr(camera_trials, "search_camera", answer)
+    monkeypatch.setattr(camera_trials, "_trial", measure_marks)
+    monkeypatch.setattr(camera_trials, "networks", lambda: None)
+    monkeypatch.setattr(camera_trials, "_alike_in_scan", lambda *_: {})
+    found = identify(tmp_path / "scan.tif", few, None, Reporter(quiet=True), likely=(likely,))
+    assert [each.cameras for each in found.best] == [(shown,)]
+    assert len(known) == searched
+
+
+def _parts(layout: FiducialLayout) -> list[str]:
+    return [repr(mark.mark)[:60] for mark in layout.marks]
+
+
 @pytest.mark.study
 @pytest.mark.parametrize(("found", "measured"), [(25, 1), (9, 2)])
 def test_a_part_of_a_lattice_is_no_other_camera(
@@ -298,7 +334,7 @@ def test_what_noise_answers_as_well_is_not_matched(tmp_path: Path, monkeypatch: 
     """Nor are marks reckoned with that a constellation puts outside of the scan."""
     grey = np.random.default_rng(3).normal(120.0, 25.0, (600, 600)).clip(0, 255).astype(np.uint8)
     tifffile.imwrite(tmp_path / "noise.tif", grey, resolution=(25, 25), resolutionunit=3)
-    monkeypatch.setattr("measure.fiducials.camera_recognition.detect_frame", pytest.fail)
+    monkeypatch.setattr("measure.fiducials.camera_recognition.detect_clear_marks", pytest.fail)
     few = {name: LIBRARY[name] for name in (RENDERED, "fairchild-t5-153", "wild-18x18-115")}
     found = identify(tmp_path / "noise.tif", few, None, Reporter())
     assert found.best == ()

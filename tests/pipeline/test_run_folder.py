@@ -16,7 +16,7 @@ from measure.scans.opening import open_scan, read_head
 from pipeline import stages
 from pipeline.archive import new_project
 from pipeline.archive.catalogue import catalogue
-from pipeline.archive.scan_groups import GroupedScans, group_scans, name_cameras, trial_of_cameras
+from pipeline.archive.scan_groups import GroupedScans, Sample, group_scans, name_cameras, trial_of_cameras
 from pipeline.cli import run
 from pipeline.files import library
 from pipeline.files.library import read_library
@@ -156,7 +156,8 @@ def test_scans_that_were_all_tried_have_each_its_own_camera(tmp_path: Path) -> N
     for number in range(2):
         scan(tmp_path / f"{number}.tif")
 
-    def identified(path: Path) -> Identification | str:
+    def identified(sample: Sample) -> Identification | str:
+        path = sample[0]
         return identify_camera(path, "wild-rc5-153" if path.stem == "0" else "zeiss-rmk-a-153")
 
     found = catalogue([tmp_path], lambda *_: None)
