@@ -339,6 +339,8 @@ def _name_cameras(
     given: Sequence[Path], project: "Project | None", pitch_um: float | None, max_pixels: int | None, as_json: bool
 ) -> int:
     """One scan with all that was tried on it; of many some of each kind."""
+    from pipeline.archive.catalogue import find_scan_files
+    from pipeline.archive.scan_groups import group_scans, name_cameras, print_groups, trial_of_cameras
     from pipeline.files.library import PREFIX, read_library
     from pipeline.measuring.camera_identification import print_identification
     from pipeline.measuring.camera_trials import identify
@@ -355,9 +357,6 @@ def _name_cameras(
         else:
             print_next(as_json, LIBRARY_STEP)
         return DONE if identification.best else LOOK
-    from pipeline.archive.catalogue import find_scan_files
-    from pipeline.archive.scan_groups import group_scans, name_cameras, print_groups, trial_of_cameras
-
     with reporter.stage("examined") as count:
         found = group_scans(find_scan_files(given)[0], count, max_pixels, by_folder=False)
     grouped = name_cameras(found, trial_of_cameras(tried, pitch_um, max_pixels), reporter, None)
