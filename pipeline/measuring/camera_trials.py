@@ -251,7 +251,10 @@ def _alike_in_scan(
     own = {name: names for names in tries for name in names}
     found = dict[str, Names]()
     for trial in trials:
-        others = dict.fromkeys(own[name] for name in drawn.get(trial.cameras[0], ())) if trial.stands_out else {}
+        alike = drawn.get(trial.cameras[0], ()) if trial.stands_out else ()
+        others = dict.fromkeys(own[name] for name in alike if name in own)
+        if not others:
+            continue
         best = tries[trial.cameras]
         frames = {names: search.recognise(replace(best, layout=tries[names].layout)) for names in others}
         near = [names for names, frame in frames.items() if frame and likeness(frame) >= CLOSE * trial.score]
