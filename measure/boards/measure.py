@@ -31,6 +31,7 @@ from measure.targets.disks import FittedDisk, fit_plain_disks
 
 Array = NDArray[np.float64]
 
+_MIRROR = np.array([-1.0, 1.0])  # of column and row
 _SMALLEST_DOT_PX = 5.0  # its diameter
 _NEAREST_DOTS = 8  # whose places and shapes predict a missing one's
 # Along the edges, in shares of a square's side:
@@ -63,7 +64,12 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
     """The dots of a grid; those that were not seen are sought where the others put them."""
     patches = disk_candidates(scan, DiskSearch((_SMALLEST_DOT_PX, _largest_dot_px(scan, spec))))
     centers = np.array([patch.center_px for patch in patches]).reshape(-1, 2)
-    grid = find_grid(centers, _appearances(patches), spec, "dots")
+    grid, is_mirrored = find_grid(centers, _appearances(patches), spec, "dots"), False
+    if grid.reason and spec.asymmetric:  # one of even columns and rows differs from its mirror image
+        mirrored = find_grid(centers * _MIRROR, _appearances(patches), spec, "dots")
+        if not mirrored.reason:
+            others_px = tuple(center_px * _MIRROR for center_px in mirrored.others_px)
+            grid, is_mirrored = replace(mirrored, others_px=others_px), True
     names = {place: f"r{place[0]}c{place[1]}" for place in spec.places()}
     if grid.reason:
         absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, grid.reason) for name in names.values())
@@ -74,7 +80,7 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
     shorter_px = [float(np.linalg.svd(start.pixel_from_disk, compute_uv=False)[1]) for start in starts]
     disks = fit_plain_disks(scan, starts, [2 * gap / (1 - gap) * axis_px for axis_px in shorter_px])
     marks = [_dot_mark(names[place], disk, place in detected) for place, disk in zip(names, disks, strict=True)]
-    measured = BoardMeasurement(tuple(marks), notes=grid.notes)
+    measured = BoardMeasurement(tuple(marks), notes=grid.notes, is_mirrored=is_mirrored)
     return _unless_alone(measured, f"grids of {spec.columns} x {spec.rows} dots", grid.others_px)
 
 

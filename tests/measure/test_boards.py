@@ -114,6 +114,20 @@ def test_circle_grids(spec: CircleGridSpec) -> None:
     assert np.abs(errors).max() < 0.06
 
 
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_an_asymmetric_grid_in_a_mirror_keeps_its_names(is_mirrored: bool) -> None:
+    spec, homography = CircleGridSpec(8, 6, 20.0, 15.0, asymmetric=True), board_from_pixel(tilt=5e-5)
+    picture, truth = picture_of(spec, homography, circles_dark(spec)), truth_of(spec, homography)
+    if is_mirrored:
+        picture = picture[:, ::-1]
+        truth = {name: np.array([picture.shape[1] - 1, 0]) + place * (-1, 1) for name, place in truth.items()}
+    board = measure_board(scan_of(picture), spec)
+    assert (board.reason, board.is_mirrored) == ("", is_mirrored)
+    errors = errors_px(board, truth)
+    half_turned = dict(zip(truth, reversed(truth.values()), strict=True))
+    assert min(np.abs(errors).max(), np.abs(errors_px(board, half_turned)).max()) < 0.06
+
+
 @parametrize_with_studies(
     ("columns", "rows", "words"),
     [

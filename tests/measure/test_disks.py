@@ -1,5 +1,7 @@
 """Disks against pictures drawn by brute force."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from drawn import drawn, ellipse, scan_of, whitened
@@ -42,8 +44,16 @@ def test_errors_are_as_large_as_their_sigmas_say(radius_px: float, flatness: flo
     assert np.abs(np.mean(offsets, axis=0)).max() < 0.01
 
 
-def test_many_disks_at_once_are_placed_as_well_as_their_sigmas_say_and_odd_ones_looked_at_closer() -> None:
-    rng = np.random.default_rng(3)
+def test_many_disks_at_once_are_placed_as_well_as_their_sigmas_say_and_odd_ones_looked_at_closer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng, alone = np.random.default_rng(3), list[Array]()
+
+    def fit_alone(scan: Scan, center_px: Array, *others: Any) -> FittedDisk:
+        alone.append(center_px)
+        return fit_disk(scan, center_px, *others)
+
+    monkeypatch.setattr("measure.targets.disks.fit_disk", fit_alone)
     picture, starts, true = np.full((240, 640), GROUND), [], []
     for number in range(40):
         corner = np.array([80 * (number % 8) + 8, 48 * (number // 8)])
@@ -58,6 +68,7 @@ def test_many_disks_at_once_are_placed_as_well_as_their_sigmas_say_and_odd_ones_
     errors = [whitened(disk.center_px - place, disk.covariance_px2) for disk, place in zip(disks, true, strict=True)]
     assert 0.85 < np.sqrt(np.mean(np.square(errors[1:]))) < 1.15  # 78 numbers: 8 % standard deviation
     assert all(not disk.reason and not disk.weakness for disk in disks[1:])
+    assert len(alone) == 1
     assert disks[0].reason or disks[0].weakness
 
 
