@@ -100,6 +100,21 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     assert re.search(r"fx = 520\.\d+ ± 0\.\d+ px", (out / "out" / "report.html").read_text(encoding="utf-8"))
 
 
+@pytest.mark.study
+def test_square_pixels_join_fx_and_fy_and_the_project_goes_on(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures = [str(folder / f"p{number}.png") for number in range(len(TURNS))]
+    assert run(["calibrate", *pictures, *BOARD, "--square-pixels", "--out", str(tmp_path), "--json"]) in (0, 1)
+    (camera,) = json.loads(capsys.readouterr().out)["cameras"]
+    assert camera["fx_px"] == camera["fy_px"]
+    assert run(["run", str(tmp_path / "project.toml")]) in (0, 1)
+    adjusted = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    pitch_mm = tomllib.loads((tmp_path / "project.toml").read_text(encoding="utf-8"))["pitch_um"] / 1000.0
+    (interior,) = adjusted["cameras"].values()
+    assert interior["principal_distance_mm"]["value"] / pitch_mm == pytest.approx(camera["fy_px"]["value"], rel=1e-6)
+
+
 def test_in_python_it_can_be_plotted_in_pixels_and_shown_in_a_notebook(
     result: dict[str, Any], calibrations: list[Calibration], monkeypatch: pytest.MonkeyPatch
 ) -> None:
