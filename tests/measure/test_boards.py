@@ -117,7 +117,7 @@ def test_circle_grids(spec: CircleGridSpec) -> None:
 @pytest.mark.parametrize("is_mirrored", [False, True])
 def test_an_asymmetric_grid_in_a_mirror_keeps_its_names(is_mirrored: bool) -> None:
     spec, homography = CircleGridSpec(8, 6, 20.0, 15.0, asymmetric=True), board_from_pixel(tilt=5e-5)
-    picture, truth = picture_of(spec, homography, circles_dark(spec)), truth_of(spec, homography)
+    picture, truth = take_picture(spec, homography, circles_dark(spec)), read_truth(spec, homography)
     if is_mirrored:
         picture = picture[:, ::-1]
         truth = {name: np.array([picture.shape[1] - 1, 0]) + place * (-1, 1) for name, place in truth.items()}
