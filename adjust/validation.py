@@ -16,7 +16,6 @@ from adjust.problem.network import Image, Network
 from adjust.problem.parameter import Parameter, description
 
 TARGETS_NEEDED = 3
-SHOWN_AS = {"fiducial": 1, "join": 2}  # all others are object points
 DEFINITE = 1e-13  # least eigenvalue of an earlier calibration's correlation matrix
 
 Faults = Iterator[str]  # sentences, the first of which is raised
@@ -218,8 +217,9 @@ def _value_faults(network: Network) -> Faults:
     observations, covariance = network.observations, network.observations.covariance_mm2
     names, of_name = observations.numbered_points
     mark = (2 * network.image_numbers + observations.is_fiducial) * len(names) + of_name
-    _, first, counts = np.unique(mark, return_index=True, return_counts=True)
-    for row, count in zip(first[counts > 1], counts[counts > 1], strict=True):
+    if len(np.unique(mark)) < len(mark):
+        _, first, counts = np.unique(mark, return_index=True, return_counts=True)
+        row, count = first[counts > 1][0], counts[counts > 1][0]
         what = "fiducial" if observations.is_fiducial[row] else "point"
         yield (
             f"{what} {observations.point[row]} is observed {count} times in image {observations.image[row]}. Keep one "
@@ -295,7 +295,7 @@ def _mark_counts(network: Network) -> Indices:
     """(frames, 2) how many object points, and how many fiducials, every frame shows, those in several parts once."""
     observations, frames = network.observations, network.frame_numbers[network.image_numbers]
     names, points = observations.numbered_points
-    kinds = np.array([SHOWN_AS.get(kind, 0) for kind in observations.kind], dtype=np.intp)
+    kinds = observations.is_of("fiducial") + 2 * observations.is_of("join")  # all others are object points
     marks = np.unique((frames * 3 + kinds) * len(names) + points) // len(names)
     return np.bincount(marks, minlength=3 * len(network.images)).reshape(-1, 3)[:, :2]
 

@@ -6,6 +6,8 @@
 #include <Python.h>
 #include <math.h>
 #include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
 
 #define MOST_TAPS 6
 
@@ -115,7 +117,572 @@ static PyObject *spline_samples(PyObject *module, PyObject *args)
     return PyLong_FromSsize_t(clamped);
 }
 
+/* Elimination of small blocks of unknowns. */
+
+#define MOST_OWN 3
+
+/* An array of eight-byte items in up to three dimensions: lengths, and steps in items. */
+typedef struct {
+    Py_buffer view;
+    Py_ssize_t length[3], step[3];
+} Table;
+
+/* Open the tables of all arguments, those from `output` on to be written; dimensions: one digit each. The first may lie
+ * in memory in any way, the others as C has them.
+ */
+static int open_tables(PyObject *args, const char *dimensions, int output, Table *tables)
+{
+    int count = (int)strlen(dimensions), opened = 0;
+    if (PyTuple_Size(args) != count) {
+        PyErr_SetString(PyExc_TypeError, "another number of arguments");
+        return 0;
+    }
+    for (; opened < count; opened++) {
+        Table *table = tables + opened;
+        int flags = (opened ? PyBUF_C_CONTIGUOUS : PyBUF_STRIDES) | (opened < output ? 0 : PyBUF_WRITABLE);
+        if (PyObject_GetBuffer(PyTuple_GetItem(args, opened), &table->view, flags) < 0)
+            break;
+        int axes = dimensions[opened] - '0';
+        if (table->view.itemsize != 8 || table->view.ndim != axes) {
+            PyErr_SetString(PyExc_ValueError, "an array of another kind");
+            PyBuffer_Release(&table->view);
+            break;
+        }
+        for (int axis = 0; axis < axes; axis++) {
+            table->length[axis] = table->view.shape[axis];
+            table->step[axis] = table->view.strides[axis] / 8;
+        }
+    }
+    if (opened == count)
+        return 1;
+    while (opened--)
+        PyBuffer_Release(&tables[opened].view);
+    return 0;
+}
+
+/* The derivatives of a pair of rows of a matrix (n, 2, k) by one column. */
+static inline void take_pair(const Table *matrix, int64_t row, int64_t column, double *x, double *y)
+{
+    const double *at = (const double *)matrix->view.buf + row * matrix->step[0] + column * matrix->step[2];
+    *x = at[0];
+    *y = at[matrix->step[1]];
+}
+
+static void close_tables(Table *tables, int count)
+{
+    for (int i = 0; i < count; i++)
+        PyBuffer_Release(&tables[i].view);
+}
+
+/* Columns of `height` elements, one behind the other, made orthonormal (Gram and Schmidt); their upper triangle. */
+static void make_orthonormal(double *columns, int count, Py_ssize_t height, double triangle[MOST_OWN][MOST_OWN])
+{
+    for (int i = 0; i < count; i++) {
+        double *column = columns + i * height, square = 0.0;
+        for (Py_ssize_t k = 0; k < height; k++)
+            square += column[k] * column[k];
+        double length = sqrt(square), over = length > 0.0 ? 1.0 / length : 0.0;
+        for (Py_ssize_t k = 0; k < height; k++)
+            column[k] *= over;
+        triangle[i][i] = length;
+        for (int j = i + 1; j < count; j++) {
+            double *other = columns + j * height, along = 0.0;
+            for (Py_ssize_t k = 0; k < height; k++)
+                along += column[k] * other[k];
+            for (Py_ssize_t k = 0; k < height; k++)
+                other[k] -= along * column[k];
+            triangle[i][j] = along;
+        }
+    }
+}
+
+/* The lower triangle of the square matrix of a front, and where the shared unknowns stand in it. */
+typedef struct {
+    double *square;
+    int64_t width;
+    int32_t *place;
+    int64_t number;
+} Front;
+
+#define INTEGERS(table) ((const int64_t *)(table).view.buf)
+#define DOUBLES(table) ((double *)(table).view.buf)
+
+/* Move on to a front. Its row of the table of fronts: its first unknown, how many it owns, where its square begins, where
+ * those that it meets later begin, and how many these are.
+ */
+static void open_front(Front *front, int64_t number, const Table *fronts, const Table *after, double *squares)
+{
+    if (front->number == number)
+        return;
+    const int64_t *row = INTEGERS(*fronts) + 5 * number;
+    for (int64_t i = 0; i < row[1]; i++)
+        front->place[row[0] + i] = (int32_t)i;
+    for (int64_t i = 0; i < row[4]; i++)
+        front->place[INTEGERS(*after)[row[3] + i]] = (int32_t)(row[1] + i);
+    front->square = squares + row[2];
+    front->width = row[1] + row[4];
+    front->number = number;
+}
+
+/* square_rows(matrix, right, columns, order, first, unknowns, sequence, home, fronts, after, squares, shared) -> None */
+static PyObject *square_rows(PyObject *module, PyObject *args)
+{
+    enum { MATRIX, RIGHT, COLUMNS, ORDER, FIRST, UNKNOWNS, SEQUENCE, HOME, FRONTS, AFTER, SQUARES, SHARED, TABLES };
+    Table t[TABLES];
+    if (!open_tables(args, "321112112111", SQUARES, t))
+        return NULL;
+    int64_t n = t[MATRIX].length[0], cells = t[UNKNOWNS].length[0], width = t[UNKNOWNS].length[1];
+    int fits = t[MATRIX].length[1] == 2 && t[RIGHT].length[0] == n && t[RIGHT].length[1] == 2 &&
+               t[COLUMNS].length[0] == width && t[FIRST].length[0] == cells + 1 && t[HOME].length[0] == cells &&
+               t[SEQUENCE].length[0] == cells && t[FRONTS].length[1] == 5;
+    Front front = {NULL, 0, malloc(((size_t)t[SHARED].length[0] + 1) * sizeof(int32_t)), -1};
+    double *row = malloc(2 * ((size_t)width + 1) * sizeof(double));
+    double *sums = malloc(((size_t)width + 1) * ((size_t)width + 1) * sizeof(double));
+    int ready = fits && front.place && row && sums;
+    if (ready) {
+        Py_BEGIN_ALLOW_THREADS
+        double *x = row, *y = row + width + 1, *shared = DOUBLES(t[SHARED]);
+        for (int64_t i = 0; i < cells; i++) {
+            int64_t cell = INTEGERS(t[SEQUENCE])[i];
+            const int64_t *unknown = INTEGERS(t[UNKNOWNS]) + cell * width;
+            open_front(&front, INTEGERS(t[HOME])[cell], &t[FRONTS], &t[AFTER], DOUBLES(t[SQUARES]));
+            memset(sums, 0, (size_t)(width + 1) * (size_t)(width + 1) * sizeof(double));
+            for (int64_t r = INTEGERS(t[FIRST])[cell]; r < INTEGERS(t[FIRST])[cell + 1]; r++) {
+                int64_t at = INTEGERS(t[ORDER])[r];
+                for (int64_t j = 0; j < width; j++)
+                    take_pair(&t[MATRIX], at, INTEGERS(t[COLUMNS])[j], x + j, y + j);
+                x[width] = DOUBLES(t[RIGHT])[2 * at];
+                y[width] = DOUBLES(t[RIGHT])[2 * at + 1];
+                for (int64_t j = 0; j <= width; j++) {
+                    double *sum = sums + j * (width + 1), by_x = x[j], by_y = y[j];
+                    for (int64_t k = 0; k <= j; k++)
+                        sum[k] += by_x * x[k] + by_y * y[k];
+                }
+            }
+            for (int64_t j = 0; j < width; j++) {
+                if (unknown[j] < 0)
+                    continue;
+                int64_t one = front.place[unknown[j]];
+                shared[unknown[j]] += sums[width * (width + 1) + j];
+                for (int64_t k = 0; k <= j; k++) {
+                    if (unknown[k] < 0)
+                        continue;
+                    int64_t other = front.place[unknown[k]];
+                    front.square[one > other ? one * front.width + other : other * front.width + one] +=
+                        sums[j * (width + 1) + k];
+                }
+            }
+        }
+        Py_END_ALLOW_THREADS
+    }
+    free(front.place);
+    free(row);
+    free(sums);
+    close_tables(t, TABLES);
+    if (!ready) {
+        PyErr_SetString(PyExc_ValueError, "the sizes of rows and cells do not go together");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+/* The border of a block (o, s) in the shared unknowns that it touches, in the order of their places in a front, and
+ * where runs of neighbouring places begin.
+ */
+typedef struct {
+    int64_t count, runs, *run;
+    int32_t *place;
+    int64_t *unknown;
+    double *row[MOST_OWN];
+} Border;
+
+/* What tells the borders of blocks, and room for the largest one. */
+typedef struct {
+    const Table *first, *numbers, *members, *singles, *parts, *alone;
+    int64_t own, group, single_count;
+    Border border;
+    Front front;
+} Borders;
+
+static int make_room(Borders *b, int64_t shared_count)
+{
+    int64_t most = 0;
+    b->own = b->parts->length[1], b->group = b->parts->length[2], b->single_count = b->singles->length[0];
+    for (int64_t i = 0; i + 1 < b->first->length[0]; i++) {
+        int64_t rows = INTEGERS(*b->first)[i + 1] - INTEGERS(*b->first)[i];
+        most = rows > most ? rows : most;
+    }
+    size_t width = (size_t)(most * b->group + b->single_count + 1);
+    b->front = (Front){NULL, 0, malloc(((size_t)shared_count + 1) * sizeof(int32_t)), -1};
+    b->border.place = malloc(width * sizeof(int32_t));
+    b->border.unknown = malloc(width * sizeof(int64_t));
+    b->border.run = malloc((width + 1) * sizeof(int64_t));
+    b->border.row[0] = malloc(MOST_OWN * width * sizeof(double));
+    if (!b->front.place || !b->border.place || !b->border.unknown || !b->border.run ||
+        !b->border.row[0])
+        return 0;
+    for (int k = 1; k < MOST_OWN; k++)
+        b->border.row[k] = b->border.row[0] + (size_t)k * width;
+    return 1;
+}
+
+static void give_back(Borders *b)
+{
+    free(b->front.place);
+    free(b->border.place);
+    free(b->border.unknown);
+    free(b->border.run);
+    free(b->border.row[0]);
+}
+
+static void insert(Borders *b, int64_t unknown, const double *value, int64_t step)
+{
+    Border *border = &b->border;
+    int32_t place = b->front.place[unknown];
+    int64_t at = border->count++;
+    for (; at > 0 && border->place[at - 1] > place; at--) {
+        border->place[at] = border->place[at - 1];
+        border->unknown[at] = border->unknown[at - 1];
+        for (int k = 0; k < MOST_OWN; k++)
+            border->row[k][at] = border->row[k][at - 1];
+    }
+    border->place[at] = place;
+    border->unknown[at] = unknown;
+    for (int64_t k = 0; k < MOST_OWN; k++)
+        border->row[k][at] = k < b->own ? value[k * step] : 0.0;
+}
+
+/* numbers (m,): the groups of the pairs of rows of the blocks. */
+static void lay_out_border(Borders *b, int64_t block)
+{
+    b->border.count = 0;
+    for (int64_t i = INTEGERS(*b->first)[block]; i < INTEGERS(*b->first)[block + 1]; i++) {
+        const int64_t *members = INTEGERS(*b->members) + INTEGERS(*b->numbers)[i] * b->group;
+        for (int64_t j = 0; j < b->group; j++)
+            if (members[j] >= 0)
+                insert(b, members[j], DOUBLES(*b->parts) + i * b->own * b->group + j, b->group);
+    }
+    for (int64_t s = 0; s < b->single_count; s++)
+        insert(b, INTEGERS(*b->singles)[s], DOUBLES(*b->alone) + block * b->own * b->single_count + s,
+               b->single_count);
+    Border *border = &b->border;
+    border->runs = 0;
+    for (int64_t j = 0; j < border->count; j++)
+        if (j == 0 || border->place[j] != border->place[j - 1] + 1)
+            border->run[border->runs++] = j;
+    border->run[border->runs] = border->count;
+}
+
+enum {
+    MATRIX, RIGHT, ORDER, FIRST, SEQUENCE, HOME, BY_OWN, BY_GROUP, BY_SINGLE, OWN, GROUP, MEMBERS, SINGLE, SINGLES,
+    WEIGHT, PRIOR, FRONTS, AFTER, TRIANGLE, REDUCED, ORTHONORMAL, PARTS, ALONE, SQUARES, SHARED, TABLES
+};
+
+/* The tables of an elimination; by shared unknown, its rank among the single ones. */
+typedef struct {
+    Table t[TABLES];
+    int64_t own, group, single, singles, m;
+    double *orthonormal, *unused; /* unused: for rows of a border beyond o */
+    int32_t *rank;
+    Borders borders;
+} Elimination;
+
+/* The own unknowns of a block, their columns made orthonormal: its triangle, right side, and border. */
+static void eliminate_block(Elimination *e, int64_t block)
+{
+    int64_t begin = INTEGERS(e->t[FIRST])[block], rows = INTEGERS(e->t[FIRST])[block + 1] - begin;
+    int64_t o = e->own, height = 2 * rows + o;
+    const int64_t *order = INTEGERS(e->t[ORDER]) + begin, *own = INTEGERS(e->t[OWN]) + block * o;
+    double *q = e->orthonormal, first[MOST_OWN][MOST_OWN], second[MOST_OWN][MOST_OWN];
+    double *reduced = DOUBLES(e->t[REDUCED]) + block * o, *alone = DOUBLES(e->t[ALONE]) + block * o * e->singles;
+    for (int64_t k = 0; k < o; k++) {
+        double *column = q + k * height;
+        for (int64_t i = 0; i < rows; i++) {
+            take_pair(&e->t[MATRIX], order[i], INTEGERS(e->t[BY_OWN])[k], column + 2 * i, column + 2 * i + 1);
+            if (own[k] < 0)
+                column[2 * i] = column[2 * i + 1] = 0.0;
+        }
+        for (int64_t j = 0; j < o; j++)
+            column[2 * rows + j] = j == k ? DOUBLES(e->t[WEIGHT])[block * o + k] : 0.0;
+    }
+    make_orthonormal(q, (int)o, height, first);
+    make_orthonormal(q, (int)o, height, second); /* twice is enough */
+    memset(alone, 0, (size_t)(o * e->singles) * sizeof(double));
+    for (int64_t k = 0; k < o; k++) {
+        reduced[k] = 0.0;
+        for (int64_t j = 0; j < o; j++) {
+            double sum = 0.0;
+            for (int64_t i = k; i <= j; i++)
+                sum += second[k][i] * first[i][j];
+            DOUBLES(e->t[TRIANGLE])[(block * o + k) * o + j] = sum;
+            reduced[k] += q[k * height + 2 * rows + j] * DOUBLES(e->t[PRIOR])[block * o + j];
+        }
+    }
+    for (int64_t i = 0; i < rows; i++) {
+        const double *right = DOUBLES(e->t[RIGHT]) + 2 * order[i];
+        double x[MOST_OWN] = {0.0}, y[MOST_OWN] = {0.0}, *part[MOST_OWN] = {e->unused, e->unused, e->unused};
+        for (int64_t k = 0; k < o; k++) {
+            x[k] = q[k * height + 2 * i];
+            y[k] = q[k * height + 2 * i + 1];
+            part[k] = DOUBLES(e->t[PARTS]) + ((begin + i) * o + k) * e->group;
+            reduced[k] += x[k] * right[0] + y[k] * right[1];
+            DOUBLES(e->t[ORTHONORMAL])[2 * k * e->m + begin + i] = x[k];
+            DOUBLES(e->t[ORTHONORMAL])[(2 * k + 1) * e->m + begin + i] = y[k];
+        }
+        for (int64_t j = 0; j < e->group; j++) {
+            double by_x, by_y;
+            take_pair(&e->t[MATRIX], order[i], INTEGERS(e->t[BY_GROUP])[j], &by_x, &by_y);
+            part[0][j] = x[0] * by_x + y[0] * by_y;
+            part[1][j] = x[1] * by_x + y[1] * by_y;
+            part[2][j] = x[2] * by_x + y[2] * by_y;
+        }
+        for (int64_t j = 0; j < e->single; j++) {
+            int64_t unknown = INTEGERS(e->t[SINGLE])[order[i] * e->single + j];
+            double by_x, by_y;
+            if (unknown < 0)
+                continue;
+            take_pair(&e->t[MATRIX], order[i], INTEGERS(e->t[BY_SINGLE])[j], &by_x, &by_y);
+            for (int64_t k = 0; k < o; k++)
+                alone[k * e->singles + e->rank[unknown]] += x[k] * by_x + y[k] * by_y;
+        }
+    }
+}
+
+/* Less the square of a block's border. */
+static void subtract_border(Elimination *e, int64_t block)
+{
+    const Border *border = &e->borders.border;
+    const double *reduced = DOUBLES(e->t[REDUCED]) + block * e->own;
+    const double *b0 = border->row[0], *b1 = border->row[1], *b2 = border->row[2];
+    for (int64_t i = 0; i < border->count; i++) {
+        double *into = e->borders.front.square + border->place[i] * e->borders.front.width;
+        double a0 = b0[i], a1 = b1[i], a2 = b2[i];
+        for (int64_t k = 0; k < e->own; k++)
+            DOUBLES(e->t[SHARED])[border->unknown[i]] -= border->row[k][i] * reduced[k];
+        for (int64_t run = 0; run < border->runs && border->run[run] <= i; run++) {
+            int64_t first = border->run[run], stop = border->run[run + 1] <= i ? border->run[run + 1] : i + 1;
+            double *restrict to = into + border->place[first];
+            const double *restrict c0 = b0 + first, *restrict c1 = b1 + first, *restrict c2 = b2 + first;
+            for (int64_t j = 0; j < stop - first; j++)
+                to[j] -= a0 * c0[j] + a1 * c1[j] + a2 * c2[j];
+        }
+        for (int64_t j = i; j-- > 0 && border->place[j] == border->place[i];) /* two rows of one image: both ways */
+            into[border->place[j]] -= a0 * b0[j] + a1 * b1[j] + a2 * b2[j];
+    }
+}
+
+static const char *prepare(Elimination *e)
+{
+    const Table *t = e->t;
+    int64_t blocks = t[OWN].length[0], n = t[MATRIX].length[0], most = 0;
+    e->m = t[ORDER].length[0], e->own = t[OWN].length[1];
+    e->group = t[BY_GROUP].length[0], e->single = t[BY_SINGLE].length[0], e->singles = t[SINGLES].length[0];
+    if (e->own > MOST_OWN || t[MATRIX].length[1] != 2 || t[RIGHT].length[0] != n || t[RIGHT].length[1] != 2 ||
+        t[GROUP].length[0] != e->m || t[SINGLE].length[0] != n || t[SINGLE].length[1] != e->single ||
+        t[FIRST].length[0] != blocks + 1 || t[SEQUENCE].length[0] != blocks || t[HOME].length[0] != blocks ||
+        t[MEMBERS].length[1] != e->group || t[TRIANGLE].length[0] != blocks || t[REDUCED].length[0] != blocks ||
+        t[ALONE].length[0] != blocks || t[ALONE].length[2] != e->singles || t[WEIGHT].length[0] != blocks ||
+        t[PRIOR].length[0] != blocks || t[PARTS].length[0] != e->m || t[PARTS].length[1] != e->own ||
+        t[PARTS].length[2] != e->group || t[ORTHONORMAL].length[2] != e->m || t[FRONTS].length[1] != 5)
+        return "the sizes of rows, blocks and groups do not go together";
+    for (int64_t i = 0; i < blocks; i++) {
+        int64_t rows = INTEGERS(t[FIRST])[i + 1] - INTEGERS(t[FIRST])[i];
+        most = rows > most ? rows : most;
+    }
+    e->orthonormal = malloc((2 * (size_t)most + MOST_OWN) * MOST_OWN * sizeof(double));
+    e->unused = malloc(((size_t)e->group + 1) * sizeof(double));
+    e->rank = calloc((size_t)t[SHARED].length[0] + 1, sizeof(int32_t));
+    e->borders = (Borders){.first = t + FIRST, .numbers = t + GROUP, .members = t + MEMBERS, .singles = t + SINGLES,
+                           .parts = t + PARTS, .alone = t + ALONE};
+    if (!make_room(&e->borders, t[SHARED].length[0]) || !e->orthonormal || !e->unused || !e->rank)
+        return "no memory for the blocks";
+    for (int64_t i = 0; i < e->singles; i++)
+        e->rank[INTEGERS(t[SINGLES])[i]] = (int32_t)i;
+    return NULL;
+}
+
+/* eliminate_blocks(...) -> None: see compiled/__init__.py. */
+static PyObject *eliminate_blocks(PyObject *module, PyObject *args)
+{
+    Elimination e = {0};
+    if (!open_tables(args, "3211111112122122213233311", TRIANGLE, e.t))
+        return NULL;
+    const char *fault = prepare(&e);
+    if (!fault) {
+        Py_BEGIN_ALLOW_THREADS
+        for (int64_t i = 0; i < e.t[SEQUENCE].length[0]; i++) {
+            int64_t block = INTEGERS(e.t[SEQUENCE])[i];
+            open_front(&e.borders.front, INTEGERS(e.t[HOME])[block], &e.t[FRONTS], &e.t[AFTER],
+                       DOUBLES(e.t[SQUARES]));
+            eliminate_block(&e, block);
+            lay_out_border(&e.borders, block);
+            subtract_border(&e, block);
+        }
+        Py_END_ALLOW_THREADS
+    }
+    free(e.orthonormal);
+    free(e.unused);
+    free(e.rank);
+    give_back(&e.borders);
+    close_tables(e.t, TABLES);
+    if (fault) {
+        PyErr_SetString(PyExc_ValueError, fault);
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+/* border_cofactors(first, sequence, home, group, members, singles, parts, alone, fronts, after, squares, cofactors)
+ *
+ * What the cofactors of shared unknowns, lower triangles of the squares of fronts, add to those of own ones of unit
+ * covariance: B Q B' for borders B, into cofactors (b, o, o).
+ */
+static PyObject *border_cofactors(PyObject *module, PyObject *args)
+{
+    enum { FIRST, SEQUENCE, HOME, GROUP, MEMBERS, SINGLES, PARTS, ALONE, FRONTS, AFTER, SQUARES, COFACTORS, TABLES };
+    Table t[TABLES];
+    if (!open_tables(args, "111121332113", COFACTORS, t))
+        return NULL;
+    int64_t blocks = t[FIRST].length[0] - 1, shared = 0;
+    int fits = t[SEQUENCE].length[0] == blocks && t[HOME].length[0] == blocks && t[ALONE].length[0] == blocks &&
+               t[GROUP].length[0] == t[PARTS].length[0] && t[MEMBERS].length[1] == t[PARTS].length[2] &&
+               t[ALONE].length[2] == t[SINGLES].length[0] && t[COFACTORS].length[0] == blocks &&
+               t[PARTS].length[1] <= MOST_OWN && t[FRONTS].length[1] == 5;
+    for (int64_t i = 0; i < t[FRONTS].length[0]; i++)
+        shared += INTEGERS(t[FRONTS])[5 * i + 1];
+    Borders b = {.first = t + FIRST, .numbers = t + GROUP, .members = t + MEMBERS, .singles = t + SINGLES,
+                 .parts = t + PARTS, .alone = t + ALONE};
+    int ready = make_room(&b, shared) && fits;
+    if (ready) {
+        Py_BEGIN_ALLOW_THREADS
+        for (int64_t i = 0; i < blocks; i++) {
+            int64_t block = INTEGERS(t[SEQUENCE])[i];
+            double sums[MOST_OWN][MOST_OWN] = {{0.0}};
+            open_front(&b.front, INTEGERS(t[HOME])[block], &t[FRONTS], &t[AFTER], DOUBLES(t[SQUARES]));
+            lay_out_border(&b, block);
+            const double *b0 = b.border.row[0], *b1 = b.border.row[1], *b2 = b.border.row[2];
+            for (int64_t j = 0; j < b.border.count; j++) {
+                const double *row = b.front.square + b.border.place[j] * b.front.width;
+                double half = 0.5 * row[b.border.place[j]];
+                double along[MOST_OWN] = {half * b0[j], half * b1[j], half * b2[j]};
+                for (int64_t k = 0; k < j; k++) {
+                    double cofactor = row[b.border.place[k]];
+                    along[0] += cofactor * b0[k];
+                    along[1] += cofactor * b1[k];
+                    along[2] += cofactor * b2[k];
+                }
+                for (int k = 0; k < MOST_OWN; k++)
+                    for (int l = 0; l < MOST_OWN; l++)
+                        sums[k][l] += b.border.row[k][j] * along[l] + along[k] * b.border.row[l][j];
+            }
+            for (int64_t k = 0; k < b.own; k++)
+                for (int64_t l = 0; l < b.own; l++)
+                    DOUBLES(t[COFACTORS])[(block * b.own + k) * b.own + l] = sums[k][l];
+        }
+        Py_END_ALLOW_THREADS
+    }
+    give_back(&b);
+    close_tables(t, TABLES);
+    if (!ready) {
+        PyErr_SetString(PyExc_ValueError, "the sizes of borders and fronts do not go together");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+/* target_derivatives(rows, image, rotation, attitude, ray, in_camera, by_ray, exterior, place, derivatives) -> None
+ *
+ * Into the first columns of derivatives (n, 2, k), at rows (m,): those by the members of exterior orientation, the
+ * vector from the station and the attitude, then by those of the point's coordinates. by_ray (m, 2, 2).
+ */
+static PyObject *target_derivatives(PyObject *module, PyObject *args)
+{
+    enum { ROWS, IMAGE, ROTATION, ATTITUDE, RAY, IN_CAMERA, BY_RAY, EXTERIOR, PLACE, DERIVATIVES, TABLES };
+    Table t[TABLES];
+    if (!open_tables(args, "1133223113", DERIVATIVES, t))
+        return NULL;
+    int64_t m = t[ROWS].length[0], exterior = t[EXTERIOR].length[0], place = t[PLACE].length[0];
+    int64_t width = t[DERIVATIVES].length[2], images = t[ROTATION].length[0];
+    int fits = t[IMAGE].length[0] == m && t[RAY].length[0] == m && t[IN_CAMERA].length[0] == m &&
+               t[BY_RAY].length[0] == m && t[ATTITUDE].length[0] == images && exterior + place <= width &&
+               t[DERIVATIVES].length[1] == 2 && t[RAY].length[1] == 2 && t[IN_CAMERA].length[1] == 3;
+    for (int64_t i = 0; fits && i < m; i++) {
+        int64_t image = INTEGERS(t[IMAGE])[i], row = INTEGERS(t[ROWS])[i];
+        const double *rotation = DOUBLES(t[ROTATION]) + 9 * image, *turn = DOUBLES(t[ATTITUDE]) + 9 * image;
+        const double *ray = DOUBLES(t[RAY]) + 2 * i, *p = DOUBLES(t[IN_CAMERA]) + 3 * i;
+        for (int64_t axis = 0; axis < 2; axis++) {
+            const double *by_ray = DOUBLES(t[BY_RAY]) + 4 * i + 2 * axis;
+            double *into = DOUBLES(t[DERIVATIVES]) + (2 * row + axis) * width;
+            double x = by_ray[0] / -p[2], y = by_ray[1] / -p[2], z = x * ray[0] + y * ray[1];
+            double about[3] = {p[1] * z - p[2] * y, p[2] * x - p[0] * z, p[0] * y - p[1] * x};
+            double by[6];
+            for (int k = 0; k < 3; k++) {
+                by[k] = x * rotation[k] + y * rotation[3 + k] + z * rotation[6 + k];
+                by[3 + k] = about[0] * turn[k] + about[1] * turn[3 + k] + about[2] * turn[6 + k];
+            }
+            for (int64_t k = 0; k < exterior; k++) {
+                int64_t member = INTEGERS(t[EXTERIOR])[k];
+                into[k] = member < 3 ? -by[member] : by[member];
+            }
+            for (int64_t k = 0; k < place; k++)
+                into[exterior + k] = by[INTEGERS(t[PLACE])[k]];
+        }
+    }
+    close_tables(t, TABLES);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the sizes of targets and derivatives do not go together");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+/* whiten_rows(by_observation, covariance, differences, root, rows, right) -> None
+ *
+ * root (n, 2, 2): L of A C A' = L L'; rows (n, 2, k), divided by it in place; right (n, 2): A v divided by it.
+ */
+static PyObject *whiten_rows(PyObject *module, PyObject *args)
+{
+    enum { A, COVARIANCE, V, ROOT, ROWS, RIGHT, TABLES };
+    Table t[TABLES];
+    if (!open_tables(args, "332332", ROOT, t))
+        return NULL;
+    int64_t n = t[A].length[0], width = t[ROWS].length[2];
+    int fits = t[COVARIANCE].length[0] == n && t[V].length[0] == n && t[ROOT].length[0] == n &&
+               t[ROWS].length[0] == n && t[RIGHT].length[0] == n && t[A].length[1] == 2 && t[A].length[2] == 2;
+    for (int64_t i = 0; fits && i < n; i++) {
+        const double *a = (const double *)t[A].view.buf + i * t[A].step[0], *c = DOUBLES(t[COVARIANCE]) + 4 * i;
+        const double *v = DOUBLES(t[V]) + 2 * i;
+        double a00 = a[0], a01 = a[t[A].step[2]], a10 = a[t[A].step[1]], a11 = a[t[A].step[1] + t[A].step[2]];
+        double x0 = a00 * c[0] + a01 * c[2], x1 = a00 * c[1] + a01 * c[3];
+        double y0 = a10 * c[0] + a11 * c[2], y1 = a10 * c[1] + a11 * c[3];
+        double *root = DOUBLES(t[ROOT]) + 4 * i, *right = DOUBLES(t[RIGHT]) + 2 * i;
+        root[0] = sqrt(x0 * a00 + x1 * a01);
+        root[1] = 0.0;
+        root[2] = (y0 * a00 + y1 * a01) / root[0];
+        root[3] = sqrt(y0 * a10 + y1 * a11 - root[2] * root[2]);
+        right[0] = (a00 * v[0] + a01 * v[1]) / root[0];
+        right[1] = (a10 * v[0] + a11 * v[1] - root[2] * right[0]) / root[3];
+        double *first = DOUBLES(t[ROWS]) + 2 * i * width, *second = first + width;
+        double over_first = 1.0 / root[0], over_second = 1.0 / root[3];
+        for (int64_t k = 0; k < width; k++) {
+            first[k] *= over_first;
+            second[k] = (second[k] - root[2] * first[k]) * over_second;
+        }
+    }
+    close_tables(t, TABLES);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the sizes of rows do not go together");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
 static PyMethodDef methods[] = {
+    {"target_derivatives", target_derivatives, METH_VARARGS, "Derivatives of images by orientations and points."},
+    {"whiten_rows", whiten_rows, METH_VARARGS, "Pairs of rows of unit weight."},
+    {"border_cofactors", border_cofactors, METH_VARARGS, "Cofactors of shared unknowns through borders of blocks."},
+    {"square_rows", square_rows, METH_VARARGS, "Normal equations of many pairs of rows in the unknowns they share."},
+    {"eliminate_blocks", eliminate_blocks, METH_VARARGS, "Own unknowns of many blocks eliminated onto shared ones."},
     {"spline_samples", spline_samples, METH_VARARGS, "Samples of a spline at places, rounded and clamped."},
     {NULL, NULL, 0, NULL},
 };

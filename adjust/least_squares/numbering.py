@@ -118,8 +118,9 @@ class Numbering:
         sizes = np.bincount(group[group >= 0], minlength=len(self._grouped))
         present = np.flatnonzero(sizes)
         met = self._group_meetings[:, present]
-        order = band_order(met)
-        fronts = make_fronts(met[:, order], sizes[present[order]], int((group < 0).sum()))
+        meeting = csr_array(met.T @ met)
+        order = band_order(meeting)
+        fronts = make_fronts(meeting[order][:, order], sizes[present[order]], int((group < 0).sum()))
         if len(fronts) == 1:
             return _Shared(shared, fronts)
         rank = np.full(len(sizes) + 1, len(sizes), dtype=np.intp)  # the last stands for what is in no group

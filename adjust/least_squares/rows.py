@@ -14,6 +14,7 @@ from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, p
 from adjust.problem.condition_equations import Derivatives
 from adjust.problem.further_observations import FurtherObservation
 from adjust.problem.problem import ABSENT, Problem, State
+from compiled import kernels
 
 
 @dataclass(frozen=True)
@@ -67,11 +68,15 @@ def whitened_rows(
     At computed observations F is 0, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed less observed. The
     derivatives B are divided where they are, and are not these any more.
     """
-    a = at.by_observation
+    a, matrix = at.by_observation, at.by_unknowns
+    further = tuple(_further_block(numbering, each, values) for each in numbering.problem.further)
+    if kernels is not None:
+        root, right = np.empty(a.shape), np.empty(v_mm.shape)
+        kernels.whiten_rows(a, *map(np.ascontiguousarray, (covariance_mm2, v_mm)), root, matrix, right)
+        return WhitenedRows(numbering, root, matrix, right, further)
     root = lower_root(product(product(a, covariance_mm2), a.transpose(0, 2, 1)))
     right = _whitened(root, applied(a, v_mm)[..., None])[..., 0]
-    further = tuple(_further_block(numbering, each, values) for each in numbering.problem.further)
-    return WhitenedRows(numbering, root, _whitened(root, at.by_unknowns), right, further)
+    return WhitenedRows(numbering, root, _whitened(root, matrix), right, further)
 
 
 def _whitened(root: Array, rows: Array) -> Array:

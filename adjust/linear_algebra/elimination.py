@@ -12,13 +12,12 @@ Rows that connect what no single block owns are blocks without own unknowns: wha
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
 
 from adjust.array_types import Array
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, column_values
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.multifrontal import factorise_normal_equations, qr_triangle, reflected, reflections_cost
-from adjust.linear_algebra.schur_complement import SparseRows, eliminated
+from adjust.linear_algebra.schur_complement import SharedEquations, SparseRows, eliminated
 from adjust.linear_algebra.sparse_factor import TEN_DIGITS
 
 CHEAP = 1e7  # rows times columns squared in the shared unknowns up to which these rows are always reflected
@@ -53,14 +52,18 @@ def eliminate(
     cost = reflections_cost(fronts, *sparse.pattern.left_over) if sparse is not None and fronts is not None else 0.0
     is_large = sparse is not None and cost > (CHEAP if sharp else REFLECTED)
     blocks = blocks if is_large else list(blocks)  # laid out once
-    squares = sparse.column_squares(count) if sparse is not None and is_large else _column_squares(blocks, count)
+    equations = sparse.equations(fronts) if sparse is not None and fronts is not None and is_large else None
+    if sparse is not None and equations is not None:
+        squares = sparse.column_squares(count, equations)
+    else:
+        squares = _column_squares(blocks, count)
     squares += prior_root_weight**2
     scale = np.where(squares > 0.0, np.sqrt(squares), 1.0)
     # One row an unknown holds its prior's and its damping's together: its coefficient and its right side.
     together = np.hypot(prior_root_weight / scale, np.sqrt(damping))
     priors = together, prior_root_weight / scale * prior_right / np.where(together > 0.0, together, 1.0)
-    if sparse is not None and fronts is not None and is_large:
-        factor = _eliminate_normally(sparse, scale, priors, fronts, 0.0 if sharp else SAFE)
+    if sparse is not None and equations is not None:
+        factor = _eliminate_normally(sparse, scale, priors, equations, 0.0 if sharp else SAFE)
         least = SAFE if cost > REFLECTED else TEN_DIGITS
         if factor is not None and (not sharp or factor.triangle.reciprocal_condition > least):
             return factor
@@ -103,17 +106,20 @@ def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array])
 
 
 def _eliminate_normally(
-    rows: SparseRows, scale: Array, priors: tuple[Array, Array], fronts: Fronts, lift: float
+    rows: SparseRows, scale: Array, priors: tuple[Array, Array], equations: SharedEquations, lift: float
 ) -> Factor | None:
     """None where the normal equations of the shared unknowns are not positive definite."""
+    fronts, squares = equations.fronts, equations.squares
     root_weight, prior_right = (prior[: fronts.count] for prior in priors)
-    blocks = eliminated(rows, *priors, scale)
-    normal, right = rows.square
-    over = diags_array(1.0 / scale[: fronts.count])
-    normal = over @ (normal - blocks.border.square()) @ over + diags_array(root_weight**2 + lift**2)
-    right = over @ (right - blocks.border.transposed_times(blocks.right.ravel())) + root_weight * prior_right
+    blocks = eliminated(rows, *priors, scale, equations)
+    over = 1.0 / scale[: fronts.count]
+    for front, square in zip(fronts, squares, strict=True):
+        square *= over[front.columns]
+        square *= over[front.columns, None]
+        square[range(front.count), range(front.count)] += root_weight[front.own] ** 2 + lift**2
+    right = over * equations.right + root_weight * prior_right
     try:
-        triangle, right = factorise_normal_equations(fronts, csr_array(normal), right)
+        triangle, right = factorise_normal_equations(fronts, squares, right)
     except np.linalg.LinAlgError:
         return None
     steady = lift == 0.0 and triangle.reciprocal_condition > TEN_DIGITS and blocks.norm_of_inverse() <= STEADY

@@ -82,28 +82,40 @@ class Fronts:
         return np.asarray(np.searchsorted(self._starts, unknowns.min(axis=-1), side="right") - 1)
 
     @cached_property
+    def table(self) -> Indices:
+        """(f, 5) of every front: its first unknown, how many it owns, where its square begins if all stand one behind
+        the other, where those that it meets later begin in `after`, and how many these are."""
+        count, later = np.array([(front.count, len(front.after)) for front in self], dtype=np.intp).T
+        sizes = (count + later) ** 2
+        return np.column_stack([self._starts, count, np.cumsum(sizes) - sizes, np.cumsum(later) - later, later])
+
+    @cached_property
+    def after(self) -> Indices:
+        """Those that the fronts meet later, one front behind the other."""
+        return np.concatenate([front.after for front in self])
+
+    @cached_property
     def _starts(self) -> Indices:
         return np.array([front.first for front in self.members], dtype=np.intp)
 
 
-def band_order(met: csr_array) -> Indices:
+def band_order(meeting: csr_array) -> Indices:
     """Groups (g,) in an order in which those that some block meets together are near each other.
 
-    met (blocks, g): which groups every block of observations meets.
+    meeting (g, g): an entry for every two groups that some block of observations meets both of.
     """
-    if met.shape[1] == 0:
+    if meeting.shape[0] == 0:
         return np.empty(0, dtype=np.intp)
-    return np.asarray(reverse_cuthill_mckee(csr_array(met.T @ met), symmetric_mode=True), dtype=np.intp)
+    return np.asarray(reverse_cuthill_mckee(meeting, symmetric_mode=True), dtype=np.intp)
 
 
-def make_fronts(met: csr_array, sizes: Indices, border: int) -> Fronts:
+def make_fronts(meeting: csr_array, sizes: Indices, border: int) -> Fronts:
     """The fronts of groups of some unknowns each (g,), in their order, and of a border of unknowns that all may meet.
 
-    met as in `band_order`. Neighbours are put together as long as that makes the elimination of an unknown cheaper.
+    meeting as in `band_order`. Neighbours are put together as long as that makes the elimination of an unknown cheaper.
     What a run of them leaves is handed on, all of it, to the first group that it meets later.
     """
     size, count = np.append(sizes, border), len(sizes)
-    meeting = csr_array(met.T @ met)
     handed_on: list[set[int]] = [set() for _ in range(count + 1)]
     runs: list[_Run] = []
     for group in range(count + 1):

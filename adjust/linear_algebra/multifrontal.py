@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.sparse import csr_array
 
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.fronts import Fronts
@@ -58,29 +57,27 @@ def append_rows(triangle: Triangle, rows: Iterable[tuple[Indices, Array]]) -> Tr
     return reflected(triangle.fronts, all_rows, nothing, nothing)[0]
 
 
-def factorise_normal_equations(fronts: Fronts, normal: csr_array, right: Array) -> tuple[Triangle, Array]:
-    """The triangle and right side (s,) of normal equations (s, s), by Cholesky.
+def factorise_normal_equations(fronts: Fronts, squares: list[Array], right: Array) -> tuple[Triangle, Array]:
+    """The triangle and right side (s,) of normal equations, by Cholesky.
 
-    Raises numpy.linalg.LinAlgError where they are not positive definite.
+    squares: of every front those (k + a, k + a) of the rows that belong to it, whose lower triangle is read and which
+    are used up; right (s,). Raises numpy.linalg.LinAlgError where they are not positive definite.
     """
     own, borders = [], []
     right = right.copy()
-    later = [np.zeros((front.width, front.width)) for front in fronts]
     for i, front in enumerate(fronts):
-        square = later[i]
-        of_own = csr_array(normal[front.own, front.first :]).tocoo()
-        square[of_own.row, front.places(of_own.col.astype(np.intp) + front.first)] += of_own.data
+        square = squares[i]
         root = np.asarray(np.linalg.cholesky(square[: front.count, : front.count]), dtype=np.float64)
-        border = solve_triangular(root, square[: front.count, front.count :], lower=True)
+        border = solve_triangular(root, square[front.count :, : front.count].T, lower=True)
         right[front.own] = solve_triangular(root, right[front.own], lower=True)
         right[front.after] -= border.T @ right[front.own]
         if len(front.after):
             home = int(fronts.home(front.after))
             at = fronts[home].places(front.after)
-            later[home][np.ix_(at, at)] += square[front.count :, front.count :] - border.T @ border
+            squares[home][np.ix_(at, at)] += square[front.count :, front.count :] - border.T @ border
         own.append(root.T)
         borders.append(border)
-        later[i] = np.empty((0, 0))
+        squares[i] = np.empty((0, 0))
     return Triangle(fronts, tuple(own), tuple(borders)), right
 
 

@@ -15,9 +15,12 @@ from scipy.sparse import bsr_array, coo_array, csr_array
 
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import BlockFactors, Blocks
+from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.sparse_factor import Triangle
+from compiled import kernels
 
 Arranged = Callable[[], Iterable[tuple[Indices, Blocks]]]  # pairs of rows (b, m) of blocks of equal shape, laid out
+COMPILED_OWN = 3  # own unknowns of a block that kernels.c holds
 ROWS_AT_ONCE = 20_000  # pairs of rows that are handled together, so that they stay in the processor's cache
 
 
@@ -45,9 +48,14 @@ class Pattern:
 
     @cached_property
     def order(self) -> Indices:
-        """(m,) the pairs of rows that touch own unknowns, block by block."""
-        order = np.argsort(self.block, kind="stable")
-        return order[: np.searchsorted(self.block[order], len(self.own) - 1)]
+        """(m,) the pairs of rows that touch own unknowns, block by block, and group by group as these are eliminated."""
+        order = np.lexsort((self._lowest[self.group], self.block))
+        return order[: np.count_nonzero(self.block < len(self.own) - 1)]
+
+    @cached_property
+    def groups(self) -> Indices:
+        """(m,) their groups."""
+        return self.group[self.order]
 
     @cached_property
     def block_numbers(self) -> Indices:
@@ -79,11 +87,15 @@ class Pattern:
         return np.asarray(rows[:, None] * (len(self.singles) + 1) + place[self.single[self.order]].T)
 
     @cached_property
+    def _lowest(self) -> Indices:
+        """(g + 1,) the first member of every group."""
+        return np.asarray(np.where(self.members >= 0, self.members, self.count).min(axis=1, initial=self.count))
+
+    @cached_property
     def left_over(self) -> tuple[Indices, Indices]:
         """(b + 1,) the first shared unknown of every block, and the rows it leaves in these; at last those of none."""
-        lowest = np.where(self.members >= 0, self.members, self.count).min(axis=1, initial=self.count)
         first = np.full(len(self.own), self.count)
-        np.minimum.at(first, self.block, lowest[self.group])
+        np.minimum.at(first, self.block, self._lowest[self.group])
         first = np.where(first < self.count, first, self.singles.min(initial=self.count))
         rows = 2 * np.bincount(self.block, minlength=len(self.own)) - (self.own >= 0).sum(axis=1)
         return first, np.where(first < self.count, np.maximum(rows, 0), 0)
@@ -136,18 +148,38 @@ class SparseRows:
     further: tuple[Blocks, ...]
     arranged: Arranged
 
-    def column_squares(self, count: int) -> Array:
+    def equations(self, fronts: Fronts) -> "SharedEquations":
+        """The normal equations of all rows in the shared unknowns, as if there were no own ones."""
+        pattern, equations = self.pattern, SharedEquations.zeros(fronts)
+        order, first, unknowns = pattern.cells
+        home = fronts.home(np.where(unknowns >= 0, unknowns, pattern.count))
+        if kernels is not None:
+            given = (
+                self.right, np.concatenate(pattern.columns[1:]), order, first, unknowns,
+                np.argsort(home, kind="stable"), home, fronts.table, fronts.after,
+            )  # fmt: skip
+            kernels.square_rows(self.matrix, *map(np.ascontiguousarray, given), equations.values, equations.right)
+        else:
+            squares = self._cell_squares()
+            np.add.at(equations.right, unknowns[unknowns >= 0], squares[:, :-1, -1][unknowns >= 0])
+            equations.add_squares(unknowns, home, squares[:, :-1, :-1])
+        for block in self.further:
+            of_rows = block.matrix.swapaxes(1, 2)
+            equations.add_squares(block.shared, fronts.home(block.shared), of_rows @ block.matrix)
+            np.add.at(equations.right, block.shared, (of_rows @ block.right[..., None])[..., 0])
+        return equations
+
+    def column_squares(self, count: int, equations: "SharedEquations") -> Array:
         """(n,) the sums of the squares in the columns of all unknowns."""
         squares = np.zeros(count + 1)
         for column, unknowns in zip(self.pattern.columns[0], self.pattern.own.T, strict=True):
             of_rows = self.matrix[:, 0, column] ** 2 + self.matrix[:, 1, column] ** 2
             squares[unknowns] = np.bincount(self.pattern.block, of_rows, len(unknowns))
-        squares[: self.pattern.count] = self.square[0].diagonal()
+        squares[: self.pattern.count] = equations.diagonal
         return squares[:-1]
 
-    @cached_property
-    def square(self) -> tuple[csr_array, Array]:
-        """The normal equations (s, s) of all rows in the shared unknowns, own ones left out, and their right side."""
+    def _cell_squares(self) -> Array:
+        """Of each cell the square (p, w + c + 1, w + c + 1) of its rows, with their right side behind."""
         pattern, (order, first, unknowns) = self.pattern, self.pattern.cells
         width = unknowns.shape[1]
         squares = np.empty((len(unknowns), width + 1, width + 1))
@@ -160,13 +192,47 @@ class SparseRows:
             for i, (x, y) in enumerate(columns):
                 sums = np.add.reduceat(x * columns[i:, 0] + y * columns[i:, 1], starts, axis=1).T
                 squares[cells, i, i:] = squares[cells, i:, i] = sums
-        right = np.zeros(pattern.count + 1)
-        np.add.at(right, unknowns, squares[:, :-1, -1])
-        normal = spread_squares(unknowns, squares[:, :-1, :-1], pattern.count)
-        for block in self.further:
-            normal = normal + spread_squares(block.shared, block.matrix.swapaxes(1, 2) @ block.matrix, pattern.count)
-            np.add.at(right, block.shared, (block.matrix.swapaxes(1, 2) @ block.right[..., None])[..., 0])
-        return normal, right[:-1]
+        return squares
+
+
+@dataclass(frozen=True)
+class SharedEquations:
+    """Normal equations of the shared unknowns: of every front the lower triangle of the square (k + a, k + a) of the
+    rows that belong to it, all of them in values, and the right side (s,)."""
+
+    fronts: Fronts
+    values: Array
+    right: Array
+
+    @staticmethod
+    def zeros(fronts: Fronts) -> "SharedEquations":
+        return SharedEquations(fronts, np.zeros(sum(front.width**2 for front in fronts)), np.zeros(fronts.count))
+
+    @property
+    def squares(self) -> list[Array]:
+        """(k + a, k + a) of every front, in the memory of the values."""
+        begins = self.fronts.table[:, 2].tolist()
+        shapes = ((front.width, front.width) for front in self.fronts)
+        return [
+            self.values[begin : begin + shape[0] ** 2].reshape(shape)
+            for begin, shape in zip(begins, shapes, strict=True)
+        ]
+
+    @property
+    def diagonal(self) -> Array:
+        """(s,)"""
+        diagonal = np.zeros(self.fronts.count)
+        for front, square in zip(self.fronts, self.squares, strict=True):
+            diagonal[front.columns] += np.diag(square)
+        return diagonal
+
+    def add_squares(self, unknowns: Indices, home: Indices, squares: Array) -> None:
+        """Add squares (b, s, s) of some unknowns (b, s) each, -1 for none, to those of their fronts (b,)."""
+        of_fronts = self.squares
+        for i in np.unique(home):
+            of_front = spread_squares(unknowns[home == i], squares[home == i], self.fronts.count).tocoo()
+            rows, columns = (self.fronts[int(i)].places(at.astype(np.intp)) for at in (of_front.row, of_front.col))
+            of_fronts[i][rows, columns] += of_front.data
 
 
 def _batches(first: Indices) -> Iterator[slice]:
@@ -194,44 +260,74 @@ def spread_squares(unknowns: Indices, squares: Array, count: int) -> csr_array:
     return csr_array(coo_array((squares[there], (rows[there], columns[there])), shape=(count, count)))
 
 
-def eliminated(rows: SparseRows, root_weight: Array, prior_right: Array, scale: Array) -> "SparseBlocks":
+def eliminated(
+    rows: SparseRows, root_weight: Array, prior_right: Array, scale: Array, equations: SharedEquations
+) -> "SparseBlocks":
     """Eliminate all own unknowns; scale (n,) as in `Factor`.
 
-    A row an unknown (n,), scaled, holds its prior: root_weight times the unknown = prior_right.
+    A row an unknown (n,), scaled, holds its prior: root_weight times the unknown = prior_right. equations: of the
+    shared unknowns, from which the squares of the borders are subtracted.
     """
-    pattern, own = rows.pattern, rows.pattern.own[:-1]
+    pattern, own, fronts = rows.pattern, rows.pattern.own[:-1], equations.fronts
+    blocks = SparseBlocks(
+        rows,
+        triangle=np.empty((*own.shape, own.shape[1])),
+        parts=np.empty((len(pattern.order), own.shape[1], pattern.members.shape[1])),
+        alone=np.empty((*own.shape, len(pattern.singles))),
+        right=np.empty(own.shape),
+        orthonormal=np.empty((own.shape[1], 2, len(pattern.order))),
+        scale=scale,
+    )
     weight = np.where(own >= 0, (root_weight * scale)[own], 1.0)
     prior = np.where(own >= 0, prior_right[own], 0.0)
-    triangle, right = np.empty((*own.shape, own.shape[1])), np.empty(own.shape)
-    orthonormal = np.empty((own.shape[1], 2, len(pattern.order)))
-    parts = np.empty((len(pattern.order), own.shape[1], pattern.members.shape[1]))
+    if kernels is not None and own.shape[1] <= COMPILED_OWN:
+        home = fronts.home(pattern.left_over[0][:-1, None])
+        given = (
+            rows.right, pattern.order, pattern.first, np.argsort(home, kind="stable"), home, *pattern.columns, own,
+            pattern.groups, pattern.members, pattern.single, pattern.singles, weight, prior,
+            fronts.table, fronts.after,
+        )  # fmt: skip
+        found = blocks.triangle, blocks.right, blocks.orthonormal, blocks.parts, blocks.alone
+        arrays = *map(np.ascontiguousarray, given), *found
+        kernels.eliminate_blocks(rows.matrix, *arrays, equations.values, equations.right)
+        return blocks
+    _eliminate(blocks, weight, prior)
+    border = blocks.border.square()
+    for front, square in zip(fronts, equations.squares, strict=True):
+        of_own = csr_array(border[front.own, front.first :]).tocoo()
+        square[front.places(of_own.col.astype(np.intp) + front.first), of_own.row] -= of_own.data
+    equations.right[...] -= blocks.border.transposed_times(blocks.right.ravel())
+    return blocks
+
+
+def _eliminate(blocks: "SparseBlocks", weight: Array, prior: Array) -> None:
+    """Fill the blocks; weight (b, o) and prior (b, o): a row for each own unknown."""
+    rows, pattern, own = blocks.rows, blocks.rows.pattern, blocks.own
     alone = np.empty((*own.shape, len(pattern.singles) + 1))
-    for blocks in _batches(pattern.first):
-        some = slice(pattern.first[blocks.start], pattern.first[blocks.stop])
-        order, of = pattern.order[some], pattern.block_numbers[some] - blocks.start
+    for members in _batches(pattern.first):
+        some = slice(pattern.first[members.start], pattern.first[members.stop])
+        order, of = pattern.order[some], pattern.block_numbers[some] - members.start
         by_block = csr_array(
-            (np.ones(len(of)), np.arange(len(of)), pattern.first[blocks.start : blocks.stop + 1] - some.start),
-            shape=(blocks.stop - blocks.start, len(of)),
+            (np.ones(len(of)), np.arange(len(of)), pattern.first[members.start : members.stop + 1] - some.start),
+            shape=(members.stop - members.start, len(of)),
         )
         by_own, by_group, by_single = (_take_columns(rows.matrix, columns, order) for columns in pattern.columns)
-        by_own.swapaxes(1, 2)[(own[blocks][of] < 0).T] = 0.0
-        by_prior = weight[blocks].T[..., None] * np.eye(own.shape[1])[:, None, :]
+        by_own.swapaxes(1, 2)[(own[members][of] < 0).T] = 0.0
+        by_prior = weight[members].T[..., None] * np.eye(own.shape[1])[:, None, :]
         first = _orthonormal(by_block, of, by_own, by_prior)
-        triangle[blocks] = _orthonormal(by_block, of, by_own, by_prior) @ first
+        blocks.triangle[members] = _orthonormal(by_block, of, by_own, by_prior) @ first
         x, y = rows.right[order].T
-        right[blocks] = by_block @ (by_own[:, 0] * x + by_own[:, 1] * y).T + (by_prior * prior[blocks]).sum(axis=2).T
+        reduced = by_block @ (by_own[:, 0] * x + by_own[:, 1] * y).T
+        blocks.right[members] = reduced + (by_prior * prior[members]).sum(axis=2).T
         by_group, by_single = (
             by_own[:, None, 0] * by[:, 0] + by_own[:, None, 1] * by[:, 1] for by in (by_group, by_single)
         )
-        parts[some] = by_group.transpose(2, 0, 1)
-        place = pattern.place_in_border[..., some] - blocks.start * alone[0].size
-        of_alone = np.bincount(place.ravel(), by_single.ravel(), alone[blocks].size)
-        alone[blocks] = of_alone.reshape(alone[blocks].shape)
-        orthonormal[..., some] = by_own
-    shape = len(own) * own.shape[1], len(pattern.members) * parts.shape[2]
-    sparse = bsr_array((parts, pattern.group[pattern.order], pattern.first), shape=shape)
-    border = Border(pattern, sparse, alone[..., :-1].reshape(shape[0], -1))
-    return SparseBlocks(rows, triangle, border, right, orthonormal, scale)
+        blocks.parts[some] = by_group.transpose(2, 0, 1)
+        place = pattern.place_in_border[..., some] - members.start * alone[0].size
+        of_alone = np.bincount(place.ravel(), by_single.ravel(), alone[members].size)
+        alone[members] = of_alone.reshape(alone[members].shape)
+        blocks.orthonormal[..., some] = by_own
+    blocks.alone[...] = alone[..., :-1]
 
 
 def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Array) -> Array:
@@ -259,12 +355,14 @@ def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Arr
 class SparseBlocks:
     """Blocks eliminated: triangle (b, o, o) own + border shared = right (b, o), of the unknowns as they are.
 
-    orthonormal (o, 2, m): the own unknowns' columns made orthonormal, as in `Pattern.order`. scale (n,) as in `Factor`.
+    The border as parts (m, o, w) in the groups of the pairs of rows `Pattern.order`, and alone (b, o, t) in the single
+    ones. orthonormal (o, 2, m): the own unknowns' columns made orthonormal. scale (n,) as in `Factor`.
     """
 
     rows: SparseRows
     triangle: Array
-    border: Border
+    parts: Array
+    alone: Array
     right: Array
     orthonormal: Array
     scale: Array
@@ -273,6 +371,13 @@ class SparseBlocks:
     def own(self) -> Indices:
         """(b, o) numbers, -1 for none."""
         return self.rows.pattern.own[:-1]
+
+    @cached_property
+    def border(self) -> "Border":
+        pattern = self.rows.pattern
+        shape = self.right.size, pattern.members.size
+        sparse = bsr_array((self.parts, pattern.groups, pattern.first), shape=shape)
+        return Border(pattern, sparse, self.alone.reshape(self.right.size, len(pattern.singles)))
 
     def substitute(self, solution: Array) -> None:
         """Put the blocks' own unknowns into a solution (n,), scaled, whose shared ones are found."""
@@ -308,17 +413,38 @@ class SparseBlocks:
         return float(np.sqrt((self._inverse**2).sum(axis=(1, 2)).max(initial=0.0)))
 
     def own_cofactors(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
+        if kernels is None or self.own.shape[1] > COMPILED_OWN or not triangle.is_safely_squared:
+            yield from self._own_cofactors_by_shape(triangle)
+            return
+        pattern, fronts, inner = self.rows.pattern, triangle.fronts, np.empty_like(self.triangle)
+        over = 1.0 / self.scale[: pattern.count]
+        squares = (
+            square * over[front.columns] * over[front.columns, None]
+            for front, square in zip(fronts, triangle.squares, strict=True)
+        )
+        home = fronts.home(pattern.left_over[0][:-1, None])
+        given = (
+            pattern.first, np.argsort(home, kind="stable"), home, pattern.groups, pattern.members, pattern.singles,
+            self.parts, self.alone, fronts.table, fronts.after, np.concatenate([square.ravel() for square in squares]),
+        )  # fmt: skip
+        kernels.border_cofactors(*map(np.ascontiguousarray, given), inner)
+        inner += np.eye(self.own.shape[1])
+        yield self.own, self._inverse @ inner @ self._inverse.swapaxes(1, 2)
+
+    def _own_cofactors_by_shape(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
+        """Those of blocks of equal shape together, by roots where the condition asks for them."""
         pattern = self.rows.pattern
-        counts, parts, count = np.diff(pattern.first), self.border.parts, pattern.count
+        counts, group, count = np.diff(pattern.first), pattern.groups, pattern.count
         shared_scale, inverse = np.append(self.scale[:count], 1.0), self._inverse
-        alone = self.border.alone.reshape(*self.right.shape, len(pattern.singles))
         for each in np.unique(counts):
             some = np.flatnonzero(counts == each)
             at = pattern.first[some][:, None] + np.arange(each)
-            border = parts.data[at].swapaxes(1, 2).reshape(*self.right[some].shape, -1)
-            border = np.concatenate([border, alone[some]], axis=2)
-            members = pattern.members[parts.indices[at]].reshape(len(some), -1)
-            unknowns = np.concatenate([members, np.broadcast_to(pattern.singles, (len(some), alone.shape[2]))], axis=1)
+            border = self.parts[at].swapaxes(1, 2).reshape(*self.right[some].shape, -1)
+            border = np.concatenate([border, self.alone[some]], axis=2)
+            members = pattern.members[group[at]].reshape(len(some), -1)
+            unknowns = np.concatenate(
+                [members, np.broadcast_to(pattern.singles, (len(some), len(pattern.singles)))], axis=1
+            )
             border *= np.where(unknowns >= 0, 1.0 / shared_scale[unknowns], 0.0)[:, None]
             some_of_each = np.where(unknowns >= 0, unknowns, unknowns.max(axis=1, keepdims=True))
             inner = triangle.through(border, some_of_each) + np.eye(self.right.shape[1])

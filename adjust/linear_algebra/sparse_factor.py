@@ -122,7 +122,7 @@ class Triangle:
         return tuple(roots)
 
     @cached_property
-    def _squares(self) -> tuple[Array, ...]:
+    def squares(self) -> tuple[Array, ...]:
         """Of every front the cofactor matrix (k + a, k + a) of what it touches."""
         return tuple(root @ root.T for root in self.roots)
 
@@ -146,7 +146,7 @@ class Triangle:
         home = self.fronts.home(groups) if groups.size else np.empty(0, dtype=np.intp)
         for i in np.unique(home):
             members = np.flatnonzero(home == i)
-            if self._conditions[i] > (TEN_DIGITS if self._is_narrow else SAFE):
+            if self._conditions[i] > self._least_condition:
                 cofactors = self._local_cofactors(int(i), self.fronts[i].places(groups[members]))
                 result[members] = rows[members] @ cofactors @ rows[members].swapaxes(1, 2)
                 continue
@@ -155,6 +155,15 @@ class Triangle:
                 roots = rows[some] @ self.group_roots(groups[some])
                 result[some] = roots @ roots.swapaxes(1, 2)
         return result
+
+    @property
+    def is_safely_squared(self) -> bool:
+        """Whether the condition of the fronts' roots allows for products with their squares."""
+        return min(self._conditions, default=1.0) > self._least_condition
+
+    @property
+    def _least_condition(self) -> float:
+        return TEN_DIGITS if self._is_narrow else SAFE
 
     @property
     def _is_narrow(self) -> bool:
@@ -190,7 +199,7 @@ class Triangle:
     def _local_cofactors(self, i: int, places: Indices) -> Array:
         """The cofactor matrices (b, s', s') themselves."""
         width = self.fronts[i].width
-        return self._squares[i].take(places[:, :, None] * width + places[:, None, :])
+        return self.squares[i].take(places[:, :, None] * width + places[:, None, :])
 
 
 def _solved(triangle: Array, right: Array, transposed: bool = False) -> Array:

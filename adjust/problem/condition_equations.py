@@ -19,6 +19,7 @@ from adjust.functional_model.line_of_sight import SightVectors, sight_vectors
 from adjust.functional_model.projection import rays
 from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, product, take_members, zeros
 from adjust.problem.problem import Part, Problem, State
+from compiled import kernels
 
 Rows = Indices | slice
 
@@ -151,29 +152,24 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     film = _film_derivatives(problem, state, xy_mm)
     at_distorted = _film_derivatives(problem, state, distorted) if problem.by_elements else film
     by_camera_xy = laid_out(np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)))
-    by_unknowns = np.zeros((parts.width, len(xy_mm), 2)).transpose(1, 2, 0)  # columns, as blocks have them
+    by_unknowns = _no_derivatives(len(xy_mm), parts.width)
     by_unknowns[:, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4; those of targets follow
     straight = problem.network.line_of_sight.is_straight
     for shown in computed.targets:
         lens = _lens(problem, state, shown.camera)
         images, rows = problem.image_numbers[shown.rows], shown.rows
         at = lens.equations_with_image(at_distorted.camera_xy[rows], shown.imaged)
-        by_in_camera = _camera_axes_derivative(at.ray_jacobian, shown)
-        by_vector = product(by_in_camera, shown.rotation)
-        by_attitude = cross(shown.in_camera[:, None, :], by_in_camera)
-        if problem.keeps_angles.any():
-            by_attitude = product(by_attitude, take_members(problem.attitude_by_unknowns(state), images))
-        by_station = -by_vector if straight else product(by_vector, shown.sight.by_station)
-        by_point = by_vector if straight else product(by_vector, shown.sight.by_point)
         if len(at.value) == len(xy_mm):
             by_camera_xy = at.xy_jacobian
         else:
             by_camera_xy[rows] = at.xy_jacobian
-        by_exterior = by_station, by_attitude
-        _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
-        _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
-        by_boards = [applied(by_point, problem.lift_directions[rows, k]) for k in parts.board.members]
-        _fill(by_unknowns, rows, parts.board, by_boards)
+        if kernels is not None and straight and not len(parts.board.members):
+            attitude = problem.attitude_by_unknowns(state)
+            given = problem.targets_by_camera[shown.camera], images, state.rotations, attitude, shown.ray
+            more = shown.in_camera, at.ray_jacobian, parts.exterior.members, parts.place.members
+            kernels.target_derivatives(*map(np.ascontiguousarray, (*given, *more)), by_unknowns)
+        else:
+            _fill_targets(by_unknowns, problem, state, shown, at.ray_jacobian)
         own = [k for k in parts.camera.members if k < len(lens.quantities)]  # others have other families
         _fill(by_unknowns, rows, parts.camera, [at.quantity_derivative(k) for k in own])
     for part, of_film, of_distorted in (
@@ -186,6 +182,29 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     return Derivatives(
         film.xy_jacobian if problem.by_elements else product(by_camera_xy, film.xy_jacobian), by_unknowns
     )
+
+
+def _no_derivatives(count: int, width: int) -> Array:
+    """(n, 2, k) zeros, in memory row by row as compiled loops take them, or column by column as numpy does."""
+    return np.zeros((count, 2, width)) if kernels is not None else np.zeros((width, count, 2)).transpose(1, 2, 0)
+
+
+def _fill_targets(by_unknowns: Array, problem: Problem, state: State, shown: TargetImages, by_ray: Array) -> None:
+    """The derivatives by exterior orientation, point and board of what has a derivative (n, 2, 2) by the ray."""
+    parts, rows, straight = problem.parts, shown.rows, problem.network.line_of_sight.is_straight
+    by_in_camera = _camera_axes_derivative(by_ray, shown)
+    by_vector = product(by_in_camera, shown.rotation)
+    by_attitude = cross(shown.in_camera[:, None, :], by_in_camera)
+    if problem.keeps_angles.any():
+        attitude = problem.attitude_by_unknowns(state)
+        by_attitude = product(by_attitude, take_members(attitude, problem.image_numbers[rows]))
+    by_station = -by_vector if straight else product(by_vector, shown.sight.by_station)
+    by_point = by_vector if straight else product(by_vector, shown.sight.by_point)
+    by_exterior = by_station, by_attitude
+    _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
+    _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
+    by_boards = [applied(by_point, problem.lift_directions[rows, k]) for k in parts.board.members]
+    _fill(by_unknowns, rows, parts.board, by_boards)
 
 
 def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Sequence[Array]) -> None:

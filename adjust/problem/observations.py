@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.problem.parameter import Parameter
@@ -36,7 +37,15 @@ class Observations:
     @cached_property
     def is_fiducial(self) -> Mask:
         """(n,) whether it is a place in the camera frame that is observed, fiducial or join, and no object point."""
-        return np.array([kind in ("fiducial", "join") for kind in self.kind], dtype=bool)
+        return np.asarray(self.is_of("fiducial") | self.is_of("join"))
+
+    def is_of(self, kind: ObservationKind) -> Mask:
+        """(n,) whether it is of a kind."""
+        return np.asarray(self._kinds == kind)
+
+    @cached_property
+    def _kinds(self) -> NDArray[np.str_]:
+        return np.array(self.kind, dtype=np.str_)
 
     @cached_property
     def numbered_points(self) -> tuple[tuple[str, ...], Indices]:

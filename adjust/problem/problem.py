@@ -28,8 +28,7 @@ def number(network: Network, approximations: Approximations, by_elements: bool =
 
     Raises AdjustmentError where a quantity has neither a value nor an approximation.
     """
-    observed = frozenset(network.observed_fiducials | {("", name) for name in network.observed_points})
-    return Problem(network, list_unknowns(network, approximations, observed), approximations.mirrored, by_elements)
+    return Problem(network, list_unknowns(network, approximations), approximations.mirrored, by_elements)
 
 
 @dataclass(frozen=True)
@@ -259,11 +258,10 @@ class Problem:
         """(n, 3) positions of the point's coordinates, or of the fiducial's or join's two and ABSENT."""
         images, observations = self.network.images, self.network.observations
         names, of_name = observations.numbered_points
-        point = side_by_side([self.unknowns.point.get(name, _NOWHERE) for name in names])
-        places = point[of_name]
+        places = np.array([self.unknowns.point.get(name, _NOWHERE) for name in names], dtype=np.intp)[of_name]
         for key, rows in self.network.joins.items():
             places[rows] = *self.unknowns.join[key], ABSENT
-        for row in np.flatnonzero([kind == "fiducial" for kind in observations.kind]):
+        for row in np.flatnonzero(observations.is_of("fiducial")):
             camera = images[self.image_numbers[row]].camera
             places[row] = *self.unknowns.fiducial[camera, observations.point[row]], ABSENT
         return places
@@ -283,6 +281,8 @@ class Problem:
     def _point_values(self, of_point: Mapping[str, NDArray[Number]], of_others: NDArray[Number]) -> NDArray[Number]:
         """What every observation's point has, or what others have."""
         names, of_name = self.network.observations.numbered_points
+        if not of_point:
+            return np.repeat(of_others[None], len(of_name), axis=0)
         rows = np.stack([of_point.get(name, of_others) for name in names])[of_name]
         rows[self.is_fiducial] = of_others
         return rows

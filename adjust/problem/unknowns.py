@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 
@@ -72,74 +72,93 @@ class Unknowns:
         return replace(self.fixed(positions), start=start)
 
 
-def list_unknowns(network: Network, approximations: Approximations, observed: frozenset[tuple[str, str]]) -> Unknowns:
+def list_unknowns(network: Network, approximations: Approximations) -> Unknowns:
     """Take down all quantities: cameras with their fiducials, scanners, points, images.
 
-    observed: (camera, id) of every fiducial and ("", id) of every point that is seen in an image. Cameras without an
-    image are left out, and so are points that nobody saw; a fiducial that nobody saw and that is free is held where it
-    is given. Held, too, is what only object points tell and no image shows any: the interior orientation of an idle
-    camera, the exterior one of an image that has none. Raises AdjustmentError where a quantity has neither a value nor
-    an approximation.
+    Cameras without an image are left out, and so are points that nobody saw; a fiducial that nobody saw and that is
+    free is held where it is given. Held, too, is what only object points tell and no image shows any: the interior
+    orientation of an idle camera, the exterior one of an image that has none. Raises AdjustmentError where a quantity
+    has neither a value nor an approximation.
     """
-    rows: list[tuple[Parameter, Prior | None, float | None]] = []
-
-    def add(kind: Kind, owner: str, id: str, quantities: Sequence[Quantity]) -> Indices:
-        rows.extend((Parameter(kind, owner, id, name), prior, start) for name, prior, start in quantities)
-        return np.arange(len(rows) - len(quantities), len(rows))
-
+    rows = _Rows([], [], [])
     used = {image.camera for image in network.images}
     camera, fiducial = dict[str, Indices](), dict[tuple[str, str], Indices]()
     for each in network.cameras:
         if each.name in used:
             quantities = _camera_quantities(each, approximations)
             idle = each.name in network.idle_cameras
-            camera[each.name] = add("interior", each.name, "", _stopped(quantities) if idle else quantities)
-            datum = fiducial_datum(each, observed, idle)
+            camera[each.name] = rows.add("interior", each.name, "", _stopped(quantities) if idle else quantities)
+            datum = fiducial_datum(each, network.observed_fiducials, idle)
             for id_, mark in each.fiducials.items():
-                hold = (each.name, id_) not in observed
+                hold = (each.name, id_) not in network.observed_fiducials
                 pair = [
                     (axis, _hold(prior) if hold or (id_, axis) in datum else prior, None)
                     for axis, prior in zip("xy", (mark.x_mm, mark.y_mm), strict=True)
                 ]
-                fiducial[each.name, id_] = add("fiducial", each.name, id_, pair)
+                fiducial[each.name, id_] = rows.add("fiducial", each.name, id_, pair)
     scanner = {
-        each.name: add("scanner", each.name, "", [(name, prior, None) for name, prior in each.terms.items()])
+        each.name: rows.add("scanner", each.name, "", [(name, prior, None) for name, prior in each.terms.items()])
         for each in network.scanners
     }
     board = {
-        each.name: add("board", each.name, "", list(zip(BOARD_NAMES, each.bends, (None, None), strict=True)))
+        each.name: rows.add("board", each.name, "", list(zip(BOARD_NAMES, each.bends, (None, None), strict=True)))
         for each in network.boards
     }
-    point = {
-        each.id: add("point", "", each.id, _point_quantities(each, approximations))
-        for each in network.points
-        if ("", each.id) in observed
-    }
+    point = rows.add_points([each for each in network.points if each.id in network.observed_points], approximations)
     transformation, exterior = dict[str, Indices](), dict[str, Indices]()
     of_frame: dict[str, Indices] = {}
     for image in network.images:
         if image.frame not in of_frame:
             quantities = _exterior_quantities(image, approximations)
             stopped = image.name in network.unoriented
-            of_frame[image.frame] = add("exterior", image.frame, "", _stopped(quantities) if stopped else quantities)
+            own = _stopped(quantities) if stopped else quantities
+            of_frame[image.frame] = rows.add("exterior", image.frame, "", own)
         exterior[image.name] = of_frame[image.frame]
-        transformation[image.name] = add("film", image.name, "", _transformation_quantities(image, approximations))
+        transformation[image.name] = rows.add("film", image.name, "", _transformation_quantities(image, approximations))
     join = {
-        (frame, id_): add("join", frame, id_, [("x", None, float(x_mm)), ("y", None, float(y_mm))])
+        (frame, id_): rows.add("join", frame, id_, [("x", None, float(x_mm)), ("y", None, float(y_mm))])
         for (frame, id_), (x_mm, y_mm) in approximations.joins.items()
     }
-    parameters, priors, starts = zip(*rows, strict=True)
-    given = np.array([np.nan if prior is None else prior.value for prior in priors])
-    sigma = np.array([np.inf if prior is None else prior.sigma for prior in priors])
-    start = np.array(starts, dtype=np.float64)
+    given = np.array([np.nan if prior is None else prior.value for prior in rows.priors])
+    sigma = np.array([np.inf if prior is None else prior.sigma for prior in rows.priors])
+    start = np.array(rows.starts, dtype=np.float64)
     start = np.where(np.isfinite(start) & (sigma > 0.0), start, given)  # what is fixed stays at its value
     for missing in np.flatnonzero(np.isnan(start)):
         raise AdjustmentError(
-            f"{parameters[missing].label} has neither a value nor an approximation. Give one of them, or observe it in "
-            f"images whose orientation can be found."
+            f"{rows.parameters[missing].label} has neither a value nor an approximation. Give one of them, or observe "
+            f"it in images whose orientation can be found."
         )
     owned = camera, fiducial, scanner, point, transformation, exterior, join, board
-    return Unknowns(parameters, given, sigma, start, *owned)
+    return Unknowns(tuple(rows.parameters), given, sigma, start, *owned)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The list as it grows: keys, what is given, where each starts, None where nothing is known."""
+
+    parameters: list[Parameter]
+    priors: list[Prior | None]
+    starts: list[float | None]
+
+    def add(self, kind: Kind, owner: str, id: str, quantities: Sequence[Quantity]) -> Indices:
+        """Quantities of one thing; their positions."""
+        first = len(self.parameters)
+        for name, prior, start in quantities:
+            self.parameters.append(Parameter(kind, owner, id, name))
+            self.priors.append(prior)
+            self.starts.append(start)
+        return np.arange(first, len(self.parameters))
+
+    def add_points(self, points: Sequence[ObjectPoint], approximations: Approximations) -> dict[str, Indices]:
+        """The coordinates of many points, three each; their positions by id."""
+        first = len(self.parameters)
+        self.parameters.extend(Parameter("point", "", point.id, axis) for point in points for axis in "XYZ")
+        self.priors.extend(chain.from_iterable((point.X, point.Y, point.Z) for point in points))
+        nowhere = np.full(3, np.nan)
+        places = np.array([approximations.points.get(point.id, nowhere) for point in points], dtype=np.float64)
+        self.starts.extend(places.ravel().tolist())
+        positions = np.arange(first, len(self.parameters)).reshape(-1, 3)
+        return dict(zip((point.id for point in points), positions, strict=True))
 
 
 def fiducial_datum(camera: Camera, observed: Collection[tuple[str, str]], idle: bool) -> frozenset[tuple[str, str]]:
@@ -189,12 +208,6 @@ def _camera_quantities(camera: Camera, approximations: Approximations) -> list[Q
             f"{', '.join(unknown)}; it has {', '.join(names) or 'none at all'}."
         )
     return quantities + [(name, given.get(name, Prior(0.0, 0.0)), None) for name in names]
-
-
-def _point_quantities(point: ObjectPoint, approximations: Approximations) -> list[Quantity]:
-    start = approximations.points.get(point.id)
-    x, y, z = (None, None, None) if start is None else start.tolist()
-    return [("X", point.X, x), ("Y", point.Y, y), ("Z", point.Z, z)]
 
 
 def _exterior_quantities(image: Image, approximations: Approximations) -> list[Quantity]:

@@ -94,8 +94,10 @@ def _views(network: Network, result: Adjustment) -> list[_View]:
         rows = np.flatnonzero(own[numbers] & ~network.observations.is_fiducial)
         xy_mm = network.straight_xy_mm[rows].copy()
         digital = all(image.transformation == "none" for image in network.images if image.camera == camera.name)
-        for number in np.unique(numbers[rows]):
-            image, shown = network.images[number], numbers[rows] == number
+        order = np.argsort(numbers[rows], kind="stable")
+        shown_numbers, first = np.unique(numbers[rows[order]], return_index=True)
+        for number, shown in zip(shown_numbers, np.split(order, first[1:]), strict=True):
+            image = network.images[number]
             if image.transformation != "none":
                 xy_mm[shown] = adjusted_image(result, image.name).film.camera_from_comparator(xy_mm[shown])
         if len(rows):

@@ -155,7 +155,7 @@ def levelled(count: int, weight: float) -> tuple[Factor, list[Blocks]]:
     met = csr_array((np.ones(2 * (count - 1)), (np.repeat(pairs[:, 0], 2), pairs.ravel())))
     weights = np.zeros(count)
     weights[0] = weight
-    of_line = make_fronts(met, np.ones(count, dtype=np.intp), 0)
+    of_line = make_fronts(csr_array(met.T @ met), np.ones(count, dtype=np.intp), 0)
     return eliminate(blocks, count, weights, np.zeros(count), fronts=of_line), blocks
 
 
@@ -179,7 +179,7 @@ def test_fronts_hold_all_that_is_met_in_elimination() -> None:
     """A ring of ten: the first and the last meet, so that the last stays in all fronts."""
     pairs = np.stack([np.arange(10), (np.arange(10) + 1) % 10], axis=1)
     met = csr_array((np.ones(20), (np.repeat(np.arange(10), 2), pairs.ravel())))
-    of_ring = make_fronts(met, np.full(10, 50, dtype=np.intp), 3)
+    of_ring = make_fronts(csr_array(met.T @ met), np.full(10, 50, dtype=np.intp), 3)
     assert isinstance(of_ring, Fronts)
     assert of_ring.count == 503
     for front in of_ring:
@@ -196,8 +196,9 @@ def test_what_a_front_leaves_is_held_by_the_next_one_that_it_meets(
     rng = np.random.default_rng(3)
     for _ in range(20):
         met = csr_array((rng.random((60, 25)) < 0.12).astype(float))
-        order = fronts.band_order(met)
-        of_network = make_fronts(met[:, order], rng.integers(1, 4, 25), 2)
+        meeting = csr_array(met.T @ met)
+        order = fronts.band_order(meeting)
+        of_network = make_fronts(meeting[order][:, order], rng.integers(1, 4, 25), 2)
         for front in of_network:
             if len(front.after):
                 next_one = of_network[int(of_network.home(front.after))]
