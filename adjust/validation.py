@@ -217,7 +217,8 @@ def _value_faults(network: Network) -> Faults:
     observations, covariance = network.observations, network.observations.covariance_mm2
     names, of_name = observations.numbered_points
     mark = (2 * network.image_numbers + observations.is_fiducial) * len(names) + of_name
-    if len(np.unique(mark)) < len(mark):
+    marks = np.sort(mark)
+    if (marks[1:] == marks[:-1]).any():
         _, first, counts = np.unique(mark, return_index=True, return_counts=True)
         row, count = first[counts > 1][0], counts[counts > 1][0]
         what = "fiducial" if observations.is_fiducial[row] else "point"
@@ -296,7 +297,8 @@ def _mark_counts(network: Network) -> Indices:
     observations, frames = network.observations, network.frame_numbers[network.image_numbers]
     names, points = observations.numbered_points
     kinds = observations.is_of("fiducial") + 2 * observations.is_of("join")  # all others are object points
-    marks = np.unique((frames * 3 + kinds) * len(names) + points) // len(names)
+    marks = np.sort((frames * 3 + kinds) * len(names) + points)
+    marks = marks[np.diff(marks, prepend=-1) > 0] // len(names)
     return np.bincount(marks, minlength=3 * len(network.images)).reshape(-1, 3)[:, :2]
 
 

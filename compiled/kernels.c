@@ -127,8 +127,8 @@ typedef struct {
     Py_ssize_t length[3], step[3];
 } Table;
 
-/* Open the tables of all arguments, those from `output` on to be written; dimensions: one digit each. The first may lie
- * in memory in any way, the others as C has them.
+/* Open the tables of all arguments, those from `output` on to be written. Of each its dimensions: as a digit where it
+ * lies in memory as C has it, as a letter, a for one and so on, where it may lie otherwise.
  */
 static int open_tables(PyObject *args, const char *dimensions, int output, Table *tables)
 {
@@ -139,10 +139,10 @@ static int open_tables(PyObject *args, const char *dimensions, int output, Table
     }
     for (; opened < count; opened++) {
         Table *table = tables + opened;
-        int flags = (opened ? PyBUF_C_CONTIGUOUS : PyBUF_STRIDES) | (opened < output ? 0 : PyBUF_WRITABLE);
+        int any = dimensions[opened] >= 'a', axes = dimensions[opened] - (any ? 'a' - 1 : '0');
+        int flags = (any ? PyBUF_STRIDES : PyBUF_C_CONTIGUOUS) | (opened < output ? 0 : PyBUF_WRITABLE);
         if (PyObject_GetBuffer(PyTuple_GetItem(args, opened), &table->view, flags) < 0)
             break;
-        int axes = dimensions[opened] - '0';
         if (table->view.itemsize != 8 || table->view.ndim != axes) {
             PyErr_SetString(PyExc_ValueError, "an array of another kind");
             PyBuffer_Release(&table->view);
@@ -158,6 +158,17 @@ static int open_tables(PyObject *args, const char *dimensions, int output, Table
     while (opened--)
         PyBuffer_Release(&tables[opened].view);
     return 0;
+}
+
+/* An element of a table of doubles that may lie in memory in any way. */
+static inline double element(const Table *table, int64_t i, int64_t j, int64_t k)
+{
+    return ((const double *)table->view.buf)[i * table->step[0] + j * table->step[1] + k * table->step[2]];
+}
+
+static inline double *place_of(const Table *table, int64_t i, int64_t j)
+{
+    return (double *)table->view.buf + i * table->step[0] + j * table->step[1];
 }
 
 /* The derivatives of a pair of rows of a matrix (n, 2, k) by one column. */
@@ -229,7 +240,7 @@ static PyObject *square_rows(PyObject *module, PyObject *args)
 {
     enum { MATRIX, RIGHT, COLUMNS, ORDER, FIRST, UNKNOWNS, SEQUENCE, HOME, FRONTS, AFTER, SQUARES, SHARED, TABLES };
     Table t[TABLES];
-    if (!open_tables(args, "321112112111", SQUARES, t))
+    if (!open_tables(args, "c21112112111", SQUARES, t))
         return NULL;
     int64_t n = t[MATRIX].length[0], cells = t[UNKNOWNS].length[0], width = t[UNKNOWNS].length[1];
     int fits = t[MATRIX].length[1] == 2 && t[RIGHT].length[0] == n && t[RIGHT].length[1] == 2 &&
@@ -505,7 +516,7 @@ static const char *prepare(Elimination *e)
 static PyObject *eliminate_blocks(PyObject *module, PyObject *args)
 {
     Elimination e = {0};
-    if (!open_tables(args, "3211111112122122213233311", TRIANGLE, e.t))
+    if (!open_tables(args, "c211111112122122213233311", TRIANGLE, e.t))
         return NULL;
     const char *fault = prepare(&e);
     if (!fault) {
@@ -590,35 +601,78 @@ static PyObject *border_cofactors(PyObject *module, PyObject *args)
     Py_RETURN_NONE;
 }
 
-/* target_derivatives(rows, image, rotation, attitude, ray, in_camera, by_ray, exterior, place, derivatives) -> None
+/* target_rays(values, exterior, place, image, rotation, ray, in_camera) -> None
  *
- * Into the first columns of derivatives (n, 2, k), at rows (m,): those by the members of exterior orientation, the
- * vector from the station and the attitude, then by those of the point's coordinates. by_ray (m, 2, 2).
+ * ray (m, 2), -U/W and -V/W, and in_camera (m, 3), of points place (m, 3) seen from the stations exterior (images, 3),
+ * both positions in values.
+ */
+static PyObject *target_rays(PyObject *module, PyObject *args)
+{
+    enum { VALUES, EXTERIOR, PLACE, IMAGE, ROTATION, RAY, IN_CAMERA, TABLES };
+    Table t[TABLES] = {0};
+    if (!open_tables(args, "1221cbb", RAY, t))
+        return NULL;
+    int64_t m = t[IMAGE].length[0], width = t[EXTERIOR].length[1];
+    int fits = t[PLACE].length[0] == m && t[PLACE].length[1] == 3 && width >= 3 && t[RAY].length[0] == m &&
+               t[RAY].length[1] == 2 && t[IN_CAMERA].length[0] == m && t[IN_CAMERA].length[1] == 3 &&
+               t[ROTATION].length[0] == t[EXTERIOR].length[0];
+    for (int64_t i = 0; fits && i < m; i++) {
+        int64_t image = INTEGERS(t[IMAGE])[i];
+        double vector[3], p[3];
+        for (int k = 0; k < 3; k++)
+            vector[k] = DOUBLES(t[VALUES])[INTEGERS(t[PLACE])[3 * i + k]] -
+                        DOUBLES(t[VALUES])[INTEGERS(t[EXTERIOR])[width * image + k]];
+        for (int k = 0; k < 3; k++)
+            p[k] = element(&t[ROTATION], image, k, 0) * vector[0] + element(&t[ROTATION], image, k, 1) * vector[1] +
+                   element(&t[ROTATION], image, k, 2) * vector[2];
+        double depth = p[2] == 0.0 ? 1.0 : p[2];
+        for (int k = 0; k < 3; k++)
+            *place_of(&t[IN_CAMERA], i, k) = p[k];
+        for (int k = 0; k < 2; k++)
+            *place_of(&t[RAY], i, k) = -p[k] / depth;
+    }
+    close_tables(t, TABLES);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the sizes of targets do not go together");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+/* target_derivatives(rows, image, rotation, attitude, ray, in_camera, by_ray, exterior, place, camera, first, derivatives)
+ *
+ * Into derivatives (n, 2, k), at rows (m,): in the first columns those by the members of exterior orientation, the
+ * vector from the station and the attitude, then by those of the point's coordinates; from column first (1,) on those
+ * by the camera (c, 2, m). by_ray (m, 2, 2).
  */
 static PyObject *target_derivatives(PyObject *module, PyObject *args)
 {
-    enum { ROWS, IMAGE, ROTATION, ATTITUDE, RAY, IN_CAMERA, BY_RAY, EXTERIOR, PLACE, DERIVATIVES, TABLES };
-    Table t[TABLES];
-    if (!open_tables(args, "1133223113", DERIVATIVES, t))
+    enum { ROWS, IMAGE, ROTATION, ATTITUDE, RAY, IN_CAMERA, BY_RAY, EXTERIOR, PLACE, CAMERA, FIRST, INTO, TABLES };
+    Table t[TABLES] = {0};
+    if (!open_tables(args, "11ccbbc11c13", INTO, t))
         return NULL;
     int64_t m = t[ROWS].length[0], exterior = t[EXTERIOR].length[0], place = t[PLACE].length[0];
-    int64_t width = t[DERIVATIVES].length[2], images = t[ROTATION].length[0];
+    int64_t camera = t[CAMERA].length[0], width = t[INTO].length[2];
     int fits = t[IMAGE].length[0] == m && t[RAY].length[0] == m && t[IN_CAMERA].length[0] == m &&
-               t[BY_RAY].length[0] == m && t[ATTITUDE].length[0] == images && exterior + place <= width &&
-               t[DERIVATIVES].length[1] == 2 && t[RAY].length[1] == 2 && t[IN_CAMERA].length[1] == 3;
+               t[BY_RAY].length[0] == m && t[ATTITUDE].length[0] == t[ROTATION].length[0] &&
+               (camera == 0 || t[CAMERA].length[2] == m) && t[FIRST].length[0] == 1 &&
+               exterior + place <= width && INTEGERS(t[FIRST])[0] + camera <= width && t[INTO].length[1] == 2 &&
+               t[RAY].length[1] == 2 && t[IN_CAMERA].length[1] == 3;
     for (int64_t i = 0; fits && i < m; i++) {
         int64_t image = INTEGERS(t[IMAGE])[i], row = INTEGERS(t[ROWS])[i];
-        const double *rotation = DOUBLES(t[ROTATION]) + 9 * image, *turn = DOUBLES(t[ATTITUDE]) + 9 * image;
-        const double *ray = DOUBLES(t[RAY]) + 2 * i, *p = DOUBLES(t[IN_CAMERA]) + 3 * i;
-        for (int64_t axis = 0; axis < 2; axis++) {
-            const double *by_ray = DOUBLES(t[BY_RAY]) + 4 * i + 2 * axis;
-            double *into = DOUBLES(t[DERIVATIVES]) + (2 * row + axis) * width;
-            double x = by_ray[0] / -p[2], y = by_ray[1] / -p[2], z = x * ray[0] + y * ray[1];
+        double p[3] = {element(&t[IN_CAMERA], i, 0, 0), element(&t[IN_CAMERA], i, 1, 0), element(&t[IN_CAMERA], i, 2, 0)};
+        for (int axis = 0; axis < 2; axis++) {
+            double *into = DOUBLES(t[INTO]) + (2 * row + axis) * width;
+            double x = element(&t[BY_RAY], i, axis, 0) / -p[2], y = element(&t[BY_RAY], i, axis, 1) / -p[2];
+            double z = x * element(&t[RAY], i, 0, 0) + y * element(&t[RAY], i, 1, 0);
             double about[3] = {p[1] * z - p[2] * y, p[2] * x - p[0] * z, p[0] * y - p[1] * x};
             double by[6];
             for (int k = 0; k < 3; k++) {
-                by[k] = x * rotation[k] + y * rotation[3 + k] + z * rotation[6 + k];
-                by[3 + k] = about[0] * turn[k] + about[1] * turn[3 + k] + about[2] * turn[6 + k];
+                by[k] = x * element(&t[ROTATION], image, 0, k) + y * element(&t[ROTATION], image, 1, k) +
+                        z * element(&t[ROTATION], image, 2, k);
+                by[3 + k] = about[0] * element(&t[ATTITUDE], image, 0, k) +
+                            about[1] * element(&t[ATTITUDE], image, 1, k) +
+                            about[2] * element(&t[ATTITUDE], image, 2, k);
             }
             for (int64_t k = 0; k < exterior; k++) {
                 int64_t member = INTEGERS(t[EXTERIOR])[k];
@@ -626,6 +680,8 @@ static PyObject *target_derivatives(PyObject *module, PyObject *args)
             }
             for (int64_t k = 0; k < place; k++)
                 into[exterior + k] = by[INTEGERS(t[PLACE])[k]];
+            for (int64_t k = 0; k < camera; k++)
+                into[INTEGERS(t[FIRST])[0] + k] = element(&t[CAMERA], k, axis, i);
         }
     }
     close_tables(t, TABLES);
@@ -643,25 +699,27 @@ static PyObject *target_derivatives(PyObject *module, PyObject *args)
 static PyObject *whiten_rows(PyObject *module, PyObject *args)
 {
     enum { A, COVARIANCE, V, ROOT, ROWS, RIGHT, TABLES };
-    Table t[TABLES];
-    if (!open_tables(args, "332332", ROOT, t))
+    Table t[TABLES] = {0};
+    if (!open_tables(args, "ccb332", ROOT, t))
         return NULL;
     int64_t n = t[A].length[0], width = t[ROWS].length[2];
     int fits = t[COVARIANCE].length[0] == n && t[V].length[0] == n && t[ROOT].length[0] == n &&
                t[ROWS].length[0] == n && t[RIGHT].length[0] == n && t[A].length[1] == 2 && t[A].length[2] == 2;
     for (int64_t i = 0; fits && i < n; i++) {
-        const double *a = (const double *)t[A].view.buf + i * t[A].step[0], *c = DOUBLES(t[COVARIANCE]) + 4 * i;
-        const double *v = DOUBLES(t[V]) + 2 * i;
-        double a00 = a[0], a01 = a[t[A].step[2]], a10 = a[t[A].step[1]], a11 = a[t[A].step[1] + t[A].step[2]];
-        double x0 = a00 * c[0] + a01 * c[2], x1 = a00 * c[1] + a01 * c[3];
-        double y0 = a10 * c[0] + a11 * c[2], y1 = a10 * c[1] + a11 * c[3];
+        double a00 = element(&t[A], i, 0, 0), a01 = element(&t[A], i, 0, 1);
+        double a10 = element(&t[A], i, 1, 0), a11 = element(&t[A], i, 1, 1);
+        double c00 = element(&t[COVARIANCE], i, 0, 0), c01 = element(&t[COVARIANCE], i, 0, 1);
+        double c10 = element(&t[COVARIANCE], i, 1, 0), c11 = element(&t[COVARIANCE], i, 1, 1);
+        double x0 = a00 * c00 + a01 * c10, x1 = a00 * c01 + a01 * c11;
+        double y0 = a10 * c00 + a11 * c10, y1 = a10 * c01 + a11 * c11;
+        double v0 = element(&t[V], i, 0, 0), v1 = element(&t[V], i, 1, 0);
         double *root = DOUBLES(t[ROOT]) + 4 * i, *right = DOUBLES(t[RIGHT]) + 2 * i;
         root[0] = sqrt(x0 * a00 + x1 * a01);
         root[1] = 0.0;
         root[2] = (y0 * a00 + y1 * a01) / root[0];
         root[3] = sqrt(y0 * a10 + y1 * a11 - root[2] * root[2]);
-        right[0] = (a00 * v[0] + a01 * v[1]) / root[0];
-        right[1] = (a10 * v[0] + a11 * v[1] - root[2] * right[0]) / root[3];
+        right[0] = (a00 * v0 + a01 * v1) / root[0];
+        right[1] = (a10 * v0 + a11 * v1 - root[2] * right[0]) / root[3];
         double *first = DOUBLES(t[ROWS]) + 2 * i * width, *second = first + width;
         double over_first = 1.0 / root[0], over_second = 1.0 / root[3];
         for (int64_t k = 0; k < width; k++) {
@@ -678,6 +736,7 @@ static PyObject *whiten_rows(PyObject *module, PyObject *args)
 }
 
 static PyMethodDef methods[] = {
+    {"target_rays", target_rays, METH_VARARGS, "Rays of object points in images."},
     {"target_derivatives", target_derivatives, METH_VARARGS, "Derivatives of images by orientations and points."},
     {"whiten_rows", whiten_rows, METH_VARARGS, "Pairs of rows of unit weight."},
     {"border_cofactors", border_cofactors, METH_VARARGS, "Cofactors of shared unknowns through borders of blocks."},

@@ -1,11 +1,24 @@
 """The compiled loops against what numpy and scipy do in their place."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from plain_environment import NO_COMPILER
+from reference_cases import CASES, approximations_of, load, network_of
+from simulated import field_points, simulated
 
 import compiled
+from adjust.functional_model.line_of_sight import LineOfSight
+from adjust.linear_algebra import elimination, fronts
+from adjust.linear_algebra.factor import Blocks
+from adjust.linear_algebra.fronts import Fronts
+from adjust.linear_algebra.schur_complement import Pattern, SharedEquations, SparseBlocks, SparseRows, eliminated
+from adjust.linear_algebra.sparse_factor import Triangle
+from adjust.solution.adjustment import adjust
+from adjust.solution.result import Adjustment
 from pipeline.cli import DONE, run
 from pipeline.resampling.interpolation import Degree, spline_samples
 
@@ -69,3 +82,104 @@ def test_the_version_says_whether_loops_are_compiled(
     monkeypatch.setattr(compiled, "kernels", object() if there else None)
     assert run(["--version"]) == DONE
     assert ("with compiled loops" if there else "without compiled loops") in capsys.readouterr().out
+
+
+def sparse_rows(seed: int) -> SparseRows:
+    """Pairs of rows of blocks of three own unknowns, some of them fixed, in groups of which two share their unknowns,
+    as scans of one frame do; some rows of no block, of no group, and single unknowns."""
+    rng = np.random.default_rng(seed)
+    count, blocks, groups = 400, 40, 9
+    members = np.arange(4, 4 + 4 * groups).reshape(groups, 4)
+    members[1, :2] = members[0, :2]
+    members[3, 3] = -1
+    own = 40 + np.arange(3 * blocks).reshape(blocks, 3)
+    own[5, 2] = own[7, 0] = -1
+    single = np.where(rng.random((count, 2)) < 0.9, rng.integers(0, 4, (count, 2)) // 2 * 2 + [0, 1], -1)
+    columns = np.arange(3), np.arange(3, 7), np.arange(7, 9)
+    pattern = Pattern(
+        columns,
+        rng.integers(0, blocks + 1, count),
+        rng.integers(0, groups + 1, count),
+        np.concatenate([own, [[-1] * 3]]),
+        np.concatenate([members, [[-1] * 4]]),
+        single,
+        40,
+    )
+    further = Blocks(np.empty((1, 0), np.intp), np.array([[2, 5, 11]]), rng.normal(size=(1, 2, 3)), np.ones((1, 2)))
+    matrix = rng.normal(size=(9, count, 2)).transpose(1, 2, 0)
+    return SparseRows(pattern, matrix, rng.normal(size=(count, 2)), (further,), lambda: [])
+
+
+def elimination_of(rows: SparseRows) -> tuple[SparseBlocks, SharedEquations, NDArray[np.float64]]:
+    """All blocks eliminated, what that leaves of the shared equations, and the cofactors of own unknowns."""
+    unknowns = 40 + 3 * 40
+    rng = np.random.default_rng(5)
+    equations = rows.equations(Fronts.single(40))
+    scale = np.sqrt(rows.column_squares(unknowns, equations))
+    scale[scale == 0.0] = 1.0
+    blocks = eliminated(rows, rng.uniform(0.1, 1.0, unknowns), rng.normal(size=unknowns), scale, equations)
+    shared = np.triu(rng.normal(size=(40, 40)))
+    shared[range(40), range(40)] = 5.0
+    triangle = Triangle(Fronts.single(40), (shared,), (np.empty((40, 0)),))
+    cofactors = np.full((40, 3, 3), np.nan)
+    for own, of_own in blocks.own_cofactors(triangle):
+        place = [int(np.flatnonzero((blocks.own == row).all(axis=1))[0]) for row in own]
+        cofactors[place] = of_own
+    return blocks, equations, cofactors
+
+
+@needs_kernels
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_compiled_elimination_is_that_of_numpy(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    found, left, cofactors = elimination_of(sparse_rows(seed))
+    monkeypatch.setattr(compiled, "kernels", None)
+    expected, expected_left, expected_cofactors = elimination_of(sparse_rows(seed))
+    for name in ("triangle", "parts", "alone", "right", "orthonormal"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-12, err_msg=name)
+    np.testing.assert_allclose(np.tril(left.squares[0]), np.tril(expected_left.squares[0]), atol=1e-11)
+    np.testing.assert_allclose(left.right, expected_left.right, atol=1e-11)
+    np.testing.assert_allclose(cofactors, expected_cofactors, atol=1e-12)
+
+
+def assert_alike(found: Adjustment, expected: Adjustment) -> None:
+    """Values to 1e-6 of a standard deviation, and cofactors and v'Pv to nine digits."""
+    assert found.termination == expected.termination
+    if not expected.converged:
+        return
+    sigma = np.sqrt(expected.cofactor.variances)
+    assert (np.abs(found.values - expected.values) <= 1e-6 * sigma).all()
+    np.testing.assert_allclose(found.cofactor.variances, expected.cofactor.variances, rtol=1e-8)
+    assert found.vpv == pytest.approx(expected.vpv, rel=1e-9, abs=1e-12)
+    np.testing.assert_allclose(found.residuals.redundancy, expected.residuals.redundancy, atol=1e-8)
+
+
+@needs_kernels
+@pytest.mark.parametrize("path", sorted(CASES.glob("*.json")), ids=lambda path: path.stem)
+def test_reference_cases_are_the_same_by_both(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where normal equations take the place of reflections, as they do in large networks."""
+    case = load(path.stem)
+    network, start = network_of(case), approximations_of(case, case["input"]["initial_approximations"])
+    found = adjust(network, start)
+    monkeypatch.setattr(elimination, "CHEAP", 0.0)
+    by_normal_equations = adjust(network, start)
+    monkeypatch.setattr(compiled, "kernels", None)
+    assert_alike(by_normal_equations, adjust(network, start))
+    monkeypatch.undo()
+    monkeypatch.setattr(compiled, "kernels", None)
+    assert_alike(found, adjust(network, start))
+
+
+@needs_kernels
+@pytest.mark.parametrize("count", [40, 9])
+@pytest.mark.parametrize("bent", [False, True])
+def test_networks_are_the_same_by_both(count: int, bent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points or images eliminated first, several fronts; straight and bent lines of sight."""
+    rng = np.random.default_rng(12)
+    network, start = simulated(rng, points=field_points(rng, count), point_sigma=0.05, free={"k3": np.inf})
+    if bent:
+        network = replace(network, line_of_sight=LineOfSight(curvature=True))
+    monkeypatch.setattr(elimination, "CHEAP", 0.0)
+    monkeypatch.setattr(fronts, "FRONT_COST", 1e3)
+    found = adjust(network, start)
+    monkeypatch.setattr(compiled, "kernels", None)
+    assert_alike(found, adjust(network, start))

@@ -1,5 +1,6 @@
 """Relinearise and solve until unknowns and adjusted observations stand still."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from adjust.problem.problem import State
 STANDSTILL_SIGMAS = 1e-8  # a step below this, in standard deviations, is none
 FORESEEN = 0.1  # of that: a next step that would be smaller if it shrank as the last two did need not be taken
 ROUNDING_SIGMAS = 1e-5  # steps below this that no longer shrink are rounding
+SAME_FACTOR_SIGMAS = 1e-5  # steps below this change no cofactor by more than some 1e-9 of it
 VPV_ROUNDING = 1e-9  # relative increase of v'Pv that is not an increase
 FIRST_DAMPING = 1e-4
 LEAST_DAMPING = 1e-9
@@ -48,7 +50,8 @@ class Iteration(NamedTuple):
 class Linearised:
     """The equations at a state: computed observations and residuals (n, 2) in mm, whitened rows, v'Pv.
 
-    by_observation (n, 2, 2): A, the derivatives of the functions by the observations.
+    by_observation (n, 2, 2): A, the derivatives of the functions by the observations. known_factor: of a state so near
+    that its factor is the same.
     """
 
     state: State
@@ -57,11 +60,12 @@ class Linearised:
     by_observation: Array
     rows: WhitenedRows
     vpv: float
+    known_factor: Factor | None = None
 
     @cached_property
     def factor(self) -> Factor:
         """The square root of the normal equations, undamped."""
-        return factorise(self.rows.numbering, self)
+        return self.known_factor or factorise(self.rows.numbering, self)
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,9 @@ def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera
     return eliminate(at.rows, *system, damping, at.rows.sparse, camera_priors, numbering.fronts)
 
 
-def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limit: int) -> Solution:
+def iterate(
+    numbering: Numbering, covariance_mm2: Array, state: State, limit: int, is_singular: Callable[[Linearised], bool]
+) -> Solution | None:
     """Gauss-Newton steps, damped where they fail (Levenberg and Marquardt), until nothing moves any more.
 
     A step is taken when it makes v'Pv smaller; if not, or where a point would have no image after it, the damping
@@ -109,8 +115,14 @@ def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limi
     parameter in Marquardt's method). Damped steps are bent along the curve on which the linear residuals stay
     (`_bent`): that follows the valleys in which the principal distance changes with heights and scale. Undamped steps
     that shrink slowly are accelerated (`_accelerated`).
+
+    is_singular: whether the equations say so, asked at the state where it begins. None: some point has no image there.
     """
-    at = start
+    at = linearise(numbering, covariance_mm2, state)
+    if at is None:
+        return None
+    if is_singular(at):
+        return Solution(at, None, "singular", ())
     damping, lately = 0.0, FIRST_DAMPING
     history: list[Iteration] = []
     moved: _Moved | None = None
@@ -118,10 +130,12 @@ def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limi
         moved = _step(numbering, covariance_mm2, at, damping, lately, moved)
         if moved is None:
             return Solution(at, None, "diverged", tuple(history))
-        at = moved.end
-        history.append(Iteration(at.vpv, moved.sigmas, moved.damping, moved.attempts))
+        history.append(Iteration(moved.end.vpv, moved.sigmas, moved.damping, moved.attempts))
         if moved.damping == 0.0 and _stands_still(history):
-            return Solution(at, at.factor, "converged", tuple(history))
+            known = at.factor if moved.sigmas < SAME_FACTOR_SIGMAS else None
+            end = replace(moved.end, known_factor=known)
+            return Solution(end, end.factor, "converged", tuple(history))
+        at = moved.end
         damping, lately = _eased(moved.damping, moved.gain), moved.damping or lately
     return Solution(at, at.factor, "iteration limit", tuple(history))
 
@@ -178,7 +192,7 @@ def _step(
         attempts += 1
         try:
             factor = factorise(numbering, at, damping) if damping else at.factor
-            solution = factor.solution()
+            solution = factor.solution
         except np.linalg.LinAlgError:
             return None
         step = np.zeros(len(problem.unknowns))
@@ -206,7 +220,7 @@ def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, be
     """
     problem, factor = numbering.problem, at.factor
     step = np.zeros(len(problem.unknowns))
-    step[numbering.free] = factor.solution()
+    step[numbering.free] = factor.solution
     length = factor.length()
     if not SLOW * before.sigmas < length < 1.0:
         return None
@@ -237,6 +251,6 @@ def _bent(numbering: Numbering, at: Linearised, damping: float, step: Array) -> 
     rows = at.rows.replace_discrepancies(at.by_observation, at.v_mm + half_curvature_mm)
     factor = factorise(numbering, replace(at, rows=rows), damping)
     bent = np.zeros_like(step)
-    bent[numbering.free] = factor.solution()
+    bent[numbering.free] = factor.solution
     length, turn = (float(np.linalg.norm(each[numbering.free] * factor.scale)) for each in (step, bent - step))
     return bent if turn <= LARGEST_TURN * length and np.isfinite(bent).all() else None

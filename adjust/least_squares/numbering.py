@@ -96,11 +96,17 @@ class Numbering:
         group = np.where((members[grouped[2]] >= 0).any(axis=1), grouped[2], len(members) - 1)
         if not (members >= 0).any() or not (own[block] >= 0).any():
             return None
-        single = self.numbers[problem.columns]
-        for columns, taken in ((owning[0], own[block]), (grouped[0], members[group])):
-            single[:, columns] = np.where(taken >= 0, ABSENT, single[:, columns])
-        used = np.flatnonzero((single >= 0).any(axis=0))
-        return Pattern((owning[0], grouped[0], used), block, group, own, members, single[:, used], self._shared_count)
+        taken = dict(zip(grouped[0], members.T, strict=True)), dict(zip(owning[0], own.T, strict=True))
+        single = {}
+        for column in every:
+            numbers = self.numbers[problem.columns[:, column]]
+            for of_all, which in zip(taken, (group, block), strict=True):
+                if column in of_all:
+                    numbers = np.where(of_all[column][which] >= 0, ABSENT, numbers)
+            if (numbers >= 0).any():
+                single[column] = numbers
+        used, rest = np.array(list(single), dtype=np.intp), np.reshape(list(single.values()), (-1, len(block))).T
+        return Pattern((owning[0], grouped[0], used), block, group, own, members, rest, self._shared_count)
 
     @property
     def _shared_count(self) -> int:
@@ -143,7 +149,7 @@ class Numbering:
     @property
     def _group_meetings(self) -> csr_array:
         """Which groups (b, g) every block of observations meets, and behind these every further observation."""
-        groups = [self._group[self.problem.columns].max(axis=1)]
+        groups = [self._frame_of_rows if self._points_own else self._group[self.problem.places[:, 0]]]
         blocks = [self._blocks.of]
         for i, further in enumerate(self.problem.further):
             groups.append(self._group[further.positions])

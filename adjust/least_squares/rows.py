@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+import compiled
 from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.numbering import Numbering, Touched
 from adjust.linear_algebra.factor import Blocks
@@ -14,7 +15,6 @@ from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, p
 from adjust.problem.condition_equations import Derivatives
 from adjust.problem.further_observations import FurtherObservation
 from adjust.problem.problem import ABSENT, Problem, State
-from compiled import kernels
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class WhitenedRows:
         pattern = self.numbering.pattern
         if pattern is None:
             return None
-        return SparseRows(pattern, self.matrix, self.right, self.further, self._arranged)
+        itself = replace(self)  # without what is kept here: no cycle, so that a step's memory is free for the next
+        return SparseRows(pattern, self.matrix, self.right, self.further, itself._arranged)
 
     def _arranged(self) -> Iterator[tuple[Indices, Blocks]]:
         nothing = np.empty((1, 0), dtype=np.intp)
@@ -70,9 +71,9 @@ def whitened_rows(
     """
     a, matrix = at.by_observation, at.by_unknowns
     further = tuple(_further_block(numbering, each, values) for each in numbering.problem.further)
-    if kernels is not None:
+    if compiled.kernels is not None:
         root, right = np.empty(a.shape), np.empty(v_mm.shape)
-        kernels.whiten_rows(a, *map(np.ascontiguousarray, (covariance_mm2, v_mm)), root, matrix, right)
+        compiled.kernels.whiten_rows(a, covariance_mm2, v_mm, root, matrix, right)
         return WhitenedRows(numbering, root, matrix, right, further)
     root = lower_root(product(product(a, covariance_mm2), a.transpose(0, 2, 1)))
     right = _whitened(root, applied(a, v_mm)[..., None])[..., 0]

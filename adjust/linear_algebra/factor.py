@@ -116,6 +116,7 @@ class Factor:
     def blocks(self) -> tuple[BlockFactors, ...]:
         return self.eliminated.blocks
 
+    @cached_property
     def solution(self) -> Array:
         """The unknowns (n,). Raises numpy.linalg.LinAlgError where a triangle is singular."""
         solution = np.empty(len(self.scale))

@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import bsr_array, coo_array, csr_array
 
+import compiled
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import BlockFactors, Blocks
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.sparse_factor import Triangle
-from compiled import kernels
 
 Arranged = Callable[[], Iterable[tuple[Indices, Blocks]]]  # pairs of rows (b, m) of blocks of equal shape, laid out
 COMPILED_OWN = 3  # own unknowns of a block that kernels.c holds
@@ -44,11 +44,13 @@ class Pattern:
     @cached_property
     def singles(self) -> Indices:
         """(t,) the numbers of the single unknowns that rows with own unknowns touch."""
-        return np.unique(self.single[self.order])[int((self.single[self.order] < 0).any()) :]
+        touched = np.zeros(self.count + 1, dtype=bool)  # the last stands for none
+        touched[self.single[self.order]] = True
+        return np.flatnonzero(touched[:-1])
 
     @cached_property
     def order(self) -> Indices:
-        """(m,) the pairs of rows that touch own unknowns, block by block, and group by group as these are eliminated."""
+        """(m,) the pairs of rows that touch own unknowns, block by block, and group by group as they are eliminated."""
         order = np.lexsort((self._lowest[self.group], self.block))
         return order[: np.count_nonzero(self.block < len(self.own) - 1)]
 
@@ -153,12 +155,14 @@ class SparseRows:
         pattern, equations = self.pattern, SharedEquations.zeros(fronts)
         order, first, unknowns = pattern.cells
         home = fronts.home(np.where(unknowns >= 0, unknowns, pattern.count))
-        if kernels is not None:
+        if compiled.kernels is not None:
             given = (
                 self.right, np.concatenate(pattern.columns[1:]), order, first, unknowns,
                 np.argsort(home, kind="stable"), home, fronts.table, fronts.after,
             )  # fmt: skip
-            kernels.square_rows(self.matrix, *map(np.ascontiguousarray, given), equations.values, equations.right)
+            compiled.kernels.square_rows(
+                self.matrix, *map(np.ascontiguousarray, given), equations.values, equations.right
+            )
         else:
             squares = self._cell_squares()
             np.add.at(equations.right, unknowns[unknowns >= 0], squares[:, :-1, -1][unknowns >= 0])
@@ -280,7 +284,7 @@ def eliminated(
     )
     weight = np.where(own >= 0, (root_weight * scale)[own], 1.0)
     prior = np.where(own >= 0, prior_right[own], 0.0)
-    if kernels is not None and own.shape[1] <= COMPILED_OWN:
+    if compiled.kernels is not None and own.shape[1] <= COMPILED_OWN:
         home = fronts.home(pattern.left_over[0][:-1, None])
         given = (
             rows.right, pattern.order, pattern.first, np.argsort(home, kind="stable"), home, *pattern.columns, own,
@@ -289,7 +293,7 @@ def eliminated(
         )  # fmt: skip
         found = blocks.triangle, blocks.right, blocks.orthonormal, blocks.parts, blocks.alone
         arrays = *map(np.ascontiguousarray, given), *found
-        kernels.eliminate_blocks(rows.matrix, *arrays, equations.values, equations.right)
+        compiled.kernels.eliminate_blocks(rows.matrix, *arrays, equations.values, equations.right)
         return blocks
     _eliminate(blocks, weight, prior)
     border = blocks.border.square()
@@ -413,7 +417,7 @@ class SparseBlocks:
         return float(np.sqrt((self._inverse**2).sum(axis=(1, 2)).max(initial=0.0)))
 
     def own_cofactors(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
-        if kernels is None or self.own.shape[1] > COMPILED_OWN or not triangle.is_safely_squared:
+        if compiled.kernels is None or self.own.shape[1] > COMPILED_OWN or not triangle.is_safely_squared:
             yield from self._own_cofactors_by_shape(triangle)
             return
         pattern, fronts, inner = self.rows.pattern, triangle.fronts, np.empty_like(self.triangle)
@@ -427,7 +431,7 @@ class SparseBlocks:
             pattern.first, np.argsort(home, kind="stable"), home, pattern.groups, pattern.members, pattern.singles,
             self.parts, self.alone, fronts.table, fronts.after, np.concatenate([square.ravel() for square in squares]),
         )  # fmt: skip
-        kernels.border_cofactors(*map(np.ascontiguousarray, given), inner)
+        compiled.kernels.border_cofactors(*map(np.ascontiguousarray, given), inner)
         inner += np.eye(self.own.shape[1])
         yield self.own, self._inverse @ inner @ self._inverse.swapaxes(1, 2)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+import compiled
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.correction import Imaged
 from adjust.functional_model.lens import Lens
@@ -19,9 +20,9 @@ from adjust.functional_model.line_of_sight import SightVectors, sight_vectors
 from adjust.functional_model.projection import rays
 from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, product, take_members, zeros
 from adjust.problem.problem import Part, Problem, State
-from compiled import kernels
 
 Rows = Indices | slice
+ROWS_AT_ONCE = 20_000  # targets that are imaged together, so that they stay in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -36,14 +37,11 @@ class Derivatives:
 class TargetImages:
     """The targets of one camera as they appear for a state.
 
-    rows: their observations; rotation (n, 3, 3) of their images; ray (n, 2) and the image of it; in_camera (n, 3): the
-    points in the camera's axes.
+    rows: their observations; ray (n, 2) and the image of it; in_camera (n, 3): the points in the camera's axes.
     """
 
     camera: str
     rows: Rows
-    sight: SightVectors
-    rotation: Array
     ray: Array
     in_camera: Array
     imaged: Imaged
@@ -65,7 +63,11 @@ def computed_observations(problem: Problem, state: State) -> Array | None:
 
 def compute(problem: Problem, state: State) -> Computed | None:
     """The observations that satisfy F1 to F4, as derivatives are taken at; None where some point has no image."""
-    targets = tuple(_image_targets(problem, state, name, rows) for name, rows in problem.targets_by_camera.items())
+    targets = tuple(
+        _image_targets(problem, state, name, rows[first : first + ROWS_AT_ONCE])
+        for name, rows in problem.targets_by_camera.items()
+        for first in range(0, len(rows), ROWS_AT_ONCE)
+    )
     camera_xy = _computed_in_camera(problem, state, targets)
     if camera_xy is None:
         return None
@@ -95,17 +97,25 @@ def _computed_in_camera(problem: Problem, state: State, targets: Iterable[Target
 def _image_targets(problem: Problem, state: State, camera: str, targets: Indices) -> TargetImages:
     """Some targets as they appear from their stations."""
     rows = _as_slice(targets)
-    images = problem.image_numbers[rows]
-    stations = state.values[problem.exterior[:, :3].T[:, images]].T
+    images, network = problem.image_numbers[rows], problem.network
+    if compiled.kernels is not None and network.line_of_sight.is_straight and not network.boards:
+        ray, in_camera = zeros(len(images), 2), zeros(len(images), 3)
+        compiled.kernels.target_rays(
+            state.values, problem.exterior, problem.places[rows], images, state.rotations, ray, in_camera
+        )
+    else:
+        ray, in_camera = rays(take_members(state.rotations, images), _sight(problem, state, rows).vector)
+    return TargetImages(camera, rows, ray, in_camera, _lens(problem, state, camera).image(ray))
+
+
+def _sight(problem: Problem, state: State, rows: Rows) -> SightVectors:
+    """From the stations to the points of some targets."""
+    stations = state.values[problem.exterior[:, :3].T[:, problem.image_numbers[rows]]].T
     points = state.values[problem.places.T[:, rows]].T
     if problem.network.boards:
         bends = state.values[problem.board_positions[rows]]  # of a point on none any values, which lift it by 0
         points = points + (bends[:, :, None] * problem.lift_directions[rows]).sum(axis=1)
-    sight = sight_vectors(problem.network.line_of_sight, stations, points)
-    rotation = take_members(state.rotations, images)
-    ray, in_camera = rays(rotation, sight.vector)
-    imaged = _lens(problem, state, camera).image(ray)
-    return TargetImages(camera, rows, sight, rotation, ray, in_camera, imaged)
+    return sight_vectors(problem.network.line_of_sight, stations, points)
 
 
 def _lens(problem: Problem, state: State, camera: str) -> Lens:
@@ -152,9 +162,10 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     film = _film_derivatives(problem, state, xy_mm)
     at_distorted = _film_derivatives(problem, state, distorted) if problem.by_elements else film
     by_camera_xy = laid_out(np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)))
+    has_films = any(films.kind.names for films in problem.films) or bool(problem.scans)
     by_unknowns = _no_derivatives(len(xy_mm), parts.width)
     by_unknowns[:, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4; those of targets follow
-    straight = problem.network.line_of_sight.is_straight
+    straight, attitude = problem.network.line_of_sight.is_straight, problem.attitude_by_unknowns(state)
     for shown in computed.targets:
         lens = _lens(problem, state, shown.camera)
         images, rows = problem.image_numbers[shown.rows], shown.rows
@@ -163,15 +174,19 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
             by_camera_xy = at.xy_jacobian
         else:
             by_camera_xy[rows] = at.xy_jacobian
-        if kernels is not None and straight and not len(parts.board.members):
-            attitude = problem.attitude_by_unknowns(state)
-            given = problem.targets_by_camera[shown.camera], images, state.rotations, attitude, shown.ray
-            more = shown.in_camera, at.ray_jacobian, parts.exterior.members, parts.place.members
-            kernels.target_derivatives(*map(np.ascontiguousarray, (*given, *more)), by_unknowns)
+        own = [k for k in parts.camera.members if k < len(lens.quantities)]  # others have other families
+        by_camera = [at.quantity_derivative(k) for k in own]
+        if compiled.kernels is not None and straight and not len(parts.board.members):
+            numbers = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
+            compiled.kernels.target_derivatives(
+                numbers, images, state.rotations, attitude, shown.ray, shown.in_camera, at.ray_jacobian,
+                parts.exterior.members, parts.place.members,
+                np.reshape([each.T for each in by_camera], (-1, 2, len(images))),
+                np.array([parts.camera.columns.start]), by_unknowns,
+            )  # fmt: skip
         else:
             _fill_targets(by_unknowns, problem, state, shown, at.ray_jacobian)
-        own = [k for k in parts.camera.members if k < len(lens.quantities)]  # others have other families
-        _fill(by_unknowns, rows, parts.camera, [at.quantity_derivative(k) for k in own])
+            _fill(by_unknowns, rows, parts.camera, by_camera)
     for part, of_film, of_distorted in (
         (parts.film, film.parameter_jacobian, at_distorted.parameter_jacobian),
         (parts.scanner, film.by_scanner, at_distorted.by_scanner),
@@ -179,27 +194,32 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         if len(part.members):
             parameter_jacobian = of_film + product(by_camera_xy - np.eye(2), of_distorted)
             _fill(by_unknowns, slice(None), part, [parameter_jacobian[..., k] for k in part.members])
-    return Derivatives(
-        film.xy_jacobian if problem.by_elements else product(by_camera_xy, film.xy_jacobian), by_unknowns
-    )
+    if problem.by_elements:
+        return Derivatives(film.xy_jacobian, by_unknowns)
+    return Derivatives(product(by_camera_xy, film.xy_jacobian) if has_films else by_camera_xy, by_unknowns)
 
 
 def _no_derivatives(count: int, width: int) -> Array:
     """(n, 2, k) zeros, in memory row by row as compiled loops take them, or column by column as numpy does."""
-    return np.zeros((count, 2, width)) if kernels is not None else np.zeros((width, count, 2)).transpose(1, 2, 0)
+    return (
+        np.zeros((count, 2, width)) if compiled.kernels is not None else np.zeros((width, count, 2)).transpose(1, 2, 0)
+    )
 
 
 def _fill_targets(by_unknowns: Array, problem: Problem, state: State, shown: TargetImages, by_ray: Array) -> None:
     """The derivatives by exterior orientation, point and board of what has a derivative (n, 2, 2) by the ray."""
     parts, rows, straight = problem.parts, shown.rows, problem.network.line_of_sight.is_straight
+    images = problem.image_numbers[rows]
     by_in_camera = _camera_axes_derivative(by_ray, shown)
-    by_vector = product(by_in_camera, shown.rotation)
+    by_vector = product(by_in_camera, take_members(state.rotations, images))
     by_attitude = cross(shown.in_camera[:, None, :], by_in_camera)
     if problem.keeps_angles.any():
         attitude = problem.attitude_by_unknowns(state)
-        by_attitude = product(by_attitude, take_members(attitude, problem.image_numbers[rows]))
-    by_station = -by_vector if straight else product(by_vector, shown.sight.by_station)
-    by_point = by_vector if straight else product(by_vector, shown.sight.by_point)
+        by_attitude = product(by_attitude, take_members(attitude, images))
+    by_station, by_point = -by_vector, by_vector
+    if not straight:
+        sight = _sight(problem, state, rows)
+        by_station, by_point = product(by_vector, sight.by_station), product(by_vector, sight.by_point)
     by_exterior = by_station, by_attitude
     _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
     _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])

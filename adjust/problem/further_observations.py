@@ -69,9 +69,11 @@ class ObservedDistance(FurtherObservation):
 
 
 def _distances(network: Network, unknowns: Unknowns) -> Iterator[ObservedDistance]:
-    place = {image: positions[:3] for image, positions in unknowns.exterior.items()} | unknowns.point
     for each in network.distances:
-        name, positions = (f"{each.start} to {each.end}",), np.concatenate([place[each.start], place[each.end]])
+        name, ends = (f"{each.start} to {each.end}",), (each.start, each.end)
+        positions = np.concatenate(
+            [unknowns.point[end] if end in unknowns.point else unknowns.exterior[end][:3] for end in ends]
+        )
         yield ObservedDistance("distance", name, name, positions, np.array([each.value]), np.array([[each.sigma**2]]))
 
 
@@ -92,7 +94,7 @@ class ObservedCalibration(FurtherObservation):
 
 def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCalibration]:
     """Those of the quantities that are free: a fiducial that no image shows is held, and has no part here."""
-    number = {parameter: i for i, parameter in enumerate(unknowns.parameters)}
+    number = {parameter: i for i, parameter in enumerate(unknowns.parameters)} if network.calibrations else {}
     for each in network.calibrations:
         free = [i for i, key in enumerate(each.parameters) if key in number and unknowns.sigma[number[key]] > 0.0]
         if free:

@@ -260,7 +260,7 @@ class Network:
     def observed_points(self) -> frozenset[str]:
         """The object points that are seen in an image."""
         names, of_name = self.observations.numbered_points
-        return frozenset(names[i] for i in np.unique(of_name[~self.observations.is_fiducial]))
+        return frozenset(names[i] for i in np.flatnonzero(np.bincount(of_name[~self.observations.is_fiducial])))
 
     @cached_property
     def observed_fiducials(self) -> frozenset[tuple[str, str]]:

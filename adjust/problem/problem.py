@@ -193,7 +193,7 @@ class Problem:
     def parts(self) -> Parts:
         """The columns of an observation's derivatives: those that are by free unknowns in some observation."""
         free = np.append(self.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
-        shown = np.unique(self.image_numbers[~self.is_fiducial])
+        shown = np.flatnonzero(np.bincount(self.image_numbers[~self.is_fiducial]))
         positions = (
             self.exterior[shown],
             self.places,

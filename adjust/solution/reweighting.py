@@ -7,10 +7,10 @@ import numpy as np
 
 from adjust.errors import NoImageError
 from adjust.functional_model.families import family
-from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
+from adjust.least_squares.iteration import Linearised, iterate, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.condition_equations import blind_marks
-from adjust.problem.estimates import Termination
+from adjust.problem.estimates import NullDirection, Termination
 from adjust.problem.problem import Problem, State
 from adjust.problem.tested import TestedUnits
 from adjust.quality.cofactor import free_cofactor
@@ -190,22 +190,20 @@ def _free_of_cameras(problem: Problem) -> list[int]:
 def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
     weighted, covariance = weighting.applied(problem)
     numbering = Numbering(weighted)
-    start = linearise(numbering, covariance, state)
-    if start is None:
+
+    def singular_at(at: Linearised) -> tuple[NullDirection, ...]:
+        return singular_directions(weighted, at.state, numbering.free, at.factor)
+
+    solution = iterate(numbering, covariance, state, limit, lambda start: bool(singular_at(start)))
+    if solution is None:
         reasons = {name: f"{reason}. {check}" for name, (reason, check) in blind_marks(problem, state).items()}
         of_name = problem.network.image_by_name
         raise NoImageError(
             f"The adjustment cannot start: with the approximations, {next(iter(reasons.values()), '')}",
             {of_name[name].frame: reason for name, reason in reasons.items() if name},
         )
-    solution = Solution(start, None, "singular", ())
-    singular = singular_directions(weighted, state, numbering.free, start.factor)
+    singular = singular_at(solution.end)
     if singular:
-        return Run(problem, numbering, weighting, solution, singular, start.factor)
-    solution = iterate(numbering, covariance, start, limit)
-    factor = solution.end.factor
-    singular = singular_directions(weighted, solution.end.state, numbering.free, factor)
-    if singular:
-        ended: Termination = "singular" if solution.termination == "converged" else "diverged"
+        ended: Termination = "singular" if solution.termination in ("converged", "singular") else "diverged"
         solution = replace(solution, factor=None, termination=ended)
-    return Run(problem, numbering, weighting, solution, singular, factor)
+    return Run(problem, numbering, weighting, solution, singular, solution.end.factor)

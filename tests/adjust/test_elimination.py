@@ -72,7 +72,7 @@ def test_it_is_the_dense_least_squares_solution(damping: float) -> None:
     scale = np.linalg.norm(matrix, axis=0)
     damped = np.vstack([matrix / scale, np.sqrt(damping) * np.eye(COUNT)])
     expected, *_ = np.linalg.lstsq(damped, np.concatenate([observed, np.zeros(COUNT)]))
-    np.testing.assert_allclose(factor.solution() * scale, expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(factor.solution * scale, expected, rtol=1e-9, atol=1e-12)
 
     cofactor = np.linalg.inv(damped.T @ damped)
     np.testing.assert_allclose(whole(factor) * np.outer(scale, scale), cofactor, rtol=1e-7, atol=1e-10)
@@ -97,7 +97,7 @@ def test_the_condition_is_not_squared() -> None:
     truth = np.array([1.0, -2.0, 3.0, 4.0])
     block = single(np.array([2, 3]), np.array([0, 1]), matrix, matrix @ truth)
     factor = eliminate([block], 4, np.zeros(4), np.zeros(4))
-    np.testing.assert_allclose(factor.solution(), truth[[2, 3, 0, 1]], atol=1e-4)
+    np.testing.assert_allclose(factor.solution, truth[[2, 3, 0, 1]], atol=1e-4)
 
 
 def test_all_shared_unknowns_fixed() -> None:
@@ -105,7 +105,7 @@ def test_all_shared_unknowns_fixed() -> None:
     matrix = rng.normal(size=(10, 3))
     block = single(np.arange(3), np.empty(0, dtype=np.intp), matrix, matrix @ np.array([1.0, 2.0, 3.0]))
     factor = eliminate([block], 3, np.zeros(3), np.zeros(3))
-    np.testing.assert_allclose(factor.solution(), [1.0, 2.0, 3.0], rtol=1e-12)
+    np.testing.assert_allclose(factor.solution, [1.0, 2.0, 3.0], rtol=1e-12)
     np.testing.assert_allclose(whole(factor), np.linalg.inv(matrix.T @ matrix), rtol=1e-10)
 
 
@@ -197,7 +197,7 @@ def test_normal_equations_give_what_reflections_give(count: int, monkeypatch: py
     factor = factorise(numbering, at)
     assert not reflected
     sigmas = np.sqrt(by_reflections.variances())
-    np.testing.assert_allclose(factor.solution() / sigmas, by_reflections.solution() / sigmas, atol=1e-8)
+    np.testing.assert_allclose(factor.solution / sigmas, by_reflections.solution / sigmas, atol=1e-8)
     expected = whole(by_reflections) / np.outer(sigmas, sigmas)
     np.testing.assert_allclose(whole(factor) / np.outer(sigmas, sigmas), expected, atol=1e-8)
     assert factor.length() == pytest.approx(by_reflections.length(), rel=1e-10)
