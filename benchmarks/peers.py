@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Prior
 from adjust.solution.adjustment import Options, adjust
+from benchmarks.harness import ONE_THREAD
 from benchmarks.large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, make_board
-from benchmarks.scale import ONE_THREAD, run_timed
+from benchmarks.scale import run_timed
 
 Array = NDArray[np.float64]
 Figures = dict[str, Any]
@@ -253,8 +254,8 @@ def bundles(_: Sequence[int]) -> None:
 
 
 def _bundle(program: str, images: int, points: int) -> Figures:
-    found = run_timed("unknown", program, images, points)
-    return found | {"seconds": found["seconds"] + found.get("covariance_seconds", 0.0)} if "seconds" in found else {}
+    found = run_timed(program, images=images, points=points)
+    return found | {"seconds": found["cpu_seconds"]} if found else {}
 
 
 def gross(views_of_tables: Sequence[int]) -> None:

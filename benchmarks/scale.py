@@ -1,13 +1,13 @@
 """Time and memory of large adjustments beside OpenCV, SciPy and Ceres, each in a process of its own with one thread.
 
-python -m benchmarks scale                      the whole table
-python -m benchmarks scale known reseau 200     one measurement: task, program, views
-python -m benchmarks scale known start 200      approximations; "nothing": without a principal distance, and adjusted
-python -m benchmarks scale unknown ceres 200 20000
+python -m benchmarks scale                                                          the whole table
+python -m benchmarks scale --case unknown --program ceres --images 60 --points 5000 --json
 
-A single measurement is of as many threads as OPENBLAS_NUM_THREADS says.
+Cases: "known", a board of 100 known points, from approximations; "free", the same without any, not even of the
+principal distance (`--flat`: points in a plane); "unknown", an aerial block; "strip". cpu_seconds are those of the
+adjustment with all its covariances, and of start values in "free"; vpv is the weighted sum of squared residuals.
 
-Ceres is measured where pycolmap is installed, which brings it. CPU seconds are told, so that other work does not count.
+Ceres is measured where pycolmap is installed, which brings it.
 """
 
 import json
@@ -16,7 +16,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,12 +28,12 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.initial_values.approximations import approximate
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.network import Exterior
 from adjust.problem.problem import ABSENT, number
 from adjust.solution.adjustment import adjust
+from benchmarks.harness import ONE_THREAD, Row
 from benchmarks.large_networks import (
     CONTROL_EVERY,
     FLIP,
@@ -49,87 +49,72 @@ from benchmarks.large_networks import (
 Array = NDArray[np.float64]
 Figures = dict[str, Any]
 
-VIEWS, VIEWS_OF_RESEAU_ALONE = (50, 200, 1000), (4000,)
-NETWORKS = ((50, 2000), (200, 20000))  # images and unknown points
-NETWORK_OF_RESEAU_ALONE = (1000, 50000)
+OWN_PROCESS = True
+COLUMNS = {
+    "case": "", "program": "", "images": "", "points": "", "observations": "", "cpu_seconds": ".3f",
+    "covariance_seconds": ".3f", "tests_seconds": ".2f", "mib": ".0f", "vpv": ".6f", "says": "",
+}  # fmt: skip
+VIEWS, VIEWS_OF_RESEAU_ALONE = (20, 50, 200, 1000), (4000,)
+NETWORKS = ((60, 5000), (200, 20000), (500, 50000))  # images and unknown points
 STRIPS, STRIPS_OF_RESEAU_ALONE, HANGING = (500,), (1000, 2000, 4000), 1000  # images
+LEAST_SCIPY_IMAGES = 200  # and beyond: it takes minutes
 PATIENCE_S = 300.0  # of CPU time, for SciPy
-ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
+GUESS = 2.0  # of the principal distance, in true ones, for a program that must have one
 
 
-def main() -> None:
-    """One measurement, or all of them."""
-    if len(sys.argv) > 1:
-        task, program, *sizes = sys.argv[1:]
-        print(json.dumps(PROGRAMS[task, program](*map(int, sizes))))
-        return
-    print("100 known points, full covariance of the camera; CPU seconds of one thread, peak MiB")
-    print("tests: all residuals' tests, reliability, suspects and warnings, where they are asked for besides")
-    print("start: approximations from the points alone, where none are given")
-    print(f"{'views':>7} {'reseau':>16} {'OpenCV':>16} {'ratio':>7} {'tests':>9} {'start':>9}")
-    for views in VIEWS:
-        ours, theirs = run_timed("known", "reseau", views), run_timed("known", "opencv", views)
-        ratio = f"{theirs['seconds'] / ours['seconds']:7.1f}" if "seconds" in theirs else f"{'':>7}"
-        print(f"{views:7} {_figures(ours)} {_figures(theirs)} {ratio} {_besides(ours, views)}")
-    for views in VIEWS_OF_RESEAU_ALONE:
-        ours = run_timed("known", "reseau", views)
-        print(f"{views:7} {_figures(ours)} {'':24} {_besides(ours, views)}")
-    print("\nUnknown points; the covariance that each gives in the time behind +")
+def cells() -> Iterator[Row]:
+    for views in (*VIEWS, *VIEWS_OF_RESEAU_ALONE):
+        for program in ("reseau", "opencv") if views in VIEWS else ("reseau",):
+            yield {"case": "known", "program": program, "images": views}
+            yield {"case": "free", "program": program, "images": views}
     for images, points in NETWORKS:
-        print(f"{images} images, {points} points")
-        _compare("unknown", images, points)
-    images, points = NETWORK_OF_RESEAU_ALONE
-    print(f"{images} images, {points} points\n    reseau   {_figures(run_timed('unknown', 'reseau', images, points))}")
-    for images in STRIPS:
-        print(f"A strip of {images} images")
-        _compare("strip", images)
-    for images in STRIPS_OF_RESEAU_ALONE:
-        ours = run_timed("strip", "reseau", images)
-        print(f"A strip of {images} images\n    reseau   {_figures(ours)}")
-    ours = run_timed("strip", "reseau", HANGING, 0)
-    print(f"A strip of {HANGING} images, known points in the first two alone\n    reseau   {_figures(ours)}")
+        for program in ("reseau", "ceres", *(("scipy",) if images <= LEAST_SCIPY_IMAGES else ())):
+            yield {"case": "unknown", "program": program, "images": images, "points": points}
+    for images in (*STRIPS, *STRIPS_OF_RESEAU_ALONE):
+        for program in ("reseau", "ceres") if images in STRIPS else ("reseau",):
+            yield {"case": "strip", "program": program, "images": images}
+    yield {"case": "hanging strip", "program": "reseau", "images": HANGING}
 
 
-def _compare(task: str, *sizes: int) -> None:
-    """All programs on one network, and whether they have come to the same minimum."""
-    vpv = {}
-    for program in ("reseau", "scipy", "ceres"):
-        found = run_timed(task, program, *sizes)
-        print(f"    {program:8} {_figures(found)}  {found.get('says', '')}")
-        if "vpv" in found and found.get("finished", True):
-            vpv[program] = found["vpv"]
-    different = [name for name in vpv if abs(vpv[name] / vpv["reseau"] - 1.0) > 1e-6]
-    same = ", ".join(name for name in vpv if name not in different)
-    print(f"    the same minimum v'Pv = {vpv['reseau']:.6f}: {same}")
-    if different:
-        sys.exit(f"another minimum: {', '.join(f'{name} {vpv[name]:.6f}' for name in different)}")
+def case(case: str, program: str, images: int, points: int = 0, flat: bool = False) -> Row:
+    """One program on one network."""
+    scene = {
+        "known": lambda: make_board(images, 0.0 if flat else 0.05),
+        "free": lambda: make_board(images, 0.0 if flat else 0.05),
+        "unknown": lambda: unknown(images, points),
+        "strip": lambda: strip(images, CONTROL_EVERY),
+        "hanging strip": lambda: strip(images, 0),
+    }[case]()
+    programs: dict[str, Callable[[Scene], Figures]] = {
+        "reseau": reseau_alone if case == "free" else reseau,
+        "opencv": lambda scene: opencv(scene, free=case == "free", flat=flat),
+        "scipy": scipy,
+        "ceres": ceres,
+    }
+    return {"observations": len(scene.network.observations), **programs[program](scene)}
 
 
-def run_timed(task: str, program: str, *sizes: int) -> Figures:
-    """The figures of one measurement in a process of its own."""
-    command = [sys.executable, __file__, task, program, *map(str, sizes)]
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, timeout=2 * PATIENCE_S, check=False, env=os.environ | ONE_THREAD
-        )
-    except subprocess.TimeoutExpired:
-        return {"says": f"not done in {2 * PATIENCE_S:.0f} s"}
-    if done.returncode:
-        return {"says": f"not measured: {done.stderr.strip().splitlines()[-1]}"}
-    return dict(json.loads(done.stdout.splitlines()[-1]))
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    """Where several programs adjusted one network: how long the first took in terms of each, and whether they came to
+    the same minimum."""
+    networks: dict[tuple[object, ...], list[Row]] = {}
+    for row in rows:
+        networks.setdefault((row["case"], row["images"], row.get("points")), []).append(row)
+    for (name, images, _), of_network in networks.items():
+        first, *others = of_network
+        for other in others:
+            same = "the same" if abs(other["vpv"] / first["vpv"] - 1.0) < 1e-6 else "another"
+            ratio = first["cpu_seconds"] / other["cpu_seconds"]
+            yield f"{name}, {images} images: {ratio:.2f} of the time of {other['program']}, {same} minimum"
 
 
-def _figures(found: Figures) -> str:
-    if "seconds" not in found:
-        return f"{'-':>16}"
-    covariance = f"+{found['covariance_seconds']:.1f}" if "covariance_seconds" in found else ""
-    return f"{found['seconds']:.2f}{covariance} s {found['mib']:.0f}".rjust(16)
-
-
-def _besides(ours: Figures, views: int) -> str:
-    """Seconds of the tests, and of approximations."""
-    start = run_timed("known", "start", views)
-    return " ".join(f"{each['seconds']:7.2f} s" for each in ({"seconds": ours["tests_seconds"]}, start))
+def run_timed(program: str, *, images: int, points: int) -> Figures:
+    """The figures of one program on an aerial block, in a process of its own."""
+    options = ["--case", "unknown", "--program", program, "--images", str(images), "--points", str(points), "--json"]
+    command = [sys.executable, "-m", "benchmarks", "scale", *options]
+    environment = os.environ | ONE_THREAD
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    return {} if done.returncode else dict(json.loads(done.stdout.splitlines()[-1]))
 
 
 def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -151,41 +136,41 @@ def reseau(scene: Scene) -> Figures:
     images, points = (np.add.outer(starts[first], np.arange(size)) for first, size in ((".X0", 6), (".X", 3)))
     of_each = result.cofactor.parts
     _, more = _timed(lambda: (result.cofactor.variances, result.cofactor_of(cameras), of_each(images), of_each(points)))
-    figures = {"seconds": seconds + more, "mib": _peak_mib(), "vpv": result.vpv, "says": "everything"}
+    figures = {"cpu_seconds": seconds + more, "covariance_seconds": more, "mib": _peak_mib(), "vpv": result.vpv}
     _, tests = _timed(lambda: (result.residuals, result.groups, result.reliability, result.suspects, result.warnings))
     return figures | {"tests_seconds": tests, "mib_with_tests": _peak_mib()}
 
 
-def start(scene: Scene) -> Figures:
-    """Approximations from the known points alone, and that the adjustment from them leads to the same minimum."""
-    found, seconds = _timed(lambda: approximate(scene.network))
-    return {"seconds": seconds, "mib": _peak_mib(), "vpv": adjust(scene.network, found).vpv}
-
-
-def nothing(scene: Scene) -> Figures:
-    """Approximations and adjustment where nothing is given but the points, not even a principal distance."""
+def reseau_alone(scene: Scene) -> Figures:
+    """Start values and adjustment where nothing is given but the points, not even a principal distance."""
     cameras = tuple(
         replace(camera, principal_distance_mm=None, x0_mm=None, y0_mm=None) for camera in scene.network.cameras
     )
     network = replace(scene.network, cameras=cameras)
-    found, seconds = _timed(lambda: approximate(network))
-    result, more = _timed(lambda: adjust(network, found))
-    return {"seconds": seconds, "adjustment_seconds": more, "mib": _peak_mib(), "vpv": result.vpv}
+
+    def adjusted() -> Figures:
+        result = adjust(network)
+        assert len(result.cofactor.variances)  # OpenCV computes them, too
+        return {"vpv": result.vpv}
+
+    figures, seconds = _timed(adjusted)
+    return figures | {"cpu_seconds": seconds, "mib": _peak_mib()}
 
 
-def opencv(scene: Scene) -> Figures:
-    """OpenCV's calibration with its standard deviations, from the same principal distance."""
+def opencv(scene: Scene, free: bool, flat: bool) -> Figures:
+    """OpenCV's calibration with its standard deviations; free: from no principal distance, or a wrong one where points
+    in relief ask for one."""
     cv2.setNumThreads(1)
     model = [scene.points[inside].astype(np.float32) for inside, _ in scene.seen]
     imaged = [((places * (1.0, -1.0) + FRAME_MM / 2) * 10.0).astype(np.float32) for _, places in scene.seen]
-    size = int(10 * FRAME_MM)
-    start = np.array([[10 * FOCAL_MM * 1.005, 0.0, size / 2], [0.0, 10 * FOCAL_MM * 1.005, size / 2], [0.0, 0.0, 1.0]])
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO
+    size, c = int(10 * FRAME_MM), 10 * FOCAL_MM * (GUESS if free else 1.005)
+    start = np.array([[c, 0.0, size / 2], [0.0, c, size / 2], [0.0, 0.0, 1.0]])
+    flags = cv2.CALIB_FIX_ASPECT_RATIO | (0 if free and flat else cv2.CALIB_USE_INTRINSIC_GUESS)
     found, seconds = _timed(
         lambda: cv2.calibrateCameraExtended(model, imaged, (size, size), start, np.zeros(5), flags=flags)
     )
     count = sum(len(inside) for inside, _ in scene.seen)
-    return {"seconds": seconds, "mib": _peak_mib(), "vpv": found[0] ** 2 * count / (10 * SIGMA_MM) ** 2}
+    return {"cpu_seconds": seconds, "mib": _peak_mib(), "vpv": found[0] ** 2 * count / (10 * SIGMA_MM) ** 2}
 
 
 class SparseProblem:
@@ -247,8 +232,8 @@ def scipy(scene: Scene) -> Figures:
     says = f"{found.nfev} evaluations" + ("" if found.status > 0 else ", stopped before it converged")
     _, more = _timed(lambda: problem.of_camera(found.jac))
     return {
-        "seconds": seconds, "covariance_seconds": more, "mib": _peak_mib(), "vpv": 2.0 * float(found.cost),
-        "finished": found.status > 0, "says": f"{says}; covariance of the camera alone",
+        "cpu_seconds": seconds + more, "covariance_seconds": more, "mib": _peak_mib(), "vpv": 2.0 * float(found.cost),
+        "says": f"{says}; covariance of the camera alone",
     }  # fmt: skip
 
 
@@ -288,24 +273,7 @@ def ceres(scene: Scene) -> Figures:
     wanted = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
     covariance, more = _timed(lambda: pycolmap.estimate_ba_covariance(wanted, block, adjuster))
     return {
-        "seconds": seconds, "covariance_seconds": more, "mib": _peak_mib(),
+        "cpu_seconds": seconds + more, "covariance_seconds": more, "mib": _peak_mib(),
         "vpv": 2.0 * summary.ceres_summary.final_cost,
         "says": "everything" if covariance is not None else "its covariance failed",
     }  # fmt: skip
-
-
-PROGRAMS: dict[tuple[str, str], Callable[..., Figures]] = {
-    ("known", "reseau"): lambda views: reseau(make_board(views)),
-    ("known", "start"): lambda views: start(make_board(views)),
-    ("known", "nothing"): lambda views: nothing(make_board(views)),
-    ("known", "opencv"): lambda views: opencv(make_board(views)),
-    ("unknown", "reseau"): lambda images, points: reseau(unknown(images, points)),
-    ("unknown", "scipy"): lambda images, points: scipy(unknown(images, points)),
-    ("strip", "reseau"): lambda images, control=CONTROL_EVERY: reseau(strip(images, control)),
-    ("strip", "scipy"): lambda images: scipy(strip(images)),
-    ("strip", "ceres"): lambda images: ceres(strip(images)),
-    ("unknown", "ceres"): lambda images, points: ceres(unknown(images, points)),
-}
-
-if __name__ == "__main__":
-    main()

@@ -158,7 +158,10 @@ def assert_alike(found: Adjustment, expected: Adjustment) -> None:
 def test_reference_cases_are_the_same_by_both(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where normal equations take the place of reflections, as they do in large networks."""
     case = load(path.stem)
-    network, start = network_of(case), approximations_of(case, case["input"]["initial_approximations"])
+    network, start = (
+        network_of(case),
+        approximations_of(case, case["input"].get("initial_approximations", case.get("state"))),
+    )
     found = adjust(network, start)
     monkeypatch.setattr(elimination, "CHEAP", 0.0)
     by_normal_equations = adjust(network, start)

@@ -42,10 +42,13 @@ def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
     costs[np.isnan(squares_mm2.reshape(len(tried), -1)).all(axis=1)] = np.inf
     c, sigma = float(tried[int(np.argmin(costs))]), np.inf
     for _ in range(2):
-        together = distance_together(fields, resections(fields, [c] * len(fields)), c)
+        resected = resections(fields, [c] * len(fields))
+        together = distance_together(fields, resected, c)
         if together is None:
             return None
         c, sigma = together
+        if all(each is not None and each.inliers.all() for each in resected):
+            break  # a better distance leaves out no other points
     return c if sigma < LARGEST_RELATIVE_SIGMA else None
 
 

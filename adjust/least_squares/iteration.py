@@ -20,7 +20,6 @@ from adjust.problem.problem import State
 STANDSTILL_SIGMAS = 1e-8  # a step below this, in standard deviations, is none
 FORESEEN = 0.1  # of that: a next step that would be smaller if it shrank as the last two did need not be taken
 ROUNDING_SIGMAS = 1e-5  # steps below this that no longer shrink are rounding
-SAME_FACTOR_SIGMAS = 1e-5  # steps below this change no cofactor by more than some 1e-9 of it
 VPV_ROUNDING = 1e-9  # relative increase of v'Pv that is not an increase
 FIRST_DAMPING = 1e-4
 LEAST_DAMPING = 1e-9
@@ -50,8 +49,7 @@ class Iteration(NamedTuple):
 class Linearised:
     """The equations at a state: computed observations and residuals (n, 2) in mm, whitened rows, v'Pv.
 
-    by_observation (n, 2, 2): A, the derivatives of the functions by the observations. known_factor: of a state so near
-    that its factor is the same.
+    by_observation (n, 2, 2): A, the derivatives of the functions by the observations.
     """
 
     state: State
@@ -60,12 +58,11 @@ class Linearised:
     by_observation: Array
     rows: WhitenedRows
     vpv: float
-    known_factor: Factor | None = None
 
     @cached_property
     def factor(self) -> Factor:
         """The square root of the normal equations, undamped."""
-        return self.known_factor or factorise(self.rows.numbering, self)
+        return factorise(self.rows.numbering, self)
 
 
 @dataclass(frozen=True)
@@ -130,12 +127,10 @@ def iterate(
         moved = _step(numbering, covariance_mm2, at, damping, lately, moved)
         if moved is None:
             return Solution(at, None, "diverged", tuple(history))
-        history.append(Iteration(moved.end.vpv, moved.sigmas, moved.damping, moved.attempts))
-        if moved.damping == 0.0 and _stands_still(history):
-            known = at.factor if moved.sigmas < SAME_FACTOR_SIGMAS else None
-            end = replace(moved.end, known_factor=known)
-            return Solution(end, end.factor, "converged", tuple(history))
         at = moved.end
+        history.append(Iteration(at.vpv, moved.sigmas, moved.damping, moved.attempts))
+        if moved.damping == 0.0 and _stands_still(history):
+            return Solution(at, at.factor, "converged", tuple(history))
         damping, lately = _eased(moved.damping, moved.gain), moved.damping or lately
     return Solution(at, at.factor, "iteration limit", tuple(history))
 

@@ -105,8 +105,9 @@ class Numbering:
                     numbers = np.where(of_all[column][which] >= 0, ABSENT, numbers)
             if (numbers >= 0).any():
                 single[column] = numbers
-        used, rest = np.array(list(single), dtype=np.intp), np.reshape(list(single.values()), (-1, len(block))).T
-        return Pattern((owning[0], grouped[0], used), block, group, own, members, rest, self._shared_count)
+        used, rest = np.array(list(single), dtype=np.intp), np.array(list(single.values()), dtype=np.intp)
+        columns = owning[0], grouped[0], used
+        return Pattern(columns, block, group, own, members, rest.reshape(-1, len(block)).T, self._shared_count)
 
     @property
     def _shared_count(self) -> int:
