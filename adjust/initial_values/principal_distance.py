@@ -15,7 +15,7 @@ from adjust.initial_values.resection import distance_together, resections
 
 GRID = np.geomspace(0.35, 16.0, 14)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
 FEWEST = 4  # points of an image
-COARSE_IMAGES = 5
+COARSE_IMAGES, COARSE_POINTS = 5, 30
 FINE_IMAGES = 12
 LARGEST_RELATIVE_SIGMA = 0.15
 ANGLES_DEG = np.arange(88.0, 8.0, -4.0)  # off the axis at which the outermost point of all images is tried
@@ -34,7 +34,7 @@ def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
     fields = _largest_fields(fields, FEWEST, FINE_IMAGES)
     if not fields:
         return None
-    coarse = fields[:COARSE_IMAGES]
+    coarse = [_thinned(each) for each in fields[:COARSE_IMAGES]]
     tried = GRID * _radius_mm(fields)
     found = resections(len(tried) * coarse, np.repeat(tried, len(coarse)).tolist(), only_quick=True)
     squares_mm2 = np.array([np.nan if each is None else len(each.inliers) * each.sigma_mm**2 for each in found])
@@ -72,6 +72,12 @@ def find_wide_distance(fields: Sequence[KnownField], distortion: Distortion) -> 
         step /= 2.0
         least, best = min((least, best), *((misfit(angle), angle) for angle in (best - step, best + step)))
     return radius_mm / float(np.radians(best)) if np.isfinite(least) else None
+
+
+def _thinned(field: KnownField) -> KnownField:
+    """An image with as many of its points as a coarse search needs, evenly taken."""
+    step = -(-len(field.xyz) // COARSE_POINTS)
+    return KnownField(field.xyz[::step], field.xy_mm[::step], field.sigma_mm)
 
 
 def _largest_fields(fields: Sequence[KnownField], fewest: int, most: int) -> list[KnownField]:
