@@ -45,7 +45,8 @@ class Pattern:
     def singles(self) -> Indices:
         """(t,) the numbers of the single unknowns that rows with own unknowns touch."""
         touched = np.zeros(self.count + 1, dtype=bool)  # the last stands for none
-        touched[self.single[self.order]] = True
+        for numbers in self.single.T:
+            touched[numbers[self.block < len(self.own) - 1]] = True
         return np.flatnonzero(touched[:-1])
 
     @cached_property
@@ -176,8 +177,8 @@ class SparseRows:
     def column_squares(self, count: int, equations: "SharedEquations") -> Array:
         """(n,) the sums of the squares in the columns of all unknowns."""
         squares = np.zeros(count + 1)
-        for column, unknowns in zip(self.pattern.columns[0], self.pattern.own.T, strict=True):
-            of_rows = self.matrix[:, 0, column] ** 2 + self.matrix[:, 1, column] ** 2
+        by_own = self.matrix[..., self.pattern.columns[0]]
+        for of_rows, unknowns in zip((by_own**2).sum(axis=1).T, self.pattern.own.T, strict=True):
             squares[unknowns] = np.bincount(self.pattern.block, of_rows, len(unknowns))
         squares[: self.pattern.count] = equations.diagonal
         return squares[:-1]

@@ -164,7 +164,7 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     by_camera_xy = laid_out(np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)))
     has_films = any(films.kind.names for films in problem.films) or bool(problem.scans)
     by_unknowns = _no_derivatives(len(xy_mm), parts.width)
-    by_unknowns[:, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4; those of targets follow
+    by_unknowns[problem.is_fiducial, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4
     straight, attitude = problem.network.line_of_sight.is_straight, problem.attitude_by_unknowns(state)
     for shown in computed.targets:
         lens = _lens(problem, state, shown.camera)

@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 from adjust.array_types import Indices
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.initial_values.approximations import initial_values
-from adjust.least_squares.malloc_tuning import keep_freed_memory
+from adjust.least_squares.malloc_tuning import keep_freed_memory, pause_cycle_search
 from adjust.problem.network import STRAIGHT, Approximations, Network
 from adjust.problem.problem import Problem, number
 from adjust.problem.reduction import Reduction
@@ -60,14 +60,15 @@ def adjust(
     explains what else contradicts itself everywhere (see `blunder_sentence`).
     """
     keep_freed_memory()
-    validate(network)
-    solver = _Solver(options or Options())
-    if approximations is None:
-        result, left_out = solver.leave_out_blind(*solver.orientable(network))
-        found = solver.try_again(network, result, left_out) if left_out else result
-    else:
-        found = solver.check_whole(network, approximations, None)
-    return check_plausibility(found, solver.trials)
+    with pause_cycle_search():
+        validate(network)
+        solver = _Solver(options or Options())
+        if approximations is None:
+            result, left_out = solver.leave_out_blind(*solver.orientable(network))
+            found = solver.try_again(network, result, left_out) if left_out else result
+        else:
+            found = solver.check_whole(network, approximations, None)
+        return check_plausibility(found, solver.trials)
 
 
 @dataclass(frozen=True)
