@@ -296,7 +296,7 @@ def _mark_counts(network: Network) -> Indices:
     """(frames, 2) how many object points, and how many fiducials, every frame shows, those in several parts once."""
     observations, frames = network.observations, network.frame_numbers[network.image_numbers]
     names, points = observations.numbered_points
-    kinds = observations.is_of("fiducial") + 2 * observations.is_of("join")  # all others are object points
+    kinds = observations.has_kind("fiducial") + 2 * observations.has_kind("join")  # all others are object points
     marks = np.sort((frames * 3 + kinds) * len(names) + points)
     marks = marks[np.diff(marks, prepend=-1) > 0] // len(names)
     return np.bincount(marks, minlength=3 * len(network.images)).reshape(-1, 3)[:, :2]

@@ -154,7 +154,7 @@ def reseau_alone(scene: Scene) -> Figures:
         return {"vpv": result.vpv}
 
     figures, seconds = _timed(adjusted)
-    return figures | {"cpu_seconds": seconds, "mib": _peak_mib()}
+    return {**figures, "cpu_seconds": seconds, "mib": _peak_mib()}
 
 
 def opencv(scene: Scene, free: bool, flat: bool) -> Figures:

@@ -141,6 +141,21 @@ def test_compiled_elimination_is_that_of_numpy(seed: int, monkeypatch: pytest.Mo
     np.testing.assert_allclose(cofactors, expected_cofactors, atol=1e-12)
 
 
+@pytest.mark.parametrize("loops", [pytest.param("compiled", marks=needs_kernels), "numpy"])
+def test_own_columns_are_orthonormal_even_if_they_are_nearly_parallel(
+    loops: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if loops == "numpy":
+        monkeypatch.setattr(compiled, "kernels", None)
+    rows = sparse_rows(1)
+    rows.matrix[..., 1] = rows.matrix[..., 0] + 1e-7 * rows.matrix[..., 1]
+    nothing, equations = np.zeros(160), SharedEquations.zeros(Fronts.single(40))
+    blocks = eliminated(rows, nothing, nothing, np.ones(160), equations)
+    first, stop = rows.pattern.first[10:12]
+    columns = blocks.orthonormal[..., first:stop].reshape(3, -1)
+    np.testing.assert_allclose(columns @ columns.T, np.eye(3), atol=1e-14)
+
+
 def assert_alike(found: Adjustment, expected: Adjustment) -> None:
     """Values to 1e-6 of a standard deviation, and cofactors and v'Pv to nine digits."""
     assert found.termination == expected.termination

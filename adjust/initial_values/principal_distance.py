@@ -34,7 +34,7 @@ def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
     fields = _largest_fields(fields, FEWEST, FINE_IMAGES)
     if not fields:
         return None
-    coarse = [_thinned(each) for each in fields[:COARSE_IMAGES]]
+    coarse = [_thin_field(each) for each in fields[:COARSE_IMAGES]]
     tried = GRID * _radius_mm(fields)
     found = resections(len(tried) * coarse, np.repeat(tried, len(coarse)).tolist(), only_quick=True)
     squares_mm2 = np.array([np.nan if each is None else len(each.inliers) * each.sigma_mm**2 for each in found])
@@ -74,7 +74,7 @@ def find_wide_distance(fields: Sequence[KnownField], distortion: Distortion) -> 
     return radius_mm / float(np.radians(best)) if np.isfinite(least) else None
 
 
-def _thinned(field: KnownField) -> KnownField:
+def _thin_field(field: KnownField) -> KnownField:
     """An image with as many of its points as a coarse search needs, evenly taken."""
     step = -(-len(field.xyz) // COARSE_POINTS)
     return KnownField(field.xyz[::step], field.xy_mm[::step], field.sigma_mm)

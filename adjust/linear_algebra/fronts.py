@@ -84,13 +84,13 @@ class Fronts:
     @cached_property
     def table(self) -> Indices:
         """(f, 5) of every front: its first unknown, how many it owns, where its square begins if all stand one behind
-        the other, where those that it meets later begin in `after`, and how many these are."""
+        the other, where those that it meets later begin in `later_unknowns`, and how many these are."""
         count, later = np.array([(front.count, len(front.after)) for front in self], dtype=np.intp).T
         sizes = (count + later) ** 2
         return np.column_stack([self._starts, count, np.cumsum(sizes) - sizes, np.cumsum(later) - later, later])
 
     @cached_property
-    def after(self) -> Indices:
+    def later_unknowns(self) -> Indices:
         """Those that the fronts meet later, one front behind the other."""
         return np.concatenate([front.after for front in self])
 

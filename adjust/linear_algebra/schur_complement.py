@@ -159,7 +159,7 @@ class SparseRows:
         if compiled.kernels is not None:
             given = (
                 self.right, np.concatenate(pattern.columns[1:]), order, first, unknowns,
-                np.argsort(home, kind="stable"), home, fronts.table, fronts.after,
+                np.argsort(home, kind="stable"), home, fronts.table, fronts.later_unknowns,
             )  # fmt: skip
             compiled.kernels.square_rows(
                 self.matrix, *map(np.ascontiguousarray, given), equations.values, equations.right
@@ -290,7 +290,7 @@ def eliminated(
         given = (
             rows.right, pattern.order, pattern.first, np.argsort(home, kind="stable"), home, *pattern.columns, own,
             pattern.groups, pattern.members, pattern.single, pattern.singles, weight, prior,
-            fronts.table, fronts.after,
+            fronts.table, fronts.later_unknowns,
         )  # fmt: skip
         found = blocks.triangle, blocks.right, blocks.orthonormal, blocks.parts, blocks.alone
         arrays = *map(np.ascontiguousarray, given), *found
@@ -430,7 +430,8 @@ class SparseBlocks:
         home = fronts.home(pattern.left_over[0][:-1, None])
         given = (
             pattern.first, np.argsort(home, kind="stable"), home, pattern.groups, pattern.members, pattern.singles,
-            self.parts, self.alone, fronts.table, fronts.after, np.concatenate([square.ravel() for square in squares]),
+            self.parts, self.alone, fronts.table, fronts.later_unknowns,
+            np.concatenate([square.ravel() for square in squares]),
         )  # fmt: skip
         compiled.kernels.border_cofactors(*map(np.ascontiguousarray, given), inner)
         inner += np.eye(self.own.shape[1])

@@ -241,7 +241,7 @@ class Network:
     def joins(self) -> dict[tuple[str, str], Indices]:
         """The observations of every join, by frame and point."""
         rows: dict[tuple[str, str], list[int]] = {}
-        for row in np.flatnonzero(self.observations.is_of("join")):
+        for row in np.flatnonzero(self.observations.has_kind("join")):
             frame = self.images[self.image_numbers[row]].frame
             rows.setdefault((frame, self.observations.point[row]), []).append(int(row))
         return {key: np.array(own, dtype=np.intp) for key, own in rows.items()}
@@ -265,7 +265,7 @@ class Network:
     @cached_property
     def observed_fiducials(self) -> frozenset[tuple[str, str]]:
         """(camera, id) of the fiducials that are seen in an image."""
-        rows = np.flatnonzero(self.observations.is_of("fiducial"))
+        rows = np.flatnonzero(self.observations.has_kind("fiducial"))
         return frozenset((self.images[self.image_numbers[row]].camera, self.observations.point[row]) for row in rows)
 
     @cached_property

@@ -37,9 +37,9 @@ class Observations:
     @cached_property
     def is_fiducial(self) -> Mask:
         """(n,) whether it is a place in the camera frame that is observed, fiducial or join, and no object point."""
-        return np.asarray(self.is_of("fiducial") | self.is_of("join"))
+        return np.asarray(self.has_kind("fiducial") | self.has_kind("join"))
 
-    def is_of(self, kind: ObservationKind) -> Mask:
+    def has_kind(self, kind: ObservationKind) -> Mask:
         """(n,) whether it is of a kind."""
         return np.asarray(self._kinds == kind)
 

@@ -261,7 +261,7 @@ class Problem:
         places = np.array([self.unknowns.point.get(name, _NOWHERE) for name in names], dtype=np.intp)[of_name]
         for key, rows in self.network.joins.items():
             places[rows] = *self.unknowns.join[key], ABSENT
-        for row in np.flatnonzero(observations.is_of("fiducial")):
+        for row in np.flatnonzero(observations.has_kind("fiducial")):
             camera = images[self.image_numbers[row]].camera
             places[row] = *self.unknowns.fiducial[camera, observations.point[row]], ABSENT
         return places
