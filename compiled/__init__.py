@@ -109,7 +109,15 @@ class Kernels(Protocol):
         ...
 
 
-try:
-    kernels: Kernels | None = cast(Kernels, import_module("compiled.kernels"))
-except ImportError:
-    kernels = None
+def _load() -> Kernels | None:
+    """None where nothing was compiled, or only what earlier sources had: all is compiled anew at the next
+    installation."""
+    try:
+        found = import_module("compiled.kernels")
+    except ImportError:
+        return None
+    names = (name for name in vars(Kernels) if not name.startswith("_"))
+    return cast(Kernels, found) if all(hasattr(found, name) for name in names) else None
+
+
+kernels = _load()
