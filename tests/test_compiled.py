@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from plain_environment import NO_COMPILER
-from reference_cases import CASES, approximations_of, load, network_of
+from reference_cases import CASES, case_approximations, case_network, load
 from simulated import field_points, simulated
 
 import compiled
@@ -174,8 +174,8 @@ def test_reference_cases_are_the_same_by_both(path: Path, monkeypatch: pytest.Mo
     """Also where normal equations take the place of reflections, as they do in large networks."""
     case = load(path.stem)
     network, start = (
-        network_of(case),
-        approximations_of(case, case["input"].get("initial_approximations", case.get("state"))),
+        case_network(case),
+        case_approximations(case, case["input"].get("initial_approximations", case.get("state"))),
     )
     found = adjust(network, start)
     monkeypatch.setattr(elimination, "CHEAP", 0.0)
