@@ -202,7 +202,12 @@ def latest(store: Store) -> Judging | None:
     found = store.connection.execute(
         f"select digest from judging where not {_UNFINISHED} order by id desc limit 1"
     ).fetchone()
-    return None if found is None else find_judging(store, found[0])
+    if found is None:
+        return None
+    judging = find_judging(store, found[0])
+    if judging is None:  # its row is there, and the index of digests, by which it is looked up, has lost it
+        raise damaged_judging(store.path)
+    return judging
 
 
 def checked_scans(

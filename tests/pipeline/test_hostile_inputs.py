@@ -349,6 +349,23 @@ def study(kind: str, count: int, seed: int, measured_folder: Path, adjusted_fold
     return counts
 
 
+def test_a_digest_changed_in_its_row_or_in_its_index_is_never_taken_for_no_judging(
+    measured_folder: Path, tmp_path: Path
+) -> None:
+    right, place = readings(measured_folder), tmp_path / "p"
+    shutil.copytree(measured_folder, place)
+    path = place / "out" / "measurement.db"
+    with sqlite3.connect(path) as db:
+        (digest,) = db.execute("select digest from judging order by id desc").fetchone()
+    data = path.read_bytes()
+    places = [at for at in range(len(data)) if data.startswith(digest.encode(), at)]
+    assert len(places) >= 2
+    for at in places:
+        path.write_bytes(data[:at] + b"g" + data[at + 1 :])
+        found = readings(place)
+        assert all(is_right(found[name], right[name]) for name in right), at
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_hostile_inputs_end_in_the_right_result_or_in_a_message(
     kind: str, measured_folder: Path, adjusted_folder: Path, tmp_path: Path
