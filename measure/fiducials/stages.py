@@ -241,7 +241,7 @@ def _search_oblique(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> 
     """The frame of film that was photographed obliquely, in the best placement: nearly all marks of the scan have to
     be measured, for so much freedom fits some of any frame."""
     found = search.search_scan(hypotheses)
-    if not found or found[0].supported < _OBLIQUE:
+    if not found or found[0].supported < max(_OBLIQUE, len(search.layout.marks) - _GAINED + 1):
         return found, []
     frame = _measure_in_its_pose(search, found[0])
     if not frame.accepted or frame.measured_count < max(_OBLIQUE, frame.inside - _GAINED + 1):
