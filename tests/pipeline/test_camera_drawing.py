@@ -1,5 +1,6 @@
 """A camera drawn on the review page: handles, where the frame lies, the saved file, and a person's session."""
 
+import csv
 import json
 import math
 import re
@@ -14,6 +15,7 @@ from browser import browser_page, needs_browser
 from brute_marks import Array
 from drawn_frames import ALIKE, CORNERS, PITCH_UM, frame_picture, pixel_from_camera
 from playwright.sync_api import Browser, Page, expect
+from real_data import DATA, needs
 from review_pages import comparator
 from review_server import Served, served
 
@@ -139,6 +141,22 @@ def test_a_fit_finds_places_and_the_size(scan: Path) -> None:
     np.testing.assert_allclose([one.px for one in fitted.marks], true_px(), atol=0.05)
     assert fitted.mark["ring_mm"] == pytest.approx(0.5, rel=0.01)
     assert fitted.marks[0].blur_px == pytest.approx(0.8, abs=0.15)
+
+
+@needs("film_rendered")
+def test_wings_are_fitted_within_the_frame_alone() -> None:
+    """Of another renderer, with gamma 2.2: what is drawn beyond the edge would shift them by more than a pixel."""
+    folder = DATA / "film_rendered" / "wings_gamma8"
+    with (folder / "truth.csv").open(encoding="utf-8") as file:
+        true = {row["point"]: (float(row["col_px"]), float(row["row_px"])) for row in csv.DictReader(file)}
+    wing = {"kind": "polygon", "vertices_mm": [[0, 0], [6, 0], [6, 3], [1.2, 3]], "rotate": "radial"}
+    marks = tuple(ClickedMark(id, px) for id, px in true.items())
+    drawing = CameraDrawing("s", wing, marks, "5", frame_mm=(226.0, 226.0))
+    with open_scan(folder / "s.tif") as opened:
+        placement = place_frame(drawing, (opened.width_px, opened.height_px), (60.0, 60.0), "")
+        fitted = take_step(drawing, placement, {"fit": True}, opened)
+    assert not any(one.unfitted for one in fitted.marks)
+    assert max(math.dist(one.px, true[one.id]) for one in fitted.marks) < 0.6
 
 
 def test_a_mark_that_the_drawing_does_not_fit_is_named_and_keeps_its_click(scan: Path, tmp_path: Path) -> None:

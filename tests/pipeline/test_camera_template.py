@@ -1,6 +1,7 @@
 """Camera files made from a kind of marks and their distances: accepted, and good for scans of such a camera."""
 
 import json
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.camera_template import MARK_KINDS, CameraSizes, camera_template
 from pipeline.rendered.scene_file import render_project
+from pipeline.review.camera_drawing import CameraDrawing, ClickedMark, place_frame
+from pipeline.review.drawing_view import fit_drawing
 
 SIZE_MM = 20.0
 SCENE = """name = "one"
@@ -76,6 +79,27 @@ def test_a_rendered_frame_of_each_kind_is_measured_with_its_template(kind: str, 
         assert mark.covariance_px2 is not None
         off_px = np.asarray(mark.center_px) - true
         assert off_px @ np.linalg.solve(mark.covariance_px2, off_px) < 20.0, (mark, true)  # one in 20,000
+
+
+def test_a_wing_is_fitted_on_the_review_page_as_far_as_it_is_true(tmp_path: Path) -> None:
+    """Beyond the frame's edge it merges into the border. Clicked 3 px off."""
+    given = image_camera(tmp_path, sizes("wing", "side"))
+    text = (tmp_path / "camera.toml").read_text(encoding="utf-8").replace('"auto"', '"dark"')
+    (tmp_path / "camera.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "scene.toml").write_text(SCENE.format(pad_mm=0.0), encoding="utf-8")
+    render_project(tmp_path / "scene.toml", tmp_path / "out", lambda *_: None)
+    truth = json.loads((tmp_path / "out" / "truth.json").read_text(encoding="utf-8"))["images"]["one"]["fiducials"]
+    true = {one.id: np.array([truth[one.id]["col_px"], truth[one.id]["row_px"]]) for one in given.fiducials}
+    marks = tuple(ClickedMark(id, (float(px[0]) + 2.0, float(px[1]) - 2.0)) for id, px in true.items())
+    wing = tomllib.loads(text)["mark"]["side"]
+    drawn = {key: wing[key] for key in ("kind", "vertices_mm", "rotate")}
+    drawing = CameraDrawing("one", drawn, marks, "5", frame_mm=given.frame_mm or (0.0, 0.0))
+    with open_scan(next((tmp_path / "out" / "scans").iterdir())) as scan:
+        placement = place_frame(drawing, (scan.width_px, scan.height_px), scan.pitch_um, "")
+        fitted = fit_drawing(drawing, placement, scan)
+    for one in fitted.marks:
+        assert not one.unfitted
+        assert np.hypot(*(np.array(one.px) - true[one.id])) < 0.02, one
 
 
 def test_eight_marks_of_an_aerial_camera_have_the_places_and_names_of_calibration_reports() -> None:

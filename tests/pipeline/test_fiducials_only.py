@@ -130,6 +130,25 @@ def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(
     assert "Distances" not in form
 
 
+@pytest.mark.parametrize(
+    ("source", "given_by"),
+    [
+        ("", "the certificate"),
+        ('[source]\ntext = "reports"\nreports = 3\n', "the library's typical coordinates"),
+        ('[source]\ntext = "adjusted"\nframes = 3\n', "the camera file"),
+    ],
+)
+def test_corrections_are_to_what_the_camera_file_rests_on(
+    source: str, given_by: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = write_project(tmp_path, {"a": 5, "b": 5})
+    camera = tmp_path / "camera.toml"
+    text = camera.read_text(encoding="utf-8").replace("sigma_mm = 0\n", "sigma_mm = 0.01\n")
+    camera.write_text(f"{text}{source}", encoding="utf-8")
+    run(["run", str(project)])
+    assert f"Corrections to {given_by}, after a common" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,7 +20,7 @@ from pipeline.files.project_file import read_project
 from pipeline.report import ReportData, Thumbnail, judge, render_report
 from pipeline.report.frame_views import MOST_CARDS
 from pipeline.report.load import report_data
-from pipeline.report.many_frames import MOST_FRAMES, reduced
+from pipeline.report.many_frames import MOST_FRAMES, frame_counts, reduced
 from pipeline.report.page import render_frame_page
 from pipeline.results.comparator_file import ComparatorPoint, mark_rows, read_measurement_hash, write_comparator
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
@@ -83,6 +83,7 @@ def test_its_counts_are_those_of_the_frames(many: ReportData) -> None:
     good = FRAMES - len(BAD) - len(FAILED)
     counts = sum(map(Counter, many.totals.verdicts.values()), Counter[str]())
     assert counts == {"good": good, "look": len(BAD), "failed": len(FAILED)}
+    assert frame_counts(many, []) == counts  # of the terminal
     assert {camera for camera, _ in many.totals.verdicts} == {"camera 0", "camera 1", "camera 2"}
     assert {kind for _, kind in many.totals.verdicts} == {"tif", "jpg"}
     observed = FRAMES * MARKS - len(BAD) - MARKS * len(FAILED)
