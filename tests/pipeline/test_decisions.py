@@ -190,13 +190,18 @@ def test_status_is_stale_until_a_decision_is_taken_in(tmp_path: Path, capsys: py
 
 
 @pytest.mark.study
-def test_a_million_lines_are_read_in_five_seconds(tmp_path: Path) -> None:
+def test_a_million_lines_are_read_in_little_more_than_their_json_takes(tmp_path: Path) -> None:
+    """1.1 to 1.8 times as long; 4.2 to 4.5 s of CPU."""
     line = '{{"image": "box/{0:05d}", "point": "{1}", "kind": "fiducial", "decision": "reject", "who": "ann"}}'
     path = tmp_path / "decisions.jsonl"
     path.write_text("\n".join(line.format(k % 50_000, k % 8) for k in range(1_000_000)) + "\n")
     began = time.process_time()
     assert len(read_decisions(path)) == 1_000_000
-    assert time.process_time() - began < 5.0
+    reading_s, began = time.process_time() - began, time.process_time()
+    with path.open("rb") as file:
+        for text in file:
+            json.loads(text)
+    assert reading_s < 2.5 * (time.process_time() - began)
 
 
 def test_lines_of_all_forms_are_read_in_their_order_and_a_wrong_one_is_named(
