@@ -64,3 +64,6 @@ def test_coarse_grain_is_distinguished_from_a_landscape(grain_px: float, is_grai
     used, design = np.ones((19, 19), dtype=bool), np.ones((1, 19, 19))
     model = grain_model(window, used, design, neighbours, patches)
     assert model.is_grain is is_grain
+    if is_grain:  # blank film that holds more pixels than the window alone tells how strong it is
+        assert model.variance_dn2 == pytest.approx(1.0, rel=0.1)
+        assert grain_model(3.0 * window, used, design, neighbours, patches).variance_dn2 == model.variance_dn2
