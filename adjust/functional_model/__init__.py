@@ -1,1 +1,1 @@
-"""The functions of observations and their derivatives: from the object through camera and film to the comparator."""
+"""Functional model: object, camera, film and comparator coordinates, with the derivatives."""

@@ -1,12 +1,13 @@
-"""Terms that a distortion family may lack: added to its correction of the observed point, each of a known cause.
+"""Additional distortion terms of known cause that a family may lack, added to its correction of the observed point.
 
-With (ξ, η) the observed point about the principal point, half the frame the unit, and s = ξ² + η², the correction is
+With (ξ, η) the observed point relative to the principal point, in units of half the frame, and s = ξ² + η², the
+correction is
 
     radial           r3, r5, ...:   (ξ, η) s^m
     decentering      p1, p2, ...:   (s + 2ξ², 2ξη) s^q, (2ξη, s + 2η²) s^q
     affinity         b1, b2:        (ξ, 0), (η, 0)
 
-All parameters are in mm at the edge of the frame. A family with them is spelled with a + behind it: "opencv+".
+All parameters are in mm at the edge of the frame. The name of a family with these terms ends in +: "opencv+".
 """
 
 import numpy as np
@@ -23,7 +24,7 @@ ADDED_NAMES = (*RADIAL, *DECENTERING[0], *DECENTERING[1], *AFFINITY)
 
 
 def correction_with_terms(correct: Correct, count: int) -> Correct:
-    """The correction of a family of so many parameters, with the terms added to it."""
+    """Add the terms to the correction of a family with count parameters."""
 
     def corrected(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
         own = correct(settings, xy, principal_point, parameters[:count])
@@ -39,7 +40,7 @@ def correction_with_terms(correct: Correct, count: int) -> Correct:
 
 
 def image_without_terms(image: Image, count: int) -> Image:
-    """The image of a ray by a family of so many parameters, which the added terms have no part in."""
+    """Pass only the first count parameters to a family's image of a ray: the added terms do not affect it."""
 
     def imaged(settings: Settings, c: float, ray: Array, parameters: Array) -> Imaged:
         own = image(settings, c, ray, parameters[:count])
@@ -53,7 +54,7 @@ def image_without_terms(image: Image, count: int) -> Image:
 
 
 def _added(unit_mm: float, reduced: Array, parameters: Array) -> Correction:
-    """The added terms and their derivatives at points (n, 2) about the principal point."""
+    """Added terms and their derivatives at points (n, 2) relative to the principal point."""
     x, y = (reduced / unit_mm).T
     one, zero, s = np.ones_like(x), np.zeros_like(x), x**2 + y**2
     radial = vectors(x, y), matrices((one, zero), (zero, one))

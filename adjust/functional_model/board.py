@@ -1,8 +1,8 @@
-"""A board that is nearly flat: how far its bend puts each of its points beside the plane.
+"""Bend of a nearly flat calibration board: offsets of its points from the plane.
 
-Two parabolas, as mrcal has them (its `ref_calibration_object`, calobject_warp): with ξ and η from -1 to 1 over the
-board's points, a point stands bend_x (1 - ξ²) + bend_y (1 - η²) off the plane. The corners stay where they are; in the
-middle the two add up.
+Two parabolas, as in mrcal (`ref_calibration_object`, calobject_warp): with ξ and η from -1 to 1 over the board's
+points, a point lies bend_x (1 - ξ²) + bend_y (1 - η²) off the plane. The corners do not move; in the middle the two
+bends add up.
 """
 
 from dataclasses import dataclass
@@ -12,29 +12,32 @@ import numpy as np
 from adjust.array_types import Array
 
 BOARD_NAMES = ("bend_x", "bend_y")
-LARGEST_RELIEF = 0.02  # of the longest extent: what has more is no board
-_EQUAL = 1e-9  # of the areas of rectangles that are one
-_UPRIGHT = 0.9  # of the normal along X, from which on the board's first axis is that along Y
+LARGEST_RELIEF = 0.02  # fraction of the longest extent; points with more relief are not a board
+_EQUAL = 1e-9  # relative difference below which the areas of two rectangles are equal
+_UPRIGHT = 0.9  # |X| of the normal above which the board's first axis is taken along Y
 
 
 @dataclass(frozen=True)
 class BoardForm:
-    """normal (3,): off the board, towards the larger of the coordinates that it runs along most. shapes (n, 2): how far
-    a bend of 1 along each axis lifts the points."""
+    """Shape of the bend of a board.
+
+    normal (3,): unit normal, positive in its largest component. shapes (n, 2): offsets of the points for a bend of 1
+    along each axis.
+    """
 
     normal: Array
     shapes: Array
 
     def offsets(self, bends: Array) -> Array:
-        """(n, 3) of the points, for bends (2,) in object units."""
+        """(n, 3) offsets of the points for bends (2,), in object units."""
         return np.asarray((self.shapes @ bends)[:, None] * self.normal)
 
 
 def board_form(xyz: Array) -> BoardForm:
-    """Of a board's flat points (n, 3). Its axes are the sides of the smallest rectangle about them, the first one that
-    is nearer to X, or to Y where the board faces X.
+    """Determine the axes of a board from its flat points (n, 3).
 
-    Raises ValueError for points that are no board: fewer than four, on a line, or with relief.
+    The axes are the sides of the smallest rectangle around the points. The first axis is the one nearer to X, or to Y
+    where the board faces X. Raises ValueError for fewer than four points, points on a line or points with relief.
     """
     centred = xyz - xyz.mean(axis=0)
     _, extents, axes = np.linalg.svd(centred, full_matrices=False)
@@ -51,9 +54,11 @@ def board_form(xyz: Array) -> BoardForm:
 
 
 def _to_sides(places: Array) -> Array:
-    """(2, 2) the turn, by 45 degrees at most, that lays points (n, 2) along the smallest rectangle about them: one
-    of its sides is an edge of their convex hull."""
-    from scipy.spatial import ConvexHull  # takes longer to import than most boards to adjust
+    """(2, 2) rotation by at most 45 degrees that aligns points (n, 2) with the smallest rectangle around them.
+
+    One side of that rectangle is an edge of the convex hull.
+    """
+    from scipy.spatial import ConvexHull  # slow import: longer than the adjustment of most boards
 
     corners = places[ConvexHull(places).vertices]
     edges = np.roll(corners, -1, axis=0) - corners

@@ -1,7 +1,7 @@
-"""What every distortion family gives: a correction of the observed point or the image of a ray, with derivatives.
+"""Interface of the distortion families: correction of the observed point or image of a ray, with derivatives.
 
-Three kinds of formulas make all families: a correction of the observed point (the image side), the same of the ideal
-point (the object side, `ideal_point_family`), and what is done to the ray itself, without units (`ray_family`).
+There are three kinds of families: correction of the observed point (image side), correction of the ideal point (object
+side, `ideal_point_family`), and distortion of the dimensionless ray (`ray_family`).
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from adjust.linear_algebra.small_matrices import applied
 
 
 class Settings(Protocol):
-    """What a family is told beside its parameters; see `adjust.functional_model.lens.Distortion`."""
+    """Settings of a family in addition to its parameters; see `adjust.functional_model.lens.Distortion`."""
 
     @property
     def decentering(self) -> str: ...
@@ -29,9 +29,9 @@ class Settings(Protocol):
 
 @dataclass(frozen=True)
 class Correction:
-    """d (n, 2) in mm, which is subtracted from the observed point, and its derivatives.
+    """Correction d (n, 2) in mm, subtracted from the observed point, and its derivatives.
 
-    by_xy, by_principal_point (n, 2, 2); by_parameters (n, 2, k).
+    xy_jacobian, by_principal_point (n, 2, 2); parameter_jacobian (n, 2, k).
     """
 
     value: Array
@@ -42,10 +42,10 @@ class Correction:
 
 @dataclass(frozen=True)
 class Imaged:
-    """The image h (n, 2) of rays in mm about the principal point, and its derivatives.
+    """Image h (n, 2) of rays in mm relative to the principal point, and its derivatives.
 
-    by_ray (n, 2, 2); by_distance (n, 2), by c; by_parameter: gives that by one of the parameters (n, 2), for many of
-    them are never asked for.
+    ray_jacobian (n, 2, 2); by_distance (n, 2), with respect to c; parameter_derivative: returns the derivative (n, 2)
+    with respect to one parameter, on demand, since many are never needed.
     """
 
     value: Array
@@ -56,7 +56,7 @@ class Imaged:
 
 @dataclass(frozen=True)
 class DistortedRay:
-    """Rays (n, 2) as a lens bends them, and their derivatives as in `Imaged`."""
+    """Distorted rays (n, 2), and their derivatives as in `Imaged`."""
 
     value: Array
     ray_jacobian: Array
@@ -68,19 +68,19 @@ Image = Callable[[Settings, float, Array, Array], Imaged]  # of settings, c, ray
 
 
 def no_correction(_: Settings, xy: Array, __: Array, parameters: Array) -> Correction:
-    """Of the families that distort the ray, and of none."""
+    """Zero correction, of the object-side families and of `none`."""
     count = len(xy)
     nothing = [np.broadcast_to(0.0, (count, *shape)) for shape in ((2,), (2, 2), (2, 2), (2, len(parameters)))]
     return Correction(*nothing)
 
 
 def straight(ray: Array) -> DistortedRay:
-    """A ray that nothing bends."""
+    """Undistorted rays."""
     return DistortedRay(ray, np.broadcast_to(np.eye(2), (len(ray), 2, 2)), lambda _: np.broadcast_to(0.0, ray.shape))
 
 
 def ray_family(bent: Callable[[Array, Array], DistortedRay]) -> Image:
-    """The image of a ray that is bent before it is imaged at c."""
+    """Make the image function of a family that distorts the ray before it is imaged at c."""
 
     def image(_: Settings, c: float, ray: Array, parameters: Array) -> Imaged:
         at = bent(ray, parameters)
@@ -89,13 +89,13 @@ def ray_family(bent: Callable[[Array, Array], DistortedRay]) -> Image:
     return image
 
 
-undistorted = ray_family(lambda ray, _: straight(ray))  # of the families that correct the observed point, and of none
+undistorted = ray_family(lambda ray, _: straight(ray))  # of the image-side families and of `none`
 
 
 def ideal_point_family(correct: Correct) -> Image:
-    """The image of a ray whose ideal point gets what a formula of points about the principal point says there.
+    """Make the image function of a family that adds a correction to the ideal point.
 
-    It is added, where the same formula of the observed point is subtracted.
+    The same formula is subtracted where a family corrects the observed point.
     """
 
     def image(settings: Settings, c: float, ray: Array, parameters: Array) -> Imaged:

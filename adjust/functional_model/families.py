@@ -1,7 +1,7 @@
-"""The table of distortion families: their parameters and what they do to a point or a ray.
+"""Table of the distortion families: parameters and formulas.
 
-A family with an order is spelled with it: "legendre(3)". Whatever works with distortion asks this table: a new family
-is a formula with its derivatives and an entry here.
+The name of a family with an order includes the order: "legendre(3)". All code that handles distortion uses this table.
+A new family needs a formula with derivatives and an entry here.
 """
 
 import re
@@ -23,21 +23,27 @@ from adjust.functional_model.correction import (
     undistorted,
 )
 
-LEGENDRE_ORDERS = range(2, 10)  # from 2, the degree of the tilts that are left out, to one digit an index
+LEGENDRE_ORDERS = range(2, 10)  # from 2, the degree of the omitted tilts, to 9, so that an index has one digit
 FOURIER_ORDERS = range(1, 10)
 
 
 @dataclass(frozen=True)
 class Family:
-    """A distortion family.
+    """Distortion family.
 
-    parameters: their names; units: theirs, mm where none is said. image, of the object side: what it makes of a ray.
-    correct, of the image side: what is subtracted from the observed point. needs: the setting that it cannot do
-    without. y_down: parameters of a family whose axes are x right, y down, that would have the other sign with y up.
-    groups: the parameters that are one cause, or of one degree, by its name. ladder: what a choice of a model tries of
-    it, simplest first. alike_at_zero: parameters that do the same as others while they are 0; apart(parameters):
-    others, of nearly the same distortion, with which they do not. is_pinhole_at_zero: whether it leaves every point
-    where it is while all parameters are 0.
+    Attributes
+    ----------
+    parameters : names of the parameters.
+    image : image of a ray (object-side families).
+    correct : correction subtracted from the observed point (image-side families).
+    units : units of the parameters; empty: mm.
+    needs : name of a required setting of `Distortion`.
+    y_down : parameters defined with y down that would change sign with y up.
+    groups : (name, parameters) of one physical cause or one degree.
+    ladder : parameter sets for model selection, simplest first.
+    alike_at_zero : parameters whose derivatives equal those of others while they are 0.
+    apart : returns parameters of nearly the same distortion at which those derivatives differ.
+    is_pinhole_at_zero : whether there is no distortion while all parameters are 0.
     """
 
     parameters: tuple[str, ...] = ()
@@ -119,12 +125,12 @@ _WITH_ORDER: dict[str, tuple[range, Callable[[int], Family]]] = {
     "legendre": (LEGENDRE_ORDERS, lambda order: _polynomials(polynomial_sets.legendre(order))),
     "fourier": (FOURIER_ORDERS, _fourier),
 }
-EXTENDED = "+"  # behind a family's name: with the added terms, by which an adjustment tests what the family lacks
+EXTENDED = "+"  # suffix of a family with the added terms, which test whether the family lacks any
 FAMILY_NAMES = (*_FAMILIES, *(f"{name}(n)" for name in _WITH_ORDER))
 
 
 def _extended(of: Family) -> Family:
-    """A family with the added terms behind its own parameters."""
+    """Append the added terms to a family's parameters."""
     count = len(of.parameters)
     units = of.units or ("mm",) * count
     return replace(
@@ -140,7 +146,7 @@ def _extended(of: Family) -> Family:
 
 @lru_cache
 def family(name: str) -> Family:
-    """The family of a name. Raises ValueError for a name or an order that there is not."""
+    """Return a family by name. Raises ValueError for an unknown name or order."""
     if name in _FAMILIES:
         return _FAMILIES[name]
     if name.endswith(EXTENDED):
@@ -156,5 +162,5 @@ def family(name: str) -> Family:
 
 
 def parameter_names(name: str) -> tuple[str, ...]:
-    """The parameters of a family, in their order. Raises ValueError for a name that there is not."""
+    """Parameter names of a family in order. Raises ValueError for an unknown family."""
     return family(name).parameters

@@ -1,8 +1,9 @@
-"""The formulas of the film transformations, each with its derivatives and its inverse.
+"""Formulas of the film transformations, with derivatives and inverses.
 
-Parameters (..., k) go with coordinates (..., 2). The columns of a polynomial about a far origin are all but dependent,
-so that the adjustment moves centred parameters: those of the same formula in (x - center) / half, with the middle and
-half the extent of what was observed in an image. `design` is the derivative by these, `centred_jacobian` leads back.
+Parameters (..., k) go with coordinates (..., 2). The columns of a polynomial around a distant origin are nearly
+dependent. The adjustment therefore estimates centred parameters: those of the same formula in (x - center) / half, with
+the centre and half the extent of the observations in an image. `design` holds the derivatives with respect to these,
+`centred_jacobian` converts back.
 """
 
 from abc import ABC, abstractmethod
@@ -16,43 +17,49 @@ from adjust.array_types import Array, Mask
 from adjust.linear_algebra.small_matrices import applied, determinant, solved
 
 NEWTON_STEPS = 30
-NEWTON_TOLERANCE = 1e-9  # of a coordinate: the error left is the square of the last step
+NEWTON_TOLERANCE = 1e-9  # fraction of a coordinate: the remaining error is the square of the last step
 
 
 class FilmKind(ABC):
-    """A formula for x', y' in x, y and its own parameters.
+    """Formula for x', y' in x, y and its parameters.
 
-    names: of the parameters, in their order; a1 and b1 are the constants.
+    names: parameter names in order; a1 and b1 are the constants.
     """
 
     names: tuple[str, ...]
 
     @abstractmethod
     def apply(self, parameters: Array, xy: Array) -> Array:
-        """The camera coordinates (..., 2) of comparator coordinates (..., 2)."""
+        """Compute camera coordinates (..., 2) from comparator coordinates (..., 2)."""
 
     @abstractmethod
     def gradient(self, parameters: Array, xy: Array) -> Array:
-        """Their derivative (..., 2, 2) by the comparator coordinates."""
+        """Derivatives (..., 2, 2) of the camera coordinates with respect to the comparator coordinates."""
 
     @abstractmethod
     def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
-        """Their derivative (..., 2, k) by the centred parameters; center (..., 2), half (...)."""
+        """Derivatives (..., 2, k) of the camera coordinates with respect to the centred parameters.
+
+        center (..., 2), half (...).
+        """
 
     @abstractmethod
     def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
-        """Derivative (..., k, k) of the parameters by the centred ones."""
+        """Derivatives (..., k, k) of the parameters with respect to the centred parameters."""
 
     @property
     def is_linear(self) -> bool:
-        """Whether it is linear in the coordinates."""
+        """Whether the formula is linear in the coordinates."""
         return False
 
     def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
-        """The comparator coordinates (n, 2), and which of them lie where the formula does not fold over.
+        """Compute comparator coordinates (n, 2) from camera coordinates, and the mask of those found.
 
-        center (2,) or (n, 2): a place in the middle of the image, from which the formula must be regular to the point.
-        By Newton's method from there; found is what it comes to with the orientation that the film has at the centre.
+        Notes
+        -----
+        Newton's method starts at center (2,) or (n, 2), a place in the middle of the image. A point is found where the
+        iteration converges and the determinant of the derivatives has the sign that it has at the centre, so that the
+        formula does not fold over.
         """
         steps = 1 if self.is_linear else NEWTON_STEPS
         xy = np.broadcast_to(center, camera_xy.shape).astype(np.float64)
@@ -73,7 +80,7 @@ class FilmKind(ABC):
 
 
 def least_marks(kind: FilmKind) -> int:
-    """How many marks, of two coordinates each, determine the parameters of a formula."""
+    """Number of marks, of two coordinates each, needed to determine the parameters of a formula."""
     return (len(kind.names) + 1) // 2
 
 
@@ -103,7 +110,7 @@ class Identity(FilmKind):
 class Polynomial(FilmKind):
     """x' = sum of a_k x^p_k y^q_k, y' = sum of b_k x^p_k y^q_k; exponents (p_k, q_k), the constant first.
 
-    mixing (2 t, k): the coefficients a, b of t terms by the parameters, the columns orthogonal.
+    mixing (2 t, k): derivatives of the coefficients a, b of t terms with respect to the parameters, orthogonal columns.
     """
 
     names: tuple[str, ...]
@@ -143,7 +150,7 @@ class Polynomial(FilmKind):
         return max(p + q for p, q in self.exponents)
 
     def _terms(self, xy: Array, by: int | None = None) -> Array:
-        """The monomials (..., terms), or their derivatives by x (0) or y (1)."""
+        """Monomials (..., terms), or their derivatives with respect to x (0) or y (1)."""
         powers = [np.ones_like(xy)]
         for _ in range(self._degree):
             powers.append(powers[-1] * xy)
@@ -164,13 +171,13 @@ class Polynomial(FilmKind):
 
 
 def polynomial(exponents: tuple[tuple[int, int], ...]) -> Polynomial:
-    """With free coefficients."""
+    """Make a polynomial with free coefficients."""
     names = tuple(f"{axis}{k}" for axis in "ab" for k in range(1, len(exponents) + 1))
     return Polynomial(names, exponents, np.eye(len(names)))
 
 
 def whole_polynomial(order: int) -> Polynomial:
-    """With all terms up to a total degree."""
+    """Make a polynomial with all terms up to a total degree."""
     return polynomial(tuple((degree - q, q) for degree in range(order + 1) for q in range(degree + 1)))
 
 
@@ -184,7 +191,7 @@ def conformal(order: int, mirrored: bool, names: tuple[str, ...]) -> Polynomial:
 
 @dataclass(frozen=True)
 class Congruent(FilmKind):
-    """A turn, a shift and, known beforehand, a mirror: a similarity with p, q the cosine and sine of the angle."""
+    """Rotation, shift and a known mirroring: a similarity with p, q the cosine and sine of the angle."""
 
     mirrored: bool
     names: tuple[str, ...] = ("a1", "b1", "angle")
@@ -211,7 +218,7 @@ class Congruent(FilmKind):
         return result
 
     def _turn(self, parameters: Array, further: float = 0.0) -> Array:
-        """The turn's matrix; its derivative is that of a right angle further."""
+        """Rotation matrix. Its derivative is the matrix of the angle plus a right angle."""
         c, s = np.cos(parameters[..., 2] + further), np.sin(parameters[..., 2] + further)
         m = -1.0 if self.mirrored else 1.0
         return np.stack([np.stack([c, -m * s], axis=-1), np.stack([s, m * c], axis=-1)], axis=-2)
@@ -243,7 +250,7 @@ class Projective(FilmKind):
         return design / centred[..., None, None]
 
     def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
-        """With d(center) the factor between both numerators, of which d(0) = 1 takes the derivative along."""
+        """Derivatives (..., 8, 8); the numerators differ by the factor d(center), and d(0) = 1 adds its derivative."""
         factor = self._denominator(parameters, center)[..., None]
         result = np.zeros((*np.shape(half), 8, 8))
         size = half[..., None]
@@ -269,7 +276,7 @@ class Projective(FilmKind):
 
 
 def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
-    """The solutions (n, 2) of 2x2 systems (n, 2, 2), and which matrices (n,) are regular."""
+    """Solutions (n, 2) of 2x2 systems (n, 2, 2), and the mask (n,) of regular matrices."""
     of = determinant(matrix)
     regular = np.isfinite(of) & (of != 0.0)
     return solved(matrix, right, regular, of), regular

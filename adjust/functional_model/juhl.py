@@ -14,7 +14,7 @@ TANGENTIAL_POWER = 1.85  # the tangential deformation grows with r to this power
 
 
 def juhl(settings: Settings, xy: Array, _: Array, parameters: Array) -> Correction:
-    """Juhl's tangential, radial and affine deformations about the camera's origin, in um at 1 dm."""
+    """Juhl's tangential, radial and affine deformations around the camera's origin, in µm at 1 dm."""
     t, (r1, r2, r3), (af, sh) = parameters[:4], parameters[4:7], parameters[7:]
     x, y = xy.T / MM_PER_DM
     radius = np.sqrt(x**2 + y**2 + np.finfo(float).tiny)  # the deformations and their derivatives vanish at 0
@@ -36,7 +36,7 @@ def juhl(settings: Settings, xy: Array, _: Array, parameters: Array) -> Correcti
         + r2 * (np.sin(phase) ** 2 + phase * np.sin(2 * phase))
         + r3 * 2 * np.pi / r0 * np.cos(2 * phase)
     )
-    # In polar coordinates: d/dxy = d/dradius along' - d/dangle across' / radius; the angle turns along to -across.
+    # Polar coordinates: d/dxy = d/dradius along' - d/dangle across' / radius; d along / d angle = -across.
     gradient = tangential_by_radius[:, None] * along - tangential_over_radius_by_angle[:, None] * across
     xy_jacobian = (
         across[:, :, None] * gradient[:, None, :]

@@ -1,11 +1,12 @@
-"""A lens: its distortion family with settings and priors, and with values the way between observed points and rays.
+"""Lens: distortion family with settings and priors; observed image points from rays and back.
 
-Every family is one pair of equations between the observed point (x', y') and the ideal ray (u, v) = (-U/W, -V/W):
+Every family is one pair of condition equations between the observed point (x', y') and the ideal ray
+(u, v) = (-U/W, -V/W):
 
     F = (x', y') - (x0', y0') - h(u, v, c) - d(x', y') = 0
 
-Families of the object side make an image h of the ray (d is 0), those of the image side correct the observed point by
-d (h is c times the ray). All arrays may be complex: the derivatives are tested by complex steps. Lengths in mm.
+Object-side families distort the ray (h; d = 0). Image-side families correct the observed point (d; h is c times the
+ray). All arrays may be complex: the derivatives are tested by complex steps. Lengths in mm.
 """
 
 from collections.abc import Mapping
@@ -28,7 +29,7 @@ NEWTON_TOLERANCE = 1e-14  # of the principal distance
 
 @dataclass(frozen=True)
 class Prior:
-    """A quantity as it is known beforehand: its value and the value's standard deviation (0 fixed, inf free)."""
+    """Prior of a quantity: value and standard deviation (0 fixed, inf free)."""
 
     value: float
     sigma: float = 0.0
@@ -42,11 +43,20 @@ class Prior:
 
 @dataclass(frozen=True)
 class Distortion:
-    """A distortion family, a name in `functional_model.families`, and its parameters; one not named is fixed at 0.
+    """Distortion family with the priors of its parameters and its settings.
 
-    decentering "paper": Torlegård's decentering terms with x', y' as printed and not reduced to the principal point.
-    r0_mm: radius of zero radial distortion of `torlegard`, of a period of `juhl`.
-    half_mm: half the frame in x' and y', the length 1 of `ebner`, `gruen`, `legendre(n)` and `fourier(n)`; 0 not given.
+    Attributes
+    ----------
+    family : str
+        Name in `functional_model.families`.
+    parameters : mapping of str to Prior
+        A parameter that is missing is fixed at 0.
+    decentering : {"reduced", "paper"}
+        "paper": Torlegård's decentering terms with x', y' as printed, not reduced to the principal point.
+    r0_mm : float
+        Radius of zero radial distortion of `torlegard`; period of `juhl`.
+    half_mm : (float, float)
+        Half the frame in x' and y', the unit length of `ebner`, `gruen`, `legendre(n)` and `fourier(n)`; 0: not given.
     """
 
     family: str = "none"
@@ -56,7 +66,7 @@ class Distortion:
     half_mm: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        parameter_names(self.family)  # refuses a family that there is not
+        parameter_names(self.family)  # raises ValueError for an unknown family
         if self.decentering not in get_args(Decentering):
             raise ValueError(f'the decentering must be "reduced" or "paper", not {self.decentering}')
         if not 0.0 <= self.r0_mm < np.inf:
@@ -66,17 +76,23 @@ class Distortion:
 
     @property
     def values(self) -> Array:
-        """(k,) what is given of the family's parameters, 0 where nothing is."""
+        """(k,) prior values of the family's parameters, 0 where none is given."""
         given = self.parameters
         return np.array([given[name].value if name in given else 0.0 for name in parameter_names(self.family)])
 
 
 @dataclass(frozen=True)
 class ImageEquations:
-    """F (n, 2) in mm of points with the image of their ray and their correction, at a principal distance.
+    """Misclosures F (n, 2) in mm of the condition equations of n points, and their derivatives.
 
-    Its derivatives are those by the observed point xy (n, 2, 2), the ray (n, 2, 2), the interior orientation c, x0',
-    y0' (n, 2, 3) and the family's parameters (n, 2, k).
+    The derivatives are with respect to the observed point xy (n, 2, 2), the ray (n, 2, 2), the interior orientation c,
+    x0', y0' (n, 2, 3) and the family's parameters (n, 2, k).
+
+    Attributes
+    ----------
+    value : (n, 2) misclosures in mm.
+    imaged : images of the rays.
+    correction : corrections of the observed points.
     """
 
     value: Array
@@ -103,7 +119,7 @@ class ImageEquations:
         )
 
     def quantity_derivative(self, k: int) -> Array:
-        """Derivative (n, 2) by c, x0', y0' or a parameter of the family, in this order."""
+        """Derivative (n, 2) with respect to quantity k: c, x0', y0', then the family's parameters."""
         if k == 0:
             return -self.imaged.by_distance
         if k < 3:
@@ -113,10 +129,13 @@ class ImageEquations:
 
 @dataclass(frozen=True)
 class Displacement:
-    """What a lens does to points: observed less ideal place (n, 2) in µm, and its derivatives (n, 2, 1 + k) by c and
-    the parameters.
+    """Distortion of n points: observed minus ideal place.
 
-    imaged (n,): which points the lens shows anything at; the others are nan, the derivatives 0.
+    Attributes
+    ----------
+    value_um : (n, 2) distortion in µm; nan where the point has no ray.
+    by_unknowns_um : (n, 2, 1 + k) derivatives with respect to c and the parameters; 0 where the point has no ray.
+    imaged : (n,) mask of the points that have a ray.
     """
 
     value_um: Array
@@ -126,18 +145,18 @@ class Displacement:
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A lens with its values.
+    """Lens: distortion family, interior orientation and values of the parameters.
 
     Attributes
     ----------
     distortion : Distortion
-        The family and its settings; its priors have no part in what the lens does.
+        The family and its settings. Its priors are not used here.
     interior : Array (3,)
         Principal distance c and principal point x0', y0' in mm.
     parameters : Array (k,)
-        Of the distortion, in the order of `families.parameter_names`, in their own units.
+        Parameters of the distortion, in the order of `families.parameter_names`, in their own units.
     covariance : Array (3 + k, 3 + k)
-        Of interior orientation and parameters; empty where it is not known.
+        Covariance of interior orientation and parameters; empty where unknown.
     """
 
     distortion: Distortion
@@ -147,51 +166,51 @@ class Lens:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """The names of c, x0', y0' and the parameters."""
+        """Names of c, x0', y0' and the parameters."""
         return (*INTERIOR_NAMES, *parameter_names(self.distortion.family))
 
     @property
     def values(self) -> Array:
-        """(3 + k,) of the quantities."""
+        """(3 + k,) values of the quantities."""
         return np.concatenate([self.interior, self.parameters])
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether the parameters leave every point where it is."""
+        """Whether the lens has no distortion."""
         return family(self.distortion.family).is_pinhole_at_zero and not self.parameters.any()
 
     def replaced_values(self, values: Array) -> "Lens":
-        """The lens with other values (3 + k,) of its quantities."""
+        """Return the lens with other values (3 + k,) of its quantities."""
         return replace(self, interior=values[:3].copy(), parameters=values[3:].copy())
 
     def image(self, ray: Array) -> Imaged:
-        """The images of rays (n, 2) about the principal point, before the correction of the observed point."""
+        """Image rays (n, 2) relative to the principal point, before the correction of the observed point."""
         with np.errstate(over="ignore", invalid="ignore"):
             return family(self.distortion.family).image(self.distortion, self.interior[0], ray, self.parameters)
 
     def equations(self, xy_mm: Array, ray: Array) -> ImageEquations:
-        """The pair of equations of observed camera points (n, 2) and their rays (n, 2), -U/W and -V/W."""
+        """Evaluate the condition equations of observed camera points (n, 2) in mm and rays (n, 2), -U/W and -V/W."""
         of = family(self.distortion.family)
         return self.equations_with_image(xy_mm, of.image(self.distortion, self.interior[0], ray, self.parameters))
 
     def equations_with_image(self, xy_mm: Array, imaged: Imaged) -> ImageEquations:
-        """The pair of equations of points whose rays' images are known."""
+        """Evaluate the condition equations of observed camera points (n, 2) and imaged rays."""
         correct = family(self.distortion.family).correct
         correction = correct(self.distortion, xy_mm, self.interior[1:], self.parameters)
         return ImageEquations(xy_mm - self.interior[1:] - imaged.value - correction.value, imaged, correction)
 
     def camera_from_ray(self, ray: Array) -> tuple[Array, Mask]:
-        """The observed camera coordinates (n, 2) in mm of rays (n, 2), and which of them (n,) were found.
+        """Compute the observed camera coordinates (n, 2) in mm of rays (n, 2), and the mask (n,) of those found.
 
         Notes
         -----
-        The correction is defined at the observed point, so that it is inverted by Newton's method. Where the distortion
-        folds the image over, which a polynomial does far enough outside, nothing is found.
+        The correction is a function of the observed point and is inverted by Newton's method. No point is found where
+        the distortion folds the image over, as a polynomial does far enough outside the frame.
         """
         return self.camera_from_image(self.image(ray))
 
     def camera_from_image(self, imaged: Imaged) -> tuple[Array, Mask]:
-        """As `camera_from_ray`, of rays whose images are known."""
+        """Do the same as `camera_from_ray` for rays that are imaged already."""
         c, principal_point = self.interior[0], self.interior[1:]
         correct = family(self.distortion.family).correct
         found = np.zeros(len(imaged.value), dtype=bool)
@@ -211,7 +230,7 @@ class Lens:
         return xy_mm, found
 
     def ideal_from_observed(self, xy_mm: Array) -> tuple[Array, Mask]:
-        """Camera coordinates (n, 2) in mm free of distortion, of observed ones (n, 2); which were found."""
+        """Remove the distortion from observed camera coordinates (n, 2) in mm; also return the mask of those found."""
         if self.is_pinhole:
             return xy_mm, np.asarray(np.isfinite(xy_mm).all(axis=1))
         ray = (xy_mm - self.interior[1:]) / self.interior[0]
@@ -227,12 +246,12 @@ class Lens:
         return self.interior[1:] + self.interior[0] * ray, found
 
     def ray_from_observed(self, xy_mm: Array) -> tuple[Array, Mask]:
-        """Rays (n, 2), -U/W and -V/W, of observed camera coordinates (n, 2) in mm; which were found."""
+        """Compute rays (n, 2), -U/W and -V/W, of observed camera coordinates (n, 2) in mm; mask of those found."""
         ideal_mm, found = self.ideal_from_observed(xy_mm)
         return (ideal_mm - self.interior[1:]) / self.interior[0], found
 
     def folded_over(self, xy_mm: Array) -> Mask:
-        """Which observed camera points (n, 2) in mm lie beyond where the distortion turns the image back on itself."""
+        """Mask of observed camera points (n, 2) in mm that lie where the distortion folds the image over."""
         ray, found = self.ray_from_observed(xy_mm)
         if self.is_pinhole:
             return ~found
@@ -242,11 +261,11 @@ class Lens:
         return ~(found & _unfolded(sides[0]) & _unfolded(sides[1]))
 
     def displacement(self, from_principal_point_mm: Array) -> Displacement:
-        """What the lens does at observed points (n, 2), counted from the principal point, mm.
+        """Compute the distortion at observed points (n, 2) in mm relative to the principal point.
 
         Notes
         -----
-        By the implicit function theorem: F(point, ray, unknowns) = 0 gives the ray's derivatives.
+        The ray's derivatives follow from F(point, ray, unknowns) = 0 by the implicit function theorem.
         """
         c, principal_point = self.interior[0], self.interior[1:]
         xy_mm = principal_point + from_principal_point_mm
@@ -262,12 +281,12 @@ class Lens:
 
 
 def _newton_step(by_unknown: Array, value: Array) -> tuple[Array, Mask]:
-    """Steps (n, 2), and which points (n,) have neighbours that are imaged on the right side of them."""
+    """Newton steps (n, 2), and the mask (n,) of points where the orientation of the image is kept."""
     side = determinant(by_unknown)
     regular = _unfolded(side)
     return solved(by_unknown, value, regular, side), regular
 
 
 def _unfolded(side: Array) -> Mask:
-    """Which determinants (n,) tell that the image's orientation is kept."""
+    """Mask of determinants (n,) that are finite and positive: the image is not folded over."""
     return np.asarray(np.isfinite(side) & (side > 0.0))

@@ -1,8 +1,8 @@
-"""A lens in the words of another distortion family: the same one where the families mean the same, else the nearest.
+"""Convert a lens to another distortion family: exactly where the families are equivalent, else by least squares.
 
-Both are given the same rays. The principal distance, the principal point and the other family's parameters are fitted
-to where the lens images these, over the frame; the orientations of images stay what they are. Families that mean the
-same leave nothing, whatever their formulas, and no list of pairs is needed.
+Both lenses get the same rays. Principal distance, principal point and the parameters of the target family are fitted to
+the image points of the source lens over the frame; exterior orientations do not change. Equivalent families leave no
+residuals, whatever their formulas, so that no list of equivalent pairs is needed.
 """
 
 from collections.abc import Sequence
@@ -15,19 +15,23 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Lens
 
-SAME = 1e-9  # of the principal distance: what two descriptions of one lens may differ by, of rounding
+SAME = 1e-9  # fraction of the principal distance: largest rounding difference of two equivalent descriptions
 _GRID = 25  # points a side of the grid over the frame
 _STEPS = 60
-_STEP = 1e-13  # of the principal distance, in the image, below which the fit stands still
-_RELATED = 1e-6  # of what one parameter does, in the image, from which on another follows it
+_STEP = 1e-13  # fraction of the principal distance: a step with less effect in the image means convergence
+_RELATED = 1e-6  # fraction of a source parameter's effect in the image: a parameter that changes by more depends on it
 
 
 @dataclass(frozen=True)
 class ConvertedLens:
-    """lens: in the other family, its covariance propagated from that of the source, exact where both say the same.
+    """Result of a conversion.
 
-    estimated: the parameters that were fitted, the others are 0. by_source (3 + k, 3 + m): derivatives of the lens's
-    values by those of the source. largest_mm, rms_mm: over the frame, what is left between the two, rms a point.
+    Attributes
+    ----------
+    lens : lens in the target family, its covariance propagated from the source; exact for equivalent families.
+    estimated : names of the fitted parameters.
+    by_source : (3 + k, 3 + m) derivatives of the lens's values with respect to those of the source.
+    largest_mm, rms_mm : largest and rms residual of a point over the frame.
     """
 
     lens: Lens
@@ -38,7 +42,7 @@ class ConvertedLens:
 
     @property
     def is_same(self) -> bool:
-        """Whether both say the same, to rounding."""
+        """Whether both lenses agree to rounding."""
         return self.largest_mm <= SAME * float(self.lens.interior[0])
 
 
@@ -50,31 +54,31 @@ def convert_lens(
     uncertain: Sequence[str] = (),
     held: Sequence[str] = (),
 ) -> ConvertedLens:
-    """A lens in another family, over a rectangle of the camera frame.
+    """Convert a lens to another family over a rectangle of the camera frame.
 
     Parameters
     ----------
     source : Lens
-        The lens that is converted.
+        Lens to convert.
     into : Distortion
-        The other family and its settings, such as r0, and its parameters where they are not to begin at 0: those that
-        are not estimated stay there.
+        Target family and its settings, such as r0, and initial values of parameters that do not start at 0. Parameters
+        that are not estimated keep these values.
     corners_mm : Array (2, 2)
         Two opposite corners of the rectangle.
     estimated : sequence of str, optional
-        Which of the family's parameters; by default the usual ones, with affinity and shear where they bring something,
-        less those that are 0 and stay it whatever the uncertain parameters of the source are.
+        Parameters of the target family to fit. Default: the usual ones, with affinity and shear where these at least
+        halve the rms, without those that stay 0 whatever the uncertain parameters of the source are.
     uncertain : sequence of str
-        Parameters of the source that have a standard deviation.
+        Quantities of the source that have a standard deviation.
     held : sequence of str
         Which of c, x0 and y0 are not estimated.
 
     Raises
     ------
     AdjustmentError
-        Where the lens has no image there or no fit stands still.
+        If the source has no rays in most of the frame, or the fit does not converge.
     ValueError
-        For a parameter that there is not.
+        For an unknown parameter.
     """
     rays = _Rays.from_lens(source, corners_mm)
     if estimated is not None:
@@ -89,14 +93,14 @@ def convert_lens(
 
 
 def frame_grid_mm(corners_mm: Array) -> Array:
-    """Camera points (n, 2) over the rectangle between two opposite corners (2, 2)."""
+    """Grid of camera points (n, 2) over the rectangle between two opposite corners (2, 2), mm."""
     along = np.linspace(0.0, 1.0, _GRID)
     fractions = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     return np.asarray(corners_mm[0] + fractions * (corners_mm[1] - corners_mm[0]))
 
 
 def _usual(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The parameters that a family is mostly used with, and with these its affinity and shear."""
+    """Usual parameters of a family, and the same with affinity and shear."""
     own_family = family(name)
     usual = tuple(own_family.ladder[-1].split()) if own_family.ladder else own_family.parameters
     affinity = dict(own_family.groups).get("affinity", ())
@@ -105,7 +109,7 @@ def _usual(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays (n, 2), where the source images them (n, 2), and the derivatives (n, 2, 3 + m) of that by the source."""
+    """Rays (n, 2), their image points (n, 2) in the source, and the derivatives (n, 2, 3 + m) of these."""
 
     source: Lens
     rays: Array
@@ -151,7 +155,7 @@ class _Rays:
         )
 
     def _linearised(self, lens: Lens, columns: list[int]) -> tuple[Array, Array]:
-        """How far (n, 2) the other lens misses the observed places, and the derivatives (2 n, k) of that."""
+        """Misfit (n, 2) of the target lens at the observed places, and its derivatives (2 n, k)."""
         at = lens.equations(self.observed_mm, self.rays)
         by = np.stack([at.quantity_derivative(k) for k in columns], axis=2)
         misfit, design = (np.asarray(np.linalg.solve(at.xy_jacobian, each)) for each in (at.value[..., None], by))
@@ -169,7 +173,7 @@ class _Rays:
         return ConvertedLens(lens, estimated, by_source, float(left_mm.max()), rms_mm)
 
     def needed(self, found: ConvertedLens, uncertain: Sequence[int]) -> tuple[str, ...]:
-        """Its parameters without those that do nothing at their values, nor where these columns of the source move."""
+        """Names of the parameters that have an effect at their values or depend on uncertain columns of the source."""
         lens = found.lens
         at = lens.equations(self.observed_mm, self.rays)
         per_unit = np.abs(at.parameter_jacobian).max(axis=(0, 1))
@@ -181,7 +185,7 @@ class _Rays:
 
 
 def _least_squares(design: Array, right: Array) -> Array:
-    """(k, j) of columns that are brought to one size; a column that does nothing gets 0."""
+    """Least-squares solution (k, j) with scaled columns; a zero column gets 0."""
     scale = np.linalg.norm(design, axis=0)
     scale[scale == 0.0] = 1.0
     return np.asarray(np.linalg.lstsq(design / scale, right, rcond=1e-14)[0] / scale[:, None])

@@ -1,9 +1,10 @@
-"""Where a point appears from a station: straight ahead, or over a curved earth and through the atmosphere.
+"""Lines of sight from stations to points: straight, or with earth curvature and atmospheric refraction.
 
-Map coordinates X, Y and heights Z are laid out on a sphere; the axes at a station are those of the map there, its
-vertical the sphere's. The refracted line of sight meets the film as a straight one would that leads to a point a little
-higher. The air is the ICAO standard atmosphere, heights above sea in m: temperature falls by 6.5 K/km up to 11 km and
-is constant above; dry air, refractivity by Edlén (1966) at 0.55 um; from 0.4 to 0.7 um it differs by less than 2 %.
+Map coordinates X, Y and heights Z refer to a sphere; the axes at a station are those of the map there, its vertical
+that of the sphere. Refraction is modelled by raising the point: the refracted line of sight is a straight one to a
+point a little higher. The air is the ICAO standard atmosphere, heights above sea in m: temperature falls by 6.5 K/km up
+to 11 km and is constant above; dry air, refractivity by Edlén (1966) at 0.55 um; from 0.4 to 0.7 um it differs by less
+than 2 %.
 """
 
 from dataclasses import dataclass
@@ -12,21 +13,23 @@ import numpy as np
 
 from adjust.array_types import Array
 
-EARTH_RADIUS_M = 6.371e6  # mean; the local one differs by half a percent, and the curvature with it
-SMALL_RAD = 1e-2  # angle at the earth's centre below which a series is exact
+EARTH_RADIUS_M = 6.371e6  # mean radius; the local radius, and thus the curvature, differs by up to half a percent
+SMALL_RAD = 1e-2  # angle at the earth's centre below which the series expansion is exact
 SEA_LEVEL_K, SEA_LEVEL_HPA = 288.15, 1013.25
 LAPSE_K_PER_M, TROPOPAUSE_M = 0.0065, 11000.0
-GRAVITY_M_PER_S2, GAS_CONSTANT = 9.80665, 287.05287  # the latter of dry air, J/(kg K)
+GRAVITY_M_PER_S2, GAS_CONSTANT = 9.80665, 287.05287  # gas constant of dry air, J/(kg K)
 REFRACTIVITY_K_PER_HPA = 2.7782e-4 * SEA_LEVEL_K / SEA_LEVEL_HPA  # (n - 1) T / p
-LEVEL_M = 1.0  # heights that differ by less count as equal
+LEVEL_M = 1.0  # heights that differ by less are taken as equal
 
 
 @dataclass(frozen=True)
 class LineOfSight:
-    """What bends the lines of sight of aerial frames; a straight line by default.
+    """Model of the lines of sight of aerial images; straight by default.
 
-    curvature: X, Y are map coordinates, true to scale at the height Z = 0, and Z heights above the curved earth.
-    refraction: in the standard atmosphere; Z are heights above sea. unit_m: metres of the object unit.
+    curvature: apply earth curvature; X, Y are map coordinates, true to scale at the height Z = 0, and Z heights above
+    the curved earth.
+    refraction: apply refraction in the standard atmosphere; Z are heights above sea.
+    unit_m: length of the object unit in m.
     """
 
     curvature: bool = False
@@ -43,9 +46,9 @@ STRAIGHT = LineOfSight()
 
 @dataclass(frozen=True)
 class SightVectors:
-    """Vectors (n, 3) from stations to points as these appear, in object units and along the axes of the map.
+    """Vectors (n, 3) from stations to apparent points, in object units and along the axes of the map.
 
-    by_station, by_point (n, 3, 3): their derivatives by the coordinates of both.
+    by_station, by_point (n, 3, 3): derivatives with respect to the coordinates of station and point.
     """
 
     vector: Array
@@ -54,7 +57,7 @@ class SightVectors:
 
 
 def sight_vectors(setting: LineOfSight, station: Array, xyz: Array) -> SightVectors:
-    """Points (n, 3) as they appear from stations (3,) or (n, 3)."""
+    """Compute the vectors from stations (3,) or (n, 3) to the apparent places of points (n, 3)."""
     stations = np.broadcast_to(station, xyz.shape)
     apparent = _over_the_sphere(setting.unit_m, stations, xyz) if setting.curvature else _straight(stations, xyz)
     return _refracted(setting.unit_m, stations, xyz, apparent) if setting.refraction else apparent
@@ -87,14 +90,14 @@ def _over_the_sphere(unit_m: float, stations: Array, xyz: Array) -> SightVectors
 
 
 def _sinc_slope(angle: Array) -> Array:
-    """The derivative of sin(a) / a, over a."""
+    """Derivative of sin(a) / a, divided by a."""
     small = angle < SMALL_RAD
     a = np.where(small, 1.0, angle)
     return np.where(small, -1.0 / 3.0 + angle**2 / 30.0, (np.cos(a) - np.sinc(a / np.pi)) / a**2)
 
 
 def _refracted(unit_m: float, stations: Array, xyz: Array, apparent: SightVectors) -> SightVectors:
-    """Points are seen higher by the coefficient times the square of their distance."""
+    """Raise the points by the refraction coefficient times the square of their distance."""
     air = bending(unit_m * stations[:, 2], unit_m * xyz[:, 2])
     coefficient = unit_m * air.coefficient
     square = (apparent.vector**2).sum(axis=1)
@@ -117,7 +120,7 @@ def _refracted(unit_m: float, stations: Array, xyz: Array, apparent: SightVector
 
 @dataclass(frozen=True)
 class Bending:
-    """By how much lines of sight bend: coefficient (n,) in 1/m, and its derivatives (n,) by both heights in 1/m²."""
+    """Refraction coefficients (n,) in 1/m, and their derivatives (n,) with respect to both heights in 1/m²."""
 
     coefficient: Array
     by_station: Array
@@ -125,9 +128,9 @@ class Bending:
 
 
 def bending(station_m: Array, point_m: Array) -> Bending:
-    """How lines of sight bend between heights (n,) of stations and of points.
+    """Compute the refraction between heights (n,) of stations and points.
 
-    A point at the slant distance s is seen higher by coefficient times s². With N = n - 1 at the station and the mean
+    A point at the slant distance s appears higher by coefficient times s². With N = n - 1 at the station and the mean
     of N between both heights, the angle of refraction is K tan(nadir angle), K = mean - N (Schut, Photogrammetric
     refraction, 1969; Saastamoinen 1972), and the coefficient K over the difference of heights. The mean needs no
     quadrature: N is proportional to the density, whose integral is the difference of the pressures over gravity.
@@ -145,7 +148,7 @@ def bending(station_m: Array, point_m: Array) -> Bending:
 
 
 def _air(height_m: Array) -> tuple[Array, Array, Array]:
-    """Pressure in hPa, N = n - 1 and its derivative by the height in 1/m."""
+    """Pressure in hPa, N = n - 1 and its derivative with respect to the height in 1/m."""
     below = height_m < TROPOPAUSE_M
     temperature = SEA_LEVEL_K - LAPSE_K_PER_M * np.minimum(height_m, TROPOPAUSE_M)
     exponent = GRAVITY_M_PER_S2 / (GAS_CONSTANT * LAPSE_K_PER_M)

@@ -1,8 +1,7 @@
-"""OpenCV's models, which distort the ideal ray.
+"""OpenCV's distortion models, which distort the ideal ray.
 
-Sources: OpenCV's documentation of camera calibration ("detailed description") and of its name space fisheye. Their axes
-are x right and y DOWN, those of the camera here have y up. The parameters keep OpenCV's values, so that they belong to
-its axes.
+Sources: OpenCV's documentation of camera calibration ("detailed description") and of its namespace fisheye. OpenCV's
+axes are x right and y DOWN, those of the camera here have y up. The parameters keep OpenCV's values, in its axes.
 """
 
 import numpy as np
@@ -12,7 +11,7 @@ from adjust.functional_model.correction import DistortedRay, straight
 from adjust.linear_algebra.small_matrices import applied, matrices, product, vectors
 
 OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "b1", "b2")
-OPENCV_DENOMINATOR = ("k4", "k5", "k6")  # at 0 their derivatives are those of k1, k2, k3 with the other sign
+OPENCV_DENOMINATOR = ("k4", "k5", "k6")  # at 0 their derivatives are those of k1, k2, k3 with opposite sign
 OPENCV_GROUPS = (
     ("radial", ("k1", "k2", "k3", "k4", "k5", "k6")),
     ("radial, denominator", OPENCV_DENOMINATOR),
@@ -21,7 +20,7 @@ OPENCV_GROUPS = (
     ("tilt", ("tau_x", "tau_y")),
     ("affinity", ("b1", "b2")),
 )
-OPENCV_Y_DOWN = ("p1", "s3", "s4", "tau_x", "b2")  # with y up they would have the other sign
+OPENCV_Y_DOWN = ("p1", "s3", "s4", "tau_x", "b2")  # would change sign with y up
 OPENCV_UNITS = (*["–"] * 12, "rad", "rad", "–", "–")
 FISHEYE_NAMES = ("k1", "k2", "k3", "k4", "b1", "b2")
 FISHEYE_GROUPS = (("radial", FISHEYE_NAMES[:4]), ("affinity", FISHEYE_NAMES[4:]))
@@ -30,7 +29,7 @@ CENTRAL = 1e-4  # tangents below which an angle and its tangent are expanded: th
 
 
 def opencv(ray: Array, parameters: Array) -> DistortedRay:
-    """The image of rays (n, 2) in the camera's axes, y up; the parameters are those of OpenCV's axes, y down.
+    """Distort rays (n, 2) given in the camera's axes, y up; the parameters are in OpenCV's axes, y down.
 
     tau_x, tau_y, the tilt of the sensor, in rad. b1 scales x and b2 shears it, as the camera matrix does: OpenCV's fx
     is c (1 + b1), its fy is c, the skew of Zhang's matrix is c b2, all over the pitch.
@@ -53,10 +52,10 @@ def opencv(ray: Array, parameters: Array) -> DistortedRay:
 
 
 def opencv_fisheye(ray: Array, parameters: Array) -> DistortedRay:
-    """The same of OpenCV's fisheye: theta (1 + k1 theta² + ... + k4 theta⁸) off the axis, theta being the ray's angle.
+    """Distort rays (n, 2) by OpenCV's fisheye model: theta (1 + k1 theta² + ... + k4 theta⁸), theta in rad.
 
-    In rad; equidistant where k1 to k4 are 0. As of every family, an image ends below 90 degrees off the axis. b1 and b2
-    as in `opencv`: OpenCV's alpha is b2 / (1 + b1).
+    The model is equidistant where k1 to k4 are 0. As with every family, an image ends below 90 degrees off the axis. b1
+    and b2 as in `opencv`: OpenCV's alpha is b2 / (1 + b1).
     """
     *k, b1, b2 = parameters
     x, y = (ray * DOWN).T
@@ -88,12 +87,14 @@ def opencv_fisheye(ray: Array, parameters: Array) -> DistortedRay:
 
 
 def _camera_axes(lens: DistortedRay, b1: float, b2: float, first: int) -> DistortedRay:
-    """What OpenCV's axes show of rays in them, stretched and sheared, in the camera's axes; first: the number of b1
-    among the parameters, b2 is the next."""
-    scale = np.array([1.0 + b1, -1.0]) + 0.0 * b2  # as complex as they are
+    """Apply affinity and shear to distorted rays in OpenCV's axes and convert them to the camera's axes.
+
+    first: index of b1 among the parameters; b2 is the next.
+    """
+    scale = np.array([1.0 + b1, -1.0]) + 0.0 * b2  # complex where b1 or b2 is
 
     def camera_axes(straight: Array) -> Array:
-        """Of vectors (2, ...) with the axes first."""
+        """Convert vectors (2, ...), the axes first."""
         sheared = (straight.T * scale).T
         if b2 != 0.0:
             sheared[0] += b2 * straight[1]
@@ -109,8 +110,7 @@ def _camera_axes(lens: DistortedRay, b1: float, b2: float, first: int) -> Distor
 
 
 def expanded(parameters: Array) -> Array:
-    """The parameters after numerator and denominator of the radial distortion are both multiplied by 1 + r²; what then
-    stands above the sixth power is left out."""
+    """Multiply numerator and denominator of the radial distortion by 1 + r²; powers above the sixth are dropped."""
     k = dict(zip(OPENCV_NAMES, parameters, strict=True))
     for names in (("k1", "k2", "k3"), OPENCV_DENOMINATOR):
         lower = [1.0, *(k[name] for name in names[:-1])]
@@ -159,7 +159,7 @@ def _lens(ray: Array, parameters: Array) -> DistortedRay:
 
 
 def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
-    """The point on a sensor that is tilted about its axes: R33 (r1 p / r3 p, r2 p / r3 p) - (R13, R23).
+    """Project points onto a sensor that is tilted around its axes: R33 (r1 p / r3 p, r2 p / r3 p) - (R13, R23).
 
     r1, r2, r3 are the rows of R = Ry(tau_y) Rx(tau_x), p = (x, y, 1).
     """
@@ -183,13 +183,13 @@ def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
 
 
 def _turned(matrix: Array, point: Array) -> list[Array]:
-    """The three coordinates (n,) of a matrix (3, 3) times (x, y, 1)."""
+    """Three coordinates (n,) of a matrix (3, 3) times (x, y, 1)."""
     x, y = point.T
     return [row[0] * x + row[1] * y + row[2] for row in matrix]
 
 
 def _turn(angle: float, axis: int) -> tuple[Array, Array]:
-    """OpenCV's turn (3, 3) by an angle about x (0) or y (1), and its derivative."""
+    """OpenCV's rotation (3, 3) around x (0) or y (1), and its derivative."""
     c, s, i = np.cos(angle), np.sin(angle), np.arange(axis + 1, axis + 3) % 3
     turn, derivative = np.zeros((2, 3, 3), dtype=np.result_type(c))
     turn[axis, axis] = 1.0

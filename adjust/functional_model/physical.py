@@ -1,7 +1,7 @@
-"""Corrections with a physical cause: radial and decentering terms, affinity and shear, as several programs have them.
+"""Physical distortion models: radial and decentering distortion, affinity and shear, in the forms of several programs.
 
-Torlegård's and Brown's are subtracted from the observed point, Fraser's are added to it, Luhmann's are added to the
-ideal one.
+Torlegård's and Brown's corrections are subtracted from the observed point, Fraser's are added to it, Luhmann's are
+added to the ideal point.
 """
 
 from dataclasses import replace
@@ -23,17 +23,17 @@ AICON_GROUPS = (("radial", AICON_NAMES[:3]), ("decentering", AICON_NAMES[3:5]), 
 
 
 def torlegard(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
-    """Torlegård's radial and decentering terms; `paper`: the decentering terms with x', y' as printed."""
+    """Torlegård's radial and decentering terms. decentering "paper": with x', y' as printed."""
     return _radial_and_decentering(xy, principal_point, parameters, settings.r0_mm, settings.decentering == "paper")
 
 
 def brown(_: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
-    """Brown's terms of the observed point: Torlegård's with r0 = 0, and an affinity b1, b2 of x'."""
+    """Brown's correction of the observed point: Torlegård's with r0 = 0, and affinity b1 and shear b2 of x'."""
     return _affine_correction(xy, principal_point, parameters, 0.0)
 
 
 def australis(_: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
-    """Fraser's terms of the observed point, which are added to it: Brown's with the other sign.
+    """Fraser's correction, added to the observed point: Brown's with opposite sign.
 
     Source: C. S. Fraser, Digital camera self-calibration, ISPRS Journal 52 (1997), the model of Australis and iWitness.
     """
@@ -42,7 +42,7 @@ def australis(_: Settings, xy: Array, principal_point: Array, parameters: Array)
 
 
 def aicon(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
-    """Balanced radial terms with a second zero at r0, decentering, affinity c1 and shear c2 of x'; for the ideal point.
+    """Balanced radial distortion (second zero at r0), decentering, affinity c1 and shear c2 of x'; of the ideal point.
 
     Sources: T. Luhmann, S. Robson, S. Kyle, J. Boehm, Close-Range Photogrammetry and 3D Imaging, the standard
     interior orientation; AICON's .ior files (A1 to A3, R0, B1, B2, C1, C2) as JAICOV's `IORFileReader` reads them, and
@@ -52,7 +52,7 @@ def aicon(settings: Settings, xy: Array, principal_point: Array, parameters: Arr
 
 
 def _affine_correction(xy: Array, principal_point: Array, parameters: Array, r0_mm: float) -> Correction:
-    """Three radial and two decentering terms, and an affinity of x' with two."""
+    """Three radial terms, two decentering terms, affinity and shear of x'."""
     stretch, shear = parameters[5:]
     whole = np.concatenate([parameters[:5], np.zeros(2)])
     common = _radial_and_decentering(xy, principal_point, whole, r0_mm, False)
@@ -71,7 +71,7 @@ def _affine_correction(xy: Array, principal_point: Array, parameters: Array, r0_
 def _radial_and_decentering(
     xy: Array, principal_point: Array, parameters: Array, r0_mm: float, literal: bool
 ) -> Correction:
-    """literal: the decentering terms with x', y' and not reduced to the principal point."""
+    """Radial and decentering terms. literal: decentering terms with x', y' not reduced to the principal point."""
     k3, k5, k7, p1, p2, p3, p4 = parameters
     reduced = xy - principal_point
     x, y = (xy if literal else reduced).T

@@ -3,11 +3,11 @@
 With ξ = xr / bx, η = yr / by, xr and yr reduced to the principal point and bx, by half the frame (`half_mm`), all are
 products φm(ξ) φn(η) up to one degree in x and in y, in dx and in dy. The polynomials φ are orthogonal over the points
 -1, 0, 1 (Ebner), over -1, -1/2, 0, 1/2, 1 (Grün) or over -1..1 (Legendre), and so are the products over the grid of
-3 x 3 or 5 x 5 points or the whole frame. Six combinations are left out, those that the exterior and interior
-orientation make themselves: two shifts, a rotation, a change of scale and, of degree two, the two tilts (x², xy),
-(xy, y²). Of the terms that these are made of, the combinations orthogonal to them stay: (ξ, -η), (η, ξ),
-(-t φ2(ξ), ξη) and (ξη, -t φ2(η)), with t = 2, 10/7 and 5/6. In a frame that is not square, all parts of these four are
-weighted with the square root of by / bx or its inverse, so that they stay orthogonal to what is left out.
+3 x 3 or 5 x 5 points or the whole frame. Six combinations are left out, since exterior and interior orientation absorb
+them: two shifts, a rotation, a change of scale and, of degree two, the two tilts (x², xy), (xy, y²). Of the terms in
+these, only the combinations orthogonal to them remain: (ξ, -η), (η, ξ), (-t φ2(ξ), ξη) and (ξη, -t φ2(η)), with t = 2,
+10/7 and 5/6. In a frame that is not square, the parts of these four are weighted with the square root of by / bx or its
+inverse, so that they remain orthogonal to the omitted combinations.
 
 All parameters are in mm. The published coefficient of a product of degree m + n is ours over b^(m + n).
 
@@ -33,7 +33,10 @@ Term = str | tuple[int, int, int]  # one of the four combinations, or (0 for dx 
 
 @dataclass(frozen=True)
 class PolynomialSet:
-    """polynomials: per degree the coefficients of φ, lowest power first. tilt: t above. terms: one a parameter."""
+    """Set of products of polynomials.
+
+    polynomials: coefficients of φ per degree, lowest power first. tilt: t above. names, terms: one per parameter.
+    """
 
     polynomials: tuple[tuple[float, ...], ...]
     tilt: float
@@ -42,20 +45,20 @@ class PolynomialSet:
 
 
 def legendre(order: int) -> PolynomialSet:
-    """a and b are the coefficients of dx and dy; their first index is the degree in x, the second in y."""
+    """Make the Legendre set of an order: a, b for dx, dy; the first index is the degree in x, the second in y."""
     combined: dict[str, Term] = {"a10": STRETCH, "a01": SHEAR, "a11": TILT_Y, "b11": TILT_X}
     single: dict[str, Term] = {f"{'ab'[axis]}{m}{n}": (axis, m, n) for axis, m, n in _single_terms(order)}
     return legendre_terms(combined | single, order)
 
 
 def legendre_terms(terms: dict[str, Term], degree: int) -> PolynomialSet:
-    """Some terms by their names, of products of Legendre polynomials up to a degree in x and in y."""
+    """Make a set of named terms of products of Legendre polynomials up to a degree in x and in y."""
     polynomials = [tuple(series.leg2poly([0.0] * each + [1.0]).tolist()) for each in range(degree + 1)]
     return _polynomial_set(polynomials, 5 / 6, terms)
 
 
 def _single_terms(degree: int) -> list[tuple[int, int, int]]:
-    """The products that are parameters by themselves: dx before dy, low degrees first."""
+    """Products that are single parameters: dx before dy, low degrees first."""
     combined = {(0, 0), (1, 0), (0, 1), (1, 1)}
     products = sorted(((m, n) for m in range(degree + 1) for n in range(degree + 1)), key=lambda mn: (sum(mn), mn[1]))
     return [
@@ -88,7 +91,7 @@ GRUEN = _polynomial_set(
 
 
 def degree_groups(of: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    """The parameters of every degree in x and y together."""
+    """Group the parameters by their total degree in x and y."""
     combined = {STRETCH: 1, SHEAR: 1, TILT_X: 2, TILT_Y: 2}
     degrees = [combined[term] if isinstance(term, str) else sum(term[1:]) for term in of.terms]
     return tuple(
@@ -98,12 +101,12 @@ def degree_groups(of: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
 
 
 def correct(of: PolynomialSet, settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
-    """The correction of a set, which is subtracted from the observed point."""
+    """Compute the correction of a set. It is subtracted from the observed point."""
     return summed(of, np.array(settings.half_mm), xy, principal_point, parameters)
 
 
 def summed(of: PolynomialSet, half: Array, xy: Array, center: Array, parameters: Array) -> Correction:
-    """The terms of a set at places (n, 2), times their parameters (k,). center, half (2,): of the extent."""
+    """Sum the terms of a set times their parameters (k,) at places (n, 2); center, half (2,) of the extent."""
     coefficients = _coefficients(of, float(half[1] / half[0]))
     scaled = (xy - center) / half
     (x, x_slope), (y, y_slope) = (_polynomials(of, scaled[:, axis]) for axis in (0, 1))
@@ -118,7 +121,7 @@ def summed(of: PolynomialSet, half: Array, xy: Array, center: Array, parameters:
 
 @lru_cache
 def _coefficients(of: PolynomialSet, ratio: float) -> Array:
-    """(2, k, degree + 1, degree + 1): the products that every parameter adds to dx and dy. ratio: by / bx."""
+    """(2, k, degree + 1, degree + 1) coefficients of the products in dx and dy for each parameter. ratio: by / bx."""
     size = len(of.polynomials)
     q = np.sqrt(ratio)
     combinations = {
@@ -135,7 +138,7 @@ def _coefficients(of: PolynomialSet, ratio: float) -> Array:
 
 
 def _polynomials(of: PolynomialSet, t: Array) -> tuple[Array, Array]:
-    """All polynomials at t (n,) and their derivatives, both (n, degree + 1)."""
+    """Values and derivatives of all polynomials at t (n,), both (n, degree + 1)."""
     size = len(of.polynomials)
     matrix = np.array([[*each, *[0.0] * (size - len(each))] for each in of.polynomials]).T
     powers = t[:, None] ** np.arange(size)

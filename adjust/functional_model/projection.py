@@ -1,4 +1,4 @@
-"""Object points into images and back: rays, camera points, comparator points, with the adjustment's own functions."""
+"""Projection of object points to camera and comparator coordinates with the functions of the adjustment."""
 
 from dataclasses import dataclass, field, replace
 
@@ -15,9 +15,16 @@ from adjust.linear_algebra.small_matrices import applied, product
 
 @dataclass(frozen=True)
 class ImageModel:
-    """One image as it is known at a time: lens, exterior orientation, film transformation, scanner.
+    """Current model of one image: lens, exterior orientation, film transformation, scanner.
 
-    rotation (3, 3) object to camera; station (3,) in object units; bend_parameters (k,) of the scanner's bend.
+    Attributes
+    ----------
+    lens : lens with values.
+    rotation : (3, 3) object to camera.
+    station : (3,) projection centre in object units.
+    film : film transformation.
+    line_of_sight : earth curvature and refraction.
+    bend, bend_parameters : scanner terms and their parameters (k,).
     """
 
     lens: Lens
@@ -29,53 +36,54 @@ class ImageModel:
     bend_parameters: Array = field(default_factory=lambda: np.empty(0))
 
     def reduced_to(self, xyz: Array) -> tuple["ImageModel", Array]:
-        """The same image and object points (n, 3), counted from its station: differences of large numbers are formed
-        once. Heights stay as they are where the line of sight depends on them.
+        """Reduce the image and object points (n, 3) to the station, so that large numbers are subtracted once.
+
+        Heights are not reduced where the line of sight depends on them.
         """
         origin = self.station * [1.0, 1.0, float(self.line_of_sight.is_straight)]
         return replace(self, station=self.station - origin), xyz - origin
 
     def camera_from_object(self, xyz: Array) -> tuple[Array, Mask]:
-        """Observed, that is distorted, camera coordinates (n, 2) in mm of object points (n, 3); which have an image."""
+        """Project object points (n, 3) to distorted camera coordinates (n, 2) in mm; mask of those imaged."""
         ray, in_camera = rays(self.rotation, sight_vectors(self.line_of_sight, self.station, xyz).vector)
         xy_mm, found = self.lens.camera_from_ray(ray)
         return xy_mm, found & (in_camera[:, 2] < 0.0)
 
     def comparator_from_object(self, xyz: Array) -> tuple[Array, Mask]:
-        """Comparator coordinates (n, 2) in mm of object points (n, 3); which of them have an image."""
+        """Project object points (n, 3) to comparator coordinates (n, 2) in mm; mask of those imaged."""
         xy_mm, visible = self.camera_from_object(xyz)
         comparator_mm, found = self.comparator_from_camera(xy_mm)
         return comparator_mm, visible & found
 
     def camera_from_comparator(self, xy_mm: Array) -> Array:
-        """Observed camera coordinates (n, 2) of comparator coordinates (n, 2), mm."""
+        """Compute observed camera coordinates (n, 2) from comparator coordinates (n, 2), mm."""
         return self.film.camera_from_comparator(self.bend.apply(self.bend_parameters, xy_mm))
 
     def camera_by_comparator(self, xy_mm: Array) -> Array:
-        """Their derivatives (n, 2, 2) by the comparator coordinates."""
+        """Derivatives (n, 2, 2) of the camera coordinates with respect to the comparator coordinates."""
         straight_mm = self.bend.apply(self.bend_parameters, xy_mm)
         return product(self.film.gradient(straight_mm), self.bend.gradient(self.bend_parameters, xy_mm))
 
     def comparator_from_camera(self, xy_mm: Array) -> tuple[Array, Mask]:
-        """Comparator coordinates (n, 2) of observed camera coordinates (n, 2), mm; which film and scanner have."""
+        """Compute comparator coordinates (n, 2) from observed camera coordinates (n, 2), mm; mask of those found."""
         straight_mm, found = self.film.comparator_from_camera(xy_mm)
         scan_mm, unfolded = self.bend.inverse(self.bend_parameters, straight_mm)
         return scan_mm, found & unfolded
 
 
 def rays(rotation: Array, vector: Array) -> tuple[Array, Array]:
-    """The rays (n, 2), -U/W and -V/W, along vectors (n, 3) from station to point, and these in the camera's axes.
+    """Compute rays (n, 2), -U/W and -V/W, of vectors (n, 3) to points, and these vectors in the camera frame.
 
     rotation (3, 3) or (n, 3, 3). A point in front of the camera has W < 0.
     """
     in_camera = applied(rotation, vector)
     depth = in_camera[..., 2:]
-    # A point in the plane of the lens has no image: its ray is kept finite and W = 0 tells.
+    # A point with W = 0 has no image: its ray is kept finite, and the caller tests W.
     return -in_camera[..., :2] / np.where(depth == 0.0, 1.0, depth), in_camera
 
 
 def ray_by_orientation(ray: Array, inverse_depth: Array) -> Array:
-    """Derivatives (n, 2, 6) of rays (n, 2) by a small turn of their points about the camera and by a shift of these.
+    """Derivatives (n, 2, 6) of rays (n, 2) with respect to a small rotation and a shift of their points.
 
     With p = (u, v, -1) along the ray, the point moves by t x p + s / depth.
     """

@@ -1,6 +1,6 @@
-"""Attitudes: object to camera, M = R3(kappa) R2(phi) R1(omega), and small rotations on top of it.
+"""Rotations from object to camera, M = R3(kappa) R2(phi) R1(omega), and small rotations applied to them.
 
-A change of attitude is a rotation vector t in the camera frame, M_new = exp([t]x) M: it has no singular attitude.
+A change of attitude is a rotation vector t in the camera frame, M_new = exp([t]x) M, which has no singularity.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ GIMBAL_LOCK = 1e-12  # cos(phi) below which only omega + kappa or omega - kappa 
 
 
 def rotation_from_angles(angles_rad: Array) -> Array:
-    """The rotation matrix, object to camera: (..., 3) omega, phi, kappa to (..., 3, 3)."""
+    """Compute the rotation matrix, object to camera: (..., 3) omega, phi, kappa to (..., 3, 3)."""
     so, sp, sk = np.moveaxis(np.sin(angles_rad), -1, 0)
     co, cp, ck = np.moveaxis(np.cos(angles_rad), -1, 0)
     rows = (
@@ -23,7 +23,7 @@ def rotation_from_angles(angles_rad: Array) -> Array:
 
 
 def angles_from_rotation(rotation: Array) -> Array:
-    """omega, phi, kappa (..., 3) of rotation matrices (..., 3, 3); omega is set to 0 where phi is +-90 degrees."""
+    """Compute omega, phi, kappa (..., 3) from rotation matrices (..., 3, 3); omega is 0 where phi is ±90 degrees."""
     cos_phi = np.hypot(rotation[..., 2, 1], rotation[..., 2, 2])
     locked = cos_phi < GIMBAL_LOCK
     omega = np.where(locked, 0.0, np.arctan2(-rotation[..., 2, 1], rotation[..., 2, 2]))
@@ -34,7 +34,7 @@ def angles_from_rotation(rotation: Array) -> Array:
 
 
 def angles_near(rotation: Array, reference_rad: Array) -> Array:
-    """omega, phi, kappa (..., 3) of rotation matrices, of all triples for one the nearest to the reference."""
+    """Compute omega, phi, kappa (..., 3) from rotation matrices, choosing the triple nearest the reference."""
     angles = angles_from_rotation(rotation)
     other = np.array([np.pi, np.pi, np.pi]) + angles * np.array([1.0, -1.0, 1.0])
     triples = np.stack([angles, other])
@@ -44,7 +44,7 @@ def angles_near(rotation: Array, reference_rad: Array) -> Array:
 
 
 def rotation_from_vector(vector_rad: Array) -> Array:
-    """exp([t]x), the rotation by the vector t (Rodrigues): (..., 3) to (..., 3, 3)."""
+    """Compute exp([t]x), the rotation by the vector t (Rodrigues): (..., 3) to (..., 3, 3)."""
     angle = np.sqrt((vector_rad**2).sum(axis=-1))[..., None, None]
     cross = cross_matrix(vector_rad)
     first = np.sinc(angle / np.pi)
@@ -53,7 +53,7 @@ def rotation_from_vector(vector_rad: Array) -> Array:
 
 
 def cross_matrix(vector: Array) -> Array:
-    """[t]x, so that [t]x u = t x u: (..., 3) to (..., 3, 3)."""
+    """Cross-product matrix [t]x, with [t]x u = t x u: (..., 3) to (..., 3, 3)."""
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     matrix = np.zeros((*vector.shape, 3), dtype=vector.dtype)
     matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = x, y, z
@@ -62,7 +62,7 @@ def cross_matrix(vector: Array) -> Array:
 
 
 def vector_by_angles(angles_rad: Array) -> Array:
-    """Derivative (..., 3, 3) of the rotation vector by omega, phi, kappa; singular where phi is +-90 degrees."""
+    """Derivative (..., 3, 3) of the rotation vector w.r.t. omega, phi, kappa; singular at phi = ±90 degrees."""
     omega_axis = rotation_from_angles(angles_rad)[..., 0]
     kappa = angles_rad[..., 2]
     zero, one = np.zeros_like(kappa), np.ones_like(kappa)

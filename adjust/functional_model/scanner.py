@@ -1,15 +1,16 @@
-"""What a scanner does to its scans: a smooth bend S, fixed to its own axes, before the film transformations.
+"""Scanner model: a smooth deformation S, fixed to the scanner's axes and applied before the film transformations.
 
     x = x_s - sum of a[mn] P_m(ξ) P_n(η),   y = y_s - sum of b[mn] P_m(ξ) P_n(η),   F1 = T_i(S(x_s, y_s)) - ...
 
-ξ, η are the scan's coordinates about the middle of its extent, half of it the unit, P Legendre polynomials, and the sum
-is how far the scanner puts a point beside its place; all parameters are in mm. What the film transformation of an image
-can take, its scanner's bend cannot be told from: only terms that no transformation takes are offered. A term `a21` is
-one product alone; `stretch`, `shear`, `tilt_x` and `tilt_y` are the combinations that a similarity, or a projective
-transformation, leaves of products of which it takes others (see `polynomial_sets`).
+ξ, η are scan coordinates relative to the centre of the extent, in units of half the extent; P are Legendre polynomials.
+The sum is the displacement of a point by the scanner; all parameters are in mm. Scanner terms that a film
+transformation can absorb cannot be estimated separately: only terms that no transformation absorbs are offered. A term
+`a21` is a single product. `stretch`, `shear`, `tilt_x` and `tilt_y` are combinations orthogonal to those that a
+similarity or a projective transformation absorbs (see `polynomial_sets`).
 
-A digital camera that took the scan has a lens besides. It is known, and comes first: S(x_s, y_s) takes the lens's
-distortion out of the comparator coordinates, which are those of its picture, and then the bend.
+A scan taken by a digital camera also has that camera's lens distortion. The lens is known and is applied first:
+S(x_s, y_s) removes the lens distortion from the comparator coordinates (image coordinates of the digital camera), then
+the scanner terms.
 """
 
 import re
@@ -35,21 +36,21 @@ from adjust.functional_model.polynomial_sets import (
 from adjust.functional_model.transformation import polynomial_order
 from adjust.linear_algebra.small_matrices import determinant, product, solved
 
-SMOOTH = (2, 3)  # degrees of the products that a bend consists of
-ALONG = (4, 5, 6)  # degrees of those along one axis alone, the carriage's, which tests may ask for
+SMOOTH = (2, 3)  # total degrees of the smooth terms
+ALONG = (4, 5, 6)  # degrees of the carriage terms, along one axis alone, for tests
 COMBINED = {"stretch": STRETCH, "shear": SHEAR, "tilt_x": TILT_X, "tilt_y": TILT_Y}
 STEPS = 30
 TOLERANCE_MM = 1e-11
 
 
 def smooth_terms(films: Iterable[str]) -> tuple[str, ...]:
-    """The terms of degree 2 and 3 that no film transformation of some takes; of degree 1 what similarities leave."""
+    """List the combined terms and those of degree 2 and 3 that none of the film transformations absorbs."""
     products = [(axis, degree - n, n) for degree in SMOOTH for axis in (0, 1) for n in range(degree + 1)]
     return _remaining_terms(films, (*COMBINED, *(_name(*each) for each in products)))
 
 
 def carriage_terms(films: Iterable[str]) -> tuple[str, ...]:
-    """Those of degree 4 to 6 along x or y alone."""
+    """List the terms of degree 4 to 6 along x or y alone that none of the film transformations absorbs."""
     products = [(axis, *pair) for degree in ALONG for pair in ((degree, 0), (0, degree)) for axis in (0, 1)]
     return _remaining_terms(films, tuple(_name(*each) for each in products))
 
@@ -60,7 +61,7 @@ def _remaining_terms(films: Iterable[str], names: Iterable[str]) -> tuple[str, .
 
 
 def is_left(kind: str, name: str) -> bool:
-    """Whether a film transformation leaves a term as it is, and does not take it or a part of it."""
+    """Whether a film transformation absorbs no part of a scanner term."""
     linear = kind not in ("congruent", "similarity") and not kind.startswith("conformal")
     match name:
         case "stretch" | "shear":
@@ -84,22 +85,25 @@ def _product(name: str) -> tuple[int, int, int]:
 
 
 def term_degree(name: str) -> int:
-    """The degree in x and y together of a term."""
+    """Total degree of a term in x and y."""
     return {"stretch": 1, "shear": 1, "tilt_x": 2, "tilt_y": 2}[name] if name in COMBINED else sum(_product(name)[1:])
 
 
 def is_term(name: str) -> bool:
-    """Whether a bend may have a parameter of this name."""
+    """Whether a scanner parameter may have this name."""
     form = re.fullmatch(r"[ab](\d)(\d)", name)
     return name in COMBINED or (form is not None and 1 < int(form[1]) + int(form[2]) <= ALONG[-1])
 
 
 @dataclass(frozen=True)
 class Bend:
-    """The formula of S: its terms in their order, the middle and half the extent of the scan in x and y, mm.
+    """Scanner deformation S. Without terms and lens it is the identity.
 
-    lens: of the digital camera that took the scan, its interior orientation in the comparator; None of a scanner.
-    Without a term and a lens it is x = x_s, y = y_s.
+    Attributes
+    ----------
+    terms : names of the terms in order.
+    center_mm, half_mm : centre and half extent of the scan in x and y.
+    lens : lens of the digital camera that took the scan, interior orientation in the comparator; None for a scanner.
     """
 
     terms: tuple[str, ...] = ()
@@ -112,7 +116,7 @@ class Bend:
         return not self.terms and self.lens is None
 
     def displacement(self, parameters: Array, scan_mm: Array) -> Correction:
-        """How far (n, 2) the scanner puts points beside their places, at the coordinates (n, 2) that it gives them."""
+        """Compute the displacements (n, 2) by the scanner at scan coordinates (n, 2), mm, with their derivatives."""
         if self.lens is None:
             return self._bend_displacement(parameters, scan_mm)
         straight_mm, by_scan = _remove_distortion(self.lens, scan_mm)
@@ -122,23 +126,23 @@ class Bend:
         return replace(bend, value=value, xy_jacobian=np.eye(2) - gradient)
 
     def _bend_displacement(self, parameters: Array, straight_mm: Array) -> Correction:
-        """Likewise, of coordinates (n, 2) that are free of a lens's distortion."""
+        """Displacements by the scanner terms alone, at coordinates (n, 2) free of lens distortion."""
         if not self.terms:
             return no_correction(Distortion(), straight_mm, np.zeros(2), parameters)
         return summed(self._polynomial_set, np.array(self.half_mm), straight_mm, np.array(self.center_mm), parameters)
 
     def apply(self, parameters: Array, scan_mm: Array) -> Array:
-        """The places (n, 2) of points whose coordinates in the scan (n, 2) are given, mm."""
+        """Correct scan coordinates (n, 2) for the scanner, mm."""
         return scan_mm if self.is_identity else scan_mm - self.displacement(parameters, scan_mm).value
 
     def gradient(self, parameters: Array, scan_mm: Array) -> Array:
-        """Their derivatives (n, 2, 2) by the coordinates in the scan."""
+        """Derivatives (n, 2, 2) of the corrected coordinates with respect to the scan coordinates."""
         if self.is_identity:
             return np.broadcast_to(np.eye(2), (*scan_mm.shape, 2))
         return np.asarray(np.eye(2) - self.displacement(parameters, scan_mm).xy_jacobian)
 
     def inverse(self, parameters: Array, xy_mm: Array) -> tuple[Array, Mask]:
-        """The coordinates in the scan (n, 2) of places (n, 2), and which were found: where the bend folds none are."""
+        """Compute scan coordinates (n, 2) from corrected ones (n, 2); mask of those found (none where S folds over)."""
         found = np.ones(len(xy_mm), dtype=bool)
         if self.is_identity:
             return xy_mm, found
@@ -164,9 +168,10 @@ class Bend:
 
 
 def _remove_distortion(lens: Lens, scan_mm: Array) -> tuple[Array, Array]:
-    """Places (n, 2) in a lens's picture free of its distortion, and their derivatives (n, 2, 2) by those in it.
+    """Distortion-free image points (n, 2), and their derivatives (n, 2, 2) with respect to the observed ones.
 
-    By the implicit function theorem, the lens's equations having no value. Nan where the lens folds over.
+    The derivatives follow from the lens's condition equations by the implicit function theorem. Points are nan where
+    the lens folds over.
     """
     straight_mm, found = lens.ideal_from_observed(scan_mm)
     at = lens.equations(scan_mm, (straight_mm - lens.interior[1:]) / lens.interior[0])

@@ -1,4 +1,4 @@
-"""What one image sees, freed of film, principal point and distortion."""
+"""Image points of one image, reduced for film transformation, principal point and distortion."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,14 @@ from adjust.array_types import Array
 
 @dataclass(frozen=True)
 class Sight:
-    """Points seen in one image, in the order of their ids.
+    """Points of one image, in the order of their ids.
 
-    points (n,) ids; xy_mm (n, 2) ideal coordinates about the principal point, y up; sigma_mm: the typical standard
-    deviation of one coordinate.
+    Attributes
+    ----------
+    points : (n,) ids.
+    xy_mm : (n, 2) ideal coordinates relative to the principal point, y up.
+    principal_distance_mm : principal distance.
+    sigma_mm : typical standard deviation of one coordinate.
     """
 
     points: tuple[str, ...]
@@ -22,5 +26,5 @@ class Sight:
 
     @property
     def rays(self) -> Array:
-        """Directions (n, 3) from the lens to the points, in the camera frame: (x', y', -c)."""
+        """(n, 3) directions to the points in the camera frame: (x', y', -c)."""
         return np.column_stack([self.xy_mm, np.full(len(self.xy_mm), -self.principal_distance_mm)])

@@ -9,9 +9,9 @@
     conformal(n)   x' + i y' = (a1 + i b1) + (a2 + i b2) z + ... + (a[n+1] + i b[n+1]) z^n,   z = x + i m y
     polynomial(n)  x' = a1 + a2 x + a3 y + a4 x² + a5 xy + a6 y² + a7 x³ + a8 x²y + ... of total degree n; y' with b
 
-x, y are comparator coordinates in mm as they were observed, neither centred nor scaled. m is -1 where the scan is
-mirrored, which a congruent, similarity and conformal transformation has to be told, and 1 elsewhere; the others are
-mirrored by their own parameters. conformal(1) is a similarity, and polynomial(1) an affine transformation.
+x, y are observed comparator coordinates in mm, neither centred nor scaled. m is -1 where the scan is mirrored, else 1.
+Congruent, similarity and conformal transformations need m as an input; the parameters of the others include mirroring.
+conformal(1) is a similarity, polynomial(1) an affine transformation.
 """
 
 import re
@@ -39,7 +39,7 @@ POSSIBLE = (
 
 @lru_cache
 def film_kind(spelling: str, mirrored: bool = False) -> FilmKind:
-    """The formula of a transformation as it is spelt. Raises ValueError, with what is possible, for any other word."""
+    """Return the formula of a transformation by its name. Raises ValueError, listing the names, for any other."""
     match spelling:
         case "none":
             return Identity()
@@ -72,24 +72,24 @@ def _name_and_order(spelling: str) -> tuple[str, int]:
 
 
 def film_parameter_names(spelling: str) -> tuple[str, ...]:
-    """The names of a transformation's parameters in their order."""
+    """Names of a transformation's parameters in order."""
     return film_kind(spelling).names
 
 
 def marks_needed(spelling: str) -> int:
-    """How many fiducial marks determine a transformation by themselves."""
+    """Number of fiducial marks that determine a transformation without redundancy."""
     return least_marks(film_kind(spelling))
 
 
 @lru_cache
 def fewest_marks(spelling: str) -> int:
-    """How many fiducial marks an adjustment needs to begin with: those of the simplest transformation of the family."""
+    """Number of fiducial marks that initial values need: those of the simplest transformation of the family."""
     lower = simpler(spelling)
     return fewest_marks(lower) if lower else marks_needed(spelling)
 
 
 def simpler(spelling: str) -> str | None:
-    """The transformation of the same family that needs fewer marks, None where there is none."""
+    """Return the transformation of the same family that needs fewer marks, or None."""
     if spelling in ("projective", "bilinear", "polynomial(2)"):
         return "affine"
     if spelling == "conformal(2)":
@@ -101,24 +101,29 @@ def simpler(spelling: str) -> str | None:
 
 
 def polynomial_order(spelling: str) -> int:
-    """The order of a conformal or general polynomial; 1 of those that are linear or nearly so."""
+    """Order of a conformal or general polynomial; 1 for all other transformations."""
     return _name_and_order(spelling)[1] if spelling.startswith(("conformal", "polynomial")) else 1
 
 
 def follows_tilts(spelling: str) -> bool:
-    """Whether a transformation can undo what a small tilt of the camera does to the image: x' + t x'², y' + t x'y'.
+    """Whether a transformation can absorb the effect of a small camera tilt: x' + t x'², y' + t x'y'.
 
-    A projective one does so exactly, a polynomial as long as it is nearly affine, a conformal one together with
-    decentering distortion.
+    A projective transformation absorbs it exactly, a polynomial as long as it is nearly affine, a conformal one
+    together with decentering distortion.
     """
     return spelling == "projective" or (simpler(spelling) is not None and spelling != "bilinear")
 
 
 @dataclass(frozen=True)
 class Film:
-    """The film transformation of one image: its spelling, its parameters (k,), whether the scan is mirrored.
+    """Film transformation of one image.
 
-    center_mm (2,): a place in the middle of the image, in the comparator.
+    Attributes
+    ----------
+    transformation : name of the transformation.
+    parameters : (k,) in the order of `film_parameter_names`.
+    center_mm : (2,) comparator coordinates of a place in the middle of the image.
+    mirrored : whether the scan is mirrored.
     """
 
     transformation: str
@@ -127,19 +132,19 @@ class Film:
     mirrored: bool = False
 
     def camera_from_comparator(self, xy_mm: Array) -> Array:
-        """Camera coordinates (n, 2) of comparator coordinates (n, 2), mm."""
+        """Compute camera coordinates (n, 2) from comparator coordinates (n, 2), mm."""
         return self._kind.apply(self.parameters, xy_mm)
 
     def gradient(self, xy_mm: Array) -> Array:
-        """Their derivatives (n, 2, 2) by the comparator coordinates."""
+        """Derivatives (n, 2, 2) of the camera coordinates with respect to the comparator coordinates."""
         return self._kind.gradient(self.parameters, xy_mm)
 
     def comparator_from_camera(self, xy_mm: Array) -> tuple[Array, Mask]:
-        """Comparator coordinates (n, 2) of camera coordinates (n, 2), mm; which lie where nothing folds over."""
+        """Compute comparator coordinates (n, 2) from camera coordinates (n, 2), mm, and the mask of those found."""
         return self._kind.inverse(self.parameters, xy_mm, self.center_mm)
 
     def changed(self, parameter: int, by: float) -> "Film":
-        """The same with one parameter, by number, changed."""
+        """Return a copy with one parameter changed; parameter: its number."""
         parameters = self.parameters.copy()
         parameters[parameter] += by
         return replace(self, parameters=parameters)
